@@ -1,0 +1,200 @@
+"""What each stage can be told: one frozen dataclass a stage, each option written down once.
+
+The command line, recon.toml, the fingerprint of a stage and the documentation are all made from
+these fields.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from recon_cli.errors import ConfigError
+from recon_cli.fields import StageConfig, option
+
+
+@dataclass(frozen=True)
+class IngestConfig(StageConfig):
+    """Which frames of the capture are kept."""
+
+    frames: int | None = option(
+        None, "How many frames to choose from a video.", unit="frames", minimum=3,
+        automatic="from the camera's motion, at most --max-frames",
+    )
+    max_frames: int = option(
+        100, "Most frames that the automatic choice takes.", unit="frames", minimum=3)
+    max_size: int = option(
+        1920, "Longest side of a stored frame; larger ones are reduced by area.",
+        unit="pixels", minimum=64)
+    holdout: str = option(
+        "every:8", "Views kept for the score and never trained on: every:N takes each Nth by "
+        "name, segment:A:B a contiguous share of the capture (0 to 1), none takes none.")
+    sharpness: float = option(
+        0.5, "A video frame must reach this share of the sharpness around it.",
+        unit="share", minimum=0.0, maximum=1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        parse_holdout(self.holdout)
+
+
+def parse_holdout(text: str) -> tuple[str, float, float]:
+    """Returns (kind, a, b) of --holdout: ("every", N, 0), ("segment", A, B) or ("none", 0, 0).
+
+    Raises:
+        ConfigError: the text is none of the three forms.
+    """
+    kind, *numbers = text.split(":")
+    try:
+        values = [float(number) for number in numbers]
+    except ValueError:
+        values = []
+    if kind == "none" and not numbers:
+        return kind, 0.0, 0.0
+    if kind == "every" and len(values) == 1 and values[0] >= 2 and values[0].is_integer():
+        return kind, values[0], 0.0
+    if kind == "segment" and len(values) == 2 and 0 <= values[0] < values[1] <= 1:
+        return kind, values[0], values[1]
+    raise ConfigError(
+        f"holdout is {text!r}, but it must be every:N (N >= 2), segment:A:B (0 <= A < B <= 1) "
+        "or none.",
+        hint="Try --holdout every:8.",
+    )
+
+
+@dataclass(frozen=True)
+class DenoiseConfig(StageConfig):
+    """Whether and how strongly the training images are denoised."""
+
+    mode: str = option(
+        "auto", "auto denoises frames whose noise reaches the threshold; force denoises all; "
+        "off passes all through.", choices=("auto", "force", "off"), flags=True)
+    threshold: float = option(
+        3.0, "Noise from which a frame is denoised.", unit="1/255", minimum=0.0)
+    strength: float = option(
+        2.5, "Range sigma of the bilateral filter, as a multiple of the estimated noise.",
+        unit="x noise", minimum=0.1)
+
+
+@dataclass(frozen=True)
+class SfmConfig(StageConfig):
+    """How cameras and points are found."""
+
+    pairs: str = option(
+        "auto", "Image pairs to match; auto is exhaustive up to 100 images, else sequential.",
+        choices=("auto", "exhaustive", "sequential"))
+    max_features: int = option(
+        4096, "Most SIFT keypoints an image.", unit="keypoints", minimum=100)
+    min_registered: float = option(
+        0.5, "Fail when fewer images than this share get a camera.", unit="share",
+        minimum=0.0, maximum=1.0)
+    seed: int = option(0, "Seed of the mapper's random sampling.", minimum=0)
+    max_minutes: float = option(
+        20.0, "Give up after this long.", unit="minutes", minimum=0.01, hashed=False)
+
+
+@dataclass(frozen=True)
+class TrainConfig(StageConfig):
+    """The reference recipe of 3D Gaussian Splatting, scaled to the number of iterations."""
+
+    iterations: int = option(3000, "Optimization steps, one view each.", unit="steps", minimum=1)
+    max_size: int = option(
+        640, "Longest side of a training image; larger ones are reduced by area.",
+        unit="pixels", minimum=16)
+    sh_degree: int = option(
+        3, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3)
+    max_gaussians: int = option(
+        200_000, "Densification stops at this count.", unit="Gaussians", minimum=1)
+    images: str = option(
+        "denoised", "Pixels to train on; scores always use the originals.",
+        choices=("denoised", "original"))
+    validation: float = option(
+        0.05, "Share of the training views kept out to watch progress.", unit="share",
+        minimum=0.0, maximum=0.5)
+    ssim_weight: float = option(
+        0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0)
+    means_rate: float = option(
+        1.6e-4, "Initial learning rate of the means, times the scene extent; it falls to a "
+        "hundredth.", minimum=0.0)
+    quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0)
+    scales_rate: float = option(5e-3, "Learning rate of the log-scales.", minimum=0.0)
+    opacities_rate: float = option(5e-2, "Learning rate of the opacity logits.", minimum=0.0)
+    sh_rate: float = option(
+        2.5e-3, "Learning rate of the base colours; higher degrees get a twentieth.", minimum=0.0)
+    densify_every: int = option(
+        100, "Clone, split and delete this often.", unit="steps", minimum=1)
+    densify_gradient: float = option(
+        2e-4, "Mean gradient of the projected mean from which a Gaussian is cloned or split.",
+        unit="NDC", minimum=0.0)
+    densify_scale: float = option(
+        0.01, "Clone up to this largest scale, split above it.", unit="x extent", minimum=0.0)
+    min_opacity: float = option(
+        0.005, "Gaussians below this opacity are deleted.", minimum=0.0, maximum=1.0)
+    mid: float = option(
+        0.6, "Point of the run whose state is kept, so that pruning can branch off there.",
+        unit="share", minimum=0.05, maximum=1.0)
+    seed: int = option(0, "Seed of every random choice.", minimum=0)
+    checkpoint_every: int = option(
+        250, "Save the full state this often.", unit="steps", minimum=1, hashed=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mid < DENSIFY_UNTIL:
+            raise ConfigError(
+                f"mid is {self.mid:g}, but densification runs until {DENSIFY_UNTIL:g} of the run "
+                "and would grow back what was pruned.",
+                hint=f"Use --mid {DENSIFY_UNTIL:g} or more.")
+
+
+DENSIFY_UNTIL = 0.5  # share of the run: 15,000 of 30,000 iterations in the reference
+
+
+@dataclass(frozen=True)
+class PruneConfig(StageConfig):
+    """Which Gaussians go, and how the rest recovers."""
+
+    ratio: float = option(
+        0.5, "Share of the Gaussians that is removed.", unit="share", minimum=0.0, maximum=1.0)
+    beta: float = option(
+        0.1, "Exponent of the normalised volume in the significance score (equation 4).",
+        minimum=0.0)
+    score: str = option(
+        "paper", "Significance: the paper's score (equations 3 to 5), or a control.",
+        choices=("paper", "blend_max", "loo", "opacity", "random"))
+    at: str = option(
+        "end", "Prune the finished model, or branch off in mid-training and train the rest of "
+        "the run (what train --prune does).", choices=("end", "mid"))
+    recovery: int | None = option(
+        None, "Training steps after pruning.", unit="steps", minimum=0,
+        automatic="the rest of the run at mid, a sixth of it at end")
+
+
+@dataclass(frozen=True)
+class EvaluateConfig(StageConfig):
+    """How the held-out views are scored."""
+
+    max_size: int | None = option(
+        None, "Longest side at which views are rendered and scored.", unit="pixels", minimum=16,
+        automatic="the size that was trained on")
+
+
+@dataclass(frozen=True)
+class ExportConfig(StageConfig):
+    """Which model is handed out."""
+
+    model: str = option(
+        "auto", "auto takes the pruned model where there is a fresh one.",
+        choices=("auto", "base", "pruned"))
+
+
+@dataclass(frozen=True)
+class ComputeConfig(StageConfig):
+    """Where the numerical work runs. Recorded in the manifest, never part of a fingerprint."""
+
+    device: str = option(
+        "auto", "Where tensors live; auto takes CUDA where there is one.",
+        choices=("auto", "cpu", "cuda"), hashed=False)
+    backend: str = option(
+        "auto", "Rasterizer; auto takes the fastest that runs on the device.",
+        choices=("auto", "torch"), hashed=False)
+    threads: int | None = option(
+        None, "CPU threads.", unit="threads", minimum=1, hashed=False, automatic="all cores")

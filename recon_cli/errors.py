@@ -1,0 +1,75 @@
+"""Everything that a user can do wrong, each with its exit code.
+
+A message says what was found and what was needed; a hint says what to type next. Programming
+mistakes stay ValueError or AssertionError and leave the CLI with exit code 1.
+"""
+
+from __future__ import annotations
+
+
+class ReconError(Exception):
+    """A failure that the user can act on.
+
+    Args:
+        message: what was found and what was needed.
+        hint: what to type or change next; empty when there is nothing to say.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, *, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+
+class ConfigError(ReconError):
+    """An option or a configuration file holds a value that cannot be used."""
+
+    exit_code = 2
+
+
+class InputError(ReconError):
+    """The capture cannot be read or does not hold enough."""
+
+    exit_code = 3
+
+
+class StageError(ReconError):
+    """A stage was asked for before what it reads is there and fresh."""
+
+    exit_code = 4
+
+
+class ReconstructionError(ReconError):
+    """The input was read, but no trustworthy reconstruction came out of it."""
+
+    exit_code = 5
+
+
+class SfmError(ReconstructionError):
+    """Structure from motion found no usable cameras."""
+
+
+class TrainingError(ReconstructionError):
+    """Training diverged or has nothing to fit."""
+
+
+class BackendError(ReconError):
+    """The rasterizer or device that was asked for is not available."""
+
+    exit_code = 6
+
+
+class WorkspaceError(ReconError):
+    """The workspace cannot be read, written or locked."""
+
+    exit_code = 7
+
+
+class ManifestError(WorkspaceError):
+    """A manifest is truncated, edited by hand, or of an unknown version."""
+
+
+class FormatError(InputError):
+    """A file does not hold what its format promises."""

@@ -1,0 +1,95 @@
+"""How an option is declared and checked: dataclass fields that know their help, unit and range.
+
+A field whose `hashed` is False changes how fast or where a stage runs, never what comes out of it,
+and so never makes a result stale.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+from recon_cli.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class OptionInfo:
+    """What is said about a field beyond its type and default."""
+
+    help: str
+    unit: str = ""
+    choices: tuple[str, ...] = ()
+    minimum: float | None = None
+    maximum: float | None = None
+    hashed: bool = True
+    flags: bool = False  # each choice other than the default gets a flag of its own: --force
+    automatic: str = ""  # what None means
+
+
+def option(default: Any, help: str, **info: Any) -> Any:
+    """Returns a dataclass field with its `OptionInfo`; see there for `info`."""
+    return field(default=default, metadata={"option": OptionInfo(help, **info)})
+
+
+def option_info(item: dataclasses.Field[Any]) -> OptionInfo:
+    """Returns what `option` recorded for a field."""
+    info: OptionInfo = item.metadata["option"]
+    return info
+
+
+def field_type(config: type[StageConfig], name: str) -> tuple[type, bool]:
+    """Returns the scalar type of a field and whether None is allowed."""
+    hint = get_type_hints(config)[name]
+    if get_origin(hint) is UnionType:
+        inner = next(t for t in get_args(hint) if t is not type(None))
+        return inner, True
+    return hint, False
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """Base of every config: checks type, choices and range of each field.
+
+    Raises:
+        ConfigError: a value has the wrong type or lies outside its range.
+    """
+
+    def __post_init__(self) -> None:
+        for item in dataclasses.fields(self):
+            object.__setattr__(self, item.name, self._checked(item))
+
+    def _checked(self, item: dataclasses.Field[Any]) -> Any:
+        value, info = getattr(self, item.name), option_info(item)
+        kind, optional = field_type(type(self), item.name)
+        if value is None and optional:
+            return None
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not kind:
+            raise self._refused(item.name, value, f"a value of type {kind.__name__}")
+        if info.choices and value not in info.choices:
+            raise self._refused(item.name, value, "one of " + ", ".join(info.choices))
+        if isinstance(value, float) and not math.isfinite(value):
+            raise self._refused(item.name, value, "a finite number")
+        if info.minimum is not None and value < info.minimum:
+            raise self._refused(item.name, value, f"at least {info.minimum:g}")
+        if info.maximum is not None and value > info.maximum:
+            raise self._refused(item.name, value, f"at most {info.maximum:g}")
+        return value
+
+    def _refused(self, name: str, value: object, needed: str) -> ConfigError:
+        return ConfigError(
+            f"{name} is {value!r}, but it must be {needed}.",
+            hint=f"Change --{name.replace('_', '-')} or {name} in recon.toml.",
+        )
+
+    def hashed(self) -> dict[str, Any]:
+        """Returns the fields that decide what comes out: the config's part of a fingerprint."""
+        return {
+            item.name: getattr(self, item.name)
+            for item in dataclasses.fields(self)
+            if option_info(item).hashed
+        }

@@ -1,0 +1,83 @@
+"""How long work reports on itself: a protocol, tqdm for terminals, a null for all else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from tqdm import tqdm
+
+
+class Bar(Protocol):
+    """One piece of work whose length is known."""
+
+    def advance(self, steps: int = 1) -> None:
+        """Counts `steps` more units as done."""
+
+    def note(self, text: str) -> None:
+        """Shows `text` beside the bar (loss, count, the file at hand)."""
+
+
+class Progress(Protocol):
+    """Opens bars; the layers below the CLI know nothing else about terminals."""
+
+    def bar(
+        self, label: str, total: int, *, unit: str = "it", done: int = 0
+    ) -> AbstractBarContext:
+        """Returns a context manager that yields a `Bar` already at `done` of `total`."""
+
+
+class AbstractBarContext(Protocol):
+    """A context manager that yields a `Bar`."""
+
+    def __enter__(self) -> Bar:
+        """Opens the bar."""
+
+    def __exit__(self, *exc: object) -> bool | None:
+        """Closes the bar; never swallows an exception."""
+
+
+class _NullBar:
+    def advance(self, steps: int = 1) -> None:
+        """Ignores the step."""
+
+    def note(self, text: str) -> None:
+        """Ignores the text."""
+
+
+class NullProgress:
+    """Says nothing: for tests and for use as a library."""
+
+    @contextmanager
+    def bar(
+        self, label: str, total: int, *, unit: str = "it", done: int = 0  # noqa: ARG002
+    ) -> Iterator[Bar]:
+        """Yields a bar that ignores everything."""
+        yield _NullBar()
+
+
+class _TqdmBar:
+    def __init__(self, bar: tqdm) -> None:
+        self._bar = bar
+
+    def advance(self, steps: int = 1) -> None:
+        self._bar.update(steps)
+
+    def note(self, text: str) -> None:
+        self._bar.set_postfix_str(text, refresh=False)
+
+
+class TqdmProgress:
+    """Bars on stderr. Where stderr is no terminal, one line every 20 seconds is enough."""
+
+    @contextmanager
+    def bar(self, label: str, total: int, *, unit: str = "it", done: int = 0) -> Iterator[Bar]:
+        """Yields a tqdm bar that is closed on leaving."""
+        interval = 0.2 if sys.stderr.isatty() else 20.0
+        with tqdm(
+            desc=label, total=total, unit=unit, initial=done, file=sys.stderr,
+            mininterval=interval, maxinterval=max(10.0, interval), dynamic_ncols=True,
+        ) as bar:
+            yield _TqdmBar(bar)

@@ -1,0 +1,73 @@
+"""The views of a reconstruction, split by what each may be used for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.scene.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One registered image.
+
+    Attributes:
+        name: file name of its frame.
+        camera: pinhole camera at the size of the undistorted image.
+        original: the undistorted image; scores are against these pixels.
+        denoised: the undistorted denoised twin; equal to `original` where nothing was denoised.
+    """
+
+    name: str
+    camera: Camera
+    original: Path
+    denoised: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Registered views and sparse points.
+
+    Attributes:
+        train: views that gradients may come from.
+        validation: views that steer decisions (progress, tuning), never trained on.
+        test: held-out views that only scores may look at.
+        unregistered_test: names of held-out frames that have no camera.
+        points: [P, 3] float64 sparse points in world units.
+        colors: [P, 3] uint8 their RGB colours.
+    """
+
+    train: tuple[View, ...]
+    validation: tuple[View, ...]
+    test: tuple[View, ...]
+    unregistered_test: tuple[str, ...]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the greatest distance of a training camera from their mean (INRIA 3DGS)."""
+        centers = np.stack([view.camera.center for view in self.train])
+        return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+def split_views(
+    views: Sequence[View], held_out: frozenset[str], *, validation: float
+) -> tuple[tuple[View, ...], tuple[View, ...], tuple[View, ...]]:
+    """Returns (train, validation, test) views, each sorted by name.
+
+    The test views are those named in `held_out`. Of the rest a share of `validation`, evenly
+    spread and at least one where the share is above 0 and four views remain, is set apart.
+    """
+    ordered = sorted(views, key=lambda view: view.name)
+    test = tuple(view for view in ordered if view.name in held_out)
+    rest = [view for view in ordered if view.name not in held_out]
+    count = max(1, round(len(rest) * validation)) if validation > 0 and len(rest) >= 4 else 0
+    chosen = {int((i + 0.5) * len(rest) / count) for i in range(count)}
+    train = tuple(view for i, view in enumerate(rest) if i not in chosen)
+    return train, tuple(rest[i] for i in sorted(chosen)), test

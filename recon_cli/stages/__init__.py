@@ -1,0 +1,66 @@
+"""The table of stages. A stage's module holds one `run(config, inputs, out, ctx) -> summary`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from recon_cli.config import (
+    DenoiseConfig,
+    EvaluateConfig,
+    ExportConfig,
+    IngestConfig,
+    PruneConfig,
+    SfmConfig,
+    TrainConfig,
+)
+from recon_cli.fields import StageConfig
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One row: what a stage needs and how it is run.
+
+    Attributes:
+        name: its folder in the workspace and its section in recon.toml.
+        verb: what the user types.
+        needs: stages that must be fresh before it starts.
+        uses: stages whose result is taken where it is fresh and left out where it is not.
+        config: the class of its options.
+        version: goes up when its output changes meaning; every older result is then stale.
+        auto: it may be started because another stage needs it; training never is.
+        module: where its run() lives.
+        volatile: patterns of outputs that hold times or logs, or are kept only to resume, and so
+            take no part in the fingerprints of later stages.
+    """
+
+    name: str
+    verb: str
+    needs: tuple[str, ...]
+    uses: tuple[str, ...]
+    config: type[StageConfig]
+    version: int
+    auto: bool
+    module: str
+    volatile: tuple[str, ...] = ()
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage("ingest", "ingest", (), (), IngestConfig, 1, False, "recon_cli.stages.ingest"),
+    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 1, True,
+          "recon_cli.stages.denoise"),
+    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 1, True, "recon_cli.stages.sfm",
+          ("database.db", "log.txt")),
+    Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 1, False,
+          "recon_cli.stages.train", ("log.jsonl",)),
+    Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 1, False,
+          "recon_cli.stages.prune", ("log.jsonl",)),
+    Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 1, False,
+          "recon_cli.stages.evaluate"),
+    Stage("export", "export", ("train",), ("prune",), ExportConfig, 1, False,
+          "recon_cli.stages.export"),
+)
+
+
+def stage(name: str) -> Stage:
+    """Returns the row of a stage by its name."""
+    return next(row for row in STAGES if row.name == name)

@@ -1,0 +1,57 @@
+"""What a stage is given beside its config: where to read, how to report, what to compute on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from recon_cli.progress import NullProgress, Progress
+
+Summary = dict[str, Any]  # JSON values only; goes into the manifest
+
+logger = logging.getLogger("recon")
+
+
+def _ignore(done: int, total: int) -> None:
+    """Keeps no record of progress."""
+
+
+@dataclass(frozen=True)
+class StageInputs:
+    """What a stage may read.
+
+    Attributes:
+        folders: finished folder of each stage named in `needs`, and of those in `uses` that are
+            fresh, by stage name.
+        sources: the user's own files; only ingest has any.
+    """
+
+    folders: Mapping[str, Path] = field(default_factory=dict)
+    sources: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """How a stage reports and where it computes.
+
+    Attributes:
+        progress: opens progress bars.
+        device: "cpu" or "cuda", already resolved.
+        backend: name of a rasterizer, already resolved.
+        threads: CPU threads to use.
+        record: called with (done, total) whenever that much would survive a crash;
+            `recon status` shows it as partial (412/600).
+    """
+
+    progress: Progress = field(default_factory=NullProgress)
+    device: str = "cpu"
+    backend: str = "torch"
+    threads: int = 1
+    record: Callable[[int, int], None] = _ignore
+
+    def notice(self, text: str) -> None:
+        """Tells the user something that is no error but must not be missed."""
+        logger.warning("%s", text)
