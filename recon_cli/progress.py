@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
 from tqdm import tqdm
@@ -25,18 +25,8 @@ class Progress(Protocol):
 
     def bar(
         self, label: str, total: int, *, unit: str = "it", done: int = 0
-    ) -> AbstractBarContext:
+    ) -> AbstractContextManager[Bar]:
         """Returns a context manager that yields a `Bar` already at `done` of `total`."""
-
-
-class AbstractBarContext(Protocol):
-    """A context manager that yields a `Bar`."""
-
-    def __enter__(self) -> Bar:
-        """Opens the bar."""
-
-    def __exit__(self, *exc: object) -> bool | None:
-        """Closes the bar; never swallows an exception."""
 
 
 class _NullBar:
