@@ -62,7 +62,8 @@ class StageConfig:
             object.__setattr__(self, item.name, self._checked(item))
 
     def _checked(self, item: dataclasses.Field[Any]) -> Any:
-        value, info = getattr(self, item.name), option_info(item)
+        value: Any = getattr(self, item.name)
+        info = option_info(item)
         kind, optional = field_type(type(self), item.name)
         if value is None and optional:
             return None
