@@ -1,0 +1,22 @@
+"""Fixtures that every test may use."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real captures and rendered rooms, which does not travel with the project."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("the captures in ../shared/data are not here")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def sample_video() -> Path:
+    """The room video that comes with the package."""
+    return ROOT / "recon_cli" / "samples" / "room.mp4"
