@@ -69,7 +69,7 @@ class StageConfig:
             return None
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
-        if type(value) is not kind:
+        if not isinstance(value, kind) or isinstance(value, bool) is not (kind is bool):
             raise self._refused(item.name, value, f"a value of type {kind.__name__}")
         if info.choices and value not in info.choices:
             raise self._refused(item.name, value, "one of " + ", ".join(info.choices))

@@ -1,0 +1,93 @@
+"""What every rasterizer promises. docs/rasterizer says it with the equations.
+
+A backend is a function of the type `Renderer`. It culls tightly (a Gaussian meets a pixel where
+q <= 2 ln(255 o)), clamps alpha at .99, composites front to back in order of depth (ties in order
+of index) and stops a pixel before the fragment that would leave T < 1e-4. It is differentiable by
+autograd in every raw parameter and bit-deterministic on one machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+
+TILE = 16  # pixels; the tile of the paper and of INRIA's rasterizer
+ALPHA_MIN = 1.0 / 255.0  # a fragment below one 8-bit step is no fragment
+ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) bounded in the backward pass
+TRANSMITTANCE_MIN = 1e-4  # a pixel stops before it would fall below this
+DILATION = 0.3  # pixels^2 added to the projected covariance: the low-pass filter of EWA splatting
+NEAR = 0.05  # world units; COLMAP's scenes measure about ten units across
+
+
+@dataclass(eq=False)
+class Statistics:
+    """What densification and pruning need, gathered by the same passes that render.
+
+    Attributes:
+        radii: [N] three standard deviations along the longer axis of the projection in pixels;
+            0 where the Gaussian was culled.
+        hits: [N] int64, pixels that the Gaussian contributes to: alpha >= 1/255 and T (1 - alpha)
+            >= 1e-4 after it (LightGaussian's hit).
+        blend_max: [N] greatest alpha T over the pixels.
+        means2d_grad: [N, 2] gradient of the loss with respect to the projected mean, per pixel;
+            zeros until backward() has run.
+        loo: [N] sum over pixels of ||alpha T (c - B)||^2, B the colour composited behind: the
+            squared error that removing this one Gaussian causes; zeros until backward() has run.
+    """
+
+    radii: Tensor
+    hits: Tensor
+    blend_max: Tensor
+    means2d_grad: Tensor
+    loo: Tensor
+
+    @staticmethod
+    def zeros(like: Tensor) -> Statistics:
+        """Returns empty statistics for the N Gaussians whose means are `like`, [N, 3]."""
+        n = like.shape[0]
+        return Statistics(
+            radii=like.new_zeros(n),
+            hits=like.new_zeros(n, dtype=torch.int64),
+            blend_max=like.new_zeros(n),
+            means2d_grad=like.new_zeros(n, 2),
+            loo=like.new_zeros(n),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RenderOutput:
+    """An image and what came with it.
+
+    Attributes:
+        rgb: [H, W, 3] colour over the background, not clamped.
+        alpha: [H, W] coverage, 1 minus the final transmittance.
+        depth: [H, W] sum of alpha T z, world units; divide by alpha for the expected depth.
+        statistics: see `Statistics`; `hits`, `blend_max` and `loo` stay zero unless they were
+            asked for with `scores=True`.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+    statistics: Statistics
+
+
+Renderer = Callable[[Splats, Camera, Tensor, int, bool], RenderOutput]
+
+
+def check_inputs(splats: Splats, background: Tensor, sh_degree: int) -> None:
+    """Raises ValueError where a shape, dtype, device or degree breaks the contract."""
+    if tuple(background.shape) != (3,):
+        raise ValueError(f"background has shape {tuple(background.shape)}, needed (3,)")
+    if background.dtype != splats.means.dtype or background.device != splats.means.device:
+        raise ValueError("background and splats differ in dtype or device")
+    if splats.means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype {splats.means.dtype}, needed float32 or float64")
+    if not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree is {sh_degree}, needed 0 to 3")

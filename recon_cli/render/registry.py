@@ -1,0 +1,103 @@
+"""Which rasterizers there are, and which one is meant by a name."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from recon_cli.errors import BackendError
+from recon_cli.render.contract import Renderer, RenderOutput, check_inputs
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+
+logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True)
+class BackendStatus:
+    """Whether a backend can run here.
+
+    Attributes:
+        name: what --backend takes.
+        devices: where it runs.
+        missing: why it cannot run; empty where it can.
+    """
+
+    name: str
+    devices: tuple[str, ...]
+    missing: str = ""
+
+
+def available_backends() -> tuple[BackendStatus, ...]:
+    """Returns every known backend, fastest first, each with the reason if it cannot run."""
+    devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+    return (BackendStatus("torch", devices),)
+
+
+def resolve(backend: str, device: str) -> tuple[str, str]:
+    """Returns (backend, device) with every `auto` replaced by what will run.
+
+    Raises:
+        BackendError: what was asked for by name is not there; nothing else is used in its place.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise BackendError(
+            "CUDA was asked for, but torch finds no CUDA device.",
+            hint="Leave --device out, or run `recon doctor`.")
+    chosen_device = device
+    if device == "auto":
+        chosen_device = "cuda" if torch.cuda.is_available() else "cpu"
+    known = {status.name: status for status in available_backends()}
+    if backend == "auto":
+        backend = next(s.name for s in known.values() if chosen_device in s.devices)
+        logger.info("rasterizer: %s on %s (chosen automatically)", backend, chosen_device)
+    if backend not in known:
+        raise BackendError(
+            f"There is no backend {backend!r}.", hint="Known are " + ", ".join(known) + ".")
+    status = known[backend]
+    if chosen_device not in status.devices:
+        reason = status.missing or f"it does not run on {chosen_device}"
+        raise BackendError(f"Backend {backend} cannot be used: {reason}.", hint="See recon doctor.")
+    return backend, chosen_device
+
+
+def renderer(backend: str) -> Renderer:
+    """Returns the render function of a backend, imported only now."""
+    if backend == "torch":
+        from recon_cli.render.torch_tiles import render as torch_render
+
+        return torch_render
+    raise BackendError(f"There is no backend {backend!r}.", hint="See recon doctor.")
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    background: Tensor,  # [3]
+    sh_degree: int,
+    *,
+    backend: str = "torch",
+    scores: bool = False,
+) -> RenderOutput:
+    """Renders `splats` as `camera` sees them (3D Gaussian Splatting, Kerbl et al. 2023).
+
+    Args:
+        splats: N Gaussians; gradients flow to every raw parameter that requires them.
+        camera: a pinhole camera, OpenCV axes, pixel centres at +0.5.
+        background: [3] colour behind everything.
+        sh_degree: spherical-harmonics degree in use, 0 to 3.
+        backend: a name from `available_backends`.
+        scores: also gather hits and blend_max, and loo in the backward pass.
+
+    Returns:
+        The image, alpha, depth and statistics; see `RenderOutput`.
+
+    Raises:
+        ValueError: a shape, dtype or device does not fit.
+        BackendError: there is no such backend here.
+    """
+    check_inputs(splats, background, sh_degree)
+    return renderer(backend)(splats, camera, background, sh_degree, scores)

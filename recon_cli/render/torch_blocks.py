@@ -1,0 +1,209 @@
+"""Blocks of the torch backend: DEPTH Gaussians over a group of tiles, as dense tensors.
+
+Inside a tile a Gaussian is whitened: with the covariance [[a, b], [b, c]], q = u^2 + v^2 where
+u = sqrt(c / det) (dx - b/c dy) and v = dy / sqrt(c). Both are affine in the pixel, so one small
+matrix product evaluates them, and the gradients are moments in (u, v), which stay of order one
+for needles, where the moments in (dx, dy) cancel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from recon_cli.render.binning import Instances
+from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+
+DEPTH = 32  # Gaussians a block: the triangular product costs DEPTH multiplications a pair
+PIXELS = TILE * TILE
+CHANNELS = 5  # r, g, b, depth, one
+_PAIRS = {"cpu": 1 << 17, "cuda": 1 << 23}  # pairs a block: the second-level cache, the launches
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What the blocks read, one row a Gaussian; the last row is empty and pads short lists.
+
+    Attributes:
+        means2d: [M+1, 2] float64 centres, so that offsets from a far centre keep their digits.
+        whitening: [M+1, 3] float64 factors (l11, l12, l22) of the inverse covariance.
+        log_opacities: [M+1]; -inf in the last row, whose alpha is therefore 0.
+        channels: [M+1, 5] r, g, b, depth, one.
+    """
+
+    means2d: Tensor
+    whitening: Tensor
+    log_opacities: Tensor
+    channels: Tensor
+
+
+class Scratch:
+    """Named buffers for the intermediate tensors of a block, allocated once.
+
+    A fresh half-megabyte tensor an operation costs its page faults each time, which on a CPU is
+    as much as the arithmetic.
+    """
+
+    def __init__(self, like: Tensor) -> None:
+        self._like = like
+        self._buffers: dict[str, Tensor] = {}
+
+    def take(self, name: str, shape: tuple[int, ...]) -> Tensor:
+        """Returns the buffer of that name as an uninitialised tensor of `shape`."""
+        size = math.prod(shape)
+        held = self._buffers.get(name)
+        if held is None or held.numel() < size:
+            held = self._buffers[name] = self._like.new_empty(max(size, DEPTH * PIXELS))
+        return held[:size].view(shape)
+
+
+@dataclass(eq=False)
+class Block:
+    """A run of instances of some tiles.
+
+    Attributes:
+        tiles: [n] tile indices.
+        start: first instance, counted within each tile.
+        positions: [n, K] instance in tile order; E (one past the end) where a list is shorter.
+        rows: [n, K] row in the table.
+        before: [n, 256] transmittance in front of the block, kept for the backward pass.
+    """
+
+    tiles: Tensor
+    start: int
+    positions: Tensor
+    rows: Tensor
+    before: Tensor
+
+
+def build_table(
+    means2d: Tensor,  # [M, 2]
+    cov2d: Tensor,  # [M, 3]
+    det: Tensor,  # [M]
+    log_o: Tensor,  # [M]
+    channels: Tensor,  # [M, 4]
+) -> Table:
+    """Returns the table of M projected Gaussians with its empty last row."""
+    _, b, c = cov2d.double().unbind(-1)
+    det = det.double()
+    whitening = torch.stack([(c / det).sqrt(), -b / (c * det).sqrt(), c.rsqrt()], dim=-1)
+    one = torch.ones_like(log_o)[:, None]
+    return Table(
+        torch.nn.functional.pad(means2d.double(), (0, 0, 0, 1)),
+        torch.nn.functional.pad(whitening, (0, 0, 0, 1)),
+        torch.nn.functional.pad(log_o, (0, 1), value=-torch.inf),
+        torch.nn.functional.pad(torch.cat([channels, one], dim=-1), (0, 0, 0, 1)),
+    )
+
+
+def walk(instances: Instances, transmittance: Tensor) -> Iterator[Block]:
+    """Yields blocks front to back. A tile drops out when its list ends or no pixel is alive.
+
+    `transmittance` [tiles, 256] is what the caller updates after each block.
+    """
+    device = instances.counts.device
+    total = len(instances.gaussians)
+    first = torch.cumsum(instances.counts, 0) - instances.counts
+    order = torch.argsort(instances.counts, descending=True, stable=True)
+    order = order[: int((instances.counts > 0).sum())]
+    group = max(1, _PAIRS[device.type] // (DEPTH * PIXELS))
+    empty_row = len(instances.per_gaussian)
+    gaussians = torch.nn.functional.pad(instances.gaussians, (0, 1), value=empty_row)
+    steps = torch.arange(DEPTH, device=device)
+    for tiles in torch.split(order, group) if len(order) else ():
+        longest = int(instances.counts[tiles[0]])
+        for start in range(0, longest, DEPTH):
+            alive = instances.counts[tiles] > start
+            alive &= (transmittance[tiles] >= TRANSMITTANCE_MIN).any(1)
+            tiles = tiles[alive]
+            if len(tiles) == 0:
+                break
+            index = start + steps[: longest - start]
+            positions = torch.where(
+                index < instances.counts[tiles, None], first[tiles, None] + index, total)
+            yield Block(tiles, start, positions, gaussians[positions], transmittance[tiles])
+
+
+def pixel_monomials(like: Tensor) -> Tensor:
+    """Returns [6, 256]: 1, x, y, x^2, xy, y^2 at the pixel centres, from the tile's centre."""
+    offset = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
+    x, y = offset.repeat(TILE), offset.repeat_interleave(TILE)
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def whitening_of(table: Table, block: Block, tiles_x: int) -> Tensor:
+    """Returns [n, K, 5]: u = k0 + k1 x + k2 y and v = k3 + k4 y at offsets from the tile centre."""
+    l11, l12, l22 = table.whitening[block.rows].unbind(-1)
+    center_x = (block.tiles % tiles_x) * TILE + TILE / 2
+    center_y = block.tiles.div(tiles_x, rounding_mode="floor") * TILE + TILE / 2
+    mean_x, mean_y = table.means2d[block.rows].unbind(-1)
+    dx, dy = center_x[:, None] - mean_x, center_y[:, None] - mean_y
+    return torch.stack([l11 * dx + l12 * dy, l11, l12, l22 * dy, l22], dim=-1)
+
+
+def alphas(
+    table: Table, block: Block, affine: Tensor, monomials: Tensor, scratch: Scratch
+) -> Tensor:
+    """Returns alpha [n, K, 256] after both thresholds: alpha = o exp(-q / 2).
+
+    `monomials` is [3, 256]: 1, x, y at the pixels. The result lies in `scratch`.
+    """
+    n, k = block.rows.shape
+    half = (affine * 0.5**0.5).to(monomials.dtype).reshape(n * k, 5)
+    q = torch.mm(half[:, :3], monomials, out=scratch.take("q", (n * k, PIXELS)))
+    q.mul_(q)
+    v = torch.mm(half[:, 3:], monomials[::2], out=scratch.take("alpha", (n * k, PIXELS)))
+    q.addcmul_(v, v)
+    alpha = torch.sub(table.log_opacities[block.rows].reshape(n * k, 1), q, out=v).exp_()
+    # threshold(x, t, 0) keeps x > t; the greatest number below 1/255 makes that x >= 1/255
+    torch.threshold_(alpha.clamp_max_(ALPHA_MAX), _below(ALPHA_MIN, alpha.dtype), 0.0)
+    return alpha.view(n, k, PIXELS)
+
+
+@cache
+def _below(value: float, dtype: torch.dtype) -> float:
+    """Returns the greatest number of the dtype below `value`."""
+    number = torch.tensor(value, dtype=dtype)
+    return float(torch.nextafter(number, number - 1))
+
+
+def composite(
+    alpha: Tensor, before: Tensor, scratch: Scratch
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns odds alpha / (1 - alpha), transmittance after each Gaussian, and the same live.
+
+    The live transmittance is 0 from the Gaussian on that would have left less than 1e-4: times
+    the odds it is the blend weight alpha T, without a mask. All three lie in `scratch`.
+    """
+    clear = torch.neg(alpha, out=scratch.take("clear", alpha.shape)).add_(1)
+    odds = torch.div(alpha, clear, out=scratch.take("odds", alpha.shape))
+    after = torch.cumprod(clear, 1, out=scratch.take("after", alpha.shape)).mul_(before[:, None])
+    live = clear.copy_(after)
+    return odds, after, torch.threshold_(live, _below(TRANSMITTANCE_MIN, alpha.dtype), 0.0)
+
+
+def gradients_of(moments: Tensor, affine: Tensor) -> Tensor:
+    """Returns gradients [n, K, 6] of mean x, y, covariance a, b, c and log-opacity.
+
+    With s = alpha dL/dalpha summed over pixels and d = pixel - mean: the inverse covariance is
+    L^T L and y = L^T (u, v). dL/dmean = sum s y, dL/dSigma = 1/2 sum s y y^T, dL/dlog o = sum s.
+    `moments` are the sums of s times 1, x, y, x^2, xy, y^2 at offsets from the tile's centre.
+    """
+    s, sx, sy, sxx, sxy, syy = moments.double().unbind(-1)
+    u0, ux, uy, v0, vy = affine.unbind(-1)
+    u = u0 * s + ux * sx + uy * sy
+    v = v0 * s + vy * sy
+    uu = u0 * (u + ux * sx + uy * sy) + ux * ux * sxx + 2 * ux * uy * sxy + uy * uy * syy
+    uv = u0 * v + v0 * (ux * sx + uy * sy) + vy * (ux * sxy + uy * syy)
+    vv = v0 * (v + vy * sy) + vy * vy * syy
+    l11, l12, l22 = ux, uy, vy
+    xx = l11 * l11 * uu
+    xy = l11 * (l12 * uu + l22 * uv)
+    yy = l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv
+    # b stands for both off-diagonal entries, hence no factor 1/2
+    return torch.stack([l11 * u, l12 * u + l22 * v, xx / 2, xy, yy / 2, s], dim=-1)

@@ -1,0 +1,64 @@
+"""Scenes for the rasterizer's tests: small, seeded, with the awkward cases mixed in."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from recon_cli.scene import Camera, Splats
+from recon_cli.scene.splats import SH_C0
+
+
+def camera_at(width: int = 50, height: int = 37, *, focal: float = 40.0) -> Camera:
+    """A camera that looks along +z, turned a little, with an off-centre principal point."""
+    angle = 0.1
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    viewmat[:3, 3] = [0.1, -0.05, 0.2]
+    return Camera(width, height, focal, 1.1 * focal, width / 2 + 1.3, height / 2 - 0.7, viewmat)
+
+
+def random_splats(n: int, *, seed: int = 0, dtype: torch.dtype = torch.float64) -> Splats:
+    """N Gaussians in front of `camera_at`: some needles, some opaque, some behind the camera."""
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-1.5, -1.2, -0.5], [1.5, 1.2, 5.0], (n, 3))
+    log_scales = rng.normal(-2.3, 0.6, (n, 3))
+    log_scales[::7, 0] += 2.0
+    values = {
+        "means": means,
+        "quats": rng.normal(size=(n, 4)),
+        "log_scales": log_scales,
+        "logit_opacities": rng.normal(0.5, 2.0, n),
+        "sh_dc": rng.normal(0, 0.8, (n, 3)),
+        "sh_rest": rng.normal(0, 0.1, (n, 15, 3)),
+    }
+    return Splats(**{k: torch.tensor(v, dtype=dtype) for k, v in values.items()})
+
+
+def one_splat(
+    mean: tuple[float, float, float], *, scale: float, opacity: float,
+    color: tuple[float, float, float], dtype: torch.dtype = torch.float64,
+) -> Splats:
+    """One round Gaussian of a plain colour."""
+    return Splats(
+        means=torch.tensor([mean], dtype=dtype),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=dtype),
+        log_scales=torch.full((1, 3), math.log(scale), dtype=dtype),
+        logit_opacities=torch.tensor([math.log(opacity / (1 - opacity))], dtype=dtype),
+        sh_dc=(torch.tensor([color], dtype=dtype) - 0.5) / SH_C0,
+        sh_rest=torch.zeros(1, 15, 3, dtype=dtype),
+    )
+
+
+def joined(*parts: Splats) -> Splats:
+    """The Gaussians of all parts in one."""
+    names = parts[0].parameters()
+    return Splats(**{name: torch.cat([getattr(p, name) for p in parts]) for name in names})
+
+
+def leaves(splats: Splats) -> Splats:
+    """A copy whose every parameter collects gradients."""
+    return splats.map(lambda tensor: tensor.detach().clone().requires_grad_())

@@ -1,0 +1,13 @@
+"""The colour basis against SciPy's associated Legendre functions."""
+
+import torch
+from oracle import sh_basis
+
+from recon_cli.render.spherical_harmonics import basis_rest
+
+
+def test_the_basis_matches_the_associated_legendre_functions():
+    directions = torch.nn.functional.normalize(
+        torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), dim=1)
+    expected = torch.stack([sh_basis(d, 3)[1:] for d in directions])
+    assert torch.allclose(basis_rest(directions, 3), expected, atol=1e-12)
