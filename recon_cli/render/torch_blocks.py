@@ -22,7 +22,7 @@ from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_
 DEPTH = 32  # Gaussians a block: the triangular product costs DEPTH multiplications a pair
 PIXELS = TILE * TILE
 CHANNELS = 5  # r, g, b, depth, one
-_PAIRS = {"cpu": 1 << 17, "cuda": 1 << 23}  # pairs a block: the second-level cache, the launches
+_PAIRS = {"cpu": 1 << 18, "cuda": 1 << 23}  # pairs a block: the second-level cache, the launches
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +68,12 @@ class Block:
 
     Attributes:
         tiles: [n] tile indices.
-        start: first instance, counted within each tile.
         positions: [n, K] instance in tile order; E (one past the end) where a list is shorter.
         rows: [n, K] row in the table.
         before: [n, 256] transmittance in front of the block, kept for the backward pass.
     """
 
     tiles: Tensor
-    start: int
     positions: Tensor
     rows: Tensor
     before: Tensor
@@ -101,32 +99,57 @@ def build_table(
     )
 
 
-def walk(instances: Instances, transmittance: Tensor) -> Iterator[Block]:
-    """Yields blocks front to back. A tile drops out when its list ends or no pixel is alive.
+@dataclass(frozen=True, eq=False)
+class TileLists:
+    """The instances of every tile in a form that blocks are cut from.
 
-    `transmittance` [tiles, 256] is what the caller updates after each block.
+    Attributes:
+        counts: [tiles] instances of each tile.
+        first: [tiles] position of the first one.
+        gaussians: [E+1] row in the table by position; the last one is the empty row.
     """
-    device = instances.counts.device
-    total = len(instances.gaussians)
-    first = torch.cumsum(instances.counts, 0) - instances.counts
-    order = torch.argsort(instances.counts, descending=True, stable=True)
-    order = order[: int((instances.counts > 0).sum())]
-    group = max(1, _PAIRS[device.type] // (DEPTH * PIXELS))
-    empty_row = len(instances.per_gaussian)
-    gaussians = torch.nn.functional.pad(instances.gaussians, (0, 1), value=empty_row)
-    steps = torch.arange(DEPTH, device=device)
-    for tiles in torch.split(order, group) if len(order) else ():
-        longest = int(instances.counts[tiles[0]])
+
+    counts: Tensor
+    first: Tensor
+    gaussians: Tensor
+
+    @staticmethod
+    def of(instances: Instances) -> TileLists:
+        """Returns the lists of some instances."""
+        empty_row = len(instances.per_gaussian)
+        gaussians = torch.nn.functional.pad(instances.gaussians, (0, 1), value=empty_row)
+        first = torch.cumsum(instances.counts, 0) - instances.counts
+        return TileLists(instances.counts, first, gaussians)
+
+    def groups(self) -> list[Tensor]:
+        """Returns the tiles that have instances, in groups of similar length, longest first."""
+        order = torch.argsort(self.counts, descending=True, stable=True)
+        order = order[: int((self.counts > 0).sum())]
+        size = max(1, _PAIRS[order.device.type] // (DEPTH * PIXELS))
+        return list(torch.split(order, size)) if len(order) else []
+
+    def walk(self, tiles: Tensor, transmittance: Tensor) -> Iterator[Block]:
+        """Yields the blocks of a group front to back.
+
+        A tile drops out when its list ends or no pixel is alive.
+
+        Args:
+            tiles: [n] the group, longest list first.
+            transmittance: [tiles, 256], which the caller updates after each block.
+        """
+        longest = int(self.counts[tiles[0]])
+        steps = torch.arange(DEPTH, device=tiles.device)
         for start in range(0, longest, DEPTH):
-            alive = instances.counts[tiles] > start
+            alive = self.counts[tiles] > start
             alive &= (transmittance[tiles] >= TRANSMITTANCE_MIN).any(1)
             tiles = tiles[alive]
             if len(tiles) == 0:
-                break
+                return
             index = start + steps[: longest - start]
             positions = torch.where(
-                index < instances.counts[tiles, None], first[tiles, None] + index, total)
-            yield Block(tiles, start, positions, gaussians[positions], transmittance[tiles])
+                index < self.counts[tiles, None], self.first[tiles, None] + index,
+                len(self.gaussians) - 1)
+            yield Block(tiles, positions, self.gaussians[positions], transmittance[tiles])
 
 
 def pixel_monomials(like: Tensor) -> Tensor:

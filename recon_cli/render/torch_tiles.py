@@ -21,12 +21,12 @@ from recon_cli.render.torch_blocks import (
     PIXELS,
     Block,
     Scratch,
+    TileLists,
     alphas,
     build_table,
     composite,
     gradients_of,
     pixel_monomials,
-    walk,
     whitening_of,
 )
 from recon_cli.scene.camera import Camera
@@ -64,28 +64,32 @@ class _Rasterize(torch.autograd.Function):
         size: tuple[int, int], statistics: Statistics, scores: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         table = build_table(means2d, cov2d, projection.det, log_opacities, channels)
-        n_tiles = len(instances.counts)
-        image = means2d.new_zeros(n_tiles, PIXELS, CHANNELS)
+        image = means2d.new_zeros(len(instances.counts), PIXELS, CHANNELS)
         # a pixel beyond the image is stopped from the start: it counts in no statistic
-        inside = means2d.new_ones(*size, 1)
-        transmittance = _to_tiles(inside, instances)[..., 0]
+        transmittance = _to_tiles(means2d.new_ones(*size, 1), instances)[..., 0]
         monomials, scratch = pixel_monomials(means2d)[:3], Scratch(means2d)
-        blocks: list[Block] = []
         tally = _Tally(instances, means2d) if scores else None
-        for block in walk(instances, transmittance):
-            affine = whitening_of(table, block, instances.tiles_x)
-            alpha = alphas(table, block, affine, monomials, scratch)
-            odds, after, live = composite(alpha, block.before, scratch)
-            transmittance[block.tiles] = after[:, -1]
-            weights = odds.mul_(live)
-            image[block.tiles] += weights.transpose(1, 2) @ table.channels[block.rows]
-            blocks.append(block)
-            if tally:
-                tally.add(block, weights)
+        lists = TileLists.of(instances)
+
+        def composite_group(tiles: Tensor) -> list[Block]:
+            blocks = []
+            for block in lists.walk(tiles, transmittance):
+                affine = whitening_of(table, block, instances.tiles_x)
+                alpha = alphas(table, block, affine, monomials, scratch)
+                odds, after, live = composite(alpha, block.before, scratch)
+                transmittance[block.tiles] = after[:, -1]
+                weights = odds.mul_(live)
+                image[block.tiles] += weights.transpose(1, 2) @ table.channels[block.rows]
+                blocks.append(block)
+                if tally:
+                    tally.add(block, weights)
+            return blocks
+
+        groups = [composite_group(tiles) for tiles in lists.groups()]
         if tally:
             tally.write(projection.ids, statistics)
         ctx.save_for_backward(means2d, cov2d, log_opacities, channels, background, image)
-        ctx.rest = projection, instances, statistics, scores, blocks
+        ctx.rest = projection, instances, statistics, scores, groups
         left = 1 - image[..., 4:]
         rgb = _to_image(image[..., :3] + left * background, instances, size)
         depth = _to_image(image[..., 3:4], instances, size)[..., 0]
@@ -96,7 +100,7 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, grad_rgb: Tensor, grad_depth: Tensor, grad_alpha: Tensor
     ) -> tuple[Tensor | None, ...]:
         means2d, cov2d, log_opacities, channels, background, image = ctx.saved_tensors
-        projection, instances, statistics, scores, blocks = ctx.rest
+        projection, instances, statistics, scores, groups = ctx.rest
         table = build_table(means2d, cov2d, projection.det, log_opacities, channels)
         monomials, scratch = pixel_monomials(means2d), Scratch(means2d)
         grads = torch.cat([grad_rgb, grad_depth[..., None], grad_alpha[..., None]], dim=-1)
@@ -110,31 +114,36 @@ class _Rasterize(torch.autograd.Function):
         features = means2d.new_zeros(len(instances.gaussians) + 1, CHANNELS + 6)
         loo = means2d.new_zeros(len(instances.gaussians) + 1) if scores else None
         upper = means2d.new_ones(DEPTH, DEPTH).triu(1)
-        for block in reversed(blocks):
-            n, k = block.rows.shape
-            affine = whitening_of(table, block, instances.tiles_x)
-            alpha = alphas(table, block, affine, monomials[:3], scratch)
-            odds, after, live = composite(alpha, block.before, scratch)
-            grad = grads[block.tiles]
-            used = table.channels[block.rows]
-            if composited is not None and loo is not None:
-                loo[block.positions] = _leave_one_out(
-                    used, odds, live, composited, block, upper[:k, :k])
-            shade = torch.bmm(
-                used, grad.transpose(1, 2), out=scratch.take("q", alpha.shape)).mul_(live)
-            weighted = torch.mul(shade, odds, out=after)  # w (g . f)
-            triangle = upper[:k, :k].expand(n, k, k)
-            later = torch.baddbmm(
-                behind[block.tiles, None], triangle, weighted,
-                out=scratch.take("later", alpha.shape))
-            behind[block.tiles] += weighted.sum(1)
-            # dL/dalpha = T g.f - (sum behind) / (1 - alpha); zero where alpha was clamped
-            unclamped = torch.threshold_(alpha.neg_(), -ALPHA_MAX, 0.0)
-            slope = later.sub_(shade).mul_(unclamped.div_(1 + unclamped))  # alpha dL/dalpha
-            features[block.positions, :CHANNELS] = odds.mul_(live) @ grad
-            moments = slope.view(n * k, PIXELS) @ monomials.T
-            features[block.positions, CHANNELS:] = gradients_of(
-                moments.view(n, k, 6), affine).to(means2d.dtype)
+
+        def descend_group(blocks: list[Block]) -> None:
+            for block in reversed(blocks):
+                n, k = block.rows.shape
+                affine = whitening_of(table, block, instances.tiles_x)
+                alpha = alphas(table, block, affine, monomials[:3], scratch)
+                odds, after, live = composite(alpha, block.before, scratch)
+                grad = grads[block.tiles]
+                used = table.channels[block.rows]
+                if composited is not None and loo is not None:
+                    loo[block.positions] = _leave_one_out(
+                        used, odds, live, composited, block, upper[:k, :k])
+                shade = torch.bmm(
+                    used, grad.transpose(1, 2), out=scratch.take("q", alpha.shape)).mul_(live)
+                weighted = torch.mul(shade, odds, out=after)  # w (g . f)
+                triangle = upper[:k, :k].expand(n, k, k)
+                later = torch.baddbmm(
+                    behind[block.tiles, None], triangle, weighted,
+                    out=scratch.take("later", alpha.shape))
+                behind[block.tiles] += weighted.sum(1)
+                # dL/dalpha = T g.f - (sum behind) / (1 - alpha); zero where alpha was clamped
+                unclamped = torch.threshold_(alpha.neg_(), -ALPHA_MAX, 0.0)
+                slope = later.sub_(shade).mul_(unclamped.div_(1 + unclamped))  # alpha dL/dalpha
+                features[block.positions, :CHANNELS] = odds.mul_(live) @ grad
+                moments = slope.view(n * k, PIXELS) @ monomials.T
+                features[block.positions, CHANNELS:] = gradients_of(
+                    moments.view(n, k, 6), affine).to(means2d.dtype)
+
+        for blocks in groups:
+            descend_group(blocks)
         per_gaussian = _reduce(features, instances)
         if loo is not None:
             statistics.loo[projection.ids] = _reduce(loo[:, None], instances)[:, 0]
