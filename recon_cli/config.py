@@ -69,9 +69,10 @@ class DenoiseConfig(StageConfig):
         "auto", "auto denoises frames whose noise reaches the threshold; force denoises all; "
         "off passes all through.", choices=("auto", "force", "off"), flags=True)
     threshold: float = option(
-        3.0, "Noise from which a frame is denoised.", unit="1/255", minimum=0.0)
+        3.0, "Noise in the flat parts of a frame from which it is denoised.", unit="1/255",
+        minimum=0.0)
     strength: float = option(
-        2.5, "Range sigma of the bilateral filter, as a multiple of the estimated noise.",
+        4.0, "Range sigma of the bilateral filter, as a multiple of the estimated noise.",
         unit="x noise", minimum=0.1)
 
 

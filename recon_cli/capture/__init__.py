@@ -1,0 +1,1 @@
+"""From a camera's files to frames: decode, choose, measure noise, denoise. Knows no stages."""

@@ -1,0 +1,119 @@
+"""Which frames of a video are kept: sharp for their place, and spread evenly over the motion."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import percentile_filter
+
+# A frame is judged against the 75th percentile of the 31 frames around it: a few sharp ones set
+# the mark, and a dark or bare stretch of the room is judged by its own frames.
+GATE_WINDOW, GATE_PERCENTILE = 31, 75
+# Way between chosen frames in widths of the image: 94% overlap, so that a point is seen from many
+# of them. A 10 s walk through a room (4.5 widths) gives 75 frames.
+FRAME_SPACING = 0.06
+# Sharp frames further apart than this, 88% overlap, get the least blurred ones between them: a
+# fast turn is blurred throughout, and without it the reconstruction falls into two pieces.
+MAX_GAP = 0.12
+# A camera that hardly moves still gets this many, to average out noise.
+MIN_AUTOMATIC = 24
+# One step counts at most this much: where tracking jumped, a larger one would eat the budget.
+MAX_STEP = 0.1
+# A way of less than this (a third of a pixel in 320) is tracking noise of a camera on a tripod.
+NO_MOTION = 0.001
+
+
+def sharp_frames(
+    sharpness: NDArray[np.float64],  # [F]
+    share: float,
+) -> NDArray[np.bool_]:  # [F]
+    """Returns which frames reach `share` of the sharpness that is usual around them."""
+    usual = percentile_filter(
+        sharpness, GATE_PERCENTILE, size=min(GATE_WINDOW, len(sharpness)), mode="nearest")
+    return np.asarray(sharpness >= share * usual)
+
+
+def bridged(
+    way: NDArray[np.float64],  # [F]
+    sharpness: NDArray[np.float64],  # [F]
+    sharp: NDArray[np.bool_],  # [F]
+    whole: NDArray[np.bool_],  # [F]
+) -> NDArray[np.bool_]:  # [F]
+    """Returns the sharp whole frames and those that are needed to close gaps between them.
+
+    A gap of more than `MAX_GAP` is halved by the sharpest whole frame of its middle half until
+    the gaps are closed or hold no more frames.
+    """
+    usable = sharp & whole
+    kept = np.flatnonzero(usable)
+    gaps = list(pairwise(kept))
+    while gaps:
+        first, last = gaps.pop()
+        inside = first + 1 + np.flatnonzero(whole[first + 1:last])
+        if way[last] - way[first] <= MAX_GAP or not len(inside):
+            continue
+        off_centre = np.abs(way[inside] - (way[first] + way[last]) / 2)
+        reach = max(off_centre.min(), (way[last] - way[first]) / 4)
+        middle = inside[off_centre <= reach]
+        bridge = middle[np.argmax(sharpness[middle])]
+        usable[bridge] = True
+        gaps += [(first, bridge), (bridge, last)]
+    return usable
+
+
+def travelled(
+    motion: NDArray[np.float64],  # [F], NaN where unknown
+) -> NDArray[np.float64]:  # [F]
+    """Returns the way up to each frame in widths; unknown steps count as the median known one.
+
+    Where no step is known (a blank wall throughout) or nothing moves, each frame is one equal
+    step of no account, so that a choice over the way becomes a choice over time.
+    """
+    known = motion[~np.isnan(motion)]
+    typical = float(np.median(known[1:])) if len(known) > 1 else 0.0
+    steps = np.minimum(np.where(np.isnan(motion), typical, motion), MAX_STEP)
+    if steps.sum() <= NO_MOTION:
+        steps = np.full(len(motion), NO_MOTION / len(motion))
+    return np.cumsum(steps)
+
+
+def automatic_count(way: NDArray[np.float64], *, most: int) -> int:
+    """Returns how many frames a way is worth: one each `FRAME_SPACING`, within bounds."""
+    return int(min(most, max(MIN_AUTOMATIC, np.ceil(way[-1] / FRAME_SPACING))))
+
+
+def choose_frames(
+    way: NDArray[np.float64],  # [F]
+    sharpness: NDArray[np.float64],  # [F]
+    usable: NDArray[np.bool_],  # [F]
+    count: int,
+) -> NDArray[np.int64]:
+    """Returns the ascending indices of min(count, usable frames) frames.
+
+    The usable frames are cut into `count` runs of equal way, none of them empty. Each run gives
+    the sharpest frame of its middle two thirds, so that sharpness cannot push neighbours together.
+    """
+    candidates = np.flatnonzero(usable)
+    if len(candidates) <= count:
+        return candidates
+    place = way[candidates]
+    start, step = place[0], (place[-1] - place[0]) / count
+    cuts = _filled(np.searchsorted(place, start + step * np.arange(count)), len(candidates))
+    chosen = []
+    for run, (first, end) in enumerate(zip(cuts, [*cuts[1:], len(candidates)], strict=True)):
+        distance = np.abs(place[first:end] - (start + (run + 0.5) * step))
+        near = np.flatnonzero(distance <= step / 3)
+        if not len(near):
+            near = np.flatnonzero(distance == distance.min())
+        members = candidates[first:end][near]
+        chosen.append(members[np.argmax(sharpness[members])])
+    return np.array(chosen, np.int64)
+
+
+def _filled(cuts: NDArray[np.int64], total: int) -> NDArray[np.int64]:
+    """Returns the starts of runs moved as little as needed for each to hold an element."""
+    order = np.arange(len(cuts))
+    forward = np.maximum.accumulate(cuts - order) + order
+    return np.minimum(forward, total - len(cuts) + order)

@@ -1,0 +1,212 @@
+"""What one pass over all frames of a video tells: sharpness, motion, and which frames are whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from av.video.frame import PictureType
+from numpy.typing import NDArray
+
+from recon_cli.capture.motion import MotionMeter
+from recon_cli.capture.video import Gap, claimed_length, decode, shown_size, to_gray
+from recon_cli.errors import InputError
+
+# Pixels on the longest side: makes sharpness comparable and keeps sensor noise of large frames
+# from passing for detail.
+SHARPNESS_SIZE = 960
+# B-frames in a row: x264 places 3 by default and 8 at its slowest. HEVC encoders mark whole
+# groups as B, so the search for them needs an end.
+MAX_B_RUN = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """F frames in the order of showing; a frame's index is its place here.
+
+    Attributes:
+        width: width of an upright frame in pixels.
+        height: height of an upright frame in pixels.
+        declared: how many frames the file claims to hold, by its duration where it keeps no
+            count; 0 where it does not say.
+        gaps: packets that gave no frame.
+        sharpness: [F] float64 variance of the Laplacian of the 8-bit gray frame.
+        motion: [F] float64 way gained since the frame before, in widths; NaN where unknown.
+        seconds: time of showing of each frame, None where the file does not say.
+        whole: [F] bool; False from a lost or damaged packet to the next key frame, because all
+            frames between are predicted from what was lost.
+    """
+
+    width: int
+    height: int
+    declared: int
+    gaps: int
+    sharpness: NDArray[np.float64]
+    motion: NDArray[np.float64]
+    seconds: tuple[float | None, ...]
+    whole: NDArray[np.bool_]
+
+    @property
+    def expected(self) -> int:
+        """How many frames there should be."""
+        return max(self.declared, len(self.whole) + self.gaps)
+
+    @property
+    def lost(self) -> int:
+        """How many frames are missing or broken."""
+        return self.expected - int(self.whole.sum())
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the scan as JSON values; NaN becomes null."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "declared": self.declared,
+            "gaps": self.gaps,
+            "sharpness": self.sharpness.tolist(),
+            "motion": [None if np.isnan(step) else step for step in self.motion.tolist()],
+            "seconds": list(self.seconds),
+            "whole": self.whole.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> Scan:
+        """Returns what `to_json` was made of."""
+        motion = [np.nan if step is None else step for step in value["motion"]]
+        return cls(
+            width=value["width"],
+            height=value["height"],
+            declared=value["declared"],
+            gaps=value["gaps"],
+            sharpness=np.array(value["sharpness"], np.float64),
+            motion=np.array(motion, np.float64),
+            seconds=tuple(value["seconds"]),
+            whole=np.array(value["whole"], np.bool_),
+        )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What is kept of one frame."""
+
+    size: tuple[int, int]
+    sharpness: float
+    motion: float
+    seconds: float | None
+    pts: int | None
+    key: bool
+    bidirectional: bool
+    corrupt: bool
+
+
+def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
+    """Returns the scan of a video; the same one for any number of threads.
+
+    A damaged stream is scanned again by one thread: only then is it certain which frames come out
+    around the damage, here and when they are decoded again (`decode_threads`).
+
+    Args:
+        path: the video.
+        threads: decoder threads.
+        step: called after each frame.
+
+    Raises:
+        InputError: the file is no video, or no frame of it can be decoded.
+    """
+    scan = _scan_once(path, threads=threads, step=step)
+    if scan.lost and threads > 1:
+        scan = _scan_once(path, threads=1, step=step)
+    return scan
+
+
+def decode_threads(scan: Scan, threads: int) -> int:
+    """Returns with how many threads a scanned video gives the frames of its scan again."""
+    return 1 if scan.lost else threads
+
+
+def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
+    looks: list[_Look] = []
+    gaps: list[tuple[int, int | None]] = []  # (frames seen before it, pts)
+    meter = MotionMeter()
+    for item in decode(path, threads=threads):
+        if isinstance(item, Gap):
+            gaps.append((len(looks), item.pts))
+            continue
+        looks.append(_look(item, meter))
+        step()
+    if not looks:
+        raise InputError(
+            f"No frame of {path} can be decoded.", hint="Copy it from the camera again.")
+    width, height = looks[0].size
+    claim = claimed_length(path)
+    return Scan(
+        width=width,
+        height=height,
+        declared=claim.count(_rate(looks) or claim.rate),
+        gaps=len(gaps),
+        sharpness=np.array([look.sharpness for look in looks], np.float64),
+        motion=np.array([look.motion for look in looks], np.float64),
+        seconds=tuple(look.seconds for look in looks),
+        whole=_whole(looks, gaps),
+    )
+
+
+def _look(frame: av.VideoFrame, meter: MotionMeter) -> _Look:
+    gray = to_gray(frame)
+    return _Look(
+        size=shown_size(frame),
+        sharpness=sharpness(gray),
+        motion=meter.advance(gray),
+        seconds=frame.time,
+        pts=frame.pts,
+        key=bool(frame.key_frame),
+        bidirectional=frame.pict_type == PictureType.B,
+        corrupt=bool(frame.is_corrupt),
+    )
+
+
+def _rate(looks: Sequence[_Look]) -> float:
+    """Returns the mean frames per second that were seen, 0 where there are no times to tell."""
+    first, last = looks[0].seconds, looks[-1].seconds
+    if first is None or last is None or last <= first:
+        return 0.0
+    return (len(looks) - 1) / (last - first)
+
+
+def sharpness(gray: NDArray[np.uint8]) -> float:
+    """Returns the variance of the Laplacian of a gray frame [H, W] at a common size."""
+    scale = SHARPNESS_SIZE / max(gray.shape)
+    if scale < 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+
+
+def _whole(
+    looks: Sequence[_Look], gaps: Sequence[tuple[int, int | None]]
+) -> NDArray[np.bool_]:  # [F]
+    """Returns False for each frame that was predicted, at whatever remove, from lost data."""
+    whole = np.ones(len(looks), np.bool_)
+    for index, look in enumerate(looks):
+        if look.corrupt:
+            _spoil(whole, looks, index, index + 1)
+    for seen, pts in gaps:
+        after = seen
+        if pts is not None:
+            after = next((i for i, look in enumerate(looks) if (look.pts or 0) > pts), len(looks))
+        _spoil(whole, looks, after, after)
+    return whole
+
+
+def _spoil(whole: NDArray[np.bool_], looks: Sequence[_Look], first: int, search: int) -> None:
+    """Clears the frames from `first` to the next key frame at or behind `search`."""
+    end = next((i for i in range(search, len(looks)) if looks[i].key), len(looks))
+    # B-frames shown before the damage are predicted from it as well.
+    earliest = max(0, first - MAX_B_RUN)
+    while first > earliest and looks[first - 1].bidirectional:
+        first -= 1
+    whole[first:end] = False

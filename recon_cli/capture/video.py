@@ -1,0 +1,212 @@
+"""Video files through PyAV: what is a video, its frames in order, and a frame as upright RGB.
+
+A packet that cannot be decoded is passed over and reported as a `Gap`. Interlaced frames stay
+woven and pixels that are not square stay so. A mirrored display matrix is read as its rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.stream import Disposition
+from av.video.reformatter import Colorspace
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from recon_cli.errors import InputError
+
+# FFmpeg renders text and text art as video; nobody means that by a capture.
+TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
+# A demuxer that fails this often in one file makes no progress any more.
+MAX_DEMUX_ERRORS = 100
+UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
+# Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
+SD_WIDTH, SD_HEIGHT = 1280, 576
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A packet that gave no frame; `pts` is its place in the stream's time base, if known."""
+
+    pts: int | None
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Yields the container and the video stream of a file, whatever its name ends in.
+
+    Raises:
+        InputError: the file is missing, not readable, no video, or a single picture.
+    """
+    try:
+        # "file:" keeps a colon in the name from being read as a protocol, and the whitelist keeps
+        # a playlist from fetching anything.
+        container = av.open(
+            f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
+    except av.error.FFmpegError as error:
+        raise _unreadable(path, error.strerror or str(error)) from error
+    with container:
+        if container.format.name.endswith("_pipe") or container.format.name == "image2":
+            raise InputError(
+                f"{path} is a single picture, but one view holds no depth.",
+                hint="Give a video, or a folder with at least 3 photos of the room.")
+        yield container, _video_stream(path, container)
+
+
+def _unreadable(path: Path, reason: str) -> InputError:
+    if not path.exists():
+        return InputError(f"{path} does not exist.", hint="Check the path.")
+    if path.is_file() and path.stat().st_size == 0:
+        return InputError(f"{path} is empty (0 bytes).", hint="Copy it from the camera again.")
+    return InputError(
+        f"{path} cannot be read as a video: {reason}.",
+        hint="Give a video, or a folder of photos; if a player shows it, try a fresh copy.")
+
+
+def _video_stream(path: Path, container: InputContainer) -> VideoStream:
+    """Returns the first moving picture; the cover of a song is none."""
+    for stream in container.streams.video:
+        if stream.disposition & Disposition.attached_pic:
+            continue
+        if stream.codec_context is not None and stream.codec_context.name not in TEXT_CODECS:
+            return stream
+    kinds = {"video": "a still picture, text or an unknown codec"}
+    found = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
+    raise InputError(
+        f"{path} holds no video that can be decoded, only {', '.join(found) or 'nothing'}.",
+        hint="Give a video or a folder of photos.")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What a file says about its length, before anything is decoded.
+
+    Attributes:
+        frames: the container's count, 0 where it keeps none.
+        seconds: duration, 0 where it is not known.
+        rate: frames per second; little more than a guess where the rate varies.
+    """
+
+    frames: int
+    seconds: float
+    rate: float
+
+    def count(self, rate: float) -> int:
+        """Returns how many frames there should be, by the duration where none are counted."""
+        return self.frames or round(self.seconds * rate)
+
+
+def claimed_length(path: Path) -> Claim:
+    """Returns what a video's container says about its length.
+
+    Raises:
+        InputError: as `open_video`.
+    """
+    with open_video(path) as (container, stream):
+        if stream.duration is not None and stream.time_base is not None:
+            seconds = float(stream.duration * stream.time_base)
+        else:
+            seconds = (container.duration or 0) / av.time_base
+        return Claim(stream.frames, seconds, float(stream.average_rate or 0))
+
+
+def decode(path: Path, *, threads: int) -> Iterator[av.VideoFrame | Gap]:
+    """Yields every frame of a video in the order of showing, and a `Gap` for each lost packet.
+
+    The frames of an undamaged video do not depend on `threads`; around damage they do. A frame of
+    another size than the first counts as lost.
+
+    Raises:
+        InputError: as `open_video`.
+    """
+    with open_video(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = threads
+        size: tuple[int, int] | None = None
+        for item in _frames(container, stream):
+            if isinstance(item, av.VideoFrame):
+                size = size or (item.width, item.height)
+                if (item.width, item.height) != size:
+                    item = Gap(item.pts)
+            yield item
+
+
+def frames_at(
+    path: Path, indices: Collection[int], *, threads: int
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yields (index, RGB [H, W, 3]) of the frames at these indices, in ascending order.
+
+    Raises:
+        InputError: as `open_video`, or the file does not hold the frames that it held before.
+    """
+    missing = set(indices)
+    if not missing:
+        return
+    frames = (item for item in decode(path, threads=threads) if isinstance(item, av.VideoFrame))
+    for index, frame in enumerate(frames):
+        if index in missing:
+            yield index, to_rgb(frame)
+            missing.remove(index)
+        if not missing:
+            return
+    raise InputError(
+        f"{path} ended before frame {min(missing)}, which was there on the first reading.",
+        hint="Leave the file alone while it is read, then run the same command again.")
+
+
+def _frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame | Gap]:
+    for packet in _packets(container, stream):
+        if isinstance(packet, Gap):
+            yield packet
+            continue
+        try:
+            yield from packet.decode()
+        except av.error.FFmpegError:
+            yield Gap(packet.pts)
+
+
+def _packets(
+    container: InputContainer, stream: VideoStream
+) -> Iterator[av.Packet[VideoStream] | Gap]:
+    """Yields the packets of a stream; goes on behind what the demuxer stumbles over."""
+    for _ in range(MAX_DEMUX_ERRORS):
+        try:
+            yield from container.demux(stream)
+            return
+        except av.error.FFmpegError:
+            yield Gap(None)
+
+
+def to_rgb(frame: av.VideoFrame) -> NDArray[np.uint8]:
+    """Returns a frame as it is shown: upright, full-range RGB, [H, W, 3].
+
+    Colour matrix and range come from the frame's tags. Ten-bit frames are reduced to eight bits.
+    """
+    untagged = frame.colorspace == UNSPECIFIED
+    large = frame.width >= SD_WIDTH or frame.height > SD_HEIGHT
+    matrix = Colorspace.ITU709 if untagged and large else None
+    rgb = frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()
+    # Both count counterclockwise.
+    return np.ascontiguousarray(np.rot90(rgb, _quarter_turns(frame)))
+
+
+def shown_size(frame: av.VideoFrame) -> tuple[int, int]:
+    """Returns width and height of a frame once it is upright."""
+    size = frame.width, frame.height
+    return size[::-1] if _quarter_turns(frame) % 2 else size
+
+
+def _quarter_turns(frame: av.VideoFrame) -> int:
+    return round(frame.rotation / 90) % 4
+
+
+def to_gray(frame: av.VideoFrame) -> NDArray[np.uint8]:
+    """Returns a frame's brightness, upright, [H, W]."""
+    gray = np.asarray(frame.reformat(format="gray").to_ndarray(), np.uint8)
+    return np.ascontiguousarray(np.rot90(gray, _quarter_turns(frame)))

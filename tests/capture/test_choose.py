@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+
+from recon_cli.capture.choose import (
+    FRAME_SPACING,
+    MAX_GAP,
+    MIN_AUTOMATIC,
+    automatic_count,
+    bridged,
+    choose_frames,
+    sharp_frames,
+    travelled,
+)
+
+
+def everything(count):
+    return np.ones(count, np.bool_)
+
+
+def test_a_blurred_frame_among_sharp_ones_is_found():
+    sharpness = np.full(100, 200.0)
+    sharpness[[7, 50, 99]] = 90.0
+    assert np.flatnonzero(~sharp_frames(sharpness, 0.5)).tolist() == [7, 50, 99]
+    assert sharp_frames(sharpness, 0.4).all()
+
+
+def test_a_bare_stretch_is_judged_by_its_own_frames():
+    sharpness = np.r_[np.full(100, 500.0), np.full(100, 5.0)]
+    sharp = sharp_frames(sharpness, 0.5)
+    assert sharp[:100].all()
+    assert sharp[125:].all()
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_a_flat_video_passes_the_gate(count):
+    assert sharp_frames(np.zeros(count), 0.5).all()
+
+
+def test_unknown_steps_count_as_the_usual_one():
+    way = travelled(np.array([0.0, 0.02, np.nan, 0.02, 0.04]))
+    np.testing.assert_allclose(way, [0, 0.02, 0.04, 0.06, 0.1])
+
+
+@pytest.mark.parametrize("motion", [np.zeros(50), np.r_[0.0, np.full(49, np.nan)]])
+def test_where_nothing_moves_the_choice_spreads_over_time(motion):
+    way = travelled(motion)
+    chosen = choose_frames(way, np.ones(50), everything(50), 10)
+    assert len(chosen) == 10
+    np.testing.assert_allclose(np.diff(chosen), 5, atol=2)
+
+
+def test_one_wild_step_does_not_eat_the_budget():
+    motion = np.full(100, 0.01)
+    motion[50] = 30.0
+    assert travelled(motion)[-1] < 1.2
+
+
+def test_the_number_of_frames_follows_the_way_within_bounds():
+    assert automatic_count(np.array([0.0, 50 * FRAME_SPACING]), most=100) == 50
+    assert automatic_count(np.array([0.0, 500 * FRAME_SPACING]), most=100) == 100
+    assert automatic_count(np.array([0.0, 0.0]), most=100) == MIN_AUTOMATIC
+    assert automatic_count(np.array([0.0, 0.0]), most=5) == 5
+
+
+def test_frames_are_spread_over_the_way_not_over_time():
+    # The camera rests for half of the video, then moves evenly.
+    way = travelled(np.r_[np.zeros(100), np.full(100, 0.01)])
+    chosen = choose_frames(way, np.ones(200), everything(200), 20)
+    assert len(chosen) == 20
+    assert (chosen < 100).sum() <= 1
+    np.testing.assert_allclose(np.diff(way[chosen]), 0.05, atol=0.02)
+
+
+def test_the_sharpest_frame_near_each_place_is_taken():
+    sharpness = np.ones(100)
+    sharpness[4::10] = 2.0
+    chosen = choose_frames(np.linspace(0, 1, 100), sharpness, everything(100), 10)
+    assert chosen.tolist() == list(range(4, 100, 10))
+
+
+def test_frames_that_are_not_usable_are_never_taken():
+    usable = np.arange(100) % 3 == 0
+    chosen = choose_frames(np.linspace(0, 1, 100), np.ones(100), usable, 20)
+    assert usable[chosen].all()
+    assert len(chosen) == 20
+
+
+@pytest.mark.parametrize("count", [3, 17, 60, 99, 100, 101])
+def test_as_many_frames_as_asked_for_come_out_whatever_the_motion(count):
+    motion = np.random.default_rng(count).exponential(0.02, 100) ** 2
+    chosen = choose_frames(travelled(motion), motion, everything(100), count)
+    assert len(chosen) == min(count, 100)
+    assert (np.diff(chosen) > 0).all()
+
+
+def test_a_blurred_turn_is_bridged_by_its_least_blurred_frames():
+    way = np.linspace(0, 2, 201)  # 0.01 a frame
+    sharp, sharpness = everything(201), np.full(201, 100.0)
+    sharp[80:120], sharpness[80:120] = False, 10.0  # 0.4 widths of blur
+    sharpness[100] = 20.0
+    usable = bridged(way, sharpness, sharp, everything(201))
+    kept = np.flatnonzero(usable)
+    assert usable[100]
+    assert np.diff(way[kept]).max() <= MAX_GAP
+    assert len(kept) - sharp.sum() <= 8  # not the whole turn
+
+
+def test_short_gaps_and_damaged_frames_are_not_bridged():
+    way = np.linspace(0, 2, 201)
+    sharp, whole = everything(201), everything(201)
+    sharp[10:15] = False
+    whole[80:120] = False
+    assert (bridged(way, np.ones(201), sharp, whole) == (sharp & whole)).all()

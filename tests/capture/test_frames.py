@@ -1,0 +1,80 @@
+import cv2
+import numpy as np
+import pytest
+from media import texture
+
+from recon_cli.capture.frames import (
+    Frame,
+    FrameList,
+    fitted,
+    held_out,
+    prepare,
+    read_frame_list,
+    read_png,
+    write_png,
+)
+from recon_cli.config import parse_holdout
+from recon_cli.errors import FormatError
+
+NAMES = [f"{index:06d}.png" for index in range(20)]
+
+
+@pytest.mark.parametrize(("holdout", "indices"), [
+    ("every:8", [0, 8, 16]),
+    ("every:7", [0, 7, 14]),
+    ("segment:0.5:0.75", [10, 11, 12, 13, 14]),
+    ("segment:0:1", list(range(20))),
+    ("none", []),
+])
+def test_held_out_frames_go_by_sorted_name(holdout, indices):
+    held = held_out(NAMES[::-1], parse_holdout(holdout))
+    assert held == {NAMES[index] for index in indices}
+
+
+def test_a_frame_list_comes_back_as_it_was_written(tmp_path):
+    frames = (
+        Frame("000003.png", 0.3, "room.mp4", 12.5, True),
+        Frame("000009.png", None, "room.mp4", None, False),
+    )
+    written = FrameList("video", 64, 48, None, frames)
+    written.write(tmp_path)
+    assert read_frame_list(tmp_path) == written
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"frames": [{"name": "a.png"}]}', "{"])
+def test_a_file_that_is_no_frame_list_is_refused(tmp_path, text):
+    (tmp_path / "frames.json").write_text(text)
+    with pytest.raises(FormatError):
+        read_frame_list(tmp_path)
+
+
+def test_frames_are_stored_without_loss_as_rgb(tmp_path):
+    rgb = texture(48, 64)
+    write_png(tmp_path / "a.png", rgb)
+    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), rgb)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[:, :, ::-1], rgb)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG"])
+def test_a_broken_frame_is_no_picture(tmp_path, content):
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(FormatError, match="no readable picture"):
+        read_png(tmp_path / "a.png")
+
+
+def test_large_frames_are_reduced_by_area():
+    rgb = texture(40, 60, coarseness=1)
+    assert fitted(rgb, 60) is rgb
+    halved = fitted(rgb, 30)
+    mean = rgb.reshape(20, 2, 30, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(halved, mean, atol=0.5)  # rounding to 8 bits
+    assert fitted(rgb.transpose(1, 0, 2), 30).shape == (30, 20, 3)
+
+
+def test_leftovers_of_a_killed_run_are_cleared_and_frames_are_kept(tmp_path):
+    folder = prepare(tmp_path)
+    (folder / "000001.png").write_bytes(b"kept")
+    (folder / ".000002.png.tmp123.png").write_bytes(b"half")
+    (tmp_path / ".frames.json.tmp123.json").write_bytes(b"half")
+    assert prepare(tmp_path) == folder
+    assert [path.name for path in tmp_path.rglob("*")] == ["frames", "000001.png"]

@@ -1,0 +1,79 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from recon_cli.capture.images import Photo
+from recon_cli.capture.photos import (
+    check_count,
+    check_sizes,
+    frame_names,
+    list_photos,
+    shared_focal,
+)
+from recon_cli.errors import InputError
+
+
+def photo(name, width=64, height=48, focal=None):
+    return Photo(Path(name), width, height, focal)
+
+
+def test_photos_are_told_from_other_files_by_content(tmp_path):
+    for name in ("b.jpg", "a.jpg", "no_suffix.png"):
+        Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / name)
+    (tmp_path / "no_suffix.png").rename(tmp_path / "no_suffix")
+    (tmp_path / ".hidden.jpg").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("not a photo")
+    (tmp_path / "broken.JPG").write_bytes(b"not a photo either")
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"cannot be read here")
+    (tmp_path / "more").mkdir()
+    folder = list_photos(tmp_path)
+    assert [found.path.name for found in folder.photos] == ["a.jpg", "b.jpg", "no_suffix"]
+    assert sorted(folder.broken) == ["IMG_1.HEIC", "broken.JPG"]
+    assert "broken.JPG cannot be read" in folder.broken["broken.JPG"]
+
+
+def test_photos_are_listed_as_a_person_counts(tmp_path):
+    for name in ("IMG_10.png", "IMG_9.png", "IMG_100.png"):
+        Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / name)
+    names = [found.path.name for found in list_photos(tmp_path).photos]
+    assert names == ["IMG_9.png", "IMG_10.png", "IMG_100.png"]
+
+
+def test_plain_names_are_kept():
+    photos = [photo("IMG_0001.jpg"), photo("IMG_0002.JPG"), photo("a.b-c.tif")]
+    assert frame_names(photos) == ["IMG_0001.png", "IMG_0002.png", "a.b-c.png"]
+
+
+@pytest.mark.parametrize("names", [
+    ["a.jpg", "a.tif", "b.jpg"],  # one stem twice
+    ["A.jpg", "a.tif", "b.jpg"],  # one file twice where case does not count
+    ["a b.jpg", "c.jpg", "d.jpg"],
+    ["Küche.jpg", "c.jpg", "d.jpg"],
+    ["IMG_9.jpg", "IMG_10.jpg", "IMG_11.jpg"],  # would sort in another order
+])
+def test_other_names_are_numbered(names):
+    assert frame_names([photo(name) for name in names]) == [
+        "000000.png", "000001.png", "000002.png"]
+
+
+def test_mixed_sizes_are_listed_with_their_counts():
+    check_sizes([photo("a"), photo("b")])
+    with pytest.raises(InputError, match="2 of 64x48, 1 of 48x64") as caught:
+        check_sizes([photo("a"), photo("b", 48, 64), photo("c")])
+    assert "one size" in caught.value.hint
+
+
+def test_too_few_photos_are_refused_with_the_reason():
+    check_count(Path("room"), 3, {})
+    with pytest.raises(InputError, match="1 readable photos, 0 broken ones"):
+        check_count(Path("room"), 1, {})
+    with pytest.raises(InputError, match=r"2 broken ones.*a\.jpg cannot be read"):
+        check_count(Path("room"), 0, {"a.jpg": "a.jpg cannot be read.", "b.jpg": "?"})
+
+
+def test_a_focal_length_counts_only_when_all_photos_share_it():
+    assert shared_focal([photo("a", focal=1000.0), photo("b", focal=1004.0)]) == 1000.0
+    assert shared_focal([photo("a", focal=1000.0), photo("b", focal=2000.0)]) is None
+    assert shared_focal([photo("a", focal=1000.0), photo("b")]) is None

@@ -1,0 +1,91 @@
+import json
+
+import av
+import cv2
+import numpy as np
+import pytest
+from media import spoil_packets, texture, write_video
+
+from recon_cli.capture.scan import Scan, decode_threads, scan_video, sharpness
+from recon_cli.capture.video import decode, to_rgb
+
+
+def quiet():
+    """A step that nobody watches."""
+
+
+def walk(frames=40, step=2):
+    wide = texture(96, 160 + frames * step)
+    return [wide[:, i * step:i * step + 160] for i in range(frames)]
+
+
+@pytest.fixture
+def video(tmp_path):
+    options = {"qp": "10", "g": "10", "bf": "2", "sc_threshold": "0"}
+    return write_video(tmp_path / "walk.mp4", walk(), options=options)
+
+
+def test_blur_lowers_sharpness():
+    gray = texture(96, 160)[:, :, 0]
+    blurred = [sharpness(cv2.GaussianBlur(gray, (0, 0), sigma)) for sigma in (0.5, 1, 2, 4)]
+    assert blurred == sorted(blurred, reverse=True)
+    assert sharpness(np.full((96, 160), 128, np.uint8)) == 0
+
+
+def test_sharpness_is_measured_at_one_size():
+    gray = texture(540, 960, coarseness=12)[:, :, 0]
+    larger = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    assert sharpness(larger) == pytest.approx(sharpness(gray), rel=1e-6)
+
+
+def test_an_undamaged_video_is_whole(video):
+    steps = []
+    scan = scan_video(video, threads=2, step=lambda: steps.append(1))
+    assert (scan.width, scan.height, scan.declared, len(steps)) == (160, 96, 40, 40)
+    assert (scan.lost, scan.expected, scan.whole.all()) == (0, 40, True)
+    np.testing.assert_allclose(scan.seconds, np.arange(40) / 10)
+    assert decode_threads(scan, 4) == 4
+
+
+def test_a_container_without_a_count_is_checked_by_its_duration(tmp_path):
+    path = write_video(tmp_path / "walk.mkv", walk())
+    assert scan_video(path, threads=1, step=quiet).declared == 40
+    data = path.read_bytes()
+    path.write_bytes(data[:len(data) * 4 // 5])  # the first frame alone is half of it
+    scan = scan_video(path, threads=1, step=quiet)
+    assert scan.declared == pytest.approx(40, abs=1)
+    assert 3 <= scan.whole.sum() <= 37
+
+
+def test_a_scan_survives_json(video):
+    scan = scan_video(video, threads=1, step=quiet)
+    scan.motion[3] = np.nan
+    again = Scan.from_json(json.loads(json.dumps(scan.to_json(), allow_nan=False)))
+    assert again.to_json() == scan.to_json()
+    assert np.isnan(again.motion[3])
+
+
+@pytest.mark.parametrize("erase", [False, True])
+@pytest.mark.parametrize("packet", [1, 4, 13, 22, 35])
+def test_whole_frames_are_exactly_those_of_the_undamaged_video(video, packet, erase):
+    def pixels():
+        frames = (f for f in decode(video, threads=1) if isinstance(f, av.VideoFrame))
+        return {frame.pts: to_rgb(frame) for frame in frames}
+
+    truth = pixels()
+    spoil_packets(video, [packet], erase=erase)
+    scan = scan_video(video, threads=1, step=quiet)
+    damaged = pixels()
+    for (pts, rgb), whole in zip(damaged.items(), scan.whole, strict=True):
+        if whole:
+            np.testing.assert_array_equal(rgb, truth[pts])
+    # No more is given up than the group of ten that the packet belongs to.
+    assert 1 <= scan.lost <= 10
+    assert decode_threads(scan, 4) == 1
+
+
+def test_damage_is_told_alike_by_any_number_of_threads(video):
+    spoil_packets(video, [5, 24])
+    scans = [scan_video(video, threads=threads, step=quiet) for threads in (1, 2, 4)]
+    assert scans[0].lost > 0
+    assert scans[0].to_json() == scans[1].to_json() == scans[2].to_json()

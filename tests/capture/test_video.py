@@ -1,0 +1,175 @@
+import av
+import numpy as np
+import pytest
+from media import set_display_matrix, texture, write_sound, write_video
+from PIL import Image
+
+from recon_cli.capture.video import (
+    Gap,
+    claimed_length,
+    decode,
+    frames_at,
+    open_video,
+    shown_size,
+    to_gray,
+    to_rgb,
+)
+from recon_cli.errors import InputError
+
+# Two roundings (to YUV and back) of 8-bit values, and a little loss of the codec.
+COLOUR_TOLERANCE = 4
+BT709, BT601, LIMITED, FULL = 1, 5, 1, 2
+
+COLOURS = ((255, 0, 0), (0, 200, 30), (20, 40, 220), (240, 240, 240))  # by quadrant
+
+
+def quadrants(height=64, width=96):
+    picture = np.zeros((height, width, 3), np.uint8)
+    picture[: height // 2, : width // 2] = COLOURS[0]
+    picture[: height // 2, width // 2:] = COLOURS[1]
+    picture[height // 2:, : width // 2] = COLOURS[2]
+    picture[height // 2:, width // 2:] = COLOURS[3]
+    return picture
+
+
+def centres(picture):
+    height, width = picture.shape[:2]
+    rows, columns = (height // 4, 3 * height // 4), (width // 4, 3 * width // 4)
+    return np.array([picture[y, x] for y in rows for x in columns], int)
+
+
+def first_frame(path):
+    return next(f for f in decode(path, threads=1) if isinstance(f, av.VideoFrame))
+
+
+# The matrices that cameras write: the picture has to be turned clockwise by so much to be upright.
+@pytest.mark.parametrize(("clockwise", "matrix"), [
+    (0, (65536, 0, 0, 0, 65536, 0)),
+    (1, (0, 65536, 0, -65536, 0, 0)),
+    (2, (-65536, 0, 0, 0, -65536, 0)),
+    (3, (0, -65536, 0, 65536, 0, 0)),
+])
+def test_a_tagged_rotation_is_applied(tmp_path, clockwise, matrix):
+    path = write_video(tmp_path / "phone.mp4", [quadrants()] * 3)
+    set_display_matrix(path, (*matrix, 0, 0, 1 << 30))
+    frame = first_frame(path)
+    upright = np.rot90(quadrants(), -clockwise)
+    rgb = to_rgb(frame)
+    assert rgb.shape == upright.shape
+    assert np.abs(centres(rgb) - centres(upright)).max() <= COLOUR_TOLERANCE
+    assert to_gray(frame).shape == upright.shape[:2]
+    assert shown_size(frame) == upright.shape[1::-1]
+
+
+@pytest.mark.parametrize(("codec", "pixels", "colorspace", "color_range"), [
+    ("libx264", "yuv420p", None, None),
+    ("libx264", "yuv420p", BT709, LIMITED),
+    ("libx264", "yuv420p", BT709, FULL),
+    ("libx264", "yuv420p", BT601, LIMITED),
+    ("libx264", "yuv420p", BT601, FULL),
+    ("libx264", "yuv420p10le", BT709, LIMITED),
+    ("ffv1", "yuv444p", None, None),
+    ("mpeg4", "yuv420p", None, None),
+])
+def test_colours_come_out_as_they_went_in(tmp_path, codec, pixels, colorspace, color_range):
+    path = write_video(
+        tmp_path / "video.mkv", [quadrants()] * 3, codec=codec, pixels=pixels,
+        colorspace=colorspace, color_range=color_range)
+    rgb = to_rgb(first_frame(path))
+    assert rgb.dtype == np.uint8
+    assert np.abs(centres(rgb) - COLOURS).max() <= COLOUR_TOLERANCE
+
+
+def test_untagged_video_of_high_definition_is_taken_as_bt709(tmp_path):
+    tagged = write_video(
+        tmp_path / "tagged.mkv", [quadrants(720, 1280)], codec="ffv1", colorspace=BT709,
+        color_range=LIMITED)
+    frame = first_frame(tagged)
+    frame.colorspace = 2  # unspecified
+    assert np.abs(centres(to_rgb(frame)) - COLOURS).max() <= COLOUR_TOLERANCE
+
+
+def test_gray_uses_the_full_range(tmp_path):
+    path = write_video(tmp_path / "video.mp4", [np.full((64, 96, 3), 255, np.uint8)] * 3)
+    assert to_gray(first_frame(path)).min() >= 255 - COLOUR_TOLERANCE
+
+
+@pytest.mark.parametrize("name", ["text.mp4", "text.txt"])
+def test_text_is_no_video_whatever_its_name(tmp_path, name):
+    path = tmp_path / name
+    path.write_text("no frames in here\n" * 100)
+    with pytest.raises(InputError, match=r"cannot be read as a video|holds no video"):
+        claimed_length(path)
+
+
+def test_sound_is_no_video(tmp_path):
+    with pytest.raises(InputError, match="holds no video that can be decoded, only audio"):
+        claimed_length(write_sound(tmp_path / "sound.mp4"))
+
+
+def test_an_empty_file_is_named_as_such(tmp_path):
+    (tmp_path / "empty.mp4").touch()
+    with pytest.raises(InputError, match="is empty"):
+        claimed_length(tmp_path / "empty.mp4")
+
+
+def test_a_missing_file_is_named_as_such(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        claimed_length(tmp_path / "none.mp4")
+
+
+def test_a_single_picture_is_refused_even_if_named_like_a_video(tmp_path):
+    Image.fromarray(quadrants()).save(tmp_path / "a.jpg")
+    (tmp_path / "a.jpg").rename(tmp_path / "a.mp4")
+    with pytest.raises(InputError, match="single picture"):
+        claimed_length(tmp_path / "a.mp4")
+
+
+def test_a_video_is_known_by_its_content_not_by_its_name(tmp_path):
+    path = write_video(tmp_path / "video.mp4", [quadrants()] * 5)
+    path = path.rename(tmp_path / "room: take 1.txt")
+    assert claimed_length(path).frames == 5
+    with open_video(path) as (_, stream):
+        assert stream.width == 96
+
+
+def test_the_count_is_taken_from_the_duration_where_the_container_names_none(tmp_path):
+    path = write_video(tmp_path / "video.mkv", [quadrants()] * 12)
+    claim = claimed_length(path)
+    assert claim.frames == 0
+    assert claim.count(claim.rate) == 12
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_every_frame_is_decoded_once_and_in_order(tmp_path, threads):
+    shades = [np.full((64, 96, 3), 10 * i + 20, np.uint8) for i in range(20)]
+    path = write_video(tmp_path / "video.mp4", shades)
+    seen = [int(np.median(to_rgb(frame))) for frame in decode(path, threads=threads)]
+    np.testing.assert_allclose(seen, [10 * i + 20 for i in range(20)], atol=COLOUR_TOLERANCE)
+
+
+def test_frames_are_found_again_by_their_index(tmp_path):
+    shades = [np.full((64, 96, 3), 10 * i + 20, np.uint8) for i in range(20)]
+    path = write_video(tmp_path / "video.mp4", shades)
+    found = {index: int(np.median(rgb)) for index, rgb in frames_at(path, [3, 11], threads=2)}
+    assert found == {
+        3: pytest.approx(50, abs=COLOUR_TOLERANCE), 11: pytest.approx(130, abs=COLOUR_TOLERANCE)}
+    assert list(frames_at(path, [], threads=1)) == []
+
+
+def test_a_frame_that_is_gone_on_the_second_reading_is_an_error(tmp_path):
+    path = write_video(tmp_path / "video.mp4", [quadrants()] * 5)
+    with pytest.raises(InputError, match="ended before frame 9"):
+        list(frames_at(path, [2, 9], threads=1))
+
+
+def test_frames_that_change_their_size_midway_count_as_lost(tmp_path):
+    parts = [
+        write_video(tmp_path / f"{width}.h264", [texture(64, width)] * 6, muxer="h264")
+        for width in (96, 128)
+    ]
+    path = tmp_path / "both.h264"
+    path.write_bytes(b"".join(part.read_bytes() for part in parts))
+    items = list(decode(path, threads=1))
+    assert {item.width for item in items if isinstance(item, av.VideoFrame)} == {96}
+    assert any(isinstance(item, Gap) for item in items)
