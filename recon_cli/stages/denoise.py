@@ -1,0 +1,99 @@
+"""denoise: measures the noise of each frame and filters those that have some.
+
+Each frame is judged by itself: a phone raises its gain when it turns to a dark corner, so that one
+capture holds clean and noisy frames. Frames that pass stay byte-identical.
+"""
+
+from __future__ import annotations
+
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from recon_cli import atomic
+from recon_cli.capture import frames as store
+from recon_cli.capture.noise import denoised, estimate_noise
+from recon_cli.capture.pace import paced
+from recon_cli.config import DenoiseConfig
+from recon_cli.stages.context import StageContext, StageInputs, Summary
+
+NOISE = "noise.json"
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    name: str
+    sigma: float  # 1/255
+    filtered: bool
+
+
+def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+    """Writes frames/*.png, twins of ingest's, and noise.json into `out`.
+
+    Args:
+        config: see `DenoiseConfig`.
+        inputs: the finished folder of ingest.
+        out: the stage's partial folder; frames already in it are kept.
+        ctx: for progress; the result does not depend on its threads.
+
+    Returns:
+        mode, frames, denoised (count), median_sigma_255.
+
+    Raises:
+        FormatError: ingest's folder does not hold what its list says.
+    """
+    ingest = inputs.folders["ingest"]
+    names = [frame.name for frame in store.read_frame_list(ingest).frames]
+    outcomes = _process(config, names, ingest / store.FOLDER, store.prepare(out), ctx)
+    atomic.write_json(out / NOISE, {
+        outcome.name: {"sigma_255": outcome.sigma, "denoised": outcome.filtered}
+        for outcome in outcomes
+    })
+    return {
+        "mode": config.mode,
+        "frames": len(outcomes),
+        "denoised": sum(outcome.filtered for outcome in outcomes),
+        "median_sigma_255": round(float(np.median([item.sigma for item in outcomes])), 4),
+    }
+
+
+def _process(
+    config: DenoiseConfig, names: list[str], source: Path, target: Path, ctx: StageContext
+) -> list[_Outcome]:
+    """Returns what became of each frame, in the order of `names`."""
+    outcomes = []
+    record = paced(ctx.record)
+    pool = ThreadPoolExecutor(ctx.threads)
+    try:
+        with ctx.progress.bar("denoise", len(names), unit="frame") as bar:
+            for outcome in pool.map(lambda n: _frame(config, source / n, target / n), names):
+                outcomes.append(outcome)
+                bar.advance()
+                record(len(outcomes), len(names))
+    finally:
+        pool.shutdown(cancel_futures=True)  # an error or Ctrl-C does not wait for the rest
+    return outcomes
+
+
+def _frame(config: DenoiseConfig, source: Path, target: Path) -> _Outcome:
+    """Measures one frame and writes it, filtered or as it is, unless it is there already."""
+    rgb = store.read_png(source)
+    sigma = round(estimate_noise(rgb), 4)
+    filtered = config.mode == "force" or (config.mode == "auto" and sigma >= config.threshold)
+    if not target.exists():
+        if filtered:
+            # Whoever forces the filter says that the estimate is too low.
+            noise = max(sigma, config.threshold)
+            store.write_png(target, denoised(rgb, config.strength * noise))
+        else:
+            _copy(source, target)
+    return _Outcome(source.name, sigma, filtered)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copies a file byte by byte; with a hard link, editing one would change the other."""
+    with atomic.replacing(target) as temporary:
+        shutil.copyfile(source, temporary)
