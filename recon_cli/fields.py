@@ -75,10 +75,13 @@ class StageConfig:
             raise self._refused(item.name, value, "one of " + ", ".join(info.choices))
         if isinstance(value, float) and not math.isfinite(value):
             raise self._refused(item.name, value, "a finite number")
+        return self._within(item.name, value, info)
+
+    def _within(self, name: str, value: Any, info: OptionInfo) -> Any:
         if info.minimum is not None and value < info.minimum:
-            raise self._refused(item.name, value, f"at least {info.minimum:g}")
+            raise self._refused(name, value, f"at least {info.minimum:g}")
         if info.maximum is not None and value > info.maximum:
-            raise self._refused(item.name, value, f"at most {info.maximum:g}")
+            raise self._refused(name, value, f"at most {info.maximum:g}")
         return value
 
     def _refused(self, name: str, value: object, needed: str) -> ConfigError:

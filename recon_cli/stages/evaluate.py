@@ -1,0 +1,158 @@
+"""evaluate: scores every model on the held-out views, against the original pixels.
+
+The .ply is read back and rendered, so that what is handed out is what is measured. Writes
+metrics.json, metrics.csv, metrics.md, table.txt, and pictures: renders/<model>/, truth/ and
+difference/<model>/ (absolute error times four).
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon_cli.atomic import write_bytes, write_json
+from recon_cli.config import EvaluateConfig
+from recon_cli.errors import ReconstructionError
+from recon_cli.io.images import fitted_camera, read_image, write_png
+from recon_cli.io.ply import read_ply
+from recon_cli.metrics import (
+    PSNR_CONVENTION,
+    SSIM_CONVENTION,
+    ModelScore,
+    ViewScore,
+    csv_table,
+    markdown_table,
+    psnr,
+    ssim,
+    text_table,
+)
+from recon_cli.progress import Bar
+from recon_cli.render import render
+from recon_cli.scene import Camera, Scene, Splats
+from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.stages.fitting import LOG, load_scene, read_config, seconds_at
+
+_LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}
+_GAIN = 4  # of the difference images
+_EVER = 1 << 62  # an iteration beyond any
+
+
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """A held-out view at the size it is scored at."""
+
+    name: str
+    camera: Camera
+    image: NDArray[np.uint8]
+
+
+def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+    """Renders and scores the held-out views and returns the means of each model."""
+    train_config = read_config(inputs.folders["train"])
+    scene = load_scene(inputs, validation=train_config.validation)
+    truths = _truths(scene, config.max_size or train_config.max_size)
+    stages = {"base": "train", "pruned": "prune"}
+    folders = {model: inputs.folders[stage] for model, stage in stages.items()
+               if stage in inputs.folders}
+    for truth in truths:
+        _save(out / "truth" / f"{Path(truth.name).stem}.png", truth.image)
+    scores: dict[str, ModelScore] = {}
+    with ctx.progress.bar("evaluate", len(truths) * len(folders), unit="view") as bar:
+        for model, folder in folders.items():
+            scores[model] = _score(
+                model, folder, truths, train_config.sh_degree, out, ctx, bar)
+    if scene.unregistered_test:
+        ctx.notice(f"{len(scene.unregistered_test)} held-out views have no camera and are not "
+                   f"scored: {', '.join(scene.unregistered_test)}")
+    _write_tables(out, scores, truths, scene)
+    return {
+        "test_views": len(truths), "unregistered_test": list(scene.unregistered_test),
+        **{f"{model}_{key}": round(getattr(score, key), 4)
+           for model, score in scores.items() for key in ("psnr_db", "ssim", "gaussians")},
+    }
+
+
+def _truths(scene: Scene, max_size: int) -> list[_Truth]:
+    if not scene.test:
+        raise ReconstructionError(
+            f"No held-out view has a camera ({len(scene.unregistered_test)} were held out).",
+            hint="Run `recon ingest` with another --holdout, such as every:8.")
+    truths = []
+    for view in scene.test:
+        camera = fitted_camera(view.camera, max_size)
+        truths.append(_Truth(
+            view.name, camera, read_image(view.original, camera.width, camera.height)))
+    return truths
+
+
+def _score(
+    model: str, folder: Path, truths: Sequence[_Truth], sh_degree: int, out: Path,
+    ctx: StageContext, bar: Bar,
+) -> ModelScore:
+    """Renders every view of one model, saves the pictures and returns its scores."""
+    path = folder / "splats.ply"
+    splats = read_ply(path).map(lambda tensor: tensor.to(ctx.device))
+    views, milliseconds = [], []
+    for truth in truths:
+        image, elapsed = _timed_render(splats, truth.camera, sh_degree, ctx)
+        milliseconds.append(elapsed)
+        views.append(ViewScore(truth.name, psnr(image, truth.image), ssim(image, truth.image)))
+        name = f"{Path(truth.name).stem}.png"
+        shown = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+        _save(out / "renders" / model / name, shown)
+        difference = np.abs(shown.astype(np.int16) - truth.image) * _GAIN
+        _save(out / "difference" / model / name, difference.clip(0, 255).astype(np.uint8))
+        bar.advance()
+    return ModelScore(
+        _LABELS[model], tuple(views), len(splats), path.stat().st_size,
+        statistics.median(milliseconds), seconds_at(folder / LOG, _EVER))
+
+
+def _timed_render(
+    splats: Splats, camera: Camera, sh_degree: int, ctx: StageContext
+) -> tuple[NDArray[np.float32], float]:
+    """Returns the image [H, W, 3] and the milliseconds that it took."""
+    start = time.perf_counter()
+    with torch.no_grad():
+        background = torch.zeros(3, device=ctx.device)
+        rgb = render(splats, camera, background, sh_degree, backend=ctx.backend).rgb
+        image: NDArray[np.float32] = rgb.cpu().numpy()  # waits for the device
+    return image, 1e3 * (time.perf_counter() - start)
+
+
+def _save(path: Path, image: NDArray[np.uint8]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, image)
+
+
+def _write_tables(
+    out: Path, scores: dict[str, ModelScore], truths: Sequence[_Truth], scene: Scene
+) -> None:
+    size = truths[0].camera
+    write_json(out / "metrics.json", {
+        "models": {
+            model: {
+                "psnr_db": score.psnr_db, "ssim": score.ssim, "gaussians": score.gaussians,
+                "bytes": score.bytes, "render_ms": score.render_ms,
+                "train_seconds": score.train_seconds,
+                "views": [vars(view) for view in score.views],
+            } for model, score in scores.items()
+        },
+        "psnr_convention": PSNR_CONVENTION, "ssim_convention": SSIM_CONVENTION,
+        "width": size.width, "height": size.height, "test_views": len(truths),
+        "unregistered_test": list(scene.unregistered_test),
+    })
+    note = (f"{len(truths)} held-out views at {size.width}x{size.height}, "
+            f"{len(scene.unregistered_test)} more without a camera\n"
+            f"PSNR: {PSNR_CONVENTION}\nSSIM: {SSIM_CONVENTION}\n")
+    table = list(scores.values())
+    write_bytes(out / "table.txt", f"{text_table(table)}\n{note}".encode())
+    write_bytes(out / "metrics.md", f"{markdown_table(table)}\n{note}".encode())
+    write_bytes(out / "metrics.csv", csv_table(scores).encode())

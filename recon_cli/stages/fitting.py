@@ -1,0 +1,179 @@
+"""What the train and prune stages share: views from disk, checkpoints, the log, a clean Ctrl-C."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from recon_cli.atomic import read_json, write_bytes
+from recon_cli.config import TrainConfig
+from recon_cli.errors import FormatError
+from recon_cli.io.colmap import read_scene
+from recon_cli.io.images import fitted_camera, read_image
+from recon_cli.scene import Scene, View
+from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.train.fit import Report, Task, TrainView, fit
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.state import TrainState, save_state
+
+CHECKPOINT = "checkpoint.safetensors"
+LOG = "log.jsonl"
+
+
+def held_out_names(ingest: Path) -> frozenset[str]:
+    """Returns the names of the frames that ingest kept for the score."""
+    try:
+        frames = read_json(ingest / "frames.json")["frames"]
+        return frozenset(frame["name"] for frame in frames if frame["held_out"])
+    except (KeyError, TypeError) as error:
+        raise FormatError(
+            f"{ingest / 'frames.json'} lacks {error}.",
+            hint="Run `recon ingest --again`.") from error
+
+
+def load_scene(inputs: StageInputs, *, validation: float) -> Scene:
+    """Returns the views and points that sfm left, split by what each may be used for."""
+    undistorted = inputs.folders["sfm"] / "undistorted"
+    return read_scene(
+        undistorted, held_out=held_out_names(inputs.folders["ingest"]), validation=validation)
+
+
+def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
+    """Returns the training task at the training size, images in memory as uint8."""
+    def views(chosen: Sequence[View]) -> list[TrainView]:
+        loaded = []
+        for view in chosen:
+            camera = fitted_camera(view.camera, config.max_size)
+            path = view.denoised if config.images == "denoised" else view.original
+            loaded.append(TrainView(camera, read_image(path, camera.width, camera.height)))
+        return loaded
+
+    return Task(
+        views(scene.train), views(scene.validation), Schedule(config), scene.extent,
+        ctx.backend, torch.device(ctx.device))
+
+
+def write_config(folder: Path, config: TrainConfig) -> None:
+    """Writes the options of a run beside its checkpoints."""
+    write_bytes(folder / "config.json", json.dumps(config.hashed(), indent=1).encode())
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """Returns the options that `write_config` wrote."""
+    values = read_json(folder / "config.json")
+    names = {item.name for item in dataclasses.fields(TrainConfig)}
+    return TrainConfig(**{name: value for name, value in values.items() if name in names})
+
+
+def seconds_at(log: Path, iteration: int) -> float:
+    """Returns the training seconds that a log counts up to an iteration."""
+    seconds = 0.0
+    for line in log.read_text(encoding="utf-8").splitlines() if log.exists() else []:
+        row = json.loads(line)
+        if row["iteration"] <= iteration:
+            seconds = float(row["seconds"])
+    return seconds
+
+
+class _Log:
+    """One JSON line a report; what a crash left behind the checkpoint is cut off."""
+
+    def __init__(self, path: Path, iteration: int, earlier_seconds: float) -> None:
+        self._path = path
+        lines = path.read_text(encoding="utf-8").splitlines(True) if path.exists() else []
+        # a kill in mid-write leaves a last line without its end
+        whole = [line for line in lines if line.endswith("\n")]
+        kept = [line for line in whole if json.loads(line)["iteration"] <= iteration]
+        if not kept:  # a branch starts where the other run stood
+            kept = [json.dumps({"iteration": iteration, "seconds": earlier_seconds}) + "\n"]
+        write_bytes(path, "".join(kept).encode())
+        self._earlier = seconds_at(path, iteration)
+
+    def add(self, report: Report) -> None:
+        """Appends a report; its seconds count from the very start of training."""
+        row = dataclasses.asdict(report)
+        row["seconds"] = round(self._earlier + report.seconds, 3)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[list[int]]:
+    """Yields a list that fills when Ctrl-C is pressed, so that a step is never cut in half.
+
+    A second Ctrl-C interrupts at once. Outside the main thread signals are left alone.
+    """
+    pressed: list[int] = []
+
+    def handle(number: int, _frame: object) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+
+    try:
+        before = signal.signal(signal.SIGINT, handle)
+    except ValueError:  # not the main thread
+        yield pressed
+        return
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def run_fit(
+    state: TrainState,
+    task: Task,
+    until: int,
+    out: Path,
+    ctx: StageContext,
+    *,
+    label: str,
+    first: int = 0,
+    earlier_seconds: float = 0.0,
+    keep: dict[int, str] | None = None,
+) -> None:
+    """Fits until `until` steps, saving the state in `out` as it goes.
+
+    Args:
+        state: changed in place.
+        task: views and plan.
+        until: total number of steps.
+        out: partial folder of the stage.
+        ctx: progress and record.
+        label: of the progress bar.
+        first: step at which this stage's own work begins.
+        earlier_seconds: training seconds before that.
+        keep: file names under which the state after certain steps is kept.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
+    """
+    log = _Log(out / LOG, state.iteration, earlier_seconds)
+    every = task.schedule.config.checkpoint_every
+    with _deferred_interrupt() as pressed, ctx.progress.bar(
+        label, until - first, unit="step", done=state.iteration - first
+    ) as bar:
+        def on_step(now: TrainState) -> None:
+            bar.advance()
+            if keep and now.iteration in keep:
+                save_state(out / keep[now.iteration], now)
+            if now.iteration % every == 0 or pressed:
+                save_state(out / CHECKPOINT, now)
+                ctx.record(now.iteration - first, until - first)
+            if pressed:
+                raise KeyboardInterrupt
+
+        def on_report(report: Report) -> None:
+            log.add(report)
+            value = report.validation_psnr_db
+            shown = "" if value is None else f", validation {value:.2f} dB"
+            bar.note(f"loss {report.loss:.4f}{shown}, {report.gaussians:,} Gaussians")
+
+        fit(state, task, until, on_step=on_step, on_report=on_report)

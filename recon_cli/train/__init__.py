@@ -1,0 +1,1 @@
+"""Fitting Gaussians to views: initialisation, loss, optimizer, densification, pruning."""

@@ -1,0 +1,118 @@
+"""All that a run needs to go on with the very same bytes, and its checkpoint.
+
+A checkpoint is one safetensors file: the tensors, and the scalars as JSON in its header, so that
+both are there or neither is.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from recon_cli.atomic import replacing
+from recon_cli.config import TrainConfig
+from recon_cli.errors import FormatError, TrainingError
+from recon_cli.scene.splats import Splats
+from recon_cli.train.densify import Pull
+from recon_cli.train.optimizer import SplatOptimizer
+
+_VERSION = 1
+
+
+@dataclass(eq=False)
+class TrainState:
+    """A run after `iteration` steps.
+
+    Attributes:
+        optimizer: holds the splats and their moments.
+        pull: what densification has gathered so far.
+        generator: source of every random choice; on the CPU whatever the device.
+        iteration: steps done.
+        queue: indices of the views still to come in this epoch, last first.
+    """
+
+    optimizer: SplatOptimizer
+    pull: Pull
+    generator: torch.Generator
+    iteration: int = 0
+    queue: list[int] = field(default_factory=list)
+
+    @property
+    def splats(self) -> Splats:
+        """The Gaussians as they are now; leaves of the optimizer."""
+        return self.optimizer.splats
+
+
+def new_state(splats: Splats, config: TrainConfig, extent: float) -> TrainState:
+    """Returns the state before the first step."""
+    generator = torch.Generator().manual_seed(config.seed)
+    pull = Pull.zeros(len(splats), splats.means.device)
+    return TrainState(SplatOptimizer(splats, config, extent), pull, generator)
+
+
+def save_state(path: Path, state: TrainState) -> None:
+    """Writes a checkpoint, whole or not at all.
+
+    Raises:
+        TrainingError: a parameter is not finite; the checkpoint before it stays.
+    """
+    tensors = state.optimizer.tensors()
+    for name, value in vars(state.pull).items():
+        tensors[f"pull.{name}"] = value
+    tensors["generator"] = state.generator.get_state()
+    check_finite(tensors, "Training diverged")
+    scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue}
+    with replacing(path) as temporary:
+        save_file({name: value.contiguous().cpu() for name, value in tensors.items()},
+                  temporary, metadata={"state": json.dumps(scalars)})
+
+
+def load_state(
+    path: Path, config: TrainConfig, extent: float, device: torch.device
+) -> TrainState:
+    """Returns the state that `save_state` wrote.
+
+    Raises:
+        FormatError: the file is truncated or of another version.
+        TrainingError: it holds values that are not finite.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            scalars = json.loads((file.metadata() or {})["state"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if scalars["version"] != _VERSION:
+            raise KeyError("version")
+        generator = torch.Generator()
+        generator.set_state(tensors.pop("generator"))
+        tensors = {name: value.to(device) for name, value in tensors.items()}
+        splats = Splats(**_under("splats.", tensors))
+        state = TrainState(
+            SplatOptimizer(splats, config, extent), Pull(**_under("pull.", tensors)), generator,
+            int(scalars["iteration"]), [int(i) for i in scalars["queue"]])
+        state.optimizer.restore(tensors)
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise FormatError(
+            f"The checkpoint {path} cannot be read: {error}.",
+            hint="Run the stage again with --again; it starts from the beginning.") from error
+    check_finite(tensors, f"The checkpoint {path} is damaged")
+    return state
+
+
+def check_finite(tensors: dict[str, Tensor], what: str) -> None:
+    """Raises TrainingError, opening with `what`, unless every value is finite."""
+    for name, value in tensors.items():
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            raise TrainingError(
+                f"{what}: {name} holds values that are not finite.",
+                hint="Run the stage again with --again; if it recurs, lower the learning rates.")
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value
+            for name, value in tensors.items() if name.startswith(prefix)}
