@@ -22,7 +22,7 @@ from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_
 DEPTH = 32  # Gaussians a block: the triangular product costs DEPTH multiplications a pair
 PIXELS = TILE * TILE
 CHANNELS = 5  # r, g, b, depth, one
-_PAIRS = {"cpu": 1 << 18, "cuda": 1 << 23}  # pairs a block: the second-level cache, the launches
+_PAIRS = {"cpu": 1 << 18, "cuda": 1 << 25}  # pairs a block: the second-level cache, the launches
 
 
 @dataclass(frozen=True, eq=False)

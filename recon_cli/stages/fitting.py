@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 
 from recon_cli.atomic import read_json, write_bytes
+from recon_cli.capture.frames import read_frame_list
 from recon_cli.config import TrainConfig
-from recon_cli.errors import FormatError
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_image
 from recon_cli.scene import Scene, View
@@ -28,13 +28,7 @@ LOG = "log.jsonl"
 
 def held_out_names(ingest: Path) -> frozenset[str]:
     """Returns the names of the frames that ingest kept for the score."""
-    try:
-        frames = read_json(ingest / "frames.json")["frames"]
-        return frozenset(frame["name"] for frame in frames if frame["held_out"])
-    except (KeyError, TypeError) as error:
-        raise FormatError(
-            f"{ingest / 'frames.json'} lacks {error}.",
-            hint="Run `recon ingest --again`.") from error
+    return frozenset(frame.name for frame in read_frame_list(ingest).frames if frame.held_out)
 
 
 def load_scene(inputs: StageInputs, *, validation: float) -> Scene:

@@ -79,12 +79,13 @@ def densify(
     splats: Splats, pull: Pull, rule: DensifyRule, generator: torch.Generator
 ) -> tuple[Splats, Tensor]:
     """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones."""
-    selected = _hardest_pulled(pull.mean, rule, len(splats))
+    opaque = splats.opacities.detach() >= rule.min_opacity
+    kept = opaque & _not_oversized(splats, pull, rule)
+    selected = opaque & _hardest_pulled(pull.mean, rule, len(splats))
     small = splats.scales.detach().amax(1) <= rule.clone_scale
-    clones = torch.nonzero(selected & small)[:, 0]
+    clones = torch.nonzero(selected & small & kept)[:, 0]
     splits = torch.nonzero(selected & ~small)[:, 0]
     halves = _halves(splats, splits, generator)
-    kept = _kept(splats, pull, rule)
     kept[splits] = False
     rows = torch.nonzero(kept)[:, 0]
     parts = [splats.select(rows), splats.select(clones), halves]
@@ -117,13 +118,13 @@ def _halves(splats: Splats, rows: Tensor, generator: torch.Generator) -> Splats:
     return parent
 
 
-def _kept(splats: Splats, pull: Pull, rule: DensifyRule) -> Tensor:
-    """Returns a mask of the Gaussians that are neither transparent nor oversized."""
-    kept = splats.opacities.detach() >= rule.min_opacity
-    if rule.large_scale is not None:
-        kept &= (pull.radius <= _MAX_RADIUS) & (
-            splats.scales.detach().amax(1) <= rule.large_scale)
-    return kept
+def _not_oversized(splats: Splats, pull: Pull, rule: DensifyRule) -> Tensor:
+    """Returns a mask of the Gaussians that are not too large on the screen or in the world."""
+    if rule.large_scale is None:
+        return torch.ones_like(pull.radius, dtype=torch.bool)
+    largest = splats.scales.detach().amax(1)
+    fits: Tensor = (pull.radius <= _MAX_RADIUS) & (largest <= rule.large_scale)
+    return fits
 
 
 def lowered_opacities(splats: Splats) -> Splats:

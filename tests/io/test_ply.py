@@ -1,0 +1,115 @@
+"""The .ply of INRIA: what we write is what it should be, and bad files are refused."""
+
+import numpy as np
+import pytest
+import torch
+from scenes import random_splats
+
+from recon_cli.errors import FormatError
+from recon_cli.io.ply import read_ply, write_ply
+
+
+@pytest.fixture
+def splats():
+    return random_splats(20, dtype=torch.float32)
+
+
+def test_what_is_written_reads_back_to_the_bit(tmp_path, splats):
+    write_ply(tmp_path / "a.ply", splats)
+    back = read_ply(tmp_path / "a.ply")
+    for name, value in splats.parameters().items():
+        assert torch.equal(getattr(back, name), value), name
+
+
+def test_the_layout_is_the_one_of_inria(tmp_path, splats):
+    path = tmp_path / "a.ply"
+    write_ply(path, splats)
+    head, data = path.read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[2] for line in head.decode().splitlines() if "property" in line]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
+    assert names[54:] == ["opacity", "scale_0", "scale_1", "scale_2",
+                          "rot_0", "rot_1", "rot_2", "rot_3"]
+    row = np.frombuffer(data, "<f4").reshape(20, 62)[3]
+    assert row[:3].tolist() == splats.means[3].tolist()
+    # channel-major: all of red, then green, then blue
+    assert row[9:24].tolist() == splats.sh_rest[3, :, 0].tolist()
+    assert row[54] == splats.logit_opacities[3]
+    assert row[58:].tolist() == splats.quats[3].tolist()
+
+
+def test_a_file_of_another_program_is_read(shared_data):
+    folder = shared_data / "interop" / "metalsplatter" / "SplatIO" / "TestData"
+    splats = read_ply(folder / "test-splat.3-points-from-train.ply")
+    plain = np.frombuffer(
+        (folder / "test-splat.3-points-from-train.splat").read_bytes(), np.uint8).reshape(3, 32)
+    positions = plain[:, :12].copy().view("<f4")
+    scales = plain[:, 12:24].copy().view("<f4")
+    # .splat sorts by size; match each of its rows to the nearest of ours
+    rows = torch.cdist(torch.from_numpy(positions), splats.means).argmin(1)
+    assert sorted(rows.tolist()) == [0, 1, 2]
+    assert torch.allclose(splats.means[rows], torch.from_numpy(positions), atol=1e-5)
+    assert torch.allclose(splats.scales[rows], torch.from_numpy(scales), rtol=1e-4)
+    alphas = torch.from_numpy(plain[:, 27] / 255.0).float()
+    assert torch.allclose(splats.opacities[rows], alphas, atol=1.01 / 255)
+
+
+def test_another_order_a_lower_degree_and_unknown_properties_are_read(tmp_path):
+    names = ["rot_3", "rot_2", "rot_1", "rot_0", "extra", "opacity",
+             "scale_2", "scale_1", "scale_0",
+             *[f"f_rest_{i}" for i in range(9)], "f_dc_2", "f_dc_1", "f_dc_0", "z", "y", "x"]
+    table = np.zeros(2, dtype=[(name, "<f8" if name == "extra" else "<f4") for name in names])
+    for i, name in enumerate(names):
+        table[name] = [i, i + 0.5]
+    head = ["ply", "format binary_little_endian 1.0", "comment made elsewhere", "element vertex 2",
+            *[f"property {'double' if n == 'extra' else 'float'} {n}" for n in names],
+            "end_header\n"]
+    path = tmp_path / "b.ply"
+    path.write_bytes("\n".join(head).encode() + table.tobytes())
+    back = read_ply(path)
+    assert back.quats[0].tolist() == [3, 2, 1, 0]
+    assert back.means[1].tolist() == [23.5, 22.5, 21.5]
+    assert back.sh_rest[0, :3].tolist() == [[9, 12, 15], [10, 13, 16], [11, 14, 17]]
+    assert back.sh_rest[0, 3:].abs().max() == 0
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda data: data[:-7], "truncated"),
+    (lambda data: data + b"1234", "truncated or damaged"),
+    (lambda data: data[:0], "no .ply"),
+    (lambda data: b"PK\x03\x04" + data, "no .ply"),
+    (lambda data: data.replace(b"vertex 20", b"vertex 2000000000"), "truncated"),
+    (lambda data: data.replace(b"vertex 20", b"vertex -5"), "other elements"),
+    (lambda data: data.replace(b"binary_little", b"binary_big"), "little endian"),
+    (lambda data: data.replace(b"float opacity", b"float opacite"), "lacks the properties"),
+    (lambda data: data.replace(b"float x\n", b"list uchar int x\n"), "of a type"),
+    (lambda data: data.replace(b"f_rest_44", b"g_rest_44"), "make a degree"),
+    (lambda data: data.replace(b"float ny", b"float nx"), "twice"),
+    (lambda data: data[:-4] + np.float32(np.nan).tobytes(), "not finite"),
+])
+def test_damaged_files_are_refused_with_the_reason(tmp_path, splats, change, message):
+    path = tmp_path / "a.ply"
+    write_ply(path, splats)
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(FormatError, match=message):
+        read_ply(path)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(FormatError, match="cannot be read"):
+        read_ply(tmp_path / "none.ply")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, splats, monkeypatch):
+    path = tmp_path / "a.ply"
+    write_ply(path, splats)
+    before = path.read_bytes()
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_ply(path, splats.select(torch.arange(3)))
+    assert path.read_bytes() == before
+    assert [item.name for item in tmp_path.iterdir()] == ["a.ply"]

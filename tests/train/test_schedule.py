@@ -1,0 +1,41 @@
+"""The reference's plan, at its own length and scaled down."""
+
+import pytest
+
+from recon_cli.config import TrainConfig
+from recon_cli.errors import ConfigError
+from recon_cli.train.schedule import Schedule
+
+
+def test_a_run_of_30000_follows_the_reference():
+    plan = Schedule(TrainConfig(iterations=30_000))
+    assert [i for i in range(1, 30_001) if plan.resets(i)] == [3000, 6000, 9000, 12000]
+    densified = [i for i in range(1, 30_001) if plan.densifies(i)]
+    assert (densified[0], densified[-1], len(densified)) == (500, 14_900, 145)
+    assert [plan.sh_degree(i) for i in (1, 1000, 1001, 2001, 3001, 30_000)] == [0, 0, 1, 2, 3, 3]
+    assert plan.means_rate(0) == pytest.approx(1.6e-4)
+    assert plan.means_rate(30_000) == pytest.approx(1.6e-6)
+    assert not plan.deletes_large(3000)
+    assert plan.deletes_large(3001)
+
+
+def test_a_short_run_reaches_the_full_degree_and_still_recovers_from_its_last_reset():
+    plan = Schedule(TrainConfig(iterations=2000))
+    assert plan.sh_degree(2000) == 3
+    resets = [i for i in range(1, 2001) if plan.resets(i)]
+    assert resets == [500]
+
+
+def test_the_degree_is_capped_by_the_option():
+    assert Schedule(TrainConfig(iterations=100, sh_degree=1)).sh_degree(100) == 1
+
+
+def test_a_run_of_one_step_has_a_plan():
+    plan = Schedule(TrainConfig(iterations=1))
+    assert plan.mid == 1
+    assert plan.sh_degree(1) == 0
+
+
+def test_a_middle_before_the_end_of_densification_is_refused():
+    with pytest.raises(ConfigError, match="densification"):
+        TrainConfig(mid=0.3)
