@@ -22,6 +22,8 @@ VIEWS = 12
 def make_inputs(folder: Path) -> StageInputs:
     """Renders 12 views of 60 Gaussians and writes what ingest and sfm would have left."""
     truth = random_splats(60, seed=0, dtype=torch.float32)
+    truth.means[:, 2] = 3 + 0.3 * truth.means[:, 2]  # none near a camera, no needles
+    truth.log_scales.clamp_(min=-2.0, max=-1.5)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(pycolmap.Camera(
         model="PINHOLE", width=WIDTH, height=HEIGHT, camera_id=1,
