@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -19,7 +21,7 @@ from recon_cli.config import (
     TrainConfig,
 )
 from recon_cli.errors import ConfigError
-from recon_cli.fields import StageConfig, option_info
+from recon_cli.fields import StageConfig, field_type, option_info
 
 SECTIONS: dict[str, type[StageConfig]] = {
     "ingest": IngestConfig,
@@ -34,30 +36,73 @@ SECTIONS: dict[str, type[StageConfig]] = {
 
 Settings = dict[str, dict[str, Any]]  # section -> field -> value, only what was set
 C = TypeVar("C", bound=StageConfig)
+AUTOMATIC = "automatic"  # how None is written in --set
+_TRUTH = {"true": True, "false": False}
 
 
 def read_settings(path: Path) -> Settings:
     """Returns what a recon.toml sets, with every section and field name checked.
 
     Raises:
-        ConfigError: the file is no TOML, or names a section or field that does not exist.
+        ConfigError: the file is missing or no TOML, or names a section or field that does not
+            exist.
     """
     try:
         with path.open("rb") as file:
             settings = tomllib.load(file)
-    except FileNotFoundError as error:
+    except OSError as error:
         raise ConfigError(
-            f"{path} does not exist.", hint="Check the path after --config.") from error
+            f"{path} cannot be read: {error.strerror}.",
+            hint="Check the path after --config.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid TOML: {error}.", hint="Mend that line.") from error
     for section, values in settings.items():
-        if section not in SECTIONS or not isinstance(values, dict):
+        check_section(section, where=str(path))
+        if not isinstance(values, dict):
             raise ConfigError(
-                f"{path} holds [{section}], which is no section.",
-                hint="The sections are " + ", ".join(SECTIONS) + ".")
+                f"{path} sets {section} to {values!r}, but it is a section.",
+                hint=f"Write [{section}] on a line of its own and its fields below.")
         for name in values:
             check_field(section, name, where=str(path))
     return settings
+
+
+def parse_assignment(text: str) -> Settings:
+    """Returns what `section.field=value` sets, the value typed as the field is.
+
+    Raises:
+        ConfigError: the text has another form, names no field, or the value has the wrong type.
+    """
+    name, equals, value = text.partition("=")
+    section, dot, field = name.strip().partition(".")
+    if not equals or not dot:
+        raise ConfigError(
+            f"--set takes section.field=value, but got {text!r}.",
+            hint="For example --set train.iterations=1000.")
+    check_section(section, where="--set")
+    check_field(section, field, where="--set")
+    return {section: {field: _typed(section, field, value.strip())}}
+
+
+def _typed(section: str, name: str, text: str) -> Any:
+    kind, optional = field_type(SECTIONS[section], name)
+    if optional and text == AUTOMATIC:
+        return None
+    try:
+        return _TRUTH[text] if kind is bool else kind(text)
+    except (KeyError, ValueError) as error:
+        needed = "true or false" if kind is bool else f"a value of type {kind.__name__}"
+        raise ConfigError(
+            f"{section}.{name} is {text!r}, but it must be {needed}.",
+            hint="Change it in --set.") from error
+
+
+def check_section(section: str, *, where: str) -> None:
+    """Raises ConfigError unless there is such a section; `where` is named in the message."""
+    if section not in SECTIONS:
+        raise ConfigError(
+            f"{where} holds the section {section}, which does not exist.",
+            hint=_suggestion(section, list(SECTIONS), "The sections are"))
 
 
 def check_field(section: str, name: str, *, where: str) -> None:
@@ -66,7 +111,12 @@ def check_field(section: str, name: str, *, where: str) -> None:
     if name not in names:
         raise ConfigError(
             f"{where} sets {section}.{name}, which does not exist.",
-            hint=f"[{section}] knows " + ", ".join(names) + ".")
+            hint=_suggestion(name, names, f"[{section}] knows"))
+
+
+def _suggestion(word: str, known: list[str], lead: str) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"Did you mean {close[0]}?" if close else f"{lead} {', '.join(known)}."
 
 
 def merged(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
@@ -84,6 +134,12 @@ def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
     return config(**settings.get(section, {}))
 
 
+def check(settings: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raises ConfigError where a value has the wrong type or range, in whichever section."""
+    for config in SECTIONS.values():
+        build(config, settings)
+
+
 def to_toml(configs: Mapping[str, StageConfig]) -> str:
     """Returns the configs as TOML that `read_settings` accepts; unset fields become comments."""
     lines: list[str] = []
@@ -92,9 +148,9 @@ def to_toml(configs: Mapping[str, StageConfig]) -> str:
         for item in dataclasses.fields(config):
             value, info = getattr(config, item.name), option_info(item)
             if value is None:
-                lines.append(f"# {item.name} = automatic: {info.automatic}")
+                lines.append(f"# {item.name} = {AUTOMATIC}: {info.automatic}")
             else:
-                text = str(value).lower() if isinstance(value, bool) else repr(value)
-                lines.append(f"{item.name} = {text.replace(chr(39), chr(34))}")
+                # TOML writes strings, numbers and truth values as JSON does.
+                lines.append(f"{item.name} = {json.dumps(value, ensure_ascii=False)}")
         lines.append("")
     return "\n".join(lines)

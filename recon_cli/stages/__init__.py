@@ -49,7 +49,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 1, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 1, True, "recon_cli.stages.sfm",
-          ("database.db", "log.txt")),
+          ("database.db", "log.txt", "steps.json")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 1, False,
           "recon_cli.stages.train", ("log.jsonl",)),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 1, False,

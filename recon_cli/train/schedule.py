@@ -14,7 +14,7 @@ _REFERENCE = 30_000  # iterations of INRIA's default run
 _DENSIFY_FROM = 500
 _RESET_EVERY = 3000
 _SH_EVERY = 1000
-_RESET_FLOOR = 500  # steps in which opacities come back after a reset at a rate of .05
+_RESET_FLOOR = 1000  # steps; after a reset at a rate of .05 a picture needs some hundred to return
 _FINAL_MEANS_RATE = 0.01  # of the initial one: 1.6e-4 to 1.6e-6
 
 

@@ -20,10 +20,11 @@ def test_a_run_of_30000_follows_the_reference():
 
 
 def test_a_short_run_reaches_the_full_degree_and_still_recovers_from_its_last_reset():
-    plan = Schedule(TrainConfig(iterations=2000))
-    assert plan.sh_degree(2000) == 3
-    resets = [i for i in range(1, 2001) if plan.resets(i)]
-    assert resets == [500]
+    plan = Schedule(TrainConfig(iterations=3000))
+    assert plan.sh_degree(3000) == 3
+    assert [i for i in range(1, 3001) if plan.resets(i)] == [1000]
+    shorter = Schedule(TrainConfig(iterations=1500))
+    assert not any(shorter.resets(i) for i in range(1, 1501))
 
 
 def test_the_degree_is_capped_by_the_option():

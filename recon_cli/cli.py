@@ -1,0 +1,311 @@
+"""One thin command per verb. main() is the only place that catches everything."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from recon_cli import __version__, cleaning, console, doctor, options, pipeline, report
+from recon_cli import settings as layers
+from recon_cli.config import (
+    ComputeConfig,
+    DenoiseConfig,
+    EvaluateConfig,
+    ExportConfig,
+    IngestConfig,
+    PruneConfig,
+    SfmConfig,
+    TrainConfig,
+)
+from recon_cli.errors import ReconError
+from recon_cli.options import Call, pass_call
+from recon_cli.pipeline import Job, Outcome, Target
+from recon_cli.progress import TqdmProgress
+from recon_cli.settings import Settings
+from recon_cli.stages import STAGES
+from recon_cli.workspace import SETTINGS, Workspace
+
+SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
+# Small enough for a laptop's CPU and a first impression.
+DEMO_SETTINGS: Settings = {
+    "train": {"iterations": 1500, "max_size": 300, "max_gaussians": 40_000}}
+MID: Settings = {"prune": {"at": "mid"}}  # what the paper does: prune while training goes on
+INTERRUPTED = 130
+
+logger = logging.getLogger("recon")
+
+
+class _InOrder(click.Group):
+    """Lists its commands in the order of the work, not of the alphabet."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Returns the verbs as they were defined."""
+        return list(self.commands)
+
+
+@click.group(cls=_InOrder)
+@click.version_option(__version__, prog_name="recon")
+def cli() -> None:
+    """Turn a video or photos of a room into a 3D Gaussian Splatting scene."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command line and returns its exit code."""
+    call = Call()
+    handler = console.show_log(detailed=lambda: call.verbose)
+    try:
+        code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
+        return code if isinstance(code, int) else 0
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted; run the same command again to resume", err=True)
+        return INTERRUPTED
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return error.exit_code
+    except click.ClickException as error:
+        _complain(error.format_message(), _usage_hint(error))
+        return error.exit_code
+    except ReconError as error:
+        logger.debug("failed", exc_info=True)
+        _complain(error.message, error.hint)
+        return error.exit_code
+    except Exception as error:
+        logger.debug("failed", exc_info=True)
+        _complain(
+            f"{type(error).__name__}: {error}",
+            "This is a bug in recon. Run the command again with -v and report what it prints.")
+        return 1
+    finally:
+        logger.removeHandler(handler)
+
+
+def _complain(message: str, hint: str) -> None:
+    click.echo(f"error: {message}", err=True)
+    if hint:
+        click.echo(f"hint: {hint}", err=True)
+
+
+def _usage_hint(error: click.ClickException) -> str:
+    ctx = error.ctx if isinstance(error, click.UsageError) else None
+    return f"See `{ctx.command_path} --help`." if ctx else ""
+
+
+def _explicit(call: Call) -> Settings:
+    """Returns what recon.toml, --config and --set set, checked."""
+    inside = call.workspace / SETTINGS
+    found = [path for path in (inside if inside.exists() else None, call.config_file) if path]
+    explicit = layers.merged([*map(layers.read_settings, found), call.assigned])
+    layers.check(explicit)
+    return explicit
+
+
+def _perform(
+    call: Call,
+    verb: str,
+    stages: Sequence[str],
+    *,
+    sources: tuple[Path, ...] = (),
+    base: Settings | None = None,
+    forced: Settings | None = None,
+) -> None:
+    """Runs stages one after the other, or prints their options.
+
+    Args:
+        call: what was typed.
+        verb: what others who want the workspace are told.
+        stages: by name, in the order of the table.
+        sources: the user's files, for ingest.
+        base: defaults of the verb; recon.toml, --config and options win over them.
+        forced: what the verb itself means; it wins over everything.
+    """
+    explicit = _explicit(call)
+    values = layers.merged([base or {}, explicit, call.settings, forced or {}])
+    rows = [row for row in STAGES if row.name in stages]
+    configs = {row.name: layers.build(row.config, values) for row in rows}
+    compute = layers.build(ComputeConfig, values)
+    if call.print_config:
+        click.echo(layers.to_toml({**configs, "compute": compute}), nl=False)
+        return
+    job = Job(Workspace(call.workspace), explicit, compute, TqdmProgress(), _tell, STAGES)
+    targets = [
+        Target(row.name, configs[row.name], () if row.needs else sources) for row in rows]
+    pipeline.run(job, verb, targets, again=call.again)
+    if "evaluate" in stages:
+        click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
+
+
+def _tell(outcome: Outcome) -> None:
+    if outcome.ran:
+        run = outcome.manifest.run
+        click.echo(report.summary_line(outcome.stage, run.summary, run.seconds))
+    else:
+        click.echo(f"{outcome.stage} is up to date")
+
+
+_inputs = click.argument(
+    "inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))
+
+
+@cli.command()
+@_inputs
+@options.stage(IngestConfig)
+@pass_call
+def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
+    """Choose frames from INPUT, a video or photos.
+
+    Photos come as a folder. Without INPUT, that of the last time is read again.
+    """
+    _perform(call, "ingest", ["ingest"], sources=inputs)
+
+
+@cli.command()
+@options.stage(DenoiseConfig)
+@pass_call
+def denoise(call: Call) -> None:
+    """Filter noisy frames and pass the others through."""
+    _perform(call, "denoise", ["denoise"])
+
+
+@cli.command()
+@options.stage(SfmConfig)
+@pass_call
+def sfm(call: Call) -> None:
+    """Find cameras and a sparse point cloud."""
+    _perform(call, "sfm", ["sfm"])
+
+
+@cli.command()
+@click.option(
+    "--prune", "with_prune", is_flag=True,
+    help="Then branch off in mid-training, prune there and train the rest of the run again.  "
+         "[default: off]")
+@options.of(PruneConfig, without=("at",), lead="With --prune: ")
+@options.stage(TrainConfig, renders=True)
+@pass_call
+def train(call: Call, with_prune: bool) -> None:
+    """Fit Gaussians; denoise and sfm run first where needed."""
+    if with_prune:
+        _perform(call, "train --prune", ["train", "prune"], forced=MID)
+        return
+    for name in call.settings.get("prune", {}):
+        raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
+    _perform(call, "train", ["train"])
+
+
+@cli.command()
+@options.stage(PruneConfig, renders=True)
+@pass_call
+def prune(call: Call) -> None:
+    """Remove the least important Gaussians; the rest recovers."""
+    _perform(call, "prune", ["prune"])
+
+
+@cli.command("eval")
+@options.stage(EvaluateConfig, renders=True)
+@pass_call
+def evaluate(call: Call) -> None:
+    """Score every model on the held-out views."""
+    _perform(call, "eval", ["evaluate"])
+
+
+@cli.command()
+@options.stage(ExportConfig)
+@pass_call
+def export(call: Call) -> None:
+    """Write a .ply that other viewers open, and check it."""
+    _perform(call, "export", ["export"])
+
+
+@cli.command("run")
+@_inputs
+@click.option(
+    "--prune/--no-prune", "with_prune", default=True,
+    help="Prune in mid-training too.  [default: --prune]")
+@options.assignments()
+@options.of(ComputeConfig)
+@options.again()
+@options.print_config()
+@options.common()
+@pass_call
+def run_all(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
+    """Do everything from INPUT to the .ply.
+
+    INPUT is a video or a folder of photos. Without it, that of the last time is read again.
+    """
+    stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
+    _perform(call, "run", stages, sources=inputs, base=MID)
+
+
+@cli.command()
+@options.assignments()
+@options.of(ComputeConfig)
+@options.again()
+@options.common(workspace="demo", envvar=None)
+@pass_call
+def demo(call: Call) -> None:
+    """Do everything on the bundled room video."""
+    stages = [row.name for row in STAGES]
+    _perform(call, "demo", stages, sources=(SAMPLE,), base=layers.merged([MID, DEMO_SETTINGS]))
+    click.echo(f"The scene is in {call.workspace / 'export' / 'splats.ply'}")
+
+
+@cli.command()
+@click.option(
+    "--json", "as_json", is_flag=True,
+    help="Print JSON: workspace, and stages with name, state, reasons, done, total, seconds, "
+         "summary, notices.  [default: off]")
+@options.common()
+@pass_call
+def status(call: Call, as_json: bool) -> None:
+    """Show what is fresh, stale and why, partial, or missing."""
+    job = Job(Workspace(call.workspace), _explicit(call), table=STAGES)
+    stages = pipeline.status(job)
+    if as_json:
+        click.echo(json.dumps({
+            "workspace": str(job.workspace.root),
+            "stages": [dataclasses.asdict(stage) for stage in stages]}, indent=1))
+        return
+    if not job.workspace.root.exists():
+        logger.warning("there is no workspace at %s yet", job.workspace.root)
+    click.echo(report.status_table(stages))
+    for stage in stages:
+        for notice in stage.notices:
+            logger.warning("%s: %s", stage.name, notice)
+
+
+@cli.command()
+@click.argument(
+    "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice([row.name for row in STAGES]))
+@click.option("--dry-run", is_flag=True, help="Only say what would go.  [default: off]")
+@options.common()
+@pass_call
+def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
+    """Free disk space.
+
+    Without STAGE, unfinished work and scratch files go and every finished result stays. With STAGE,
+    the results of those stages go.
+    """
+    job = Job(Workspace(call.workspace), table=STAGES)
+    freed = cleaning.clean(job, stages, dry=dry_run)
+    for one in freed:
+        click.echo(f"{one.path}: {report.megabytes(one.size)}")
+    verb = "would be freed" if dry_run else "freed"
+    click.echo(f"{report.megabytes(sum(one.size for one in freed))} {verb}")
+
+
+@cli.command("doctor")
+@click.option(
+    "--json", "as_json", is_flag=True,
+    help="Print the same as JSON.  [default: off]")
+@options.common()
+@pass_call
+def show_doctor(call: Call, as_json: bool) -> None:
+    """Show versions, rasterizers, memory and disk."""
+    found = doctor.examine(call.workspace)
+    text = json.dumps(dataclasses.asdict(found), indent=1)
+    click.echo(text if as_json else report.doctor_text(found))

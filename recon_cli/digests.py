@@ -1,0 +1,91 @@
+"""What files hold, as SHA-256. Size and modification time vouch for a digest that is known."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recon_cli.errors import InputError
+
+
+@dataclass(frozen=True)
+class FileDigest:
+    """What a file held when it was last read, and how to tell that it is still that file."""
+
+    sha256: str
+    size: int  # bytes
+    mtime_ns: int
+
+
+@dataclass(frozen=True)
+class Source:
+    """One file or folder that the user handed in.
+
+    Attributes:
+        path: absolute.
+        files: digests by path relative to the folder; a single file goes by its name.
+    """
+
+    path: str
+    files: Mapping[str, FileDigest]
+
+    def contents(self) -> list[str]:
+        """Returns the digests alone, in order: names and times are no part of a fingerprint."""
+        return [file.sha256 for file in self.files.values()]
+
+
+def sha256_json(value: Any) -> str:
+    """Returns the SHA-256 of a JSON value, whatever the order of its keys."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def digest_file(path: Path, known: FileDigest | None = None) -> FileDigest:
+    """Returns the digest of a file; `known` is believed when size and time are still the same."""
+    stat = path.stat()
+    if known and (known.size, known.mtime_ns) == (stat.st_size, stat.st_mtime_ns):
+        return known
+    with path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    return FileDigest(sha256, stat.st_size, stat.st_mtime_ns)
+
+
+def read_source(path: Path, *, known: Source | None = None, without: Path) -> Source:
+    """Returns what a file, or every file below a folder, holds.
+
+    Args:
+        path: file or folder. Hidden files and folders below it are skipped.
+        known: an earlier reading of the same path, to save time.
+        without: a folder that is skipped: the workspace may lie beside the photos.
+
+    Raises:
+        InputError: the path is missing or cannot be read.
+    """
+    path, known_files = path.absolute(), known.files if known else {}
+    try:
+        if path.is_dir():
+            paths = {str(p.relative_to(path)): p for p in _files_below(path, without)}
+        elif path.exists():
+            paths = {path.name: path}
+        else:
+            raise InputError(f"{path} does not exist.", hint="Check the path.")
+        return Source(str(path), {
+            name: digest_file(paths[name], known_files.get(name)) for name in sorted(paths)})
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or path} cannot be read: {error.strerror}.",
+            hint="Check the file and its permissions.") from error
+
+
+def _files_below(folder: Path, without: Path) -> Iterator[Path]:
+    for path in folder.iterdir():
+        if path.name.startswith(".") or path == without:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            yield from _files_below(path, without)
+        elif path.is_file():
+            yield path

@@ -1,0 +1,195 @@
+"""Runs one stage: gives it a folder, a device and its inputs, and commits what it leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+from recon_cli import machine
+from recon_cli.config import ComputeConfig
+from recon_cli.digests import Source, read_source
+from recon_cli.errors import ConfigError, ManifestError
+from recon_cli.fields import StageConfig
+from recon_cli.freshness import Inspection
+from recon_cli.manifest import Basis, Manifest, RunRecord, Unfinished
+from recon_cli.progress import NullProgress, Progress
+from recon_cli.settings import Settings
+from recon_cli.stages import STAGES, Stage
+from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.workspace import Workspace, combined
+
+RENDERING = frozenset({"train", "prune", "evaluate"})  # the stages that need a rasterizer
+_RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
+
+logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one stage: its result, and whether it had to be run for that."""
+
+    stage: str
+    manifest: Manifest
+    ran: bool
+
+
+def _say_nothing(_outcome: Outcome) -> None:
+    """Reports to nobody."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Where to work and on what terms.
+
+    Attributes:
+        workspace: holds the results.
+        settings: what recon.toml, --config and --set set.
+        compute: device, backend and threads as asked for.
+        progress: opens progress bars.
+        report: called with every stage that is done or was already.
+        table: the stages.
+    """
+
+    workspace: Workspace
+    settings: Settings = field(default_factory=dict)
+    compute: ComputeConfig = field(default_factory=ComputeConfig)
+    progress: Progress = field(default_factory=NullProgress)
+    report: Callable[[Outcome], None] = _say_nothing
+    table: Sequence[Stage] = STAGES
+
+    def inspect(self) -> Inspection:
+        """Returns a look at the workspace as it is now."""
+        return Inspection(self.workspace, self.settings, self.table)
+
+
+def run_stage(
+    job: Job,
+    look: Inspection,
+    row: Stage,
+    config: StageConfig,
+    sources: tuple[Source, ...] | None = None,
+) -> Manifest:
+    """Runs one stage whose needs are fresh, commits its result and returns the manifest.
+
+    Args:
+        job: where and how.
+        look: at the workspace as it is now.
+        row: the stage.
+        config: its options.
+        sources: the user's files; None means those of the last time.
+
+    Raises:
+        ReconError: whatever the stage raises; what it had finished stays for the next try.
+    """
+    if sources is None:
+        sources = () if row.needs else _remembered(job, row)
+    basis = Basis(row.name, row.version, config.hashed(), sources, look.upstream(row))
+    _say_what_is_left_out(look, row)
+    inputs = StageInputs(
+        {name: job.workspace.folder(name) for name, digest in basis.upstream.items() if digest},
+        tuple(Path(source.path) for source in sources))
+    logger.debug("%s: running with %s", row.name, config)
+    out, earlier = job.workspace.begin(basis)
+    with machine.Meter() as meter:
+        ctx = _context(job, row, _recorder(job.workspace, earlier, meter))
+        summary = importlib.import_module(row.module).run(config, inputs, out, ctx)
+    outputs = job.workspace.seal(row.name)
+    manifest = Manifest(
+        basis, outputs, combined(outputs, row.volatile),
+        _run_record(row, ctx, meter, earlier, summary))
+    job.workspace.commit(manifest)
+    logger.debug("%s: finished in %.1f s", row.name, manifest.run.seconds)
+    return manifest
+
+
+def _run_record(
+    row: Stage, ctx: StageContext, meter: machine.Meter, earlier: Unfinished, summary: Summary
+) -> RunRecord:
+    rendering = row.name in RENDERING
+    return RunRecord(
+        seconds=round(earlier.seconds + meter.seconds, 3),
+        peak_memory_bytes=meter.peak_memory_bytes,
+        summary=summary,
+        versions=machine.versions(),
+        device=ctx.device if rendering else None,
+        backend=ctx.backend if rendering else None,
+        threads=ctx.threads,
+        finished=datetime.now().astimezone().isoformat(timespec="seconds"),
+    )
+
+
+def _say_what_is_left_out(look: Inspection, row: Stage) -> None:
+    for name in row.uses:
+        check = look.check(name)
+        if check.manifest and not check.fresh:
+            logger.warning("%s is left out of %s: it is %s", name, row.verb, check.described())
+
+
+def last_sources(job: Job, stage: str) -> tuple[Source, ...]:
+    """Returns the user's files of a stage's last run as they were then; none if unknown."""
+    try:
+        latest = job.workspace.unfinished(stage) or job.workspace.manifest(stage)
+    except ManifestError:  # whoever needs more than a guess reads the manifest himself
+        latest = None
+    return latest.basis.sources if latest else ()
+
+
+def _remembered(job: Job, row: Stage) -> tuple[Source, ...]:
+    """Returns the sources of the last run, read again."""
+    sources = last_sources(job, row.name)
+    if not sources:
+        raise ConfigError(
+            f"{row.verb} needs an input: none was given and {job.workspace.root} remembers none.",
+            hint=f"Type `recon {row.verb} VIDEO`, or a folder of photos in place of VIDEO.")
+    return tuple(
+        read_source(Path(source.path), known=source, without=job.workspace.root)
+        for source in sources)
+
+
+def _recorder(
+    workspace: Workspace, earlier: Unfinished, meter: machine.Meter
+) -> Callable[[int, int], None]:
+    """Returns the function behind `StageContext.record`; it writes at most twice a second."""
+    last = float("-inf")
+
+    def record(done: int, total: int) -> None:
+        nonlocal last
+        if done == total or time.monotonic() - last >= _RECORD_SECONDS:
+            last = time.monotonic()
+            workspace.record(dataclasses.replace(
+                earlier, done=done, total=total, seconds=earlier.seconds + meter.seconds))
+
+    return record
+
+
+def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:
+    threads = job.compute.threads or machine.usable_threads()
+    if row.name not in RENDERING:
+        return StageContext(progress=job.progress, threads=threads, record=record)
+    # Importing torch takes seconds, which status and --help must not pay.
+    import torch  # noqa: PLC0415
+
+    from recon_cli.render import registry  # noqa: PLC0415
+
+    torch.set_num_threads(threads)
+    backend, device = registry.resolve(job.compute.backend, job.compute.device)
+    return StageContext(job.progress, device, backend, threads, record)
+
+
+def refuse_missing_backend(job: Job, stages: Sequence[str]) -> None:
+    """Fails before hours of other work where a device or backend was named that is not here.
+
+    Raises:
+        BackendError: one of `stages` renders, and what was asked for cannot be had.
+    """
+    named = (job.compute.device, job.compute.backend) != ("auto", "auto")
+    if named and RENDERING.intersection(stages):
+        from recon_cli.render import registry  # noqa: PLC0415 (imports torch)
+
+        registry.resolve(job.compute.backend, job.compute.device)

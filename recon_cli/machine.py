@@ -1,0 +1,92 @@
+"""The machine that a stage runs on: its threads, the memory it took, the programs' versions."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import threading
+import time
+from types import TracebackType
+
+import psutil
+
+_PACKAGES = {
+    "recon": "recon-cli",
+    "torch": "torch",
+    "pycolmap": "pycolmap",
+    "opencv": "opencv-contrib-python-headless",
+    "numpy": "numpy",
+    "av": "av",
+    "rawpy": "rawpy",
+    "scikit-image": "scikit-image",
+}
+_SAMPLE_SECONDS = 0.5  # a look at all children takes about 5 ms
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions of Python and of the packages that a result depends on."""
+    found = {"python": platform.python_version()}
+    for name, package in _PACKAGES.items():
+        try:
+            found[name] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "missing"
+    return found
+
+
+def usable_threads() -> int:
+    """Returns how many CPU cores this process may use."""
+    process = psutil.Process()
+    if hasattr(process, "cpu_affinity"):  # macOS has none
+        return len(process.cpu_affinity())
+    return psutil.cpu_count() or 1
+
+
+class Meter:
+    """Measures the time and the peak memory of a block of work.
+
+    Memory is the resident set of this process and its children together, looked at twice a second:
+    the operating system's own peak covers the whole life of a process, not one stage of it.
+
+    Attributes:
+        peak_memory_bytes: largest sum seen.
+    """
+
+    def __init__(self) -> None:
+        self.peak_memory_bytes = 0
+        self._start = time.monotonic()
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the block was entered."""
+        return time.monotonic() - self._start
+
+    def __enter__(self) -> Meter:
+        self._start = time.monotonic()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._done.set()
+        self._thread.join()
+        self._look()
+
+    def _watch(self) -> None:
+        while not self._done.wait(_SAMPLE_SECONDS):
+            self._look()
+
+    def _look(self) -> None:
+        process, total = psutil.Process(), 0
+        for one in [process, *process.children(recursive=True)]:
+            try:
+                total += one.memory_info().rss
+            except psutil.Error:  # it ended meanwhile
+                continue
+        self.peak_memory_bytes = max(self.peak_memory_bytes, total)

@@ -1,0 +1,89 @@
+"""Stages that do next to nothing, for the tests of what runs them.
+
+Every stage writes result.txt, made of its options and of what it reads. The seed changes nothing
+in it, as an option may whose effect does not show on the data at hand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from recon_cli import pipeline
+from recon_cli import settings as layers
+from recon_cli.fields import StageConfig
+from recon_cli.pipeline import Job, Target
+from recon_cli.settings import Settings
+from recon_cli.stages import STAGES
+from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.workspace import Workspace
+
+TABLE = tuple(dataclasses.replace(row, module="fake_stages") for row in STAGES)
+NAMES = [row.name for row in TABLE]
+STEPS = 6
+
+ran: list[str] = []  # stages that have been run, in order
+actions: dict[str, Callable[[], None]] = {}  # done by a stage before it writes anything
+seen: dict[str, StageInputs] = {}  # what a stage was given to read
+
+
+def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+    """Writes result.txt in steps, each of which survives a crash."""
+    name = out.name
+    ran.append(name)
+    seen[name] = inputs
+    actions.get(name, lambda: None)()
+    for step in range(1, STEPS + 1):
+        path = out / f"step{step}.txt"
+        if not path.exists():
+            path.write_text(f"{step} of {name}")
+            ctx.record(step, STEPS)
+            time.sleep(float(os.environ.get(f"SLOW_{name.upper()}", "0")))
+    options = {key: value for key, value in config.hashed().items() if key != "seed"}
+    read = [(path / "result.txt").read_text() for path in inputs.folders.values()]
+    read += [path.read_text() for path in inputs.sources if path.is_file()]
+    result = hashlib.sha256(json.dumps([name, options, read]).encode()).hexdigest()
+    (out / "result.txt").write_text(result)
+    for volatile in next(row.volatile for row in TABLE if row.name == name):
+        (out / volatile).write_text(str(time.time_ns()))
+    (out / "table.txt").write_text(f"the table of {name}\n")
+    return {"steps": STEPS, "length": 1.5, "names": ["a", "b"]}
+
+
+def job_at(root: Path, settings: Settings | None = None) -> Job:
+    """Returns a job on the fake stages."""
+    return Job(Workspace(root), settings or {}, table=TABLE)
+
+
+def bring(
+    job: Job,
+    *names: str,
+    video: Path | None = None,
+    again: bool = False,
+    changes: Settings | None = None,
+) -> list[str]:
+    """Runs stages as the CLI does, `changes` being what was typed, and returns which ran."""
+    before = len(ran)
+    values = layers.merged([job.settings, changes or {}])
+    targets = [
+        Target(row.name, layers.build(row.config, values),
+               (video,) if video and row.name == "ingest" else ())
+        for row in TABLE if row.name in names]
+    pipeline.run(job, " ".join(names), targets, again=again)
+    return ran[before:]
+
+
+def stale(job: Job) -> dict[str, Sequence[str]]:
+    """Returns the stages that are not fresh, each with the reasons."""
+    return {one.name: one.reasons for one in pipeline.status(job) if one.state != "fresh"}
+
+
+if __name__ == "__main__":  # python fake_stages.py WORKSPACE STAGE: run by the tests to be killed
+    import sys
+
+    bring(job_at(Path(sys.argv[1])), sys.argv[2])
