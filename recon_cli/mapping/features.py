@@ -1,0 +1,86 @@
+"""SIFT features of every frame, all taken by one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import pycolmap
+from PIL import Image
+
+from recon_cli.errors import FormatError
+from recon_cli.mapping import database, doctor
+from recon_cli.mapping.doctor import listed
+from recon_cli.mapping.job import Job
+from recon_cli.mapping.ledger import Result
+from recon_cli.mapping.protocol import Reporter
+
+CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
+
+
+def extract(job: Job, report: Reporter) -> Result:
+    """Fills the database with the features of all frames and returns how many there are.
+
+    Images that an interrupted run has finished are kept.
+
+    Raises:
+        FormatError: a frame cannot be read.
+        SfmError: too few frames hold any texture.
+    """
+    report.phase("features", len(job.names), done=database.progress(job.database, "features"))
+    pycolmap.extract_features(
+        job.database, job.frames, list(job.names), pycolmap.CameraMode.SINGLE, _reader(job),
+        _extraction(job), pycolmap.Device.cpu)
+    counts = database.keypoint_counts(job.database)
+    _check_readable(job, counts)
+    doctor.check_texture(counts)
+    return {"rows": len(counts), "keypoints": sum(counts.values())}
+
+
+def create_database(job: Job) -> None:
+    """Writes a database that holds the camera and every image, whole or not at all.
+
+    Their ids are given here, in the order of the names, because extraction in several threads
+    would number the images as they happen to be finished.
+
+    Raises:
+        FormatError: frames cannot be read or differ in size.
+    """
+    temporary = job.database.with_suffix(".partial")
+    database.remove(job.database)
+    database.remove(temporary)
+    pycolmap.Database.open(temporary).close()
+    pycolmap.import_images(
+        temporary, job.frames, pycolmap.CameraMode.SINGLE, list(job.names), _reader(job))
+    with pycolmap.Database.open(temporary) as opened:
+        names = {image.name for image in opened.read_all_images()}
+    _check_readable(job, names)
+    temporary.replace(job.database)
+
+
+def _check_readable(job: Job, found: Collection[str]) -> None:
+    missing = [name for name in job.names if name not in found]
+    if missing:
+        raise FormatError(
+            f"{len(missing)} of {len(job.names)} frames cannot be read or differ from the first in "
+            f"size: {listed(missing)}.",
+            hint="Run `recon ingest --again`.")
+
+
+def _reader(job: Job) -> pycolmap.ImageReaderOptions:
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = CAMERA_MODEL
+    if job.focal_px is not None:
+        with Image.open(job.frames / job.names[0]) as first:
+            width, height = first.size
+        focal = job.focal_px
+        options.camera_params = f"{focal},{focal},{width / 2},{height / 2},0,0,0,0"
+    return options
+
+
+def _extraction(job: Job) -> pycolmap.FeatureExtractionOptions:
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = job.threads
+    # No hard cap: COLMAP stops after the scale at which the count is reached, and a keypoint with
+    # two orientations counts twice.
+    options.sift.max_num_features = job.max_features
+    return options

@@ -1,0 +1,97 @@
+"""How far the mapping process is: from what it says, and from what lies on the disk.
+
+COLMAP calls nobody back while it extracts, matches and undistorts, but it writes each result as
+soon as it has it. So the parent counts those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from recon_cli.mapping import database, protocol
+from recon_cli.mapping.job import Job
+from recon_cli.mapping.ledger import STEPS
+from recon_cli.progress import Bar, Progress
+
+_DOING = {
+    "features": ("finding features", "frame"),
+    "matches": ("matching frames", "pair"),
+    "mapping": ("placing cameras", "frame"),
+    "undistorted": ("undistorting frames", "frame"),
+}
+
+
+class Monitor:
+    """Shows one bar a phase and records what would survive a crash.
+
+    Args:
+        job: what the process does.
+        progress: opens the bars.
+        record: called with (done, total); each step counts as many units as there are frames.
+    """
+
+    def __init__(
+        self, job: Job, progress: Progress, record: Callable[[int, int], None]
+    ) -> None:
+        self._job = job
+        self._progress = progress
+        self._record = record
+        self._phase: protocol.Phase | None = None
+        self._count = 0
+        self._bar: Bar | None = None
+        self._open = ExitStack()
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._open.close()
+
+    @property
+    def doing(self) -> str:
+        """What the process is at, in words."""
+        if self._phase is None:
+            return "starting"
+        text, unit = _DOING[self._phase.name]
+        return f"{text} ({self._count} of {self._phase.total} {unit}s done)"
+
+    def show(self, event: protocol.Event | None) -> None:
+        """Takes notice of an event, or of what lies on the disk when there is none."""
+        if isinstance(event, protocol.Phase):
+            self._begin(event)
+        elif isinstance(event, protocol.Done):
+            self._reach(event.count)
+        else:
+            self._reach(self._counted())
+
+    def _begin(self, phase: protocol.Phase) -> None:
+        self._open.close()
+        text, unit = _DOING[phase.name]
+        self._phase, self._count = phase, phase.done
+        self._bar = self._open.enter_context(
+            self._progress.bar(text, phase.total, unit=unit, done=phase.done))
+        self._note_durable()
+
+    def _reach(self, count: int) -> None:
+        if self._bar is not None and count > self._count:
+            self._bar.advance(count - self._count)
+            self._count = count
+            self._note_durable()
+
+    def _counted(self) -> int:
+        """Returns how many results of the current phase lie on the disk."""
+        name = "" if self._phase is None else self._phase.name
+        if name in ("features", "matches"):
+            return database.progress(self._job.database, name)
+        if name == "undistorted":
+            return sum(1 for _ in self._job.undistorting.rglob("*.png"))
+        return 0
+
+    def _note_durable(self) -> None:
+        """Records finished steps, and images or pairs that the database keeps."""
+        assert self._phase is not None
+        frames = len(self._job.names)
+        step = {"features": 0, "matches": 1, "mapping": 2, "undistorted": 3}[self._phase.name]
+        share = self._count / self._phase.total if step < 2 else 0.0
+        self._record(round((step + min(1.0, share)) * frames), len(STEPS) * frames)

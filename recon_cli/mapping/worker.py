@@ -1,0 +1,104 @@
+"""The mapping process: `python -m recon_cli.mapping.worker JOB`, started by `process` alone.
+
+It speaks on its standard output (see `protocol`), logs to its standard error, and lives no longer
+than its parent: the end of its standard input ends it, in the midst of whatever it does.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+import filelock
+
+from recon_cli.errors import ReconError, WorkspaceError
+from recon_cli.mapping import database, features, mapper, pairs, undistort
+from recon_cli.mapping.job import LOCK, Job
+from recon_cli.mapping.ledger import Ledger, Result
+from recon_cli.mapping.protocol import Reporter
+
+LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
+
+_ACTIONS: dict[str, Callable[[Job, Reporter], Result]] = {
+    "features": features.extract,
+    "matches": pairs.match,
+    "sparse": mapper.build,
+    "undistorted": undistort.undistort,
+}
+_FOLDERS = ("sparse", "undistorted")  # steps that write a folder of their name
+
+
+def work(job: Job, report: Reporter) -> None:
+    """Does every step that is not finished yet.
+
+    Raises:
+        SfmError: no model came out, or none to trust.
+        FormatError: a frame cannot be read.
+    """
+    ledger = Ledger(job.out)
+    _prepare_database(job, ledger)
+    for step, action in _ACTIONS.items():
+        if ledger.result(step) is not None:
+            continue
+        ledger.forget_from(step)
+        start = time.monotonic()
+        result = action(job, report)
+        result["seconds"] = round(time.monotonic() - start, 2)
+        ledger.finish(step, result, job.out / step if step in _FOLDERS else None)
+
+
+def _prepare_database(job: Job, ledger: Ledger) -> None:
+    """Keeps the database of an interrupted run where it is intact, else starts a new one."""
+    if not database.is_sound(job.database, job.names):
+        ledger.forget_from("features")
+        features.create_database(job)
+    for step in ("features", "matches"):
+        result = ledger.result(step)
+        if result is not None and result["rows"] != database.progress(job.database, step):
+            ledger.forget_from(step)
+
+
+def _end_with_parent() -> None:
+    """Ends this process when its standard input does, which is when its parent is gone."""
+
+    def watch() -> None:
+        while os.read(0, 1):  # not sys.stdin, whose lock the interpreter wants at its own end
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _take_stdout() -> BinaryIO:
+    """Returns the pipe to the parent; what native code prints from now on goes to the log."""
+    stream = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return stream
+
+
+def main() -> None:
+    """Runs the job named on the command line and reports what the parent shall raise."""
+    report = Reporter(_take_stdout())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
+    faulthandler.enable()
+    _end_with_parent()
+    job = Job.read(Path(sys.argv[1]))
+    try:
+        with filelock.FileLock(job.out / LOCK, timeout=LOCK_SECONDS):
+            work(job, report)
+    except filelock.Timeout:
+        report.failed(WorkspaceError(
+            f"Another process still works in {job.out}.", hint="End it, then run this again."))
+    except (ReconError, OSError) as error:
+        report.failed(error)
+
+
+if __name__ == "__main__":
+    main()
