@@ -33,7 +33,7 @@ from recon_cli.workspace import SETTINGS, Workspace
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
 # Small enough for a laptop's CPU and a first impression.
 DEMO_SETTINGS: Settings = {
-    "train": {"iterations": 1500, "max_size": 300, "max_gaussians": 40_000}}
+    "train": {"iterations": 1000, "max_size": 300, "max_gaussians": 30_000}}
 MID: Settings = {"prune": {"at": "mid"}}  # what the paper does: prune while training goes on
 INTERRUPTED = 130
 

@@ -84,7 +84,8 @@ class SfmConfig(StageConfig):
         "auto", "Image pairs to match; auto is exhaustive up to 100 images, else sequential.",
         choices=("auto", "exhaustive", "sequential"))
     max_features: int = option(
-        4096, "Most SIFT keypoints an image.", unit="keypoints", minimum=100)
+        2048, "SIFT keypoints an image to aim for, coarse ones first; an image may get up to "
+        "twice as many.", unit="keypoints", minimum=100)
     min_registered: float = option(
         0.5, "Fail when fewer images than this share get a camera.", unit="share",
         minimum=0.0, maximum=1.0)

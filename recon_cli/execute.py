@@ -172,6 +172,7 @@ def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageC
     threads = job.compute.threads or machine.usable_threads()
     if row.name not in RENDERING:
         return StageContext(progress=job.progress, threads=threads, record=record)
+    machine.share_cores()
     # Importing torch takes seconds, which status and --help must not pay.
     import torch  # noqa: PLC0415
 

@@ -30,11 +30,14 @@ def is_sound(path: Path, names: Sequence[str]) -> bool:
 
 
 def progress(path: Path, step: str) -> int:
-    """Returns how many images ("features") or pairs ("matches") are finished; 0 while locked."""
+    """Returns how many images ("features") or pairs ("matches") are finished.
+
+    That is 0 where the file cannot be read: it is locked, broken or not there yet.
+    """
     try:
         with closing(_opened(path)) as connection:
             (count,), = connection.execute(f"SELECT count(*) FROM {_TABLES[step]}")
-    except sqlite3.OperationalError:
+    except sqlite3.DatabaseError:
         return 0
     return int(count)
 
@@ -62,5 +65,9 @@ def remove(path: Path) -> None:
 
 
 def _opened(path: Path) -> sqlite3.Connection:
-    """Returns a connection that can only read."""
-    return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=1.0)
+    """Returns a connection that makes no file.
+
+    It may write, because the last one to close takes SQLite's side files away, and one that can
+    only read would leave them.
+    """
+    return sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=1.0)

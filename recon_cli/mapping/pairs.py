@@ -9,6 +9,11 @@ from recon_cli.mapping.job import SEQUENTIAL_OVERLAP, Job
 from recon_cli.mapping.ledger import Result
 from recon_cli.mapping.protocol import Reporter
 
+# COLMAP tries 10000 samples before it gives up on a pair, and most of its time goes to pairs that
+# show nothing in common. 2000 took a third off the verification of five captures; of their 5700
+# verified pairs 8 got lost, all with few matches, and every model kept its images.
+MAX_TRIALS = 2000
+
 
 def match(job: Job, report: Reporter) -> Result:
     """Matches and verifies image pairs in the database; returns how many were verified.
@@ -55,4 +60,5 @@ def _matching(job: Job) -> pycolmap.FeatureMatchingOptions:
 def _verification(job: Job) -> pycolmap.TwoViewGeometryOptions:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.seed
+    options.ransac.max_num_trials = MAX_TRIALS
     return options

@@ -132,7 +132,7 @@ def main(gaussians: int, size: str, threads: int, device: str, repeat: int) -> N
     for attempt in range(repeat + 1):
         images = []
         with _PeakMemory() as memory:
-            forward.append(_timed(lambda: images.append(
+            forward.append(_timed(lambda made=images: made.append(
                 registry.render(splats, camera, background, 3)), device))
             loss = images[0].rgb.square().mean()
             backward.append(_timed(loss.backward, device))

@@ -1,0 +1,347 @@
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import psutil
+import pytest
+
+from recon_cli.capture.frames import Frame, FrameList, read_png, write_png
+from recon_cli.config import SfmConfig
+from recon_cli.errors import FormatError, SfmError
+from recon_cli.io.colmap import read_images, read_scene
+from recon_cli.mapping import database
+from recon_cli.stages import sfm
+from recon_cli.stages.context import StageContext, StageInputs
+
+STEP, COUNT = 4, 12  # every 4th frame of the sample: few, and each still overlaps the next
+BLANK = "000099.png"  # a grey frame, held out, that can find no camera
+FILTERED = "000012.png"  # the one frame whose denoised twin differs
+FEATURES = 2048
+MODEL = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
+
+# A parent of its own, to be killed: run.py FOLDER OUT
+RUN = """
+import sys
+from pathlib import Path
+from recon_cli.config import SfmConfig
+from recon_cli.stages import sfm
+from recon_cli.stages.context import StageContext, StageInputs
+base = Path(sys.argv[1])
+sfm.run(SfmConfig(max_features=int(sys.argv[3])),
+        StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"}), Path(sys.argv[2]),
+        StageContext(threads=2))
+"""
+
+
+def write_inputs(base, images, *, filtered=(), held_out=()):
+    """Writes the finished folders of ingest and denoise; `images` maps names to RGB pixels."""
+    for stage in ("ingest", "denoise"):
+        (base / stage / "frames").mkdir(parents=True)
+    for name, rgb in images.items():
+        write_png(base / "ingest" / "frames" / name, rgb)
+        twin = cv2.GaussianBlur(rgb, (0, 0), 2) if name in filtered else rgb
+        write_png(base / "denoise" / "frames" / name, np.asarray(twin))
+    height, width = next(iter(images.values())).shape[:2]
+    FrameList("video", width, height, None, tuple(
+        Frame(name, None, "room.mp4", None, name in held_out) for name in sorted(images)
+    )).write(base / "ingest")
+    return base
+
+
+def run(base, out, *, ctx=None, **options):
+    out.mkdir(exist_ok=True)
+    inputs = StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"})
+    return sfm.run(SfmConfig(**options), inputs, out, ctx or StageContext(threads=2))
+
+
+def workers():
+    """The mapping processes that this test process has started."""
+    return [
+        child for child in psutil.Process().children(recursive=True)
+        if "recon_cli.mapping.worker" in " ".join(child.cmdline())
+    ]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory, sample_video):
+    """Twelve frames of the sample room and a blank one."""
+    images = {
+        f"{index:06d}.png": frame.to_ndarray(format="rgb24")
+        for index, frame in enumerate(av.open(str(sample_video)).decode(video=0))
+        if index % STEP == 0 and index < STEP * COUNT
+    }
+    images[BLANK] = np.full_like(images["000000.png"], 128)
+    return write_inputs(
+        tmp_path_factory.mktemp("room"), images, filtered=[FILTERED],
+        held_out=["000000.png", "000040.png", BLANK])
+
+
+@pytest.fixture(scope="module")
+def mapped(room, tmp_path_factory):
+    """(output folder, summary, what was recorded) of an uninterrupted run."""
+    out, seen = tmp_path_factory.mktemp("mapped"), []
+    ctx = StageContext(threads=2, record=lambda *done: seen.append(done))
+    return out, run(room, out, ctx=ctx, max_features=FEATURES), seen
+
+
+def test_every_frame_that_shows_the_room_gets_a_camera(mapped):
+    _, summary, _ = mapped
+    assert summary["frames"] == COUNT + 1
+    assert summary["registered"] == COUNT
+    assert summary["unregistered"] == summary["unregistered_held_out"] == [BLANK]
+
+
+def test_the_summary_is_json_and_has_plausible_figures(mapped):
+    _, summary, _ = mapped
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    assert summary["points"] > 300
+    assert summary["mean_track_length"] > 2
+    assert 0 < summary["reprojection_error_px"] < 1
+    assert summary["median_triangulation_angle_deg"] > 5
+    assert summary["models"][0] == COUNT
+    assert set(summary["seconds"]) == {"features", "matches", "sparse", "undistorted"}
+    assert summary["focal_px"] == pytest.approx(300, rel=0.03)  # the room was rendered with 300
+
+
+def test_camera_centres_agree_with_the_rendered_path(mapped, shared_data):
+    out, _, _ = mapped
+    lines = (shared_data / "rooms" / "office" / "traj.txt").read_text().splitlines()
+    poses = read_images(out / "sparse" / "images.bin")
+    found = np.array([-view[:3, :3].T @ view[:3, 3] for _, _, view in poses])
+    truth = np.array([
+        np.array(lines[int(name[:6])].split(), float).reshape(4, 4)[:3, 3] for name, _, _ in poses])
+    # The walk is 7 m long; all 100 frames come within 0.3 cm, twelve of them within 1.
+    assert similarity_rmse(found, truth) < 0.03
+
+
+def similarity_rmse(found, truth):
+    """Root mean square distance after the best similarity (Umeyama 1991), units of `truth`."""
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = np.trace(np.diag(s) @ flip) / (a**2).sum()
+    return np.sqrt(((scale * a @ (u @ flip @ vt).T - b) ** 2).sum(axis=1).mean())
+
+
+def test_the_scene_can_be_read_with_its_twins(mapped):
+    out, summary, _ = mapped
+    scene = read_scene(
+        out / "undistorted", held_out=frozenset({"000000.png", "000040.png", BLANK}),
+        validation=0.1)
+    assert len(scene.train) + len(scene.validation) == COUNT - 2
+    assert [view.name for view in scene.test] == ["000000.png", "000040.png"]
+    assert scene.unregistered_test == (BLANK,)
+    assert len(scene.points) == summary["points"]
+    assert (scene.train[0].camera.width, scene.train[0].camera.height) == (
+        summary["width"], summary["height"])
+
+
+def test_twins_are_identical_exactly_where_nothing_was_denoised(mapped):
+    out, _, _ = mapped
+    images, twins = out / "undistorted" / "images", out / "undistorted" / "denoised"
+    names = sorted(path.name for path in images.iterdir())
+    assert names == sorted(path.name for path in twins.iterdir())
+    same = [name for name in names if (images / name).read_bytes() == (twins / name).read_bytes()]
+    assert same == [name for name in names if name != FILTERED]
+    difference = read_png(images / FILTERED).astype(int) - read_png(twins / FILTERED)
+    assert np.abs(difference).mean() < 20  # the same view, blurred
+
+
+def test_undistortion_keeps_pixels_and_has_no_blank_border(mapped):
+    out, _, _ = mapped
+    rgb = read_png(out / "undistorted" / "images" / "000012.png")
+    edges = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
+    assert (edges.max(axis=1) > 0).all()
+
+
+def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
+    out, _, _ = mapped
+    assert sorted(path.name for path in out.iterdir()) == [
+        "database.db", "log.txt", "sparse", "steps.json", "undistorted"]
+    assert sorted(path.name for path in (out / "undistorted").iterdir()) == [
+        "denoised", "images", "sparse"]
+    for folder in (out / "sparse", out / "undistorted" / "sparse"):
+        assert sorted(path.name for path in folder.iterdir()) == list(MODEL)
+
+
+def test_progress_is_recorded_in_order_up_to_the_last_step(mapped):
+    _, _, seen = mapped
+    assert seen == sorted(seen)
+    assert {total for _, total in seen} == {4 * (COUNT + 1)}
+    assert seen[-1][0] >= 2 * (COUNT + 1)  # features and matches, which a crash leaves
+
+
+def kill_when(base, out, reached):
+    """Runs the stage in a process of its own and kills that, and only that, when `reached()`."""
+    out.mkdir(exist_ok=True)
+    parent = subprocess.Popen([sys.executable, "-c", RUN, str(base), str(out), str(FEATURES)])
+    while not reached():
+        assert parent.poll() is None, "the run ended before it could be killed"
+        time.sleep(0.005)
+    children = psutil.Process(parent.pid).children(recursive=True)
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    _, alive = psutil.wait_procs(children, timeout=20)
+    assert not alive, "the mapping process outlived its parent"
+
+
+def noted(out, step):
+    try:
+        return step in json.loads((out / "steps.json").read_text())
+    except (OSError, ValueError):
+        return False
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_a_run_killed_in_every_step_ends_with_the_bytes_of_one_that_was_not(
+    mapped, room, tmp_path
+):
+    uninterrupted, _, _ = mapped
+    out = tmp_path / "out"
+    kill_when(room, out, lambda: database.progress(out / "database.db", "features") >= 3)
+    with (out / "database.db").open("r+b") as file:  # as a crash of the machine may leave it
+        file.truncate(20_000)
+    kill_when(room, out, lambda: database.progress(out / "database.db", "features") >= 3)
+    kill_when(room, out, lambda: database.progress(out / "database.db", "matches") >= 5)
+    kill_when(room, out, lambda: noted(out, "matches"))
+    kill_when(room, out, lambda: (
+        noted(out, "sparse") and any((out / "undistorted.partial").rglob("*.png"))))
+    run(room, out, max_features=FEATURES)
+    for folder in ("sparse", "undistorted"):
+        files = sorted(path for path in (uninterrupted / folder).rglob("*") if path.is_file())
+        assert files
+        for path in files:
+            other = out / path.relative_to(uninterrupted)
+            assert other.read_bytes() == path.read_bytes(), path
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        path.name for path in uninterrupted.iterdir())
+
+
+def test_a_finished_run_is_not_done_again(mapped, room):
+    out, summary, _ = mapped
+    before = (out / "undistorted").stat().st_ino, (out / "sparse").stat().st_ino
+    assert run(room, out, max_features=FEATURES) == summary
+    assert ((out / "undistorted").stat().st_ino, (out / "sparse").stat().st_ino) == before
+
+
+def test_running_out_of_time_is_a_failure_that_says_where_it_was(room, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(SfmError, match=r"not found within 0\.01 minutes: it was") as caught:
+        run(room, out, max_minutes=0.01)
+    assert "--max-minutes" in caught.value.hint
+    assert not (out / "sparse").exists()
+    assert not workers()
+
+
+def test_a_mapping_process_that_dies_is_a_failure_that_names_its_log(room, tmp_path):
+    def kill():
+        while not (found := workers()) or not (tmp_path / "out" / "database.db").exists():
+            time.sleep(0.01)
+        found[0].kill()
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    with pytest.raises(SfmError, match="ended by SIGKILL while it was") as caught:
+        run(room, tmp_path / "out")
+    thread.join()
+    assert str(tmp_path / "out" / "log.txt") in caught.value.message
+    assert "memory" in caught.value.hint
+
+
+def test_an_interrupt_ends_the_mapping_process_and_goes_on(room, tmp_path):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(room, tmp_path / "out", ctx=StageContext(record=interrupt))
+    assert not workers()
+    assert not (tmp_path / "out" / "job.json").exists()
+
+
+def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
+    grey = {f"{index:06d}.png": np.full((120, 160, 3), 90, np.uint8) for index in range(5)}
+    with pytest.raises(SfmError, match="No features: 0 of 5 frames"):
+        run(write_inputs(tmp_path, grey), tmp_path / "out")
+
+
+def texture(height, width, seed):
+    """Noise on five scales, full of keypoints, [H, W, 3]."""
+    noise = np.random.default_rng(seed)
+    total = sum(
+        scale**0.5 * cv2.resize(
+            noise.normal(size=(height // scale, width // scale, 3)), (width, height),
+            interpolation=cv2.INTER_CUBIC)
+        for scale in (2, 4, 8, 16, 32))
+    return np.asarray(255 * (total - total.min()) / np.ptp(total), np.uint8)
+
+
+def turning(count):
+    """Frames of a camera that turns on the spot: one textured picture through homographies."""
+    sky = texture(600, 1200, 0)
+    inner = np.array([[250, 0, 120], [0, 250, 90], [0, 0, 1.0]])
+    outer = np.array([[250, 0, 600], [0, 250, 300], [0, 0, 1.0]])
+    frames = {}
+    for index, angle in enumerate(np.linspace(-0.5, 0.5, count)):
+        turn, _ = cv2.Rodrigues(np.array([0.1 * np.sin(index), angle, 0]))
+        frames[f"{index:06d}.png"] = np.asarray(cv2.warpPerspective(
+            sky, outer @ turn @ np.linalg.inv(inner), (240, 180),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+    return frames
+
+
+def test_a_camera_that_turns_on_the_spot_is_not_taken_for_a_success(tmp_path):
+    with pytest.raises(SfmError, match="The camera did not move"):
+        run(write_inputs(tmp_path, turning(12)), tmp_path / "out", max_minutes=1.0)
+    assert not (tmp_path / "out" / "sparse").exists()
+
+
+def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):
+    images = {f"{seed}.png": texture(180, 240, seed) for seed in range(4)}
+    with pytest.raises(SfmError, match="No two frames show the same things"):
+        run(write_inputs(tmp_path, images), tmp_path / "out", max_minutes=1.0)
+
+
+def test_a_missing_twin_is_found_before_anything_is_done(tmp_path):
+    base = write_inputs(
+        tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
+    (base / "denoise" / "frames" / "1.png").unlink()
+    with pytest.raises(FormatError, match=r"lacks 1 of 3 frames: 1\.png") as caught:
+        run(base, tmp_path / "out")
+    assert "recon denoise" in caught.value.hint
+    assert not (tmp_path / "out" / "log.txt").exists()
+
+
+def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
+    base = write_inputs(
+        tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
+    (base / "ingest" / "frames" / "2.png").write_bytes(b"no picture")
+    with pytest.raises(FormatError, match=r"1 of 3 frames cannot be read .* 2\.png"):
+        run(base, tmp_path / "out")
+
+
+def test_models_that_are_left_aside_are_told(caplog):
+    summary = {
+        "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
+        "unregistered_held_out": ["3.png"], "models": [49, 28, 3],
+    }
+    sfm._report(summary, StageContext())
+    told = caplog.text
+    assert "11 of 60 frames have no camera" in told
+    assert "and 6 more" in told
+    assert "1 of them were held out and so cannot be scored: 3.png" in told
+    assert "of 49 frames, is kept; others of 28, 3 frames are left aside" in told
+
+
+def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    grey = {f"{index}.png": np.full((60, 80, 3), 90, np.uint8) for index in range(3)}
+    write_inputs(Path("in"), grey)
+    with pytest.raises(SfmError, match="No features"):
+        run(Path("in"), Path("out"))

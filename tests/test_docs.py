@@ -1,0 +1,74 @@
+"""The documentation says what is true: links, the generated CLI page, the batch example."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from recon_cli.errors import ReconError
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_to_a_file_leads_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_the_index_lists_every_page():
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").glob("*.md"):
+        if page.name != "index.md":
+            assert f"({page.name})" in index
+
+
+def test_the_cli_page_is_what_help_says():
+    command = [sys.executable, str(ROOT / "docs" / "generate_cli.py"), "--check"]
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0
+
+
+def _family(kind: type[ReconError]) -> set[int]:
+    return {kind.exit_code}.union(*(_family(sub) for sub in kind.__subclasses__()))
+
+
+def test_every_exit_code_is_documented():
+    page = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
+    for code in _family(ReconError) | {0, 130}:
+        assert f"\n| {code} |" in page
+
+
+def test_the_design_names_every_module_of_the_package():
+    page = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    for path in (ROOT / "recon_cli").glob("*.py"):
+        if not path.name.startswith("__"):
+            assert path.name in page, f"docs/design.md does not mention {path.name}"
+
+
+
+def test_the_batch_example_goes_on_after_a_failure_and_says_so(tmp_path, sample_video):
+    videos, results = tmp_path / "videos", tmp_path / "results"
+    videos.mkdir()
+    (videos / "a_broken.mp4").write_text("this is no video")
+    (videos / "b_room.mp4").write_bytes(sample_video.read_bytes())
+    environment = {
+        **os.environ, "OMP_NUM_THREADS": "1",
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    small = {"ingest.frames": 24, "sfm.max_features": 1500, "train.iterations": 10,
+             "train.max_size": 80}
+    options = [word for key, value in small.items() for word in ("--set", f"{key}={value}")]
+    done = subprocess.run(
+        [str(ROOT / "docs" / "examples" / "batch.sh"), str(videos), str(results), *options],
+        env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stderr
+    summary = (results / "summary.txt").read_text(encoding="utf-8").splitlines()
+    assert summary[0].startswith("a_broken: failed with exit code 3: error:")
+    assert summary[1] == "b_room: done"
+    assert (results / "b_room.ply").stat().st_size > 10_000

@@ -1,0 +1,121 @@
+"""The sample video all the way through the command line, and killed in every stage on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from recon_cli.io.ply import read_ply
+
+SETTINGS = """
+[ingest]
+frames = 24
+[sfm]
+max_features = 1500
+[train]
+iterations = 40
+max_size = 96
+densify_every = 10
+checkpoint_every = 5
+"""
+STAGES = ("ingest", "denoise", "sfm", "train", "prune", "evaluate", "export")
+VERBS = {"evaluate": "eval"}
+
+
+def command(*words: object) -> list[str]:
+    return [sys.executable, "-m", "recon_cli", *map(str, words)]
+
+
+def environment() -> dict[str, str]:
+    # one thread: what is compared to the bit must not depend on how busy the machine is
+    return {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def recon(*words: object) -> str:
+    done = subprocess.run(command(*words), capture_output=True, text=True, env=environment(),
+                          check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def make_workspace(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "recon.toml").write_text(SETTINGS, encoding="utf-8")
+    return folder
+
+
+def words_for(stage: str, workspace: Path, video: Path) -> list[object]:
+    words: list[object] = [VERBS.get(stage, stage)]
+    if stage == "ingest":
+        words.append(video)
+    if stage == "prune":
+        words += ["--at", "mid"]
+    return [*words, "-w", workspace, *(["--threads", 1])] if stage != "export" else [
+        *words, "-w", workspace]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, sample_video):
+    """A workspace that nothing interrupted."""
+    workspace = make_workspace(tmp_path_factory.mktemp("whole") / "workspace")
+    for stage in STAGES:
+        recon(*words_for(stage, workspace, sample_video))
+    return workspace
+
+
+def test_the_sample_video_becomes_a_scene_with_a_table(finished):
+    status = json.loads(recon("status", "--json", "-w", finished))
+    assert {row["state"] for row in status["stages"]} == {"fresh"}
+    metrics = json.loads((finished / "evaluate" / "metrics.json").read_text(encoding="utf-8"))
+    base, pruned = metrics["models"]["base"], metrics["models"]["pruned"]
+    assert pruned["gaussians"] < base["gaussians"]
+    assert base["psnr_db"] > 14  # forty steps at 96 pixels: a room, not yet a good one
+    assert len(read_ply(finished / "export" / "splats.ply")) == pruned["gaussians"]
+    frames = json.loads((finished / "ingest" / "frames.json").read_text(encoding="utf-8"))
+    held_out = sorted(f["name"] for f in frames["frames"] if f["held_out"])
+    scored = [view["name"] for view in base["views"]]
+    assert sorted(scored + metrics["unregistered_test"]) == held_out
+
+
+def test_a_second_run_has_nothing_to_do(finished):
+    before = (finished / "train" / "manifest.json").stat().st_mtime_ns
+    recon("train", "-w", finished, "--threads", 1)
+    assert (finished / "train" / "manifest.json").stat().st_mtime_ns == before
+
+
+def test_killed_in_every_stage_it_ends_with_the_same_scene(finished, tmp_path, sample_video):
+    workspace = make_workspace(tmp_path / "workspace")
+    killed = []
+    for stage in STAGES:
+        words = words_for(stage, workspace, sample_video)
+        if kill_in(stage, workspace, words):
+            killed.append(stage)
+        recon(*words)
+    assert {"ingest", "sfm", "train", "prune"} <= set(killed)
+    for path in ("train/splats.ply", "prune/splats.ply", "export/splats.ply"):
+        assert (workspace / path).read_bytes() == (finished / path).read_bytes(), path
+    scores = [json.loads((w / "evaluate" / "metrics.json").read_text(encoding="utf-8"))
+              for w in (workspace, finished)]
+    assert scores[0]["models"]["base"]["views"] == scores[1]["models"]["base"]["views"]
+
+
+def kill_in(stage: str, workspace: Path, words: list[object]) -> bool:
+    """Starts a verb, kills it with -9 while its stage is at work, and tells whether it was."""
+    partial = workspace / ".partial" / stage
+    with subprocess.Popen(command(*words), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                          env=environment()) as process:
+        while process.poll() is None:
+            # two files: it has begun to leave something, and is not yet done
+            if partial.is_dir() and sum(1 for p in partial.rglob("*") if p.is_file()) >= 2:
+                process.send_signal(signal.SIGKILL)
+                break
+            time.sleep(0.002)
+        process.wait()
+    return not (workspace / stage / "manifest.json").exists()
