@@ -3,8 +3,8 @@
 `python tests/bench/bench_novel_views.py WORKSPACE ROOM`, with ROOM a folder in the Replica layout
 of NICE-SLAM (traj.txt, results/, test/) whose video.mp4 the workspace was made from. The frame of
 the reconstruction is aligned to the true one by a similarity over the camera centres (Umeyama
-1991); the true test cameras are then carried into it. Prints the alignment error and, for each model, PSNR
-and SSIM over the novel views at the size that was trained on.
+1991); the true test cameras are then carried into it. Prints the alignment error and, for each
+model, PSNR and SSIM over the novel views at the size that was trained on.
 """
 
 from __future__ import annotations

@@ -19,7 +19,10 @@ CONFIG = TrainConfig(
 EXTENT = 1.0
 
 
-def tiny_task(config=CONFIG):
+DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
+
+
+def tiny_task(config=CONFIG, device="cpu"):
     truth = random_splats(40, seed=0, dtype=torch.float32)
     views = []
     for i in range(5):
@@ -27,13 +30,13 @@ def tiny_task(config=CONFIG):
         with torch.no_grad():
             rgb = render(truth, camera, torch.zeros(3), 0).rgb
         views.append(TrainView(camera, (rgb.clamp(0, 1) * 255).to(torch.uint8).numpy()))
-    return Task(views[1:], views[:1], Schedule(config), EXTENT, "torch", torch.device("cpu"))
+    return Task(views[1:], views[:1], Schedule(config), EXTENT, "torch", torch.device(device))
 
 
-def first_state(config=CONFIG):
+def first_state(config=CONFIG, device="cpu"):
     splats = random_splats(40, seed=0, dtype=torch.float32)
     splats.sh_dc = torch.zeros(40, 3)
-    return new_state(splats, config, EXTENT)
+    return new_state(splats.map(lambda tensor: tensor.to(device)), config, EXTENT)
 
 
 def run(state, task, until, **hooks):
@@ -46,8 +49,9 @@ def same(a, b):
                for name, value in a.splats.parameters().items())
 
 
-def test_training_raises_the_psnr_of_a_view_that_it_never_sees():
-    state, task = first_state(), tiny_task()
+@pytest.mark.parametrize("device", DEVICES)
+def test_training_raises_the_psnr_of_a_view_that_it_never_sees(device):
+    state, task = first_state(device=device), tiny_task(device=device)
     before = validation_psnr(state, task)
     reports = []
     run(state, task, 60, on_report=reports.append)
@@ -56,10 +60,11 @@ def test_training_raises_the_psnr_of_a_view_that_it_never_sees():
     assert reports[-1].gaussians == len(state.splats) <= 90
 
 
-def test_two_runs_with_one_seed_give_the_same_bits():
-    first, second = first_state(), first_state()
-    run(first, tiny_task(), 30)
-    run(second, tiny_task(), 30)
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_runs_with_one_seed_give_the_same_bits(device):
+    first, second = first_state(device=device), first_state(device=device)
+    run(first, tiny_task(device=device), 30)
+    run(second, tiny_task(device=device), 30)
     assert same(first, second)
 
 
@@ -70,14 +75,15 @@ def test_another_seed_gives_another_result():
     assert not same(first, second)
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("stop", [1, 17, 30])
-def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(tmp_path, stop):
-    whole, task = first_state(), tiny_task()
+def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(tmp_path, stop, device):
+    whole, task = first_state(device=device), tiny_task(device=device)
     run(whole, task, 45)
-    part = first_state()
+    part = first_state(device=device)
     run(part, task, stop)
     save_state(tmp_path / "state.safetensors", part)
-    resumed = load_state(tmp_path / "state.safetensors", CONFIG, EXTENT, torch.device("cpu"))
+    resumed = load_state(tmp_path / "state.safetensors", CONFIG, EXTENT, torch.device(device))
     run(resumed, task, 45)
     assert same(whole, resumed)
     assert resumed.iteration == 45
