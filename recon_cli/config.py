@@ -98,14 +98,14 @@ class SfmConfig(StageConfig):
 class TrainConfig(StageConfig):
     """The reference recipe of 3D Gaussian Splatting, scaled to the number of iterations."""
 
-    iterations: int = option(3000, "Optimization steps, one view each.", unit="steps", minimum=1)
+    iterations: int = option(2000, "Optimization steps, one view each.", unit="steps", minimum=1)
     max_size: int = option(
-        640, "Longest side of a training image; larger ones are reduced by area.",
+        400, "Longest side of a training image; larger ones are reduced by area.",
         unit="pixels", minimum=16)
     sh_degree: int = option(
         3, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3)
     max_gaussians: int = option(
-        200_000, "Densification stops at this count.", unit="Gaussians", minimum=1)
+        60_000, "Densification stops at this count.", unit="Gaussians", minimum=1)
     images: str = option(
         "denoised", "Pixels to train on; scores always use the originals.",
         choices=("denoised", "original"))

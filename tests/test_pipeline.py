@@ -98,7 +98,7 @@ def test_a_changed_field_makes_exactly_its_stage_and_those_behind_it_stale(
 
 def test_the_reason_names_the_field_and_both_values(job: Job) -> None:
     changed = stale(job_at(job.workspace.root, {"train": {"iterations": 100}}))
-    assert changed["train"] == ("train.iterations changed: 3000 -> 100",)
+    assert changed["train"] == ("train.iterations changed: 2000 -> 100",)
     assert changed["export"][0] == "train is stale"
 
 
@@ -207,7 +207,7 @@ def test_training_is_never_implicit_and_the_command_to_type_is_named(
 
 def test_a_stage_keeps_the_options_it_was_made_with_when_others_need_it(job: Job) -> None:
     bring(job, "train", changes={"train": {"iterations": 100}})
-    assert bring(job, "evaluate") == ["evaluate"]  # although the default is 3000
+    assert bring(job, "evaluate") == ["evaluate"]  # although the default is 2000
     assert list(stale(job)) == ["prune", "export"]
 
 
@@ -224,7 +224,7 @@ def test_a_verb_does_the_same_whatever_was_typed_before(job: Job) -> None:
     assert bring(job, "train") == ["train"]
     manifest = job.workspace.manifest("train")
     assert manifest
-    assert manifest.basis.config["iterations"] == 3000
+    assert manifest.basis.config["iterations"] == 2000
 
 
 def test_a_stage_that_runs_implicitly_keeps_its_options(job: Job, folder: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import pycolmap
-from PIL import Image
 
 from recon_cli.errors import FormatError
 from recon_cli.mapping import database, doctor
@@ -70,10 +69,8 @@ def _reader(job: Job) -> pycolmap.ImageReaderOptions:
     options = pycolmap.ImageReaderOptions()
     options.camera_model = CAMERA_MODEL
     if job.focal_px is not None:
-        with Image.open(job.frames / job.names[0]) as first:
-            width, height = first.size
         focal = job.focal_px
-        options.camera_params = f"{focal},{focal},{width / 2},{height / 2},0,0,0,0"
+        options.camera_params = f"{focal},{focal},{job.width / 2},{job.height / 2},0,0,0,0"
     return options
 
 

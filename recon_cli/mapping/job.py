@@ -27,6 +27,8 @@ class Job:
         denoised: folder of their denoised twins, under the same names.
         out: the stage's folder; database, model and undistorted images go there.
         names: file names of the frames, sorted.
+        width: of every frame in pixels.
+        height: of every frame in pixels.
         focal_px: focal length of the frames in pixels where it is known.
         pairs: "auto", "exhaustive" or "sequential".
         max_features: SIFT keypoints an image to aim for.
@@ -39,6 +41,8 @@ class Job:
     denoised: Path
     out: Path
     names: tuple[str, ...]
+    width: int
+    height: int
     focal_px: float | None
     pairs: str
     max_features: int

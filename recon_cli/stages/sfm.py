@@ -48,6 +48,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         denoised=denoise / store.FOLDER,
         out=out.resolve(),
         names=tuple(frame.name for frame in frames.frames),
+        width=frames.width,
+        height=frames.height,
         focal_px=frames.focal_px,
         pairs=config.pairs,
         max_features=config.max_features,

@@ -22,8 +22,8 @@ def job(tmp_path):
         Image.new("RGB", (64, 48)).save(tmp_path / "frames" / name)
     return Job(
         frames=tmp_path / "frames", denoised=tmp_path / "frames", out=tmp_path / "out",
-        names=NAMES, focal_px=None, pairs="auto", max_features=500, min_registered=0.5, seed=0,
-        threads=1)
+        names=NAMES, width=64, height=48, focal_px=None, pairs="auto", max_features=500,
+        min_registered=0.5, seed=0, threads=1)
 
 
 def camera(job):

@@ -9,8 +9,9 @@ from recon_cli.mapping.job import Job
 def job(count, pairs="auto"):
     return Job(
         frames=Path("/in/frames"), denoised=Path("/in/denoised"), out=Path("/out"),
-        names=tuple(f"{index:06d}.png" for index in range(count)), focal_px=None, pairs=pairs,
-        max_features=2048, min_registered=0.5, seed=0, threads=2)
+        names=tuple(f"{index:06d}.png" for index in range(count)), width=600,
+        height=340, focal_px=None, pairs=pairs, max_features=2048, min_registered=0.5, seed=0,
+        threads=2)
 
 
 def test_what_is_written_is_read_back(tmp_path):
