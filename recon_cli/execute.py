@@ -24,7 +24,6 @@ from recon_cli.stages import STAGES, Stage
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.workspace import Workspace, combined
 
-RENDERING = frozenset({"train", "prune", "evaluate"})  # the stages that need a rasterizer
 _RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
 
 logger = logging.getLogger("recon")
@@ -111,14 +110,13 @@ def run_stage(
 def _run_record(
     row: Stage, ctx: StageContext, meter: machine.Meter, earlier: Unfinished, summary: Summary
 ) -> RunRecord:
-    rendering = row.name in RENDERING
     return RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
         peak_memory_bytes=meter.peak_memory_bytes,
         summary=summary,
         versions=machine.versions(),
-        device=ctx.device if rendering else None,
-        backend=ctx.backend if rendering else None,
+        device=ctx.device if row.renders else None,
+        backend=ctx.backend if row.renders else None,
         threads=ctx.threads,
         finished=datetime.now().astimezone().isoformat(timespec="seconds"),
     )
@@ -170,7 +168,7 @@ def _recorder(
 
 def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:
     threads = job.compute.threads or machine.usable_threads()
-    if row.name not in RENDERING:
+    if not row.renders:
         return StageContext(progress=job.progress, threads=threads, record=record)
     machine.share_cores()
     # Importing torch takes seconds, which status and --help must not pay.
@@ -190,7 +188,7 @@ def refuse_missing_backend(job: Job, stages: Sequence[str]) -> None:
         BackendError: one of `stages` renders, and what was asked for cannot be had.
     """
     named = (job.compute.device, job.compute.backend) != ("auto", "auto")
-    if named and RENDERING.intersection(stages):
+    if named and any(row.renders for row in job.table if row.name in stages):
         from recon_cli.render import registry  # noqa: PLC0415 (imports torch)
 
         registry.resolve(job.compute.backend, job.compute.device)

@@ -31,6 +31,7 @@ class Stage:
         module: where its run() lives.
         volatile: patterns of outputs that hold times or logs, or are kept only to resume, and so
             take no part in the fingerprints of later stages.
+        renders: it needs a rasterizer, and so torch and a device.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Stage:
     auto: bool
     module: str
     volatile: tuple[str, ...] = ()
+    renders: bool = False
 
 
 STAGES: tuple[Stage, ...] = (
@@ -51,11 +53,11 @@ STAGES: tuple[Stage, ...] = (
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 1, True, "recon_cli.stages.sfm",
           ("database.db", "log.txt", "steps.json")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 1, False,
-          "recon_cli.stages.train", ("log.jsonl",)),
+          "recon_cli.stages.train", ("log.jsonl",), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 1, False,
-          "recon_cli.stages.prune", ("log.jsonl",)),
+          "recon_cli.stages.prune", ("log.jsonl",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 1, False,
-          "recon_cli.stages.evaluate"),
+          "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("train",), ("prune",), ExportConfig, 1, False,
           "recon_cli.stages.export"),
 )
