@@ -6,7 +6,8 @@ import dataclasses
 import importlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -14,7 +15,7 @@ from pathlib import Path
 from recon_cli import machine
 from recon_cli.config import ComputeConfig
 from recon_cli.digests import Source, read_source
-from recon_cli.errors import ConfigError, ManifestError
+from recon_cli.errors import ConfigError, ManifestError, ReconError
 from recon_cli.fields import StageConfig
 from recon_cli.freshness import Inspection
 from recon_cli.manifest import Basis, Manifest, RunRecord, Unfinished
@@ -95,7 +96,7 @@ def run_stage(
         tuple(Path(source.path) for source in sources))
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = job.workspace.begin(basis)
-    with machine.Meter() as meter:
+    with machine.Meter() as meter, _no_trace_of_nothing(job.workspace, row.name):
         ctx = _context(job, row, _recorder(job.workspace, earlier, meter))
         summary = importlib.import_module(row.module).run(config, inputs, out, ctx)
     outputs = job.workspace.seal(row.name)
@@ -105,6 +106,18 @@ def run_stage(
     job.workspace.commit(manifest)
     logger.debug("%s: finished in %.1f s", row.name, manifest.run.seconds)
     return manifest
+
+
+@contextmanager
+def _no_trace_of_nothing(workspace: Workspace, stage: str) -> Iterator[None]:
+    """Discards the unfinished work of a stage that failed before anything was worth resuming."""
+    try:
+        yield
+    except ReconError:
+        unfinished = workspace.unfinished(stage)
+        if unfinished and unfinished.total == 0:
+            workspace.discard(stage)
+        raise
 
 
 def _run_record(

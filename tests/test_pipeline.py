@@ -305,6 +305,18 @@ def test_a_failure_keeps_the_old_result_and_everything_finished_before(job: Job)
     assert "sfm" not in stale(job)
 
 
+def test_a_run_refused_at_its_start_leaves_nothing_to_resume(job: Job) -> None:
+    def refuse() -> None:
+        raise InputError("not this file")
+
+    fake_stages.actions["train"] = refuse
+    shutil.rmtree(job.workspace.folder("train"))
+    with pytest.raises(InputError):
+        bring(job, "train")
+    assert pipeline.status(job)[3].state == "missing"
+    assert job.workspace.scraps() == []
+
+
 def test_a_broken_manifest_is_refused_and_again_replaces_it(job: Job) -> None:
     (job.workspace.folder("train") / NAME).write_text("{")
     with pytest.raises(ManifestError):

@@ -56,8 +56,8 @@ def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
         return
     first = next(iter(broken.values()), "")
     raise InputError(
-        f"{folder}: {readable} readable photos, {len(broken)} broken ones, but at least "
-        f"{MIN_FRAMES} readable ones are needed. {first}".rstrip(),
+        f"{folder}: {readable} photos, {len(broken)} more that cannot be read, but at least "
+        f"{MIN_FRAMES} are needed. {first}".rstrip(),
         hint="Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, "
         "camera RAW; HEIC has to be converted first).")
 

@@ -67,9 +67,9 @@ def test_mixed_sizes_are_listed_with_their_counts():
 
 def test_too_few_photos_are_refused_with_the_reason():
     check_count(Path("room"), 3, {})
-    with pytest.raises(InputError, match="1 readable photos, 0 broken ones"):
+    with pytest.raises(InputError, match="1 photos, 0 more"):
         check_count(Path("room"), 1, {})
-    with pytest.raises(InputError, match=r"2 broken ones.*a\.jpg cannot be read"):
+    with pytest.raises(InputError, match=r"2 more.*a\.jpg cannot be read"):
         check_count(Path("room"), 0, {"a.jpg": "a.jpg cannot be read.", "b.jpg": "?"})
 
 
