@@ -4,16 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow check docs clean
+.PHONY: demo test check docs clean
 
 demo: $(READY)
 	$(BIN)/recon demo
 
 test: $(READY)
 	$(BIN)/python -m pytest -q --cov=recon_cli --cov-report=term
-
-test-slow: $(READY)
-	$(BIN)/python -m pytest -q -m slow
 
 check: $(READY)
 	$(BIN)/ruff check .

@@ -61,7 +61,10 @@ def run_job(
                 if time.monotonic() > deadline:
                     raise _too_late(max_minutes, monitor)
                 monitor.show(event)
-            code = child.wait()
+            try:
+                code = child.wait(timeout=max(1.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired as error:  # native code may hang on its way out
+                raise _too_late(max_minutes, monitor) from error
             if code != 0:
                 raise _crashed(job.out / LOG, code, monitor)
     finally:

@@ -224,6 +224,14 @@ def test_a_run_killed_in_every_step_ends_with_the_bytes_of_one_that_was_not(
         path.name for path in uninterrupted.iterdir())
 
 
+def test_the_model_does_not_depend_on_the_number_of_threads(mapped, room, tmp_path):
+    other, _, _ = mapped
+    run(room, tmp_path / "out", ctx=StageContext(threads=1), max_features=FEATURES)
+    for name in MODEL:
+        assert (tmp_path / "out" / "sparse" / name).read_bytes() == (
+            other / "sparse" / name).read_bytes(), name
+
+
 def test_a_finished_run_is_not_done_again(mapped, room):
     out, summary, _ = mapped
     before = (out / "undistorted").stat().st_ino, (out / "sparse").stat().st_ino
