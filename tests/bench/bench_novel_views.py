@@ -14,6 +14,7 @@ from pathlib import Path
 import click
 import numpy as np
 import torch
+from bench_sfm import similarity
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap import read_scene
@@ -25,18 +26,6 @@ from recon_cli.scene import Camera
 from recon_cli.stages.fitting import read_config
 
 FOCAL, WIDTH, HEIGHT = 300.0, 600, 340  # pixels, with the principal point at the centre
-
-
-def similarity(
-    source: NDArray[np.float64], target: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Returns scale, rotation and translation that map source [N, 3] best onto target [N, 3]."""
-    mean_s, mean_t = source.mean(0), target.mean(0)
-    U, D, Vt = np.linalg.svd((target - mean_t).T @ (source - mean_s) / len(source))
-    sign = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
-    R = U @ sign @ Vt
-    scale = float(np.trace(np.diag(D) @ sign) / ((source - mean_s) ** 2).sum(1).mean())
-    return scale, R, mean_t - scale * R @ mean_s
 
 
 def load_poses(path: Path) -> NDArray[np.float64]:
@@ -54,7 +43,8 @@ def main(workspace: Path, room: Path) -> None:
     poses = load_poses(room / "traj.txt")
     true = np.stack([poses[int(Path(view.name).stem)][:3, 3] for view in scene.train])
     ours = np.stack([view.camera.center for view in scene.train])
-    scale, R, t = similarity(true, ours)
+    scale, motion = similarity(true, ours)
+    R, t = motion[:3, :3], motion[:3, 3]
     error = np.linalg.norm(ours - (scale * true @ R.T + t), axis=1) / scale
     click.echo(f"{len(ours)} cameras, centre RMSE {100 * np.sqrt((error**2).mean()):.2f} cm, "
                f"largest {100 * error.max():.2f} cm")
