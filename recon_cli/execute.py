@@ -183,7 +183,6 @@ def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageC
     threads = job.compute.threads or machine.usable_threads()
     if not row.renders:
         return StageContext(progress=job.progress, threads=threads, record=record)
-    machine.share_cores()
     # Importing torch takes seconds, which status and --help must not pay.
     import torch  # noqa: PLC0415
 

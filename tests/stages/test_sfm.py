@@ -4,21 +4,18 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 import psutil
 import pytest
+from sfm_inputs import run, write_inputs
 
-from recon_cli.capture.frames import Frame, FrameList, read_png, write_png
-from recon_cli.config import SfmConfig
-from recon_cli.errors import FormatError, SfmError
+from recon_cli.capture.frames import read_png
+from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images, read_scene
 from recon_cli.mapping import database
-from recon_cli.stages import sfm
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages.context import StageContext
 
 STEP, COUNT = 4, 12  # every 4th frame of the sample: few, and each still overlaps the next
 BLANK = "000099.png"  # a grey frame, held out, that can find no camera
@@ -26,7 +23,7 @@ FILTERED = "000012.png"  # the one frame whose denoised twin differs
 FEATURES = 2048
 MODEL = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 
-# A parent of its own, to be killed: run.py FOLDER OUT
+# A parent of its own, to be killed; its arguments: inputs, output, features.
 RUN = """
 import sys
 from pathlib import Path
@@ -38,27 +35,6 @@ sfm.run(SfmConfig(max_features=int(sys.argv[3])),
         StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"}), Path(sys.argv[2]),
         StageContext(threads=2))
 """
-
-
-def write_inputs(base, images, *, filtered=(), held_out=()):
-    """Writes the finished folders of ingest and denoise; `images` maps names to RGB pixels."""
-    for stage in ("ingest", "denoise"):
-        (base / stage / "frames").mkdir(parents=True)
-    for name, rgb in images.items():
-        write_png(base / "ingest" / "frames" / name, rgb)
-        twin = cv2.GaussianBlur(rgb, (0, 0), 2) if name in filtered else rgb
-        write_png(base / "denoise" / "frames" / name, np.asarray(twin))
-    height, width = next(iter(images.values())).shape[:2]
-    FrameList("video", width, height, None, tuple(
-        Frame(name, None, "room.mp4", None, name in held_out) for name in sorted(images)
-    )).write(base / "ingest")
-    return base
-
-
-def run(base, out, *, ctx=None, **options):
-    out.mkdir(exist_ok=True)
-    inputs = StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"})
-    return sfm.run(SfmConfig(**options), inputs, out, ctx or StageContext(threads=2))
 
 
 def workers():
@@ -271,85 +247,3 @@ def test_an_interrupt_ends_the_mapping_process_and_goes_on(room, tmp_path):
         run(room, tmp_path / "out", ctx=StageContext(record=interrupt))
     assert not workers()
     assert not (tmp_path / "out" / "job.json").exists()
-
-
-def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
-    grey = {f"{index:06d}.png": np.full((120, 160, 3), 90, np.uint8) for index in range(5)}
-    with pytest.raises(SfmError, match="No features: 0 of 5 frames"):
-        run(write_inputs(tmp_path, grey), tmp_path / "out")
-
-
-def texture(height, width, seed):
-    """Noise on five scales, full of keypoints, [H, W, 3]."""
-    noise = np.random.default_rng(seed)
-    total = sum(
-        scale**0.5 * cv2.resize(
-            noise.normal(size=(height // scale, width // scale, 3)), (width, height),
-            interpolation=cv2.INTER_CUBIC)
-        for scale in (2, 4, 8, 16, 32))
-    return np.asarray(255 * (total - total.min()) / np.ptp(total), np.uint8)
-
-
-def turning(count):
-    """Frames of a camera that turns on the spot: one textured picture through homographies."""
-    sky = texture(600, 1200, 0)
-    inner = np.array([[250, 0, 120], [0, 250, 90], [0, 0, 1.0]])
-    outer = np.array([[250, 0, 600], [0, 250, 300], [0, 0, 1.0]])
-    frames = {}
-    for index, angle in enumerate(np.linspace(-0.5, 0.5, count)):
-        turn, _ = cv2.Rodrigues(np.array([0.1 * np.sin(index), angle, 0]))
-        frames[f"{index:06d}.png"] = np.asarray(cv2.warpPerspective(
-            sky, outer @ turn @ np.linalg.inv(inner), (240, 180),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
-    return frames
-
-
-def test_a_camera_that_turns_on_the_spot_is_not_taken_for_a_success(tmp_path):
-    with pytest.raises(SfmError, match="The camera did not move"):
-        run(write_inputs(tmp_path, turning(12)), tmp_path / "out", max_minutes=1.0)
-    assert not (tmp_path / "out" / "sparse").exists()
-
-
-def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):
-    images = {f"{seed}.png": texture(180, 240, seed) for seed in range(4)}
-    with pytest.raises(SfmError, match="No two frames show the same things"):
-        run(write_inputs(tmp_path, images), tmp_path / "out", max_minutes=1.0)
-
-
-def test_a_missing_twin_is_found_before_anything_is_done(tmp_path):
-    base = write_inputs(
-        tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
-    (base / "denoise" / "frames" / "1.png").unlink()
-    with pytest.raises(FormatError, match=r"lacks 1 of 3 frames: 1\.png") as caught:
-        run(base, tmp_path / "out")
-    assert "recon denoise" in caught.value.hint
-    assert not (tmp_path / "out" / "log.txt").exists()
-
-
-def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
-    base = write_inputs(
-        tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
-    (base / "ingest" / "frames" / "2.png").write_bytes(b"no picture")
-    with pytest.raises(FormatError, match=r"1 of 3 frames cannot be read .* 2\.png"):
-        run(base, tmp_path / "out")
-
-
-def test_models_that_are_left_aside_are_told(caplog):
-    summary = {
-        "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
-        "unregistered_held_out": ["3.png"], "models": [49, 28, 3],
-    }
-    sfm._report(summary, StageContext())
-    told = caplog.text
-    assert "11 of 60 frames have no camera" in told
-    assert "and 6 more" in told
-    assert "1 of them were held out and so cannot be scored: 3.png" in told
-    assert "of 49 frames, is kept; others of 28, 3 frames are left aside" in told
-
-
-def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    grey = {f"{index}.png": np.full((60, 80, 3), 90, np.uint8) for index in range(3)}
-    write_inputs(Path("in"), grey)
-    with pytest.raises(SfmError, match="No features"):
-        run(Path("in"), Path("out"))

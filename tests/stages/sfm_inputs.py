@@ -1,0 +1,55 @@
+"""What sfm reads, made on the spot, and frames that defeat it."""
+
+import cv2
+import numpy as np
+
+from recon_cli.capture.frames import Frame, FrameList, write_png
+from recon_cli.config import SfmConfig
+from recon_cli.stages import sfm
+from recon_cli.stages.context import StageContext, StageInputs
+
+
+def write_inputs(base, images, *, filtered=(), held_out=()):
+    """Writes the finished folders of ingest and denoise; `images` maps names to RGB pixels."""
+    for stage in ("ingest", "denoise"):
+        (base / stage / "frames").mkdir(parents=True)
+    for name, rgb in images.items():
+        write_png(base / "ingest" / "frames" / name, rgb)
+        twin = cv2.GaussianBlur(rgb, (0, 0), 2) if name in filtered else rgb
+        write_png(base / "denoise" / "frames" / name, np.asarray(twin))
+    height, width = next(iter(images.values())).shape[:2]
+    FrameList("video", width, height, None, tuple(
+        Frame(name, None, "room.mp4", None, name in held_out) for name in sorted(images)
+    )).write(base / "ingest")
+    return base
+
+
+def run(base, out, *, ctx=None, **options):
+    out.mkdir(exist_ok=True)
+    inputs = StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"})
+    return sfm.run(SfmConfig(**options), inputs, out, ctx or StageContext(threads=2))
+
+
+def texture(height, width, seed):
+    """Noise on five scales, full of keypoints, [H, W, 3]."""
+    noise = np.random.default_rng(seed)
+    total = sum(
+        scale**0.5 * cv2.resize(
+            noise.normal(size=(height // scale, width // scale, 3)), (width, height),
+            interpolation=cv2.INTER_CUBIC)
+        for scale in (2, 4, 8, 16, 32))
+    return np.asarray(255 * (total - total.min()) / np.ptp(total), np.uint8)
+
+
+def turning(count):
+    """Frames of a camera that turns on the spot: one textured picture through homographies."""
+    sky = texture(600, 1200, 0)
+    inner = np.array([[250, 0, 120], [0, 250, 90], [0, 0, 1.0]])
+    outer = np.array([[250, 0, 600], [0, 250, 300], [0, 0, 1.0]])
+    frames = {}
+    for index, angle in enumerate(np.linspace(-0.5, 0.5, count)):
+        turn, _ = cv2.Rodrigues(np.array([0.1 * np.sin(index), angle, 0]))
+        frames[f"{index:06d}.png"] = np.asarray(cv2.warpPerspective(
+            sky, outer @ turn @ np.linalg.inv(inner), (240, 180),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+    return frames

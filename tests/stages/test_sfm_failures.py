@@ -1,0 +1,73 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sfm_inputs import run, texture, turning, write_inputs
+
+from recon_cli.errors import FormatError, SfmError
+from recon_cli.mapping import database
+from recon_cli.stages import sfm
+from recon_cli.stages.context import StageContext
+
+
+def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
+    grey = {f"{index:06d}.png": np.full((120, 160, 3), 90, np.uint8) for index in range(5)}
+    with pytest.raises(SfmError, match="No features: 0 of 5 frames"):
+        run(write_inputs(tmp_path, grey), tmp_path / "out")
+
+
+@pytest.mark.parametrize(("pairs", "count"), [
+    ("exhaustive", 66),
+    ("sequential", 65),  # all but the first with the last: neighbours reach 10 frames far
+])
+def test_a_camera_that_turns_on_the_spot_is_not_taken_for_a_success(tmp_path, pairs, count):
+    out = tmp_path / "out"
+    with pytest.raises(SfmError, match="The camera did not move"):
+        run(write_inputs(tmp_path, turning(12)), out, pairs=pairs, max_minutes=1.0)
+    assert not (out / "sparse").exists()
+    assert database.progress(out / "database.db", "matches") == count
+
+
+def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):
+    images = {f"{seed}.png": texture(180, 240, seed) for seed in range(4)}
+    with pytest.raises(SfmError, match="No two frames show the same things"):
+        run(write_inputs(tmp_path, images), tmp_path / "out", max_minutes=1.0)
+
+
+def test_a_missing_twin_is_found_before_anything_is_done(tmp_path):
+    base = write_inputs(
+        tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
+    (base / "denoise" / "frames" / "1.png").unlink()
+    with pytest.raises(FormatError, match=r"lacks 1 of 3 frames: 1\.png") as caught:
+        run(base, tmp_path / "out")
+    assert "recon denoise" in caught.value.hint
+    assert not (tmp_path / "out" / "log.txt").exists()
+
+
+def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
+    base = write_inputs(
+        tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
+    (base / "ingest" / "frames" / "2.png").write_bytes(b"no picture")
+    with pytest.raises(FormatError, match=r"1 of 3 frames cannot be read .* 2\.png"):
+        run(base, tmp_path / "out")
+
+
+def test_models_that_are_left_aside_are_told(caplog):
+    summary = {
+        "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
+        "unregistered_held_out": ["3.png"], "models": [49, 28, 3],
+    }
+    sfm._report(summary, StageContext())
+    told = caplog.text
+    assert "11 of 60 frames have no camera" in told
+    assert "and 6 more" in told
+    assert "1 of them were held out and so cannot be scored: 3.png" in told
+    assert "of 49 frames, is kept; others of 28, 3 frames are left aside" in told
+
+
+def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    grey = {f"{index}.png": np.full((60, 80, 3), 90, np.uint8) for index in range(3)}
+    write_inputs(Path("in"), grey)
+    with pytest.raises(SfmError, match="No features"):
+        run(Path("in"), Path("out"))
