@@ -1,0 +1,59 @@
+"""Small videos and photos, and how the tests of ingest run the stage on them."""
+
+import json
+
+import av
+import numpy as np
+from PIL import Image
+
+from recon_cli.config import IngestConfig
+from recon_cli.stages import ingest
+from recon_cli.stages.context import StageContext, StageInputs
+
+
+def take(source, out, *, config=None, threads=2, record=None):
+    out.mkdir(parents=True, exist_ok=True)
+    ctx = StageContext(threads=threads, **({"record": record} if record else {}))
+    sources = source if isinstance(source, tuple) else (source,)
+    return ingest.run(config or IngestConfig(), StageInputs(sources=sources), out, ctx)
+
+
+def listed(out):
+    return json.loads((out / "frames.json").read_text())
+
+
+def files(out):
+    """Every file of a folder with its bytes."""
+    return {
+        str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def blocks(height, width, seed=0):
+    colours = np.random.default_rng(seed).integers(30, 226, (height // 4, width // 4, 3))
+    return np.kron(colours, np.ones((4, 4, 1), int)).astype(np.uint8)
+
+
+def write_video(path, frames, *, options=None):
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.options = {"qp": "10", **(options or {})}
+        images = (av.VideoFrame.from_ndarray(np.ascontiguousarray(f), "rgb24") for f in frames)
+        for image in [*images, None]:
+            for packet in stream.encode(image):
+                container.mux(packet)
+    return path
+
+
+def walk(frames, step=4, height=96, width=128):
+    wide = blocks(height, width + frames * step)
+    return [wide[:, i * step:i * step + width] for i in range(frames)]
+
+
+def write_photos(folder, count, *, size=(64, 48), suffix=".jpg"):
+    folder.mkdir(exist_ok=True)
+    for index in range(count):
+        rgb = blocks(size[1], size[0], seed=index)
+        Image.fromarray(rgb).save(folder / f"IMG_{index:04d}{suffix}")
+    return folder

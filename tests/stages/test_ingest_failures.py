@@ -1,0 +1,174 @@
+"""ingest on captures that are damaged, too small, or not captures at all."""
+
+import errno
+import logging
+import os
+
+import numpy as np
+import pytest
+from ingest_media import blocks, files, listed, take, walk, write_photos, write_video
+from PIL import Image
+
+from recon_cli.capture import frames as store
+from recon_cli.errors import InputError
+
+
+@pytest.fixture
+def video(tmp_path):
+    return write_video(tmp_path / "walk.mp4", walk(40))
+
+
+@pytest.fixture
+def notices(caplog):
+    caplog.set_level(logging.WARNING, logger="recon")
+    return lambda: [record.getMessage() for record in caplog.records]
+
+
+def test_a_video_cut_off_goes_on_with_what_is_left(video, tmp_path, notices):
+    data = video.read_bytes()
+    video.write_bytes(data[:len(data) // 2])
+    summary = take(video, tmp_path / "out")
+    assert summary["declared_frames"] == 40
+    assert 3 <= summary["decoded_frames"] < 40
+    assert summary["lost_frames"] == 40 - summary["decoded_frames"]
+    assert len(notices()) == 1
+    assert f"{summary['lost_frames']} of 40 frames are lost" in notices()[0]
+
+
+@pytest.mark.parametrize("filler", [b"\0", b"\xa5"])
+def test_a_video_corrupted_in_the_middle_goes_on_around_the_damage(
+        tmp_path, notices, filler):
+    video = write_video(
+        tmp_path / "walk.mp4", walk(60), options={"g": "10", "sc_threshold": "0"})
+    data = bytearray(video.read_bytes())
+    middle = len(data) // 2
+    data[middle:middle + 1500] = filler * 1500
+    video.write_bytes(data)
+    summary = take(video, tmp_path / "out")
+    assert 1 <= summary["lost_frames"] <= 20  # at most the two groups that the hole may touch
+    assert summary["decoded_frames"] == 60 - summary["lost_frames"]
+    assert f"{summary['lost_frames']} of 60 frames are lost" in notices()[0]
+    for frame in listed(tmp_path / "out")["frames"]:
+        rgb = store.read_png(tmp_path / "out" / "frames" / frame["name"])
+        truth = walk(60)[int(frame["time_seconds"] * 10 + 0.5)].astype(float)
+        assert np.abs(rgb - truth).mean() < 12
+
+
+def test_a_video_that_lost_nearly_all_is_refused(tmp_path):
+    video = write_video(tmp_path / "walk.mp4", walk(40))
+    data = bytearray(video.read_bytes())
+    start = data.index(b"mdat") + 2000
+    data[start:] = bytes(len(data) - start)
+    video.write_bytes(data)
+    with pytest.raises(InputError, match=r"whole frames of 40|No frame"):
+        take(video, tmp_path / "out")
+
+
+def test_a_video_cut_off_before_its_index_is_refused(tmp_path, sample_video):
+    data = sample_video.read_bytes()
+    (tmp_path / "head.mp4").write_bytes(data[:1000])
+    with pytest.raises(InputError, match=r"cannot be read as a video|No frame"):
+        take(tmp_path / "head.mp4", tmp_path / "out")
+
+
+def test_a_video_of_two_frames_is_refused(tmp_path):
+    video = write_video(tmp_path / "short.mp4", walk(2))
+    with pytest.raises(InputError, match="2 whole frames of 2, but at least 3"):
+        take(video, tmp_path / "out")
+
+
+def test_a_source_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"room\.mp4 does not exist"):
+        take(tmp_path / "room.mp4", tmp_path / "out")
+
+
+def test_several_sources_are_refused_for_now(video, tmp_path):
+    with pytest.raises(InputError, match="2 sources were given, but one is taken for now"):
+        take((video, video), tmp_path / "out")
+
+
+def test_text_named_like_a_video_is_refused(tmp_path):
+    (tmp_path / "room.mp4").write_text("this is not a video\n" * 50)
+    with pytest.raises(InputError, match="cannot be read as a video"):
+        take(tmp_path / "room.mp4", tmp_path / "out")
+
+
+def test_an_empty_file_is_refused(tmp_path):
+    (tmp_path / "room.mp4").touch()
+    with pytest.raises(InputError, match="is empty"):
+        take(tmp_path / "room.mp4", tmp_path / "out")
+
+
+def test_one_photo_is_refused(tmp_path):
+    folder = write_photos(tmp_path / "room", 1)
+    with pytest.raises(InputError, match="single picture"):
+        take(folder / "IMG_0000.jpg", tmp_path / "out")
+    with pytest.raises(InputError, match="1 photos"):
+        take(folder, tmp_path / "out")
+
+
+def test_a_folder_without_photos_is_refused(tmp_path):
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "notes.txt").write_text("nothing")
+    with pytest.raises(InputError, match="0 photos, 0 more"):
+        take(tmp_path / "room", tmp_path / "out")
+
+
+def test_a_folder_of_unreadable_photos_is_refused(tmp_path):
+    (tmp_path / "room").mkdir()
+    for index in range(5):
+        (tmp_path / "room" / f"{index}.jpg").write_bytes(b"\xff\xd8 broken")
+    with pytest.raises(InputError, match=r"5 more.*0\.jpg cannot be read"):
+        take(tmp_path / "room", tmp_path / "out")
+
+
+def test_half_a_jpeg_among_good_photos_is_left_out_and_named(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 6)
+    half = folder / "IMG_0002.jpg"
+    half.write_bytes(half.read_bytes()[:half.stat().st_size // 2])
+    (folder / "IMG_0007.jpg").write_bytes(b"no photo at all")
+    summary = take(folder, tmp_path / "out")
+    assert (summary["frames"], summary["lost_frames"]) == (5, 2)
+    assert summary["skipped"] == ["IMG_0002.jpg", "IMG_0007.jpg"]
+    assert not (tmp_path / "out" / "frames" / "IMG_0002.png").exists()
+    assert sum("IMG_0002.jpg" in text for text in notices()) == 1
+    assert sum("IMG_0007.jpg" in text for text in notices()) == 1
+
+
+def test_too_few_photos_that_are_whole_are_refused(tmp_path):
+    folder = write_photos(tmp_path / "room", 4)
+    for path in sorted(folder.iterdir())[:2]:
+        path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+    with pytest.raises(InputError, match="2 photos, 2 more"):
+        take(folder, tmp_path / "out")
+
+
+def test_photos_of_mixed_sizes_are_refused_with_the_sizes(tmp_path):
+    folder = write_photos(tmp_path / "room", 4)
+    Image.fromarray(blocks(64, 48)).save(folder / "IMG_0009.jpg")
+    with pytest.raises(InputError, match="4 of 64x48, 1 of 48x64"):
+        take(folder, tmp_path / "out")
+
+
+@pytest.mark.parametrize("kind", ["video", "photos"])
+def test_a_full_disk_leaves_no_half_written_frame(video, tmp_path, monkeypatch, kind):
+    source = video if kind == "video" else write_photos(tmp_path / "room", 5)
+    flush, calls = os.fsync, []
+
+    def full(descriptor):
+        calls.append(descriptor)
+        if len(calls) > 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        flush(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        take(source, tmp_path / "out")
+    left = sorted((tmp_path / "out" / "frames").iterdir())
+    assert 0 < len(left) <= 3
+    for path in left:
+        store.read_png(path)
+    monkeypatch.setattr(os, "fsync", flush)
+    take(source, tmp_path / "out")
+    take(source, tmp_path / "undisturbed")
+    assert files(tmp_path / "out") == files(tmp_path / "undisturbed")
