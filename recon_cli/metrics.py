@@ -14,7 +14,7 @@ from skimage.metrics import structural_similarity
 PSNR_CONVENTION = "mean of per-image dB, float render clamped to [0, 1] against 8-bit truth"
 SSIM_CONVENTION = (
     "scikit-image: 11x11 Gaussian window, sigma 1.5, 5 px border cropped, mean of channels")
-_MIN_SIDE = 11  # pixels; the window of SSIM
+MIN_SIDE = 11  # pixels; the window of SSIM
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ViewScore:
     Attributes:
         name: of the view.
         psnr_db: peak signal-to-noise ratio in dB.
-        ssim: structural similarity; NaN where the image is smaller than the window.
+        ssim: structural similarity.
     """
 
     name: str
@@ -79,8 +79,8 @@ def ssim(image: NDArray[np.float32], truth: NDArray[np.uint8]) -> float:
     Raises:
         ValueError: the image is smaller than the 11-pixel window.
     """
-    if min(truth.shape[:2]) < _MIN_SIDE:
-        raise ValueError(f"SSIM needs {_MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
+    if min(truth.shape[:2]) < MIN_SIDE:
+        raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
     value: float = structural_similarity(
         np.clip(image, 0, 1).astype(np.float64), truth / 255.0, gaussian_weights=True, sigma=1.5,
         use_sample_covariance=False, data_range=1.0, channel_axis=-1)

@@ -72,9 +72,8 @@ def read_scene(
         views.append(view)
     points, colors = read_points(undistorted / "sparse" / "points3D.bin")
     train, chosen, test = split_views(views, held_out, validation=validation)
-    if not train or not len(points):
-        raise _damaged(
-            undistorted / "sparse", f"{len(train)} views to train on and {len(points)} points")
+    if not views or not len(points):
+        raise _damaged(undistorted / "sparse", f"{len(views)} views and {len(points)} points")
     missing = sorted(held_out - {view.name for view in views})
     return Scene(train, chosen, test, tuple(missing), points, colors)
 

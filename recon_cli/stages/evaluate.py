@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from recon_cli.atomic import write_bytes, write_json
 from recon_cli.config import EvaluateConfig
-from recon_cli.errors import ReconstructionError
+from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.io.images import fitted_camera, read_image, write_png
 from recon_cli.io.ply import read_ply
 from recon_cli.metrics import (
+    MIN_SIDE,
     PSNR_CONVENTION,
     SSIM_CONVENTION,
     ModelScore,
@@ -87,6 +88,11 @@ def _truths(scene: Scene, max_size: int) -> list[_Truth]:
     truths = []
     for view in scene.test:
         camera = fitted_camera(view.camera, max_size)
+        if min(camera.width, camera.height) < MIN_SIDE:
+            raise ConfigError(
+                f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
+                f"needs {MIN_SIDE} pixels a side.",
+                hint="Run `recon eval` with a larger --max-size.")
         truths.append(_Truth(
             view.name, camera, read_image(view.original, camera.width, camera.height)))
     return truths

@@ -14,6 +14,7 @@ import torch
 from recon_cli.atomic import read_json, write_bytes
 from recon_cli.capture.frames import read_frame_list
 from recon_cli.config import TrainConfig
+from recon_cli.errors import TrainingError
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_image
 from recon_cli.scene import Scene, View
@@ -39,7 +40,16 @@ def load_scene(inputs: StageInputs, *, validation: float) -> Scene:
 
 
 def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
-    """Returns the training task at the training size, images in memory as uint8."""
+    """Returns the training task at the training size, images in memory as uint8.
+
+    Raises:
+        TrainingError: fewer than two views are left to train on.
+    """
+    if len(scene.train) < 2:
+        raise TrainingError(
+            f"{len(scene.train)} views are left to train on; at least 2 are needed.",
+            hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
+
     def views(chosen: Sequence[View]) -> list[TrainView]:
         loaded = []
         for view in chosen:

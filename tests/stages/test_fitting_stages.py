@@ -14,7 +14,13 @@ import torch
 from tiny_scene import VIEWS, make_inputs
 
 from recon_cli.config import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
-from recon_cli.errors import FormatError, ReconstructionError, StageError
+from recon_cli.errors import (
+    ConfigError,
+    FormatError,
+    ReconstructionError,
+    StageError,
+    TrainingError,
+)
 from recon_cli.io.images import read_image
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.metrics import psnr, ssim
@@ -233,16 +239,33 @@ def test_a_held_out_frame_without_a_camera_is_named(inputs, tmp_path, caplog):
     assert "999999.png" in caplog.text
 
 
+def test_views_too_small_to_score_are_a_usage_error(inputs, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate, "MIN_SIDE", 13)  # 16 pixels wide are 12 high here
+    with pytest.raises(ConfigError, match="16x12 pixels are too small") as caught:
+        run(evaluate, EvaluateConfig(max_size=16), inputs, tmp_path / "out")
+    assert "--max-size" in caught.value.hint
+
+
+def test_nothing_to_train_on_is_an_error(inputs, tmp_path):
+    with pytest.raises(TrainingError, match="0 views"):
+        run(train, CONFIG, holding_out(inputs, tmp_path, held_out=True), tmp_path / "out")
+
+
 def test_nothing_to_score_on_is_an_error(inputs, tmp_path):
+    with pytest.raises(ReconstructionError, match="No held-out view"):
+        run(evaluate, EvaluateConfig(), holding_out(inputs, tmp_path, held_out=False),
+            tmp_path / "out")
+
+
+def holding_out(inputs, tmp_path, *, held_out):
+    """The same inputs with every view held out, or none."""
     folder = tmp_path / "ingest"
     shutil.copytree(inputs.folders["ingest"], folder)
     frames = json.loads((folder / "frames.json").read_text())
     for frame in frames["frames"]:
-        frame["held_out"] = False
+        frame["held_out"] = held_out
     (folder / "frames.json").write_text(json.dumps(frames))
-    with pytest.raises(ReconstructionError, match="No held-out view"):
-        run(evaluate, EvaluateConfig(), StageInputs({**inputs.folders, "ingest": folder}),
-            tmp_path / "out")
+    return StageInputs({**inputs.folders, "ingest": folder})
 
 
 def test_export_hands_out_the_pruned_model_where_there_is_one(inputs, tmp_path):
