@@ -184,12 +184,15 @@ def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageC
     if not row.renders:
         return StageContext(progress=job.progress, threads=threads, record=record)
     # Importing torch takes seconds, which status and --help must not pay.
-    import torch  # noqa: PLC0415
-
     from recon_cli.render import registry  # noqa: PLC0415
 
-    torch.set_num_threads(threads)
     backend, device = registry.resolve(job.compute.backend, job.compute.device)
+    registry.use_threads(backend, threads)
+    count = registry.kernels_to_compile(backend)
+    if count:
+        with job.progress.bar("compile for this CPU, once", count, unit="kernel") as bar:
+            seconds = registry.prepare(backend, bar.advance)
+        logger.info("kernels compiled in %.1f s", seconds)
     return StageContext(job.progress, device, backend, threads, record)
 
 

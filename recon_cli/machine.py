@@ -15,6 +15,7 @@ _PACKAGES = {
     "torch": "torch",
     "pycolmap": "pycolmap",
     "opencv": "opencv-contrib-python-headless",
+    "numba": "numba",
     "numpy": "numpy",
     "av": "av",
     "rawpy": "rawpy",

@@ -47,13 +47,18 @@ ALLOWED: dict[str, set[str]] = {
     "doctor": {"errors", "machine", "render"},
     "report": {"doctor", "pipeline"},
     "options": OPTIONS | {"settings"},
+    "bench": BOTTOM | OPTIONS | {
+        "settings", "options", "machine", "progress", "scene", "render", "train"},
     "cli": OPTIONS | {
         "settings", "options", "pipeline", "cleaning", "report", "doctor", "console", "progress",
-        "stages", "workspace"},
+        "stages", "workspace", "bench"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "options"},
+    "click": {"cli", "options", "bench"},
+    "matplotlib": {"bench"},
+    "numba": {"render"},
+    "llvmlite": {"render"},
     "tqdm": {"progress"},
     "pycolmap": {"mapping", "io"},
 }

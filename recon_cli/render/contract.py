@@ -25,6 +25,25 @@ DILATION = 0.3  # pixels^2 added to the projected covariance: the low-pass filte
 NEAR = 0.05  # world units; COLMAP's scenes measure about ten units across
 
 
+@dataclass(frozen=True)
+class Approximation:
+    """Where a picture may be cheaper than exact. The defaults are the contract.
+
+    Attributes:
+        alpha_min: fragments below this alpha are dropped.
+        transmittance_min: a pixel stops before it would fall below this; 0 never stops.
+        square: tiles are chosen by the square around three standard deviations of the longer
+            axis, as INRIA's rasterizer does, and not by the ellipse.
+    """
+
+    alpha_min: float = ALPHA_MIN
+    transmittance_min: float = TRANSMITTANCE_MIN
+    square: bool = False
+
+
+EXACT = Approximation()
+
+
 @dataclass(eq=False)
 class Statistics:
     """What densification and pruning need, gathered by the same passes that render.
@@ -37,15 +56,25 @@ class Statistics:
         blend_max: [N] greatest alpha T over the pixels.
         means2d_grad: [N, 2] gradient of the loss with respect to the projected mean, per pixel;
             zeros until backward() has run.
+        absolute_grad: [N, 2] the same with the magnitude of each pixel's part; zeros until
+            backward() has run.
+        variance: [N] sum s^2 - (sum s)^2 / n over the n pixels of the Gaussian, with
+            s = o dL/do = alpha dL/dalpha; zeros until backward() has run.
         loo: [N] sum over pixels of ||alpha T (c - B)||^2, B the colour composited behind: the
             squared error that removing this one Gaussian causes; zeros until backward() has run.
+        broken: how many Gaussians were culled because a value in use is not finite, or is projected
+            to one that is not; at degree d the values in use of sh_rest are its first (d+1)^2 - 1
+            rows. Those that lie behind the camera or beside the image anyway need not be counted.
     """
 
     radii: Tensor
     hits: Tensor
     blend_max: Tensor
     means2d_grad: Tensor
+    absolute_grad: Tensor
+    variance: Tensor
     loo: Tensor
+    broken: int = 0
 
     @staticmethod
     def zeros(like: Tensor) -> Statistics:
@@ -56,6 +85,8 @@ class Statistics:
             hits=like.new_zeros(n, dtype=torch.int64),
             blend_max=like.new_zeros(n),
             means2d_grad=like.new_zeros(n, 2),
+            absolute_grad=like.new_zeros(n, 2),
+            variance=like.new_zeros(n),
             loo=like.new_zeros(n),
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -34,7 +35,7 @@ class BackendStatus:
 def available_backends() -> tuple[BackendStatus, ...]:
     """Returns every known backend, fastest first, each with the reason if it cannot run."""
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
-    return (BackendStatus("torch", devices),)
+    return (BackendStatus("numba", ("cpu",)), BackendStatus("torch", devices))
 
 
 def resolve(backend: str, device: str) -> tuple[str, str]:
@@ -64,12 +65,50 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
     return backend, chosen_device
 
 
+def use_threads(backend: str, threads: int) -> None:
+    """Lets a backend compute with `threads` CPU threads from now on."""
+    if backend == "numba":
+        from recon_cli.render.numba.crew import crew
+
+        crew.threads = threads
+        # torch's own threads spin after each operation and would take the cores from the kernels
+        threads = 1
+    torch.set_num_threads(threads)
+
+
+def kernels_to_compile(backend: str) -> int:
+    """Returns how many kernels a backend must compile on this machine before its first picture."""
+    if backend != "numba":
+        return 0
+    from recon_cli.render.numba import warm
+
+    return 0 if warm.is_warm() else warm.KERNELS
+
+
+def prepare(backend: str, on_kernel: Callable[[], None]) -> float:
+    """Gets a backend ready and returns the seconds that it took.
+
+    Args:
+        backend: a name from `available_backends`.
+        on_kernel: called after each kernel.
+    """
+    if backend != "numba":
+        return 0.0
+    from recon_cli.render.numba import warm
+
+    return warm.warm_up(on_kernel)
+
+
 def renderer(backend: str) -> Renderer:
     """Returns the render function of a backend, imported only now."""
     if backend == "torch":
         from recon_cli.render.torch_tiles import render as torch_render
 
         return torch_render
+    if backend == "numba":
+        from recon_cli.render.numba.backend import render as numba_render
+
+        return numba_render
     raise BackendError(f"There is no backend {backend!r}.", hint="See recon doctor.")
 
 

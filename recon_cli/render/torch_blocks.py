@@ -17,7 +17,13 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.binning import Instances
-from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+from recon_cli.render.contract import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    DILATION,
+    TILE,
+    TRANSMITTANCE_MIN,
+)
 
 DEPTH = 32  # Gaussians a block: the triangular product costs DEPTH multiplications a pair
 PIXELS = TILE * TILE
@@ -210,11 +216,9 @@ def composite(
     return odds, after, torch.threshold_(live, _below(TRANSMITTANCE_MIN, alpha.dtype), 0.0)
 
 
-def gradients_of(moments: Tensor, affine: Tensor) -> Tensor:
-    """Returns gradients [n, K, 6] of mean x, y, covariance a, b, c and log-opacity.
+def whitened_moments(moments: Tensor, affine: Tensor) -> Tensor:
+    """Returns the sums [n, K, 6] of s times u, v, u^2, uv, v^2, 1, with s = alpha dL/dalpha.
 
-    With s = alpha dL/dalpha summed over pixels and d = pixel - mean: the inverse covariance is
-    L^T L and y = L^T (u, v). dL/dmean = sum s y, dL/dSigma = 1/2 sum s y y^T, dL/dlog o = sum s.
     `moments` are the sums of s times 1, x, y, x^2, xy, y^2 at offsets from the tile's centre.
     """
     s, sx, sy, sxx, sxy, syy = moments.double().unbind(-1)
@@ -224,9 +228,62 @@ def gradients_of(moments: Tensor, affine: Tensor) -> Tensor:
     uu = u0 * (u + ux * sx + uy * sy) + ux * ux * sxx + 2 * ux * uy * sxy + uy * uy * syy
     uv = u0 * v + v0 * (ux * sx + uy * sy) + vy * (ux * sxy + uy * syy)
     vv = v0 * (v + vy * sy) + vy * vy * syy
-    l11, l12, l22 = ux, uy, vy
-    xx = l11 * l11 * uu
-    xy = l11 * (l12 * uu + l22 * uv)
-    yy = l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv
-    # b stands for both off-diagonal entries, hence no factor 1/2
-    return torch.stack([l11 * u, l12 * u + l22 * v, xx / 2, xy, yy / 2, s], dim=-1)
+    return torch.stack([u, v, uu, uv, vv, s], dim=-1)
+
+
+def gradients_of(
+    sums: Tensor,  # [M, 5] u, v, uu, uv, vv
+    whitening: Tensor,  # [M, 3]
+    directions: Tensor,  # [M, 2, 3]
+    log_scales: Tensor,  # [M, 3]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns the gradients of means2d [M, 2], directions [M, 2, 3] and log_scales [M, 3].
+
+    With d = pixel - mean the inverse covariance is L^T L, and y = L^T (u, v) = Sigma^-1 d. So
+    dL/dmean = sum s y, and as dL/dSigma = 1/2 sum s y y^T and Sigma = V V^T + 0.3 I,
+
+        dL/dV = L^T M P,   dL/dlog s = diag(P^T M P),   M = sum s (u, v)(u, v)^T,   P = L V.
+
+    P is of order one. By way of dL/dSigma the long axis of a needle would get its gradient as what
+    is left of terms that are larger by the square of its length in pixels.
+    """
+    u, v, uu, uv, vv = sums.double().unbind(-1)
+    l11, l12, l22 = whitening.unbind(-1)
+    scales = log_scales.double().exp()[:, None]
+    vx, vy = (directions.double() * scales).unbind(1)
+    # vx - b/c vy = (0.3 vx + vy x (vx x vy)) / c, in which no long terms cancel
+    c = (vy * vy).sum(-1) + DILATION
+    across = DILATION * vx + torch.linalg.cross(vy, torch.linalg.cross(vx, vy))
+    p, q = (l11 / c)[:, None] * across, l22[:, None] * vy  # the rows of P
+    e = uu[:, None] * p + uv[:, None] * q
+    f = uv[:, None] * p + vv[:, None] * q
+    pull = torch.stack([l11[:, None] * e, l12[:, None] * e + l22[:, None] * f], dim=1)
+    return torch.stack([l11 * u, l12 * u + l22 * v], dim=-1), pull * scales, e * p + f * q
+
+
+def spread_of(
+    slope: Tensor, weights: Tensor, affine: Tensor, monomials: Tensor, scratch: Scratch
+) -> Tensor:
+    """Returns [n, K, 4]: sum |s y| along x and y, sum s^2, and the number of fragments.
+
+    As in `gradients_of`, s y is a pixel's part of the gradient with respect to the mean.
+
+    Args:
+        slope: [n, K, 256] s = alpha dL/dalpha.
+        weights: [n, K, 256] alpha T, positive where there is a fragment.
+        affine: [n, K, 5] of `whitening_of`.
+        monomials: [3, 256] 1, x, y at the pixels.
+        scratch: its buffer "q" is overwritten.
+    """
+    n, k, pixels = slope.shape
+    _, l11, l12, v0, l22 = affine.unbind(-1)
+    along_x = l11[..., None] * affine[..., :3]
+    along_y = l12[..., None] * affine[..., :3]
+    along_y += l22[..., None] * torch.stack([v0, torch.zeros_like(v0), l22], dim=-1)
+    totals = []
+    for along in (along_x, along_y):
+        part = torch.mm(along.reshape(n * k, 3).to(slope.dtype), monomials,
+                        out=scratch.take("q", (n * k, pixels)))
+        totals.append(part.mul_(slope.view(n * k, pixels)).abs_().sum(-1).view(n, k))
+    squares = torch.linalg.vector_norm(slope, dim=-1).square()
+    return torch.stack([*totals, squares, (weights > 0).sum(-1).to(slope.dtype)], dim=-1)

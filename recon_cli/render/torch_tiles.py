@@ -27,6 +27,8 @@ from recon_cli.render.torch_blocks import (
     composite,
     gradients_of,
     pixel_monomials,
+    spread_of,
+    whitened_moments,
     whitening_of,
 )
 from recon_cli.scene.camera import Camera
@@ -41,6 +43,7 @@ def render(
     with torch.no_grad():
         instances = bin_to_tiles(projection, camera.width, camera.height)
         statistics = Statistics.zeros(splats.means)
+        statistics.broken = projection.broken
         a, b, c = projection.cov2d.unbind(-1)
         longest = (a + c) / 2 + (((a - c) / 2) ** 2 + b * b).sqrt()
         statistics.radii[projection.ids] = 3 * longest.sqrt()
@@ -48,8 +51,8 @@ def render(
     log_opacities = torch.nn.functional.logsigmoid(splats.logit_opacities[projection.ids])
     channels = torch.cat([projection.colors, projection.depths[:, None]], dim=-1)
     rgb, depth, alpha = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        projection.means2d, projection.cov2d, log_opacities, channels, background,
-        projection, instances, (camera.height, camera.width), statistics, scores)
+        projection.means2d, projection.directions, projection.log_scales, log_opacities, channels,
+        background, projection, instances, (camera.height, camera.width), statistics, scores)
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
@@ -59,11 +62,11 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        means2d: Tensor, cov2d: Tensor, log_opacities: Tensor, channels: Tensor,
-        background: Tensor, projection: Projection, instances: Instances,
+        means2d: Tensor, directions: Tensor, log_scales: Tensor, log_opacities: Tensor,
+        channels: Tensor, background: Tensor, projection: Projection, instances: Instances,
         size: tuple[int, int], statistics: Statistics, scores: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        table = build_table(means2d, cov2d, projection.det, log_opacities, channels)
+        table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
         image = means2d.new_zeros(len(instances.counts), PIXELS, CHANNELS)
         # a pixel beyond the image is stopped from the start: it counts in no statistic
         transmittance = _to_tiles(means2d.new_ones(*size, 1), instances)[..., 0]
@@ -88,7 +91,8 @@ class _Rasterize(torch.autograd.Function):
         groups = [composite_group(tiles) for tiles in lists.groups()]
         if tally:
             tally.write(projection.ids, statistics)
-        ctx.save_for_backward(means2d, cov2d, log_opacities, channels, background, image)
+        ctx.save_for_backward(
+            means2d, directions, log_scales, log_opacities, channels, background, image)
         ctx.rest = projection, instances, statistics, scores, groups
         left = 1 - image[..., 4:]
         rgb = _to_image(image[..., :3] + left * background, instances, size)
@@ -99,9 +103,10 @@ class _Rasterize(torch.autograd.Function):
     def backward(
         ctx: Any, grad_rgb: Tensor, grad_depth: Tensor, grad_alpha: Tensor
     ) -> tuple[Tensor | None, ...]:
-        means2d, cov2d, log_opacities, channels, background, image = ctx.saved_tensors
+        means2d, directions, log_scales, log_opacities, channels, background, image = (
+            ctx.saved_tensors)
         projection, instances, statistics, scores, groups = ctx.rest
-        table = build_table(means2d, cov2d, projection.det, log_opacities, channels)
+        table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
         monomials, scratch = pixel_monomials(means2d), Scratch(means2d)
         grads = torch.cat([grad_rgb, grad_depth[..., None], grad_alpha[..., None]], dim=-1)
         grads = _to_tiles(grads, instances)
@@ -112,7 +117,7 @@ class _Rasterize(torch.autograd.Function):
         behind = means2d.new_zeros(len(instances.counts), PIXELS)  # sum of w (g . f) behind
         composited = left * background if scores else None  # colour behind, not divided by T
         features = means2d.new_zeros(len(instances.gaussians) + 1, CHANNELS + 6)
-        loo = means2d.new_zeros(len(instances.gaussians) + 1) if scores else None
+        scored = means2d.new_zeros(len(instances.gaussians) + 1, 5) if scores else None
         upper = means2d.new_ones(DEPTH, DEPTH).triu(1)
 
         def descend_group(blocks: list[Block]) -> None:
@@ -123,8 +128,8 @@ class _Rasterize(torch.autograd.Function):
                 odds, after, live = composite(alpha, block.before, scratch)
                 grad = grads[block.tiles]
                 used = table.channels[block.rows]
-                if composited is not None and loo is not None:
-                    loo[block.positions] = _leave_one_out(
+                if composited is not None and scored is not None:
+                    scored[block.positions, 4] = _leave_one_out(
                         used, odds, live, composited, block, upper[:k, :k])
                 shade = torch.bmm(
                     used, grad.transpose(1, 2), out=scratch.take("q", alpha.shape)).mul_(live)
@@ -139,19 +144,22 @@ class _Rasterize(torch.autograd.Function):
                 slope = later.sub_(shade).mul_(unclamped.div_(1 + unclamped))  # alpha dL/dalpha
                 features[block.positions, :CHANNELS] = odds.mul_(live) @ grad
                 moments = slope.view(n * k, PIXELS) @ monomials.T
-                features[block.positions, CHANNELS:] = gradients_of(
+                features[block.positions, CHANNELS:] = whitened_moments(
                     moments.view(n, k, 6), affine).to(means2d.dtype)
+                if scored is not None:
+                    scored[block.positions, :4] = spread_of(
+                        slope, odds, affine, monomials[:3], scratch)
 
         for blocks in groups:
             descend_group(blocks)
         per_gaussian = _reduce(features, instances)
-        if loo is not None:
-            statistics.loo[projection.ids] = _reduce(loo[:, None], instances)[:, 0]
-        statistics.means2d_grad[projection.ids] = per_gaussian[:, 5:7]
-        return (
-            per_gaussian[:, 5:7], per_gaussian[:, 7:10], per_gaussian[:, 10], per_gaussian[:, :4],
-            grad_background, None, None, None, None, None,
-        )
+        if scored is not None:
+            _write_scores(_reduce(scored, instances), per_gaussian, projection.ids, statistics)
+        shape = [gradient.to(means2d.dtype) for gradient in gradients_of(
+            per_gaussian[:, 5:10], table.whitening[:-1], directions, log_scales)]
+        statistics.means2d_grad[projection.ids] = shape[0]
+        return (*shape, per_gaussian[:, 10], per_gaussian[:, :4], grad_background,
+                None, None, None, None, None)
 
 
 def _leave_one_out(
@@ -170,6 +178,17 @@ def _leave_one_out(
         # `later` still counts what lies behind a stopped pixel; there the Gaussian is no part
         total += (((own - later) * odds) ** 2 * (live > 0)).sum(-1)
     return total
+
+
+def _write_scores(
+    scored: Tensor, per_gaussian: Tensor, ids: Tensor, statistics: Statistics
+) -> None:
+    """Writes the statistics of the backward pass from the sums [M, 5] of `spread_of` and loo."""
+    statistics.absolute_grad[ids] = scored[:, :2]
+    squares, count = scored[:, 2].double(), scored[:, 3].double().clamp_min(1)
+    variance = squares - per_gaussian[:, 10].double().square() / count
+    statistics.variance[ids] = variance.clamp_min(0).to(scored.dtype)
+    statistics.loo[ids] = scored[:, 4]
 
 
 class _Tally:

@@ -19,9 +19,10 @@ from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_image
 from recon_cli.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.train.fit import Report, Task, TrainView, fit
+from recon_cli.train.fit import Report, Task, fit
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
+from recon_cli.train.step import TrainView
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"

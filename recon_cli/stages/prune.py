@@ -28,6 +28,7 @@ from recon_cli.train.densify import Pull
 from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.importance import kept_rows, significance
 from recon_cli.train.state import TrainState, load_state
+from recon_cli.train.step import fuses
 
 _END_RECOVERY = 6  # the reference recovers for 5,000 steps after 30,000
 
@@ -39,12 +40,14 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
     source = train / ("mid.safetensors" if config.at == "mid" else "final.safetensors")
-    start = load_state(source, train_config, task.extent, task.device)
+    fused = fuses(task.backend)
+    start = load_state(source, train_config, task.extent, task.device, fused=fused)
     until = _until(config, train_config, start.iteration)
     before, first = len(start.splats), start.iteration
     psnr_before = validation_psnr(start, task)
     if (out / CHECKPOINT).exists():
-        state = load_state(out / CHECKPOINT, train_config, task.extent, task.device)
+        state = load_state(
+            out / CHECKPOINT, train_config, task.extent, task.device, fused=fused)
     else:
         state = _pruned(start, task, config)
     psnr_pruned = None if state.iteration > first else validation_psnr(state, task)

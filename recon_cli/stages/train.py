@@ -24,6 +24,7 @@ from recon_cli.stages.fitting import (
 )
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.state import load_state, new_state, save_state
+from recon_cli.train.step import fuses
 
 
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
@@ -32,12 +33,14 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     task = load_task(scene, config, ctx)
     checkpoint = out / CHECKPOINT
     if checkpoint.exists():
-        state = load_state(checkpoint, config, task.extent, task.device)
+        state = load_state(
+            checkpoint, config, task.extent, task.device, fused=fuses(task.backend))
     else:
         first = splats_from_points(
             scene.points, scene.colors, most=config.max_gaussians, seed=config.seed)
         state = new_state(
-            first.map(lambda tensor: tensor.to(task.device)), config, task.extent)
+            first.map(lambda tensor: tensor.to(task.device)), config, task.extent,
+            fused=fuses(task.backend))
     run_fit(
         state, task, config.iterations, out, ctx, label="train",
         keep={task.schedule.mid: "mid.safetensors"})

@@ -8,41 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
-from recon_cli.scene import Camera
 from recon_cli.train.densify import (
     DensifyRule,
     Pull,
     densify,
     lowered_opacities,
 )
-from recon_cli.train.losses import photometric_loss
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
+from recon_cli.train.step import GradientStep, TrainView, gradient_step
 
 _LARGE_SCALE = 0.1  # x extent; larger Gaussians are deleted once opacities were reset
 _REPORT_EVERY = 100  # steps between looks at the validation views
-
-
-@dataclass(frozen=True, eq=False)
-class TrainView:
-    """One view in the form that training reads.
-
-    Attributes:
-        camera: at the size of the image.
-        image: [H, W, 3] uint8; a fourth of the memory of float32.
-    """
-
-    camera: Camera
-    image: NDArray[np.uint8]
-
-    def pixels(self, device: torch.device) -> Tensor:
-        """Returns the image as float32 in [0, 1], [H, W, 3]."""
-        return torch.from_numpy(self.image).to(device).float() / 255
 
 
 @dataclass(frozen=True)
@@ -106,8 +86,9 @@ def fit(
         TrainingError: the loss is not finite, or no Gaussian is left.
     """
     start = time.perf_counter()
+    compute = gradient_step(task.backend)
     while state.iteration < until:
-        loss = _step(state, task)
+        loss = _step(state, task, compute)
         if state.iteration % _REPORT_EVERY == 0 or state.iteration == until:
             on_report(Report(
                 state.iteration, loss, validation_psnr(state, task), len(state.splats),
@@ -115,30 +96,26 @@ def fit(
         on_step(state)
 
 
-def _step(state: TrainState, task: Task) -> float:
+def _step(state: TrainState, task: Task, compute: GradientStep) -> float:
     """Takes one optimization step and returns its loss."""
     if not state.queue:
         state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
     view = task.train[state.queue.pop()]
     iteration = state.iteration + 1
-    background = torch.zeros(3, device=task.device)
-    output = render(state.splats, view.camera, background, task.schedule.sh_degree(iteration),
-                    backend=task.backend)
-    loss = photometric_loss(
-        output.rgb, view.pixels(task.device), task.schedule.config.ssim_weight)
-    value = float(loss.detach())
-    if not np.isfinite(value):
+    degree = task.schedule.sh_degree(iteration)
+    loss, statistics = compute(
+        state.optimizer, view, degree, task.schedule.config.ssim_weight)
+    if not np.isfinite(loss):
         raise TrainingError(
             f"The loss is not finite at step {iteration}.",
             hint="Lower the learning rates, or run `recon train --again` with another --seed.")
-    if loss.requires_grad and output.statistics.radii.any():
-        loss.backward()  # type: ignore[no-untyped-call]
+    if statistics is not None:
         if task.schedule.gathers(iteration):
-            state.pull.add(output.statistics, view.camera.width, view.camera.height)
-        state.optimizer.step(task.schedule.means_rate(iteration))
+            state.pull.add(statistics, view.camera.width, view.camera.height)
+        state.optimizer.step(task.schedule.means_rate(iteration), sh_rest=degree > 0)
     state.iteration = iteration
     _control_density(state, task)
-    return value
+    return loss
 
 
 def _control_density(state: TrainState, task: Task) -> None:

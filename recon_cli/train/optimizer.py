@@ -1,96 +1,164 @@
-"""Adam over the raw parameters, whose rows follow added and removed Gaussians."""
+"""Adam over the raw parameters, whose rows follow added and removed Gaussians in place."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from recon_cli.config import TrainConfig
 from recon_cli.scene.splats import Splats
 
+_BETAS = 0.9, 0.999
 _EPSILON = 1e-15  # of the reference: gradients of single Gaussians are tiny
 _REST_FACTOR = 1 / 20  # learning rate of higher SH degrees against the base colour
+_ROLES = ("value", "gradient", "exp_avg", "exp_avg_sq")
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class SplatOptimizer:
-    """torch's fused Adam with one group a parameter.
+    """Adam with a learning rate for each parameter (Kingma and Ba 2015, algorithm 1).
+
+    Values, gradients and moments lie in buffers with room for more Gaussians than there are;
+    memory that was never used costs nothing.
 
     Args:
-        splats: their tensors become the optimized leaves.
-        config: learning rates.
+        splats: their values are copied.
+        config: learning rates, and how many Gaussians there may be.
         extent: of the scene in world units; scales the rate of the means.
+        fused: a backend writes the gradients into `gradients`, and one kernel moves all
+            parameters (float32 on the CPU). Otherwise autograd leaves them in `splats`.
+
+    Attributes:
+        splats: leaves that autograd knows; views of the buffers.
+        gradients: views of the buffers, of the same shapes.
+        count: steps taken.
     """
 
-    def __init__(self, splats: Splats, config: TrainConfig, extent: float) -> None:
-        self._extent = extent
-        rates = {
+    def __init__(
+        self, splats: Splats, config: TrainConfig, extent: float, *, fused: bool = False
+    ) -> None:
+        self._extent, self._fused = extent, fused
+        self._rates = {
             "means": config.means_rate * extent, "quats": config.quats_rate,
             "log_scales": config.scales_rate, "logit_opacities": config.opacities_rate,
             "sh_dc": config.sh_rate, "sh_rest": config.sh_rate * _REST_FACTOR,
         }
-        self.splats = splats.map(lambda tensor: tensor.detach().requires_grad_())
-        self._adam = torch.optim.Adam(
-            [{"params": [value], "lr": rates[name], "name": name}
-             for name, value in self.splats.parameters().items()],
-            eps=_EPSILON, fused=True)
+        self.count = 0
+        self._buffers: dict[str, dict[str, Tensor]] = {}
+        self._reserve(splats, max(len(splats), config.max_gaussians))
+        self._show(len(splats))
+        with torch.no_grad():
+            for name, value in splats.parameters().items():
+                getattr(self.splats, name).copy_(value)
+                for role in _MOMENTS:
+                    self._view(name, role).zero_()
 
-    def step(self, means_rate: float) -> None:
-        """Moves the parameters against their gradients, which are then dropped.
+    def _reserve(self, like: Splats, capacity: int) -> None:
+        self._capacity = capacity
+        for name, value in like.parameters().items():
+            roles = _ROLES if self._fused else [role for role in _ROLES if role != "gradient"]
+            self._buffers[name] = {
+                role: torch.empty(
+                    capacity, *value.shape[1:], dtype=value.dtype, device=value.device)
+                for role in roles}
+
+    def _view(self, name: str, role: str) -> Tensor:
+        return self._buffers[name][role][: self._n]
+
+    def _show(self, n: int) -> None:
+        """Makes the first n rows of the buffers the Gaussians of the moment."""
+        self._n = n
+        self.splats = Splats(**{
+            name: self._view(name, "value").detach().requires_grad_() for name in self._buffers})
+        self.gradients = Splats(**{
+            name: self._view(name, "gradient") for name in self._buffers}
+        ) if self._fused else self.splats
+
+    @property
+    def bytes_per_gaussian(self) -> int:
+        """Memory of values, gradients and moments of one Gaussian."""
+        held = sum(buffer[0].nbytes
+                   for roles in self._buffers.values() for buffer in roles.values())
+        return held if self._fused else held // 3 * 4  # autograd holds the gradients
+
+    def step(self, means_rate: float, *, sh_rest: bool = True) -> None:
+        """Moves the parameters against their gradients, which are then used up.
 
         Args:
             means_rate: learning rate of the means in units of the scene extent.
+            sh_rest: the higher SH degrees are in use; otherwise they stay as they are.
         """
-        self._adam.param_groups[0]["lr"] = means_rate * self._extent
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        self._rates["means"] = means_rate * self._extent
+        self.count += 1
+        names = [name for name in self._buffers if sh_rest or name != "sh_rest"]
+        if self._fused:
+            self._step_fused(names)
+        else:
+            self._step_torch(names)
 
+    def _step_fused(self, names: list[str]) -> None:
+        from recon_cli.render.numba.optimizer import step
+
+        def flat(role: str) -> list[Tensor]:
+            return [self._view(name, role).reshape(-1) for name in self._buffers]
+
+        rates = [self._rates[name] if name in names else None for name in self._buffers]
+        step(flat("value"), flat("gradient"), flat("exp_avg"), flat("exp_avg_sq"), rates,
+             count=self.count, betas=_BETAS, epsilon=_EPSILON)
+
+    @torch.no_grad()
+    def _step_torch(self, names: list[str]) -> None:
+        for name in names:
+            value = getattr(self.splats, name)
+            if value.grad is None:
+                continue
+            count = torch.full((), self.count - 1.0, device=value.device)
+            adam([value], [value.grad], [self._view(name, "exp_avg")],
+                 [self._view(name, "exp_avg_sq")], [], [count], fused=True, amsgrad=False,
+                 beta1=_BETAS[0], beta2=_BETAS[1], lr=self._rates[name], weight_decay=0.0,
+                 eps=_EPSILON, maximize=False)
+            value.grad = None
+
+    @torch.no_grad()
     def replace(self, splats: Splats, source: Tensor) -> None:
         """Goes on with other Gaussians.
 
         Args:
-            splats: the new Gaussians, M of them.
+            splats: the new Gaussians, M of them; no views of this optimizer's own.
             source: [M] the old row that each continues, whose moments it keeps; -1 for a new one,
                 which starts with zeros.
         """
-        fresh = source < 0
-        rows = source.clamp_min(0)
-        for group, value in zip(
-            self._adam.param_groups, splats.parameters().values(), strict=True
-        ):
-            state = self._adam.state.pop(group["params"][0], {})
-            leaf = value.detach().contiguous().requires_grad_()
-            for key in _MOMENTS:
-                if key in state:
-                    state[key] = state[key][rows]
-                    state[key][fresh] = 0
-            group["params"] = [leaf]
-            if state:
-                self._adam.state[leaf] = state
-        leaves = [group["params"][0] for group in self._adam.param_groups]
-        self.splats = Splats(*leaves)
+        fresh, rows = source < 0, source.clamp_min(0)
+        moments = {(name, role): self._view(name, role)
+                   for name in self._buffers for role in _MOMENTS}
+        if len(splats) > self._capacity:
+            self._reserve(splats, len(splats))
+        self._show(len(splats))
+        for name, value in splats.parameters().items():
+            for role in _MOMENTS:  # one parameter at a time: the copies stay small
+                kept = moments.pop((name, role))[rows]
+                kept[fresh] = 0
+                self._view(name, role).copy_(kept)
+            self._view(name, "value").copy_(value)
 
     def forget(self, name: str) -> None:
         """Zeroes the moments of one parameter."""
-        for key in _MOMENTS:
-            state = self._adam.state[getattr(self.splats, name)]
-            if key in state:
-                state[key].zero_()
+        for role in _MOMENTS:
+            self._view(name, role).zero_()
 
     def tensors(self) -> dict[str, Tensor]:
-        """Returns parameters, moments and step counts by name, for a checkpoint."""
-        result: dict[str, Tensor] = {}
-        for name, value in self.splats.parameters().items():
-            result[f"splats.{name}"] = value.detach()
-            for key, item in self._adam.state[value].items():
-                result[f"adam.{name}.{key}"] = item
+        """Returns parameters, moments and the step count by name, for a checkpoint."""
+        result = {"adam.count": torch.tensor(self.count)}
+        for name in self._buffers:
+            result[f"splats.{name}"] = self._view(name, "value")
+            for role in _MOMENTS:
+                result[f"adam.{name}.{role}"] = self._view(name, role)
         return result
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Takes moments and step counts back from what `tensors` returned."""
-        for name, value in self.splats.parameters().items():
-            prefix = f"adam.{name}."
-            state = {key.removeprefix(prefix): item.clone()
-                     for key, item in tensors.items() if key.startswith(prefix)}
-            if state:
-                self._adam.state[value] = state
+        """Takes moments and the step count back from what `tensors` returned."""
+        self.count = int(tensors["adam.count"])
+        for name in self._buffers:
+            for role in _MOMENTS:
+                self._view(name, role).copy_(tensors[f"adam.{name}.{role}"])

@@ -22,7 +22,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.train.densify import Pull
 from recon_cli.train.optimizer import SplatOptimizer
 
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(eq=False)
@@ -49,11 +49,13 @@ class TrainState:
         return self.optimizer.splats
 
 
-def new_state(splats: Splats, config: TrainConfig, extent: float) -> TrainState:
-    """Returns the state before the first step."""
+def new_state(
+    splats: Splats, config: TrainConfig, extent: float, *, fused: bool = False
+) -> TrainState:
+    """Returns the state before the first step; `fused` as in `SplatOptimizer`."""
     generator = torch.Generator().manual_seed(config.seed)
     pull = Pull.zeros(len(splats), splats.means.device)
-    return TrainState(SplatOptimizer(splats, config, extent), pull, generator)
+    return TrainState(SplatOptimizer(splats, config, extent, fused=fused), pull, generator)
 
 
 def save_state(path: Path, state: TrainState) -> None:
@@ -74,7 +76,7 @@ def save_state(path: Path, state: TrainState) -> None:
 
 
 def load_state(
-    path: Path, config: TrainConfig, extent: float, device: torch.device
+    path: Path, config: TrainConfig, extent: float, device: torch.device, *, fused: bool = False
 ) -> TrainState:
     """Returns the state that `save_state` wrote.
 
@@ -93,8 +95,9 @@ def load_state(
         tensors = {name: value.to(device) for name, value in tensors.items()}
         splats = Splats(**_under("splats.", tensors))
         state = TrainState(
-            SplatOptimizer(splats, config, extent), Pull(**_under("pull.", tensors)), generator,
-            int(scalars["iteration"]), [int(i) for i in scalars["queue"]])
+            SplatOptimizer(splats, config, extent, fused=fused),
+            Pull(**_under("pull.", tensors)), generator, int(scalars["iteration"]),
+            [int(i) for i in scalars["queue"]])
         state.optimizer.restore(tensors)
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise FormatError(

@@ -7,6 +7,7 @@ matrix, the spherical harmonics come from SciPy's associated Legendre functions.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +18,46 @@ from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, DILATION, NEAR, TRAN
 from recon_cli.scene import Camera, Splats
 
 
+class Composite(NamedTuple):
+    """What the oracle knows of a picture.
+
+    Attributes:
+        rgb: [H, W, 3], differentiable, like the next two.
+        alpha: [H, W].
+        depth: [H, W].
+        alphas: [N, H, W] of every fragment, 0 where there is none; detached.
+        weights: [N, H, W] alpha T of every fragment; detached.
+        margin: [H, W] smallest relative distance of an alpha to 1/255, or of the transmittance
+            behind a fragment to 1e-4.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+    alphas: Tensor
+    weights: Tensor
+    margin: Tensor
+
+
+class Nudges(NamedTuple):
+    """Zeros whose gradients are the parts that single pixels have in a Gaussian's gradient.
+
+    Attributes:
+        means2d: [N, H, W, 2] added to the projected mean, at that pixel alone.
+        log_alphas: [N, H, W] added to log alpha before it is clamped, at that pixel alone.
+    """
+
+    means2d: Tensor
+    log_alphas: Tensor
+
+    @staticmethod
+    def zeros(n: int, camera: Camera) -> Nudges:
+        """Returns nudges that collect gradients."""
+        shape = n, camera.height, camera.width
+        return Nudges(torch.zeros(*shape, 2, dtype=torch.float64, requires_grad=True),
+                      torch.zeros(shape, dtype=torch.float64, requires_grad=True))
+
+
 def brute_force(
     splats: Splats, camera: Camera, background: Tensor, sh_degree: int
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -24,46 +65,59 @@ def brute_force(
     return composited(splats, camera, background, sh_degree)[:3]
 
 
-def blend_weights(splats: Splats, camera: Camera) -> Tensor:
-    """Returns alpha T of every Gaussian at every pixel, [N, H, W]."""
-    return composited(splats, camera, torch.zeros(3, dtype=torch.float64), 0)[3]
-
-
 def composited(
-    splats: Splats, camera: Camera, background: Tensor, sh_degree: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Returns rgb, alpha, depth and the detached blend weights [N, H, W]."""
+    splats: Splats, camera: Camera, background: Tensor, sh_degree: int, *,
+    nudges: Nudges | None = None, thresholds: bool = True,
+) -> Composite:
+    """Returns the picture of float64 splats; without thresholds no fragment is too faint."""
     R = torch.from_numpy(camera.viewmat[:3, :3])
     t = torch.from_numpy(camera.viewmat[:3, 3])
     local = splats.means @ R.T + t
     rows, columns = torch.meshgrid(
         torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     pixels = torch.stack([columns, rows], -1).double()
-    rgb = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
-    depth = torch.zeros(camera.height, camera.width, dtype=torch.float64)
-    left = torch.ones(camera.height, camera.width, dtype=torch.float64)
-    weights = torch.zeros(len(splats), camera.height, camera.width, dtype=torch.float64)
-    running = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    size = camera.height, camera.width
+    rgb, depth = torch.zeros(*size, 3, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
+    left, margin = torch.ones(size, dtype=torch.float64), torch.full(size, torch.inf)
+    alphas = torch.zeros(len(splats), *size, dtype=torch.float64)
+    weights = torch.zeros_like(alphas)
+    running = torch.ones(size, dtype=torch.bool)
+    alpha_min, t_min = (ALPHA_MIN, TRANSMITTANCE_MIN) if thresholds else (0.0, 0.0)
     for i in torch.argsort(local[:, 2].detach(), stable=True).tolist():
         if local[i, 2] <= NEAR:
             continue
         mean, cov = _project(local[i], _covariance(splats, i), R, camera)
         d = pixels - mean
+        if nudges is not None:
+            d = d - nudges.means2d[i]
         q = torch.einsum("hwi,ij,hwj->hw", d, torch.linalg.inv(cov), d)
-        alpha = (splats.opacities[i] * torch.exp(-q / 2)).clamp_max(ALPHA_MAX)
-        part = running & (alpha >= ALPHA_MIN)
-        running = running & ~(part & (left * (1 - alpha) < TRANSMITTANCE_MIN))
+        # log sigmoid keeps its gradient where the sigmoid has rounded to 1
+        opacity = torch.nn.functional.logsigmoid(splats.logit_opacities[i]).exp()
+        alpha = opacity * torch.exp(-q / 2)
+        if nudges is not None:
+            alpha = alpha * torch.exp(nudges.log_alphas[i])
+        alpha = alpha.clamp_max(ALPHA_MAX)
+        part = running & (alpha >= alpha_min)
+        if thresholds:
+            margin = torch.where(running, margin.minimum((alpha / ALPHA_MIN - 1).abs()), margin)
+            behind = (left * (1 - alpha) / TRANSMITTANCE_MIN - 1).abs()
+            margin = torch.where(part, margin.minimum(behind), margin)
+        running = running & ~(part & (left * (1 - alpha) < t_min))
         part = part & running
+        alphas[i] = torch.where(part, alpha, 0.0).detach()
         weight = torch.where(part, alpha * left, 0.0)
         weights[i] = weight.detach()
         rgb = rgb + weight[..., None] * _color(splats, i, camera, sh_degree)
         depth = depth + weight * local[i, 2]
         left = torch.where(part, left * (1 - alpha), left)
-    return rgb + left[..., None] * background, 1 - left, depth, weights
+    return Composite(
+        rgb + left[..., None] * background, 1 - left, depth, alphas, weights, margin.detach())
 
 
 def _covariance(splats: Splats, i: int) -> Tensor:
-    w, x, y, z = splats.quats[i] / splats.quats[i].norm()
+    given = splats.quats[i].abs().max() > 1e-30  # zero stands for no rotation
+    quat = splats.quats[i] if given else torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    w, x, y, z = quat / quat.norm()
     R = torch.stack([
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
         torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),

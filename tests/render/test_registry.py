@@ -8,7 +8,7 @@ from recon_cli.render import resolve
 
 
 def test_auto_names_what_will_run():
-    assert resolve("auto", "cpu") == ("torch", "cpu")
+    assert resolve("auto", "cpu") == ("numba", "cpu")
 
 
 def test_a_backend_that_does_not_exist_is_refused():

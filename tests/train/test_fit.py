@@ -10,9 +10,10 @@ from scenes import camera_at, random_splats
 from recon_cli.config import TrainConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.render import render
-from recon_cli.train.fit import Task, TrainView, fit, validation_psnr
+from recon_cli.train.fit import Task, fit, validation_psnr
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
+from recon_cli.train.step import TrainView
 
 CONFIG = TrainConfig(
     iterations=60, densify_every=10, densify_gradient=1e-5, max_gaussians=90, sh_rate=0.05)

@@ -1,0 +1,1 @@
+"""The numba backend: vector kernels for any CPU, compiled once on the machine that runs them."""

@@ -1,0 +1,193 @@
+"""Which ellipse meets which tile, and the list of every tile in order of depth.
+
+An instance is one Gaussian in one tile. The test is exact: along a row of tiles the ellipse
+alpha = 1/255 covers one interval of x, found in closed form. Gaussians are sorted once by depth
+(radix sort), then counted into the tiles in that order (stable), so that each tile's list is in
+order of depth, ties in order of index.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from recon_cli.render.numba.kernel import kernel
+from recon_cli.render.numba.lane_memory import fetch_add
+from recon_cli.render.numba.layout import (
+    EXTENT_X,
+    EXTENT_Y,
+    HALF_X,
+    MEAN_X,
+    MEAN_Y,
+    RECORD,
+    SLOPE_X,
+    SLOPE_Y,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
+from recon_cli.render.numba.planes import BLOCK
+
+_MARGIN = np.float32(1e-3)  # pixels
+_HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0), np.float32(1)
+_W, _H = np.float32(TILE_WIDTH), np.float32(TILE_HEIGHT)
+_DIGIT = 11  # bits that a pass of the radix sort orders by
+_PASSES = 4
+_DIGITS = 1 << _DIGIT
+_DIGIT_MASK = np.uint64(_DIGITS - 1)
+_DROPPED = np.uint64(20)  # low bits of the mantissa; 32 of 52 stay
+
+
+@kernel
+def row_starts(rows, starts):
+    """Writes where the spans of each Gaussian begin; the last entry is how many there are."""
+    total = 0
+    for j in range(len(starts) - 1):
+        starts[j] = total
+        total += rows[2 * j + 1]
+    starts[len(starts) - 1] = total
+
+
+@kernel
+def find_spans(counter, records, rows, starts, tiles_x, spans, tiles):
+    """Writes for each row of tiles of each Gaussian the first tile and the end.
+
+    Args:
+        counter: [1] shared; blocks already taken.
+        records: [M * 16].
+        rows: [M * 2] first row of tiles, number of rows.
+        starts: [M + 1] where the spans of each begin.
+        tiles_x: tiles in a row.
+        spans: [S * 2] out.
+        tiles: [M] out, number of tiles of each Gaussian.
+    """
+    n = len(tiles)
+    blocks = (n + BLOCK - 1) // BLOCK
+    while True:
+        block = fetch_add(counter, 0, 1)
+        if block >= blocks:
+            break
+        for j in range(block * BLOCK, min((block + 1) * BLOCK, n)):
+            at, found = j * RECORD, 0
+            mean_x, mean_y = records[at + MEAN_X], records[at + MEAN_Y]
+            extent_x, extent_y = records[at + EXTENT_X], records[at + EXTENT_Y]
+            slope, half = records[at + SLOPE_X], records[at + HALF_X]
+            per_extent = _ONE / extent_y
+            rightmost = records[at + SLOPE_Y] * extent_x  # y offset of the rightmost point
+            for k in range(rows[2 * j + 1]):
+                top = np.float32((rows[2 * j] + k) * TILE_HEIGHT) + _HALF - mean_y
+                low, high = max(top, -extent_y), min(top + (_H - _ONE), extent_y)
+                first, end = 0, 0
+                if low <= high:
+                    y = min(max(rightmost, low), high)
+                    along = y * per_extent
+                    right = slope * y + half * math.sqrt(max(_ONE - along * along, _ZERO))
+                    right = min(right, extent_x)
+                    y = min(max(-rightmost, low), high)
+                    along = y * per_extent
+                    left = slope * y - half * math.sqrt(max(_ONE - along * along, _ZERO))
+                    left = max(left, -extent_x)
+                    # pixel i lies at i + 1/2; the first one in is ceil(x - 1/2)
+                    left = math.ceil(mean_x + left - _HALF - _MARGIN)
+                    right = math.floor(mean_x + right - _HALF + _MARGIN)
+                    if right >= left and right >= _ZERO and left < _W * np.float32(tiles_x):
+                        first = np.int64(math.floor(max(left, _ZERO) / _W))
+                        end = np.int64(min(math.floor(right / _W) + _ONE, np.float32(tiles_x)))
+                spans[2 * (starts[j] + k)] = first
+                spans[2 * (starts[j] + k) + 1] = end
+                found += end - first
+            tiles[j] = found
+
+
+@kernel
+def order_by_depth(keys, tiles, order, spare):
+    """Writes the Gaussians that have tiles in order of depth, ties by index; returns how many.
+
+    Radix sort, four passes of 11 bits. `keys` are the bits of float64 depths, which for positive
+    numbers are ordered as the numbers are. float32 depths would tie, and a tie that the exact
+    depths do not have is a wrong picture where two Gaussians overlap.
+    """
+    n = 0
+    for j in range(len(tiles)):
+        if tiles[j] > 0:
+            order[n] = j
+            n += 1
+    histogram = np.zeros((_PASSES, _DIGITS), np.int64)
+    for i in range(n):
+        key = keys[order[i]] >> _DROPPED
+        for digit in range(_PASSES):
+            histogram[digit, (key >> np.uint64(_DIGIT * digit)) & _DIGIT_MASK] += 1
+    for digit in range(_PASSES):
+        total = 0
+        for b in range(_DIGITS):
+            count = histogram[digit, b]
+            histogram[digit, b] = total
+            total += count
+        for i in range(n):
+            j = order[i]
+            b = (keys[j] >> (_DROPPED + np.uint64(_DIGIT * digit))) & _DIGIT_MASK
+            spare[histogram[digit, b]] = j
+            histogram[digit, b] += 1
+        order, spare = spare, order
+    return n  # after an even number of passes the result lies in `order`
+
+
+@kernel
+def slot_starts(tiles, starts):
+    """Writes where the slots of each Gaussian begin; the last entry is the number of instances."""
+    total = 0
+    for j in range(len(tiles)):
+        starts[j] = total
+        total += tiles[j]
+    starts[len(tiles)] = total
+
+
+@kernel
+def count_tiles(counter, cuts, order, rows, span_starts, spans, tiles_x, counts):
+    """Counts the instances of each tile in each part of the order; `cuts` divides it."""
+    parts = len(cuts) - 1
+    while True:
+        part = fetch_add(counter, 0, 1)
+        if part >= parts:
+            break
+        for i in range(cuts[part], cuts[part + 1]):
+            j = order[i]
+            for k in range(rows[2 * j + 1]):
+                span, base = 2 * (span_starts[j] + k), (rows[2 * j] + k) * tiles_x
+                for x in range(spans[span], spans[span + 1]):
+                    counts[part, base + x] += 1
+
+
+@kernel
+def tile_starts(counts, starts):
+    """Turns counts [parts, tiles] into the places where each part of each tile begins."""
+    total = 0
+    for tile in range(counts.shape[1]):
+        starts[tile] = total
+        for part in range(counts.shape[0]):
+            count = counts[part, tile]
+            counts[part, tile] = total
+            total += count
+    starts[counts.shape[1]] = total
+
+
+@kernel
+def fill_tiles(counter, cuts, order, rows, span_starts, spans, tiles_x, slot_start, places,
+               members, slots):
+    """Writes the Gaussian and the slot of every instance to its place."""
+    parts = len(cuts) - 1
+    while True:
+        part = fetch_add(counter, 0, 1)
+        if part >= parts:
+            break
+        for i in range(cuts[part], cuts[part + 1]):
+            j = order[i]
+            slot = slot_start[j]
+            for k in range(rows[2 * j + 1]):
+                span, base = 2 * (span_starts[j] + k), (rows[2 * j] + k) * tiles_x
+                for x in range(spans[span], spans[span + 1]):
+                    place = places[part, base + x]
+                    places[part, base + x] = place + 1
+                    members[place] = j
+                    slots[place] = slot
+                    slot += 1

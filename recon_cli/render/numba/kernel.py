@@ -1,0 +1,108 @@
+"""How every kernel is compiled, and where the machine code is kept.
+
+Compiling takes seconds, so the machine code is kept in the user's cache folder and loaded by the
+next process. numba stores it by pickle, which runs what the file says: the folder must belong to
+the user alone, or it is not used. Its name holds a digest of the CPU, of the versions and of all
+sources here (numba itself looks only at the file that a kernel stands in, not at what it inlines),
+so that code for another CPU or of another version is never found.
+
+RECON_CACHE_DIR names another folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import stat
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+import numba
+from numba.core import config
+
+logger = logging.getLogger("recon")
+
+_OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+
+Compiled = Callable[..., Any]
+
+
+def kernel(function: Compiled) -> Compiled:
+    """Compiles a function that runs without the GIL and is called from Python; kept on disk."""
+    dispatcher = numba.njit(**_OPTIONS)(function)
+    folder = cache_folder()
+    if folder:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        try:
+            dispatcher.enable_caching()
+        finally:
+            config.CACHE_DIR = before
+    return dispatcher  # type: ignore[no-any-return]
+
+
+def inlined(function: Compiled) -> Compiled:
+    """Compiles a function into every kernel that calls it."""
+    return numba.njit(**_OPTIONS, forceinline=True)(function)  # type: ignore[no-any-return]
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Returns the folder of the machine code; None where there is no place for it."""
+    folder = cache_root() / "kernels" / fingerprint()
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        probe = folder / f".probe-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        logger.warning(
+            "no place to keep compiled kernels (%s); they are compiled in every run. Set "
+            "RECON_CACHE_DIR to a folder that can be written.", error)
+        return None
+    if not _ours_alone(folder):
+        logger.warning(
+            "%s can be written by others and is not used; kernels are compiled in every run. Set "
+            "RECON_CACHE_DIR to a folder of your own.", folder)
+        return None
+    return folder
+
+
+def cache_root() -> Path:
+    """Returns the folder for what recon keeps between runs, by the platform's custom."""
+    chosen = os.environ.get("RECON_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "recon"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "recon" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "recon"
+
+
+def fingerprint() -> str:
+    """Returns a digest of all that machine code depends on."""
+    digest = hashlib.sha256()
+    features = config.CPU_FEATURES
+    if features is None:
+        features = llvm.get_host_cpu_features().flatten()
+    for text in (platform.machine(), config.CPU_NAME or llvm.get_host_cpu_name(), features,
+                 sys.version, numba.__version__, llvmlite.__version__):
+        digest.update(text.encode() + b"\0")
+    here = Path(__file__).parent
+    for path in sorted([*here.glob("*.py"), here.parent / "contract.py"]):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _ours_alone(folder: Path) -> bool:
+    if not hasattr(os, "getuid"):  # Windows keeps the folder inside the user's profile
+        return True
+    found = folder.stat()
+    return found.st_uid == os.getuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

@@ -1,0 +1,124 @@
+"""A group of LANES Gaussians side by side: one plane of scratch for each number that they have.
+
+Parameters lie in memory Gaussian by Gaussian, and kernels compute on LANES of them at once:
+`gather` turns rows into planes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from recon_cli.render.numba.kernel import inlined
+from recon_cli.render.numba.lane_functions import absolute, maximum, minimum, select, square_root
+from recon_cli.render.numba.lane_memory import copy, load, transpose
+from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.layout import RECORD
+
+BLOCK = 1024  # Gaussians that a thread takes at a time
+_F = np.float32
+
+
+class Viewpoint(NamedTuple):
+    """A camera as kernels take it: world to camera R x + t, pixels, limits of x/z and y/z."""
+
+    R: np.ndarray  # [9] float64
+    t: np.ndarray  # [3] float64
+    center: np.ndarray  # [3] float64
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    tan_left: float
+    tan_right: float
+    tan_top: float
+    tan_bottom: float
+
+
+# planes of a group of LANES Gaussians in scratch
+(P_X, P_Y, P_Z, P_MEAN_X, P_MEAN_Y, P_QW, P_QX, P_QY, P_QZ, P_S0, P_S1, P_S2, P_LOGIT,
+ P_DX, P_DY, P_DZ, P_DC) = range(17)
+P_REST = P_DC + 3
+P_BASIS = P_REST + 45
+OUT = P_BASIS + 15
+SQUARE = OUT + RECORD  # LANES planes in which blocks are turned
+PROJECTION_FLOATS = (SQUARE + LANES) * LANES
+_REST_FLOATS = 45  # of a Gaussian's higher SH coefficients
+
+
+@inlined
+def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest, terms,
+           view, depths):
+    """Fills the planes of `scratch` with Gaussians ids[first : first + count], `depths` too."""
+    R = view.R
+    for k in range(LANES):
+        i = np.int64(ids[first + min(k, count - 1)])
+        x, y, z = (np.float64(means[3 * i]), np.float64(means[3 * i + 1]),
+                   np.float64(means[3 * i + 2]))
+        # in float64: an error of the mean in pixels is an error of every alpha
+        to_x = R[0] * x + R[1] * y + R[2] * z + view.t[0]
+        to_y = R[3] * x + R[4] * y + R[5] * z + view.t[1]
+        to_z = R[6] * x + R[7] * y + R[8] * z + view.t[2]
+        scratch[P_X * LANES + k] = to_x
+        scratch[P_Y * LANES + k] = to_y
+        scratch[P_Z * LANES + k] = to_z
+        if k < count:
+            depths[first + k] = to_z
+        scratch[P_MEAN_X * LANES + k] = view.fx * to_x / to_z + view.cx
+        scratch[P_MEAN_Y * LANES + k] = view.fy * to_y / to_z + view.cy
+        scratch[P_DX * LANES + k] = x - view.center[0]
+        scratch[P_DY * LANES + k] = y - view.center[1]
+        scratch[P_DZ * LANES + k] = z - view.center[2]
+        for c in range(4):
+            scratch[(P_QW + c) * LANES + k] = quats[4 * i + c]
+        for c in range(3):
+            scratch[(P_S0 + c) * LANES + k] = log_scales[3 * i + c]
+            scratch[(P_DC + c) * LANES + k] = sh_dc[3 * i + c]
+        scratch[P_LOGIT * LANES + k] = logits[i]
+    for block in range(0, 3 * terms, LANES):
+        at = min(block, _REST_FLOATS - LANES)
+        for k in range(LANES):
+            i = np.int64(ids[first + min(k, count - 1)])
+            copy(sh_rest, _REST_FLOATS * i + at, scratch, (SQUARE + k) * LANES)
+        transpose(scratch, SQUARE * LANES, scratch, (P_REST + at) * LANES)
+
+
+@inlined
+def unit_quaternion(scratch):
+    """Returns w, x, y, z of length 1, one over the length, and where there is one.
+
+    Divided by the largest entry first: the squares of small entries would vanish. A quaternion
+    of zeros stands for no rotation and has no gradient.
+    """
+    w, x = load(scratch, P_QW * LANES), load(scratch, P_QX * LANES)
+    y, z = load(scratch, P_QY * LANES), load(scratch, P_QZ * LANES)
+    top = maximum(maximum(absolute(w), absolute(x)), maximum(absolute(y), absolute(z)))
+    given = top > 1e-30
+    top = select(given, top, 1.0)
+    per_top = 1.0 / top
+    w, x, y, z = w * per_top, x * per_top, y * per_top, z * per_top
+    w = select(given, w, 1.0)
+    per_length = 1.0 / square_root(w * w + x * x + y * y + z * z)
+    return (w * per_length, x * per_length, y * per_length, z * per_length,
+            select(given, per_length * per_top, 0.0))
+
+
+@inlined
+def image_axes(scratch, view):
+    """Returns the rows of J W, [6], and the clamped x/z and y/z.
+
+    The linearisation blows up at grazing angles: x/z and y/z are held within the image widened by
+    15% on each side (INRIA's 3DGS).
+    """
+    per_z = 1.0 / load(scratch, P_Z * LANES)
+    u, v = load(scratch, P_X * LANES) * per_z, load(scratch, P_Y * LANES) * per_z
+    u = minimum(maximum(u, _F(view.tan_left)), _F(view.tan_right))
+    v = minimum(maximum(v, _F(view.tan_top)), _F(view.tan_bottom))
+    R = view.R
+    x, y = _F(view.fx) * per_z, _F(view.fy) * per_z
+    return (x * (_F(R[0]) - u * _F(R[6])), x * (_F(R[1]) - u * _F(R[7])),
+            x * (_F(R[2]) - u * _F(R[8])), y * (_F(R[3]) - v * _F(R[6])),
+            y * (_F(R[4]) - v * _F(R[7])), y * (_F(R[5]) - v * _F(R[8])), u, v)

@@ -1,0 +1,215 @@
+"""From raw parameters to ellipses on the image plane, LANES Gaussians at a time.
+
+EWA splatting (Zwicker et al. 2002, eqs. 24 to 31; Kerbl et al. 2023, eq. 5): the covariance on the
+image is V V^T + 0.3 I with V = J W R S, J the Jacobian of the pinhole projection at the mean.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from recon_cli.render.contract import DILATION
+from recon_cli.render.numba.culling import INFINITE
+from recon_cli.render.numba.kernel import inlined, kernel
+from recon_cli.render.numba.lane_functions import (
+    absolute,
+    bits,
+    exp2,
+    fill,
+    log2,
+    maximum,
+    minimum,
+    square_root,
+)
+from recon_cli.render.numba.lane_memory import copy, fetch_add, load, store, transpose
+from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.layout import (
+    BLUE,
+    DEPTH,
+    EXTENT_X,
+    EXTENT_Y,
+    GREEN,
+    HALF_X,
+    HALF_Y,
+    LOG2_E,
+    LOG2_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    RECORD,
+    RED,
+    SLOPE_X,
+    SLOPE_Y,
+    TILE_HEIGHT,
+    U_X,
+    U_Y,
+    V_Y,
+)
+from recon_cli.render.numba.planes import (
+    BLOCK,
+    OUT,
+    P_BASIS,
+    P_DC,
+    P_DX,
+    P_DY,
+    P_DZ,
+    P_LOGIT,
+    P_MEAN_X,
+    P_MEAN_Y,
+    P_QW,
+    P_QX,
+    P_QY,
+    P_QZ,
+    P_REST,
+    P_S0,
+    P_S1,
+    P_S2,
+    P_Z,
+    SQUARE,
+    gather,
+    image_axes,
+    unit_quaternion,
+)
+from recon_cli.render.numba.spherical_harmonics import C0, write_basis
+
+_SLACK = np.float32(1e-3)  # in q; culling keeps what rounding leaves in doubt
+_LARGEST = np.float32(1e30)  # a determinant beyond it has no useful inverse
+_FAR = np.float32(1e9)  # pixels; an ellipse that is cut only by its box
+_F = np.float32
+
+
+@kernel
+def project(counter, ids, means, quats, log_scales, logits, sh_dc, sh_rest, terms, view, alpha_min,
+            square, records, depths, rows, radii, broken, scratch):
+    """Writes record, depth (float64), rows of tiles and radius of every Gaussian in `ids`."""
+    n = len(ids)
+    blocks = (n + BLOCK - 1) // BLOCK
+    tiles_y = (view.height + TILE_HEIGHT - 1) // TILE_HEIGHT
+    bad = 0
+    while True:
+        block = fetch_add(counter, 0, 1)
+        if block >= blocks:
+            break
+        for first in range(block * BLOCK, min((block + 1) * BLOCK, n), LANES):
+            count = min(LANES, n - first)
+            gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest,
+                   terms, view, depths)
+            sound = shape(scratch, view, _F(alpha_min), square)
+            sound &= (bits(colour(scratch, terms)))
+            for plane in range(0, RECORD, LANES):
+                transpose(scratch, (OUT + plane) * LANES, scratch, SQUARE * LANES)
+                for k in range(count):
+                    copy(scratch, (SQUARE + k) * LANES, records, (first + k) * RECORD + plane)
+            for k in range(count):
+                j = first + k
+                at = j * RECORD
+                rows[2 * j] = 0
+                rows[2 * j + 1] = 0
+                if not (sound >> np.uint64(k)) & np.uint64(1):
+                    bad += 1
+                    continue
+                mean_x, mean_y = records[at + MEAN_X], records[at + MEAN_Y]
+                extent_x, extent_y = records[at + EXTENT_X], records[at + EXTENT_Y]
+                if not (mean_x + extent_x > _F(0) and mean_x - extent_x < _F(view.width)):
+                    continue
+                top = math.floor((mean_y - extent_y - _F(0.5)) / _F(TILE_HEIGHT))
+                bottom = math.floor((mean_y + extent_y - _F(0.5)) / _F(TILE_HEIGHT))
+                if bottom < _F(0) or top >= _F(tiles_y):
+                    continue
+                rows[2 * j] = np.int32(max(top, _F(0)))
+                rows[2 * j + 1] = np.int32(min(bottom, _F(tiles_y - 1))) - rows[2 * j] + 1
+                radii[ids[j]] = scratch[P_S0 * LANES + k]
+    fetch_add(broken, 0, bad)
+
+
+@inlined
+def colour(scratch, terms):
+    """Writes red, green and blue towards the camera; returns a mask of those that are numbers."""
+    dx, dy, dz = load(scratch, P_DX * LANES), load(scratch, P_DY * LANES), load(
+        scratch, P_DZ * LANES)
+    per_length = 1.0 / square_root(maximum(dx * dx + dy * dy + dz * dz, 1e-37))
+    write_basis(scratch, P_BASIS * LANES, dx * per_length, dy * per_length, dz * per_length, terms)
+    red = C0 * load(scratch, P_DC * LANES) + 0.5
+    green = C0 * load(scratch, (P_DC + 1) * LANES) + 0.5
+    blue = C0 * load(scratch, (P_DC + 2) * LANES) + 0.5
+    for k in range(terms):
+        basis, at = load(scratch, (P_BASIS + k) * LANES), (P_REST + 3 * k) * LANES
+        red = red + basis * load(scratch, at)
+        green = green + basis * load(scratch, at + LANES)
+        blue = blue + basis * load(scratch, at + 2 * LANES)
+    store(scratch, (OUT + RED) * LANES, maximum(red, 0.0))
+    store(scratch, (OUT + GREEN) * LANES, maximum(green, 0.0))
+    store(scratch, (OUT + BLUE) * LANES, maximum(blue, 0.0))
+    return absolute(red) + absolute(green) + absolute(blue) < INFINITE
+
+
+@inlined
+def factor(scratch, view):
+    """Returns the rows of V = J W R S, [6]."""
+    w, x, y, z, _ = unit_quaternion(scratch)
+    ax, ay, az, bx, by, bz, _, _ = image_axes(scratch, view)
+    s0 = exp2(minimum(maximum(load(scratch, P_S0 * LANES) * LOG2_E, -126.0), 126.0))
+    s1 = exp2(minimum(maximum(load(scratch, P_S1 * LANES) * LOG2_E, -126.0), 126.0))
+    s2 = exp2(minimum(maximum(load(scratch, P_S2 * LANES) * LOG2_E, -126.0), 126.0))
+    r00, r01, r02 = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+    r10, r11, r12 = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+    r20, r21, r22 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    return ((ax * r00 + ay * r10 + az * r20) * s0, (ax * r01 + ay * r11 + az * r21) * s1,
+            (ax * r02 + ay * r12 + az * r22) * s2, (bx * r00 + by * r10 + bz * r20) * s0,
+            (bx * r01 + by * r11 + bz * r21) * s1, (bx * r02 + by * r12 + bz * r22) * s2)
+
+
+@inlined
+def shape(scratch, view, alpha_min, square):
+    """Writes the ellipse of each lane; returns the bits of those that are sound."""
+    v00, v01, v02, v10, v11, v12 = factor(scratch, view)
+    a0, b = v00 * v00 + v01 * v01 + v02 * v02, v00 * v10 + v01 * v11 + v02 * v12
+    c0 = v10 * v10 + v11 * v11 + v12 * v12
+    a, c = a0 + DILATION, c0 + DILATION
+    # a c - b^2 cancels for needles; |vx x vy|^2 does not (Lagrange), and it is never negative
+    w0, w1, w2 = v01 * v12 - v02 * v11, v02 * v10 - v00 * v12, v00 * v11 - v01 * v10
+    det = w0 * w0 + w1 * w1 + w2 * w2 + DILATION * (a0 + c0 + DILATION)
+    logit = load(scratch, P_LOGIT * LANES)
+    odds = exp2(minimum(-logit * LOG2_E, 126.0))
+    log2_opacity = -log2(1.0 + odds)
+    above = log2_opacity - log2(fill(alpha_min))
+    reach = maximum(above, 0.0) * _F(2 / LOG2_E)  # 2 ln(o / alpha_min): 2 ln(255 o)
+    reach = reach * (1.0 + _SLACK) + _SLACK
+    per_c, per_a = 1.0 / c, 1.0 / a
+    root = square_root(det * per_c)  # standard deviation along x at fixed y
+    unit = _F(math.sqrt(LOG2_E / 2))
+    u_x = unit / root
+    extent_x, extent_y = square_root(reach * a), square_root(reach * c)
+    slope_y, slope_x = b * per_a, b * per_c
+    half_y, half_x = square_root(reach * det * per_a), square_root(reach) * root
+    mid, half = 0.5 * (a + c), 0.5 * (a - c)
+    radius = 3.0 * square_root(mid + square_root(half * half + b * b))  # along the longer axis
+    if square:
+        extent_x, extent_y, slope_x, slope_y = radius, radius, 0.0 * a, 0.0 * a
+        half_x, half_y = fill(_FAR), fill(_FAR)
+    at = OUT * LANES
+    mean_x, mean_y = load(scratch, P_MEAN_X * LANES), load(scratch, P_MEAN_Y * LANES)
+    store(scratch, at + MEAN_X * LANES, mean_x)
+    store(scratch, at + MEAN_Y * LANES, mean_y)
+    store(scratch, at + U_X * LANES, u_x)
+    store(scratch, at + U_Y * LANES, -b * per_c * u_x)
+    store(scratch, at + V_Y * LANES, unit * square_root(per_c))
+    store(scratch, at + LOG2_OPACITY * LANES, log2_opacity)
+    store(scratch, at + DEPTH * LANES, load(scratch, P_Z * LANES))
+    store(scratch, at + EXTENT_X * LANES, extent_x)
+    store(scratch, at + EXTENT_Y * LANES, extent_y)
+    store(scratch, at + SLOPE_Y * LANES, slope_y)
+    store(scratch, at + SLOPE_X * LANES, slope_x)
+    store(scratch, at + HALF_Y * LANES, half_y)
+    store(scratch, at + HALF_X * LANES, half_x)
+    sum_of_all = (
+        absolute(load(scratch, P_QW * LANES)) + absolute(load(scratch, P_QX * LANES))
+        + absolute(load(scratch, P_QY * LANES)) + absolute(load(scratch, P_QZ * LANES))
+        + absolute(load(scratch, P_S0 * LANES)) + absolute(load(scratch, P_S1 * LANES))
+        + absolute(load(scratch, P_S2 * LANES)) + absolute(logit))
+    store(scratch, P_S0 * LANES, radius)  # the plane is free now
+    sound = ((sum_of_all < INFINITE) & (det < _LARGEST) & (det > 0.0)
+             & (absolute(mean_x) < _LARGEST) & (absolute(mean_y) < _LARGEST)
+             & (above >= 0.0))
+    return bits(sound)

@@ -1,0 +1,101 @@
+"""Loss and gradients of one training view without autograd: the inner half of a training step.
+
+Everything between the parameters and their gradients lies in buffers that are used again, so a
+step allocates next to nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon_cli.render.contract import Statistics
+from recon_cli.render.numba.backend import flat
+from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba.frame import Frame, Parameters
+from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.loss import CHANNELS, MAPS, loss_gradient, similarity, taps
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+
+MIN_WIDTH = -(-LANES // CHANNELS)  # pixels; a row must fill one vector
+
+
+class PhotometricStep:
+    """Renders a view, compares it with the truth and carries the gradient back.
+
+    Attributes:
+        statistics: of the last view; its tensors are written anew by each call.
+    """
+
+    def __init__(self) -> None:
+        self._frame = Frame()
+        self._window = taps()
+        self.statistics = Statistics.zeros(torch.zeros(0, 3))
+
+    @property
+    def instances(self) -> int:
+        """Gaussian-tile pairs of the last view; 0 where nothing was seen."""
+        return len(self._frame.members)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the buffers."""
+        return self._frame.bytes
+
+    def __call__(
+        self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
+        background: Tensor, sh_degree: int, ssim_weight: float,
+    ) -> float:
+        """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
+
+        Args:
+            splats: N Gaussians, float32 on the CPU.
+            gradients: tensors of the same shapes; sh_rest is left alone at degree 0.
+            camera: of the view.
+            truth: [H, W, 3], contiguous.
+            background: [3].
+            sh_degree: in use.
+            ssim_weight: w in [0, 1].
+        """
+        height, width, n = camera.height, camera.width, len(splats)
+        if width < MIN_WIDTH:
+            raise ValueError(f"an image {width} pixels wide, needed at least {MIN_WIDTH}")
+        if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
+            raise ValueError(f"truth has shape {truth.shape}, needed {(height, width, 3)}")
+        if len(self.statistics.radii) != n:
+            self.statistics = Statistics.zeros(splats.means.detach())
+        statistics, frame, pixels = self.statistics, self._frame, height * width
+        statistics.radii.zero_()
+        rgb = frame.take("rgb", CHANNELS * pixels)
+        ours = Parameters(*map(flat, splats.parameters().values()))
+        frame.forward(
+            ours, camera, flat(background), sh_degree, rgb=rgb, alpha=frame.take("alpha", pixels),
+            depth=frame.take("depth", pixels), radii=flat(statistics.radii))
+        statistics.broken = frame.broken
+        grad_rgb = frame.take("grad_rgb", CHANNELS * pixels)
+        if not truth.flags.writeable:  # would be another type, and kernels compiled once more
+            truth = truth.copy()
+        loss = self._loss(rgb, truth.reshape(-1), width, height, ssim_weight, grad_rgb)
+        nothing = frame.take("nothing", 0)
+        frame.backward(
+            ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,
+            grad_alpha=nothing, grad_depth=nothing, details=False, scores=False,
+            means2d_grad=flat(statistics.means2d_grad),
+            absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
+            loo=flat(statistics.loo))
+        return loss
+
+    def _loss(
+        self, rgb: NDArray[np.float32], truth: NDArray[np.uint8], width: int, height: int,
+        ssim_weight: float, grad_rgb: NDArray[np.float32],
+    ) -> float:
+        maps = self._frame.take("maps", MAPS * len(rgb))
+        similar, apart = np.zeros(height), np.zeros(height)
+        crew.run(similarity, rgb, truth, width, height, self._window, maps, similar)
+        crew.run(loss_gradient, rgb, truth, width, height, self._window, maps, ssim_weight,
+                 grad_rgb, apart)
+        ssim, l1 = float(similar.sum()) / len(rgb), float(apart.sum()) / len(rgb)
+        return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)

@@ -1,0 +1,82 @@
+"""Gets all kernels ready: from the cache, or compiled with something to look at meanwhile."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import shutil
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from recon_cli.render.numba.backend import render
+from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba.kernel import cache_folder
+from recon_cli.render.numba.optimizer import step
+from recon_cli.render.numba.step import PhotometricStep
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+
+logger = logging.getLogger("recon")
+
+KERNELS = 11  # that threads share; the progress counts these
+_READY = "ready"  # file in the cache folder once every kernel is there
+_DAMAGE = (pickle.UnpicklingError, EOFError, ImportError, AttributeError, IndexError, KeyError,
+           ValueError, TypeError, RuntimeError)
+
+
+def is_warm() -> bool:
+    """Tells whether machine code for this CPU is there."""
+    folder = cache_folder()
+    return folder is not None and (folder / _READY).exists()
+
+
+def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
+    """Loads or compiles every kernel by running a tiny scene, and returns the seconds it took.
+
+    Args:
+        on_kernel: called after each of the KERNELS kernels is ready.
+    """
+    start = time.perf_counter()
+    seen: set[str] = set()
+
+    def observe(name: str, _seconds: float) -> None:
+        if name not in seen:
+            seen.add(name)
+            on_kernel()
+
+    before, crew.observer = crew.observer, observe
+    try:
+        _run_all()
+    except _DAMAGE:
+        folder = cache_folder()
+        if folder is None or not is_warm():
+            raise
+        logger.warning("the compiled kernels in %s cannot be read; compiling them again", folder)
+        for path in folder.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        _run_all()
+    finally:
+        crew.observer = before
+    folder = cache_folder()
+    if folder is not None:
+        (folder / _READY).touch()
+    return time.perf_counter() - start
+
+
+def _run_all() -> None:
+    """Runs every kernel once, on three Gaussians and an image of 20x20 pixels."""
+    n = 3
+    splats = Splats(
+        means=torch.tensor([[0.0, 0.0, 2.0]] * n), quats=torch.tensor([[1.0, 0, 0, 0]] * n),
+        log_scales=torch.full((n, 3), -2.0), logit_opacities=torch.zeros(n),
+        sh_dc=torch.zeros(n, 3), sh_rest=torch.zeros(n, 15, 3))
+    camera = Camera(20, 20, 20.0, 20.0, 10.0, 10.0, np.eye(4))
+    gradients = splats.map(torch.zeros_like)
+    PhotometricStep()(
+        splats, gradients, camera, np.zeros((20, 20, 3), np.uint8), torch.zeros(3), 3, 0.2)
+    render(splats, camera, torch.zeros(3), 3, scores=True)
+    flat = [tensor.reshape(-1) for tensor in gradients.parameters().values()]
+    step(flat, flat, flat, flat, [0.0] * len(flat), count=1, betas=(0.9, 0.999), epsilon=1e-15)

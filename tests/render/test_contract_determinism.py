@@ -1,0 +1,99 @@
+"""The same picture, gradients and statistics, bit by bit, whatever the threads and the order."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+import torch
+from backends import BLACK, CASES, GREENISH, every_backend
+from scenes import camera_at, random_splats
+
+from recon_cli.render import Statistics
+
+THREADS = (1, 2, 3, 7)
+# Sums of matrix products may be taken in another order by another number of torch's threads.
+THREADS_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-12}
+# Ties apart, the order of the input changes no term and no order of composition.
+ORDER_TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}
+
+
+def everything(case, splats, camera):
+    """The images, all gradients and all statistics of a picture, by name."""
+    tracked = case.leaves(splats)
+    out = case.render(tracked, camera, GREENISH, 3, scores=True)
+    (out.rgb.square().sum() + out.depth.sum() + out.alpha.square().sum()).backward()
+    found = {"rgb": out.rgb, "alpha": out.alpha, "depth": out.depth}
+    found |= {f"gradient of {name}": p.grad for name, p in tracked.parameters().items()}
+    found |= {field.name: getattr(out.statistics, field.name) for field in fields(Statistics)
+              if field.name != "broken"}
+    return {name: value.detach().cpu() for name, value in found.items()}
+
+
+@pytest.fixture
+def threads():
+    """Sets the number of threads, and puts it back."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@every_backend
+def test_the_same_input_gives_the_same_bits(case):
+    splats, camera = random_splats(400, seed=2), camera_at(90, 70)
+    first, second = (everything(case, splats, camera) for _ in range(2))
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if c.device == "cpu"], ids=str)
+def test_the_number_of_threads_changes_nothing(case, threads):
+    splats, camera = random_splats(3000, seed=2), camera_at(90, 70)
+    found = {}
+    for count in THREADS:
+        threads(count)
+        found[count] = everything(case, splats, camera)
+    for count in THREADS[1:]:
+        for name, value in found[count].items():
+            expected = found[1][name]
+            if case.backend == "numba":
+                assert torch.equal(value, expected), f"{name} with {count} threads"
+            else:
+                error = (value - expected).double().norm() / expected.double().norm()
+                assert error <= THREADS_TOLERANCE[case.dtype], f"{name} with {count} threads"
+
+
+@every_backend
+def test_the_order_of_the_gaussians_does_not_matter(case):
+    splats, camera = random_splats(200, seed=3), camera_at()
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
+    first = everything(case, splats, camera)
+    second = everything(case, splats.select(order), camera)
+    for name, value in second.items():
+        expected = first[name] if name in ("rgb", "alpha", "depth") else first[name][order]
+        scale = max(1.0, expected.abs().max().item())
+        error = (value - expected).abs().max().item()
+        assert error <= ORDER_TOLERANCE[case.dtype] * scale, name
+
+
+@every_backend
+def test_a_picture_does_not_remember_the_one_before_it(case):
+    splats, small = random_splats(100, seed=4), camera_at(20, 20)
+    alone = everything(case, splats, small)
+    everything(case, random_splats(800, seed=5), camera_at(120, 90))  # leaves larger buffers
+    again = everything(case, splats, small)
+    for name, value in alone.items():
+        assert torch.equal(value, again[name]), name
+
+
+@every_backend
+def test_two_pictures_may_wait_for_their_backward_passes(case):
+    splats, camera, other = random_splats(100, seed=4), camera_at(), camera_at(31, 23)
+    alone = everything(case, splats, camera)
+    tracked = case.leaves(splats)
+    first = case.render(tracked, camera, GREENISH, 3, scores=True)
+    second = case.render(case.leaves(random_splats(300, seed=6)), other, BLACK, 3, scores=True)
+    second.rgb.sum().backward()
+    (first.rgb.square().sum() + first.depth.sum() + first.alpha.square().sum()).backward()
+    for name, parameter in tracked.parameters().items():
+        assert torch.equal(parameter.grad.cpu(), alone[f"gradient of {name}"]), name
