@@ -12,6 +12,7 @@ import click
 
 from recon_cli import __version__, cleaning, console, doctor, options, pipeline, report
 from recon_cli import settings as layers
+from recon_cli.bench.command import bench
 from recon_cli.config import (
     ComputeConfig,
     DenoiseConfig,
@@ -309,3 +310,6 @@ def show_doctor(call: Call, as_json: bool) -> None:
     found = doctor.examine(call.workspace)
     text = json.dumps(dataclasses.asdict(found), indent=1)
     click.echo(text if as_json else report.doctor_text(found))
+
+
+cli.add_command(bench)

@@ -75,10 +75,15 @@ def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPAC
             expose_value=False, callback=_keep("config_file"),
             help="TOML file with options; it wins over recon.toml in the workspace.  "
                  "[default: none]"),
-        click.option(
-            "-v", "--verbose", is_flag=True, expose_value=False, callback=_keep("verbose"),
-            help="Show details, and the traceback of an error.  [default: off]"),
+        verbosity(),
     ])
+
+
+def verbosity() -> Decorator:
+    """Returns a decorator that adds -v."""
+    return click.option(
+        "-v", "--verbose", is_flag=True, expose_value=False, callback=_keep("verbose"),
+        help="Show details, and the traceback of an error.  [default: off]")
 
 
 def again() -> Decorator:

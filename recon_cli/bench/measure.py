@@ -1,0 +1,223 @@
+"""The run itself: every backend, thread count, loss and approximation on one scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+
+from recon_cli.bench.accuracy import Answer, accuracy, answer, oracle
+from recon_cli.bench.clock import Samples, Stopwatch, alternate, timing_of
+from recon_cli.bench.host import Host
+from recon_cli.bench.memory import added_memory
+from recon_cli.bench.peak import FLOPS_BACKWARD, FLOPS_FORWARD, peak_fraction, rate
+from recon_cli.bench.probes import COMPOSITE, DECOMPOSE, probe_for
+from recon_cli.bench.result import BackendResult, SceneResult, Speed, VariantResult
+from recon_cli.bench.scenes import QUICK, BenchScene, SceneSize, build_scene
+from recon_cli.bench.step import ADAM, Mark, loss_passes, training_step
+from recon_cli.bench.variants import CONTRACT, renderer_of, variants_for
+from recon_cli.progress import Bar, Progress
+from recon_cli.render import registry
+from recon_cli.render.contract import Renderer, RenderOutput
+
+Work = Callable[[], Mapping[str, float]]
+Pairs = tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is measured.
+
+    Attributes:
+        size: of the scene.
+        sh_degree: 0 to 3.
+        backends: by name.
+        device: "cpu" or "cuda".
+        threads: CPU threads; the figures of one thread are taken as well.
+        rounds: behind each median.
+    """
+
+    size: SceneSize
+    sh_degree: int
+    backends: tuple[str, ...]
+    device: str
+    threads: int
+    rounds: int
+
+    @property
+    def thread_counts(self) -> list[int]:
+        """The numbers of threads that speeds are taken with."""
+        return [self.threads] if self.device == "cuda" else sorted({1, self.threads})
+
+
+def measure(plan: Plan, host: Host, progress: Progress) -> SceneResult:
+    """Returns every figure of one scene."""
+    scene = build_scene(plan.size, plan.sh_degree, plan.device)
+    with _threads(plan.threads), progress.bar(
+        "bench", 3 * (plan.rounds + 1) + 1, unit="round"
+    ) as bar:
+        memory = {name: _memory(scene, name, plan.device) for name in plan.backends}
+        truth = oracle(scene)
+        bar.advance()
+        backends = _backends(scene, plan, host, truth, memory, bar)
+        losses = alternate(
+            {name: _whole(work, plan.device)
+             for name, work in loss_passes(scene, plan.device).items()},
+            plan.rounds, bar.advance)
+        variants = _variants(scene, plan, truth, bar)
+    return SceneResult(
+        plan.size.gaussians, plan.size.width, plan.size.height, plan.sh_degree, backends,
+        {name: timing_of(samples["whole"]) for name, samples in losses.items()},
+        plan.backends[0], variants)
+
+
+def _backends(
+    scene: BenchScene, plan: Plan, host: Host, truth: Answer, memory: Mapping[str, int], bar: Bar
+) -> dict[str, BackendResult]:
+    """Returns speed and accuracy of every backend, all thread counts in turn."""
+    peak = host.peak_gflops if plan.device == "cpu" else None
+    works, pairs = _speed_works(scene, plan)
+    samples = alternate(works, plan.rounds, bar.advance)
+
+    def speed(name: str, threads: int) -> Speed:
+        return _speed(samples[_label(name, threads)], pairs[name], peak, threads)
+
+    return {
+        name: BackendResult(
+            speed(name, plan.threads), speed(name, 1) if plan.device == "cpu" else None,
+            accuracy(answer(scene, registry.renderer(name)), truth), pairs[name], memory[name])
+        for name in plan.backends}
+
+
+def _variants(
+    scene: BenchScene, plan: Plan, truth: Answer, bar: Bar
+) -> list[VariantResult]:
+    """Returns time and accuracy of the contract and of every approximation, in turn."""
+    backend = plan.backends[0]
+    tried = [CONTRACT, *variants_for(backend, plan.sh_degree)]
+    renderers = {one.name: renderer_of(one, backend) for one in tried}
+    samples = alternate(
+        {name: _whole(_passes(scene, draw), plan.device) for name, draw in renderers.items()},
+        plan.rounds, bar.advance)
+    return [
+        VariantResult(
+            one.name, timing_of(samples[one.name]["whole"]) if one.saves_time else None,
+            accuracy(answer(scene, renderers[one.name]), truth))
+        for one in tried]
+
+
+def _label(backend: str, threads: int) -> str:
+    return f"{backend} {threads}"
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Lets torch and the kernels use `count` threads within the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _render(scene: BenchScene, draw: Renderer) -> RenderOutput:
+    splats = scene.splats.map(lambda tensor: tensor.detach().requires_grad_())
+    return draw(splats, scene.camera, scene.background, scene.sh_degree, False)
+
+
+def _memory(scene: BenchScene, backend: str, device: str) -> int:
+    """Returns the memory of a first pass, after one on a tiny scene has compiled everything."""
+    draw = registry.renderer(backend)
+    tiny = build_scene(QUICK, scene.sh_degree, device)
+
+    _passes(tiny, draw)()
+    return added_memory(_passes(scene, draw), device)
+
+
+def _speed_works(scene: BenchScene, plan: Plan) -> tuple[dict[str, Work], dict[str, Pairs]]:
+    """Returns the timed work of each backend and thread count, and where their pairs end up."""
+    pairs: dict[str, Pairs] = dict.fromkeys(plan.backends)
+
+    def work(name: str, threads: int) -> Work:
+        step = training_step(scene, name)
+
+        def run() -> Mapping[str, float]:
+            with _threads(threads):
+                passes, pairs[name] = _timed_passes(scene, name, plan.device)
+                return {**passes, **_timed_step(step, name, plan.device)}
+
+        return run
+
+    works = {_label(name, threads): work(name, threads)
+             for threads in plan.thread_counts for name in plan.backends}
+    return works, pairs
+
+
+def _timed_passes(scene: BenchScene, name: str, device: str) -> tuple[dict[str, float], Pairs]:
+    """Returns the milliseconds of both passes and of their parts, and the pairs."""
+    draw, probe = registry.renderer(name), probe_for(name, device)
+    with probe.watching():
+        watch = Stopwatch(device)
+        output = _render(scene, draw)
+        watch.mark("forward")
+        forward = probe.collect()
+        output.rgb.backward(scene.weights)  # type: ignore[no-untyped-call]
+        watch.mark("backward")
+        backward = probe.collect()
+    return {
+        **_parts("forward", watch.ms["forward"], forward),
+        **_parts("backward", watch.ms["backward"], backward)}, probe.pairs(output)
+
+
+def _timed_step(step: Callable[[Mark], None], name: str, device: str) -> dict[str, float]:
+    """Returns the milliseconds of an optimization step and of its parts."""
+    probe = probe_for(name, device)
+    with probe.watching():
+        watch = Stopwatch(device)
+        step(watch.mark)
+    parts = probe.collect()
+    parts.setdefault(ADAM, watch.ms[ADAM])
+    return _parts("step", sum(watch.ms.values()), parts)
+
+
+def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float]:
+    """Returns the time of a pass under its name, and of its parts with what they leave over."""
+    found = {whole: ms}
+    if parts:
+        found |= {f"{whole}: {part}": part_ms for part, part_ms in parts.items()}
+        found[f"{whole}: rest"] = max(0.0, ms - sum(parts.values()))
+    return found
+
+
+def _whole(work: Callable[[], object], device: str) -> Work:
+    """Returns a function that does some work and returns its milliseconds."""
+    def run() -> Mapping[str, float]:
+        watch = Stopwatch(device)
+        work()
+        watch.mark("whole")
+        return watch.ms
+
+    return run
+
+
+def _passes(scene: BenchScene, draw: Renderer) -> Callable[[], object]:
+    """Returns a function that runs both passes of a renderer."""
+    return lambda: _render(scene, draw).rgb.backward(  # type: ignore[no-untyped-call]
+        scene.weights)
+
+
+def _speed(samples: Samples, pairs: Pairs, peak: float | None, threads: int) -> Speed:
+    """Returns medians and rates; those of pairs are of the compositing stages alone."""
+    timings = {name: timing_of(values) for name, values in samples.items()}
+    whole = {name: timings.pop(name) for name in ("forward", "backward", "step")}
+    inner = [timings.get(f"forward: {COMPOSITE}"), timings.get(f"backward: {DECOMPOSE}")]
+    forward, backward = (
+        rate(pairs[i] if pairs else None, stage.ms if stage else None)
+        for i, stage in enumerate(inner))
+    return Speed(
+        threads, whole["forward"], whole["backward"], whole["step"], forward, backward,
+        peak_fraction(forward, FLOPS_FORWARD, peak, threads),
+        peak_fraction(backward, FLOPS_BACKWARD, peak, threads), timings)
