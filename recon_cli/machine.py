@@ -6,6 +6,8 @@ import importlib.metadata
 import platform
 import threading
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from types import TracebackType
 
 import psutil
@@ -41,6 +43,24 @@ def usable_threads() -> int:
     if hasattr(process, "cpu_affinity"):  # macOS has none
         return len(process.cpu_affinity())
     return psutil.cpu_count() or 1
+
+
+_LIMITS = (  # of a container: (limit, in use), cgroups version 2 and 1
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
+
+
+def free_memory_bytes(limits: Sequence[tuple[str, str]] = _LIMITS) -> int:
+    """Returns how much memory this process may still take, the container's limit included."""
+    free = int(psutil.virtual_memory().available)
+    for limit, used in limits:
+        try:
+            left = int(Path(limit).read_text()) - int(Path(used).read_text())
+        except (OSError, ValueError):  # no such file, or "max"
+            continue
+        free = min(free, max(0, left))
+    return free
 
 
 class Meter:

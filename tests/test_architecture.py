@@ -38,7 +38,7 @@ ALLOWED: dict[str, set[str]] = {
     "mapping": BOTTOM | OPTIONS | {"progress", "io", "scene"},
     "train": BOTTOM | OPTIONS | {"progress", "scene", "render"},
     "stages": BOTTOM | OPTIONS | {
-        "progress", "metrics", "capture", "mapping", "scene", "io", "train", "render"},
+        "progress", "metrics", "machine", "capture", "mapping", "scene", "io", "train", "render"},
     "freshness": OPTIONS | RECORDS | {"settings", "stages"},
     "execute": OPTIONS | RECORDS | {
         "settings", "stages", "freshness", "machine", "progress", "render"},

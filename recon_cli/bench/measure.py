@@ -21,6 +21,7 @@ from recon_cli.bench.variants import CONTRACT, renderer_of, variants_for
 from recon_cli.progress import Bar, Progress
 from recon_cli.render import registry
 from recon_cli.render.contract import Renderer, RenderOutput
+from recon_cli.render.numba.crew import crew
 
 Work = Callable[[], Mapping[str, float]]
 Pairs = tuple[int, int] | None
@@ -98,9 +99,10 @@ def _variants(
     backend = plan.backends[0]
     tried = [CONTRACT, *variants_for(backend, plan.sh_degree)]
     renderers = {one.name: renderer_of(one, backend) for one in tried}
-    samples = alternate(
-        {name: _whole(_passes(scene, draw), plan.device) for name, draw in renderers.items()},
-        plan.rounds, bar.advance)
+    with _threads(plan.threads, backend):
+        samples = alternate(
+            {name: _whole(_passes(scene, draw), plan.device) for name, draw in renderers.items()},
+            plan.rounds, bar.advance)
     return [
         VariantResult(
             one.name, timing_of(samples[one.name]["whole"]) if one.saves_time else None,
@@ -113,14 +115,15 @@ def _label(backend: str, threads: int) -> str:
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """Lets torch and the kernels use `count` threads within the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
+def _threads(count: int, backend: str = "torch") -> Iterator[None]:
+    """Lets a backend use `count` threads within the block, in the way that training does."""
+    before, crew_before = torch.get_num_threads(), crew.threads
+    registry.use_threads(backend, count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+        crew.threads = crew_before
 
 
 def _render(scene: BenchScene, draw: Renderer) -> RenderOutput:
@@ -145,7 +148,7 @@ def _speed_works(scene: BenchScene, plan: Plan) -> tuple[dict[str, Work], dict[s
         step = training_step(scene, name)
 
         def run() -> Mapping[str, float]:
-            with _threads(threads):
+            with _threads(threads, name):
                 passes, pairs[name] = _timed_passes(scene, name, plan.device)
                 return {**passes, **_timed_step(step, name, plan.device)}
 

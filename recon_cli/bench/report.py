@@ -20,7 +20,7 @@ def tables(result: Result) -> list[Table]:
         where = (f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
                  f"SH degree {scene.sh_degree}")
         found += [
-            _figures(where, scene), _stages(where, scene), _errors(where, scene),
+            _figures(where, scene, result.warm_start), _stages(where, scene), _errors(where, scene),
             _variants(where, scene)]
     return found
 
@@ -44,18 +44,19 @@ def _both(speed: Speed) -> float:
     return speed.forward.ms + speed.backward.ms
 
 
-def _figures(where: str, scene: SceneResult) -> Table:
+def _figures(where: str, scene: SceneResult, warm_start: Timing | None) -> Table:
     """The figures that are quoted, one row each, a column a backend."""
     backends = scene.backends
     rows = [(what, *(figure(one) for one in backends.values()))
             for what, figure in _quoted(scene)]
-    # The warm start (seconds from a fresh process to kernels that are ready) is a row here.
     width = len(backends) - 1
+    if warm_start is not None:
+        rows.append(("kernels ready in a fresh process, ms", timed(warm_start), *[""] * width))
+    fused = scene.losses.get("fused")
     for name, timing in scene.losses.items():
         rows.append((f"loss {name}, ms", timed(timing), *[""] * width))
-        if name != _REFERENCE and _REFERENCE in scene.losses:
-            rows.append((f"loss {_REFERENCE} : {name}",
-                         _ratio(scene.losses[_REFERENCE].ms, timing.ms), *[""] * width))
+        if fused and timing is not fused:
+            rows.append((f"loss {name} : fused", _ratio(timing.ms, fused.ms), *[""] * width))
     return Table(f"Figures ({where})", ("what", *backends), rows)
 
 

@@ -166,17 +166,20 @@ class Result:
         host: where it ran.
         rounds: behind each median.
         scenes: by name.
+        warm_start: of the numba backend in a fresh process; None where it was left out.
     """
 
     host: Host
     rounds: int
     scenes: dict[str, SceneResult]
+    warm_start: Timing | None = None
 
     def record(self) -> dict[str, Any]:
         """Returns what the JSON file holds."""
         return {
             "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
             "rounds": self.rounds,
+            "warm_start": asdict(self.warm_start) if self.warm_start else None,
             "scenes": {name: scene.record() for name, scene in self.scenes.items()},
         }
 

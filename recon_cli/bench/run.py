@@ -15,6 +15,7 @@ from recon_cli.bench.measure import Plan, measure
 from recon_cli.bench.request import Request, pixels
 from recon_cli.bench.result import Result, read_record
 from recon_cli.bench.scenes import QUICK, SIZES
+from recon_cli.bench.warm_start import warm_start
 from recon_cli.progress import Progress
 from recon_cli.render import registry
 
@@ -30,7 +31,8 @@ def run(request: Request, progress: Progress) -> str:
     plan = plan_of(request)
     old = check(request, plan)
     host = examine(plan.threads, plan.device)
-    result = Result(host, plan.rounds, {request.scene: measure(plan, host, progress)})
+    warm = warm_start(plan.rounds) if "numba" in plan.backends else None
+    result = Result(host, plan.rounds, {request.scene: measure(plan, host, progress)}, warm)
     _write(request, result)
     parts = [report.head(result), *(table.text() for table in report.tables(result))]
     if old is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,15 +18,19 @@ from recon_cli.config import TrainConfig
 from recon_cli.errors import TrainingError
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_image
+from recon_cli.machine import free_memory_bytes
 from recon_cli.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train.fit import Report, Task, fit
+from recon_cli.train.memory import estimate, refuse_what_does_not_fit
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
-from recon_cli.train.step import TrainView
+from recon_cli.train.step import TrainView, fuses
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
+
+logger = logging.getLogger("recon")
 
 
 def held_out_names(ingest: Path) -> frozenset[str]:
@@ -51,6 +56,8 @@ def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
             f"{len(scene.train)} views are left to train on; at least 2 are needed.",
             hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
 
+    _check_memory(scene, config, ctx)
+
     def views(chosen: Sequence[View]) -> list[TrainView]:
         loaded = []
         for view in chosen:
@@ -62,6 +69,23 @@ def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
     return Task(
         views(scene.train), views(scene.validation), Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device))
+
+
+def _check_memory(scene: Scene, config: TrainConfig, ctx: StageContext) -> None:
+    """Says what the run will take, and refuses what does not fit.
+
+    Raises:
+        TrainingError: there is not enough memory.
+    """
+    camera = fitted_camera(scene.train[0].camera, config.max_size)
+    needed = estimate(
+        views=len(scene.train) + len(scene.validation), width=camera.width, height=camera.height,
+        gaussians=config.max_gaussians, fused=fuses(ctx.backend))
+    free = free_memory_bytes()
+    if ctx.device == "cuda":
+        free = torch.cuda.mem_get_info()[0]
+    logger.info("training takes %s at most; %.0f MB are free", needed.described(), free / 1e6)
+    refuse_what_does_not_fit(needed, free)
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.render.numba.crew import crew
 from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.lane_functions import (
     absolute,
@@ -33,16 +34,53 @@ _REACH = RADIUS * CHANNELS  # numbers to the outermost tap
 _COLUMNS = 512  # numbers of a row that are blurred at a time: four maps fit the first-level cache
 _WIDTH = LANES + _REACH + _COLUMNS + _REACH + LANES  # of a row of blurred numbers with its margins
 _ROWS = 4  # rows that a thread takes at a time
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # for images in [0, 1]
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)  # for images in [0, 1]
 _STEP = np.float32(1 / 255)
 MAPS = 3
 
 
+MIN_WIDTH = -(-LANES // CHANNELS)  # pixels; a row must fill one vector
+
+
 def taps() -> NDArray[np.float32]:
-    """Returns the window, [11] float32, of sum 1."""
+    """Returns the window, [11], of sum 1."""
     window = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
     normalised: NDArray[np.float32] = (window / window.sum()).astype(np.float32)
     return normalised
+
+
+_WINDOW = taps()
+
+
+def photometric(
+    image: NDArray[np.float32], truth: NDArray[np.uint8], width: int, height: int,
+    ssim_weight: float, *, maps: NDArray[np.float32], gradient: NDArray[np.float32],
+) -> float:
+    """Returns the loss (1 - w) L1 + w (1 - SSIM) of an image and writes its gradient.
+
+    Args:
+        image: [H * W * 3].
+        truth: [H * W * 3], writeable like all arrays of kernels.
+        width: in pixels, at least MIN_WIDTH.
+        height: in pixels.
+        ssim_weight: w in [0, 1].
+        maps: [3 * H * W * 3] scratch.
+        gradient: [H * W * 3] out.
+
+    Raises:
+        ValueError: the image is too narrow or the sizes do not fit.
+    """
+    size = CHANNELS * width * height
+    if width < MIN_WIDTH:
+        raise ValueError(f"an image {width} pixels wide, needed at least {MIN_WIDTH}")
+    if (len(image), len(truth), len(gradient), len(maps)) != (size, size, size, MAPS * size):
+        raise ValueError(f"arrays that do not fit an image of {width}x{height}")
+    similar, apart = np.zeros(height), np.zeros(height)
+    crew.run(similarity, image, truth, width, height, _WINDOW, maps, similar)
+    crew.run(loss_gradient, image, truth, width, height, _WINDOW, maps, ssim_weight, gradient,
+             apart)
+    ssim, l1 = float(similar.sum()) / size, float(apart.sum()) / size
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
 
 
 @inlined
@@ -106,8 +144,8 @@ def similarity(counter, image, truth, width, height, window, maps, row_sums, scr
                     squares = blurred_across(scratch, 2, at, window)
                     products = blurred_across(scratch, 3, at, window)
                     means = fma(mx, mx, my * my)
-                    a1, a2 = 2.0 * mx * my + _C1, 2.0 * (products - mx * my) + _C2
-                    b1, b2 = means + _C1, (squares - means) + _C2
+                    a1, a2 = 2.0 * mx * my + C1, 2.0 * (products - mx * my) + C2
+                    b1, b2 = means + C1, (squares - means) + C2
                     per_b = 1.0 / (b1 * b2)
                     ssim = a1 * a2 * per_b
                     by_square = -ssim * b1 * per_b

@@ -13,14 +13,10 @@ from torch import Tensor
 
 from recon_cli.render.contract import Statistics
 from recon_cli.render.numba.backend import flat
-from recon_cli.render.numba.crew import crew
 from recon_cli.render.numba.frame import Frame, Parameters
-from recon_cli.render.numba.lanes import LANES
-from recon_cli.render.numba.loss import CHANNELS, MAPS, loss_gradient, similarity, taps
+from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-
-MIN_WIDTH = -(-LANES // CHANNELS)  # pixels; a row must fill one vector
 
 
 class PhotometricStep:
@@ -32,7 +28,6 @@ class PhotometricStep:
 
     def __init__(self) -> None:
         self._frame = Frame()
-        self._window = taps()
         self.statistics = Statistics.zeros(torch.zeros(0, 3))
 
     @property
@@ -61,8 +56,6 @@ class PhotometricStep:
             ssim_weight: w in [0, 1].
         """
         height, width, n = camera.height, camera.width, len(splats)
-        if width < MIN_WIDTH:
-            raise ValueError(f"an image {width} pixels wide, needed at least {MIN_WIDTH}")
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
             raise ValueError(f"truth has shape {truth.shape}, needed {(height, width, 3)}")
         if len(self.statistics.radii) != n:
@@ -78,7 +71,9 @@ class PhotometricStep:
         grad_rgb = frame.take("grad_rgb", CHANNELS * pixels)
         if not truth.flags.writeable:  # would be another type, and kernels compiled once more
             truth = truth.copy()
-        loss = self._loss(rgb, truth.reshape(-1), width, height, ssim_weight, grad_rgb)
+        loss = photometric(
+            rgb, truth.reshape(-1), width, height, ssim_weight,
+            maps=frame.take("maps", MAPS * len(rgb)), gradient=grad_rgb)
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,
@@ -87,15 +82,3 @@ class PhotometricStep:
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))
         return loss
-
-    def _loss(
-        self, rgb: NDArray[np.float32], truth: NDArray[np.uint8], width: int, height: int,
-        ssim_weight: float, grad_rgb: NDArray[np.float32],
-    ) -> float:
-        maps = self._frame.take("maps", MAPS * len(rgb))
-        similar, apart = np.zeros(height), np.zeros(height)
-        crew.run(similarity, rgb, truth, width, height, self._window, maps, similar)
-        crew.run(loss_gradient, rgb, truth, width, height, self._window, maps, ssim_weight,
-                 grad_rgb, apart)
-        ssim, l1 = float(similar.sum()) / len(rgb), float(apart.sum()) / len(rgb)
-        return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)

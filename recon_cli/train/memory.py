@@ -1,0 +1,82 @@
+"""How much memory a training run will take, told before it starts.
+
+The figures per Gaussian and per pixel are counted from what the code allocates and rounded up;
+`recon bench` prints what a step really holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from recon_cli.errors import TrainingError
+
+# values, gradients and two moments of 59 float32, and a copy of the values and of one moment
+# while densification rebuilds them
+_PER_GAUSSIAN = 4 * 4 * 59 + 4 * 59 + 4 * 45
+# a record, indices and the gradient sums of about six tiles
+_BUFFERS_PER_GAUSSIAN = 128 + 6 * 72
+_BUFFERS_PER_PIXEL = 96  # image, its gradient, three maps of the loss, transmittance
+_PROGRAM = 350 << 20  # Python, torch and the kernels
+_TORCH_FACTOR = 4  # autograd keeps what the fused kernels compute again
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """The bytes that a run needs at its peak.
+
+    Attributes:
+        images: all views as uint8.
+        gaussians: parameters, gradients, moments at the largest count.
+        buffers: of one step.
+        program: everything else.
+    """
+
+    images: int
+    gaussians: int
+    buffers: int
+    program: int
+
+    @property
+    def total(self) -> int:
+        """Sum of all parts."""
+        return self.images + self.gaussians + self.buffers + self.program
+
+    def described(self) -> str:
+        """Returns the estimate in words."""
+        return (f"about {_megabytes(self.total)} (images {_megabytes(self.images)}, Gaussians "
+                f"{_megabytes(self.gaussians)}, buffers {_megabytes(self.buffers)})")
+
+
+def estimate(
+    *, views: int, width: int, height: int, gaussians: int, fused: bool
+) -> MemoryEstimate:
+    """Returns the memory that training takes.
+
+    Args:
+        views: held in memory.
+        width: of a view in pixels.
+        height: of a view in pixels.
+        gaussians: the most that there will be.
+        fused: the backend computes gradients without autograd.
+    """
+    pixels = width * height
+    buffers = gaussians * _BUFFERS_PER_GAUSSIAN + pixels * _BUFFERS_PER_PIXEL
+    return MemoryEstimate(
+        images=3 * pixels * views, gaussians=gaussians * _PER_GAUSSIAN,
+        buffers=buffers if fused else _TORCH_FACTOR * buffers, program=_PROGRAM)
+
+
+def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
+    """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes."""
+    if needed.total <= free:
+        return
+    largest = max(("images", needed.images), ("gaussians", needed.gaussians + needed.buffers),
+                  key=lambda part: part[1])[0]
+    lower = "--max-size" if largest == "images" else "--max-gaussians"
+    raise TrainingError(
+        f"Training needs {needed.described()}, but {_megabytes(free)} are free.",
+        hint=f"Lower {lower}, or close other programs.")
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 1e6:,.0f} MB"

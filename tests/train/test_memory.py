@@ -1,0 +1,33 @@
+"""The memory that a run will take, told and refused before it starts."""
+
+import pytest
+
+from recon_cli.errors import TrainingError
+from recon_cli.train.memory import estimate, refuse_what_does_not_fit
+
+
+def needed(**changes):
+    values = {"views": 100, "width": 640, "height": 360, "gaussians": 100_000, "fused": True}
+    return estimate(**(values | changes))
+
+
+def test_images_are_counted_as_bytes():
+    assert needed(gaussians=0).images == 100 * 640 * 360 * 3
+
+
+def test_a_gaussian_takes_at_most_one_and_a_half_kilobytes():
+    assert needed().gaussians <= 1500 * 100_000
+
+
+def test_what_fits_is_not_refused():
+    refuse_what_does_not_fit(needed(), needed().total)
+
+
+@pytest.mark.parametrize(("changes", "option"), [
+    ({"gaussians": 50_000_000}, "--max-gaussians"),
+    ({"views": 3000, "width": 4000, "height": 3000}, "--max-size"),
+])
+def test_the_error_says_what_to_lower(changes, option):
+    with pytest.raises(TrainingError, match="MB are free") as caught:
+        refuse_what_does_not_fit(needed(**changes), 8_000_000_000)
+    assert option in caught.value.hint
