@@ -17,7 +17,7 @@ class Splats:
 
     Attributes:
         means: [N, 3] centres in world units.
-        quats: [N, 4] rotations, wxyz, of any length but zero.
+        quats: [N, 4] rotations, wxyz, of any length; zeros stand for no rotation.
         log_scales: [N, 3] natural logarithm of the standard deviations along the own axes.
         logit_opacities: [N] opacity before the sigmoid.
         sh_dc: [N, 3] spherical-harmonics coefficients of degree 0; colour = SH_C0 * sh_dc + 0.5.

@@ -83,12 +83,9 @@ def test_a_thousand_opaque_layers_stop_before_the_third(case):
     splats = layers(1000, logit=40.0)
     out, tracked = rendered(case, splats, camera_at(8, 8), scores=True)
     left = 1 - out.alpha.double()
-    # Two clamped fragments leave 1e-4, which is the threshold itself: whether the second is part
-    # of the picture is a matter of rounding, and worth at most the 1e-2 that it covers.
-    assert left.min() >= TRANSMITTANCE_MIN * (1 - 1e-3)
-    assert left.max() <= STOPPED_BELOW * (1 + 1e-5)
-    first = SH_C0 * splats.sh_dc[0] + 0.5
-    assert (out.rgb.cpu().double() - first).abs().max() <= STOPPED_BELOW * (1 + 1e-5)
+    # Two clamped fragments leave 1e-4; the threshold lies a rounding margin below that.
+    assert (left - 1e-4).abs().max() <= 1e-7  # alpha is near 1, where float32 steps by 6e-8
+    assert (out.statistics.hits[:2] == 64).all()
     assert (out.statistics.hits[2:] == 0).all()
     assert all((p.grad[2:] == 0).all() for p in tracked.parameters().values()
                if p.grad is not None)
@@ -189,7 +186,7 @@ def _covering(count: int) -> Splats:
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("case", [c for c in CASES if c.dtype == torch.float32], ids=str)
 def test_up_to_ten_million_instances_fit_into_memory_and_into_integers(case):
-    count = 20_000 if case.backend == "numba" else 500  # the torch backend takes its time
+    count = 20_000 if case.backend == "numba" else 2_000  # the torch backend takes its time
     camera = camera_at(480, 270, focal=300.0)
     tracked = case.leaves(_covering(count))
     out = case.render(tracked, camera, BLACK, scores=True)

@@ -56,6 +56,25 @@ def test_a_depth_swept_through_the_near_plane_ends_at_it(case, depth):
     assert out.statistics.broken == 0
 
 
+def test_a_depth_on_the_near_plane_is_drawn_or_culled_as_a_whole(case):
+    # found by test_hypothesis: 0.05 rounded to float32 lies behind the plane or on it, as one
+    # compares in float64 or in float32
+    splats = case.rounded(
+        one_splat((0.0, 0.0, NEAR), scale=0.01, opacity=0.7, color=(0.9, 0.5, 0.1)))
+    tracked = case.leaves(splats)
+    out = case.render(tracked, STRAIGHT)
+    out.rgb.square().sum().backward()
+    drawn = bool(out.statistics.radii[0] > 0)
+    splats.means[0, 2] = NEAR * (1 + 1e-6)
+    behind = case.render(splats, STRAIGHT)
+    expected = behind.alpha if drawn else torch.zeros_like(behind.alpha)
+    assert behind.alpha.max() > 0.5
+    assert torch.allclose(out.alpha, expected, rtol=0, atol=1e-4)
+    assert (tracked.means.grad.abs().sum() > 0) == drawn
+    assert all(torch.isfinite(p.grad).all() for p in tracked.parameters().values()
+               if p.grad is not None)
+
+
 @pytest.mark.parametrize("slope", [1.0, 3.0, 3.8, 4.3, 7.0, 34.0])
 def test_grazing_angles_agree_with_the_oracle_inside_and_beyond_the_clamp(case, slope):
     # 144 degrees across; x/z is held at -4.2 and at 3.9
