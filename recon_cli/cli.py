@@ -32,9 +32,6 @@ from recon_cli.stages import STAGES
 from recon_cli.workspace import SETTINGS, Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
-# Small enough for a laptop's CPU and a first impression.
-DEMO_SETTINGS: Settings = {
-    "train": {"iterations": 1000, "max_size": 300, "max_gaussians": 30_000}}
 MID: Settings = {"prune": {"at": "mid"}}  # what the paper does: prune while training goes on
 INTERRUPTED = 130
 
@@ -251,7 +248,7 @@ def run_all(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
 def demo(call: Call) -> None:
     """Do everything on the bundled room video."""
     stages = [row.name for row in STAGES]
-    _perform(call, "demo", stages, sources=(SAMPLE,), base=layers.merged([MID, DEMO_SETTINGS]))
+    _perform(call, "demo", stages, sources=(SAMPLE,), base=MID)
     click.echo(f"The scene is in {call.workspace / 'export' / 'splats.ply'}")
 
 

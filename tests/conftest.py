@@ -1,10 +1,13 @@
 """Fixtures that every test may use."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+# Compiled kernels are kept from one run of the tests to the next, but not among the user's own.
+os.environ.setdefault("RECON_CACHE_DIR", str(ROOT / ".pytest_cache" / "recon"))
 
 
 @pytest.fixture(scope="session")

@@ -75,7 +75,6 @@ def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
     assert fake_stages.ran == NAMES
     train = config_of("train", "demo")
     assert train["iterations"] == 10  # what is typed wins
-    assert train["max_size"] == cli.DEMO_SETTINGS["train"]["max_size"]
     out = capsys.readouterr().out
     assert "the table of evaluate" in out
     assert str(Path("demo/export/splats.ply")) in out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,7 +36,8 @@ class BackendStatus:
 def available_backends() -> tuple[BackendStatus, ...]:
     """Returns every known backend, fastest first, each with the reason if it cannot run."""
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
-    return (BackendStatus("numba", ("cpu",)), BackendStatus("torch", devices))
+    missing = "" if importlib.util.find_spec("numba") else "the package numba is not installed"
+    return (BackendStatus("numba", ("cpu",), missing), BackendStatus("torch", devices))
 
 
 def resolve(backend: str, device: str) -> tuple[str, str]:
@@ -53,13 +55,14 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
         chosen_device = "cuda" if torch.cuda.is_available() else "cpu"
     known = {status.name: status for status in available_backends()}
     if backend == "auto":
-        backend = next(s.name for s in known.values() if chosen_device in s.devices)
+        backend = next(s.name for s in known.values()
+                       if chosen_device in s.devices and not s.missing)
         logger.info("rasterizer: %s on %s (chosen automatically)", backend, chosen_device)
     if backend not in known:
         raise BackendError(
             f"There is no backend {backend!r}.", hint="Known are " + ", ".join(known) + ".")
     status = known[backend]
-    if chosen_device not in status.devices:
+    if chosen_device not in status.devices or status.missing:
         reason = status.missing or f"it does not run on {chosen_device}"
         raise BackendError(f"Backend {backend} cannot be used: {reason}.", hint="See recon doctor.")
     return backend, chosen_device

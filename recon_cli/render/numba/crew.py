@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-_SCRATCH_FLOATS = 1 << 13  # 32 KB: no kernel needs more, and it stays in the first-level cache
+SCRATCH_FLOATS = 1 << 13  # 32 KB: no kernel needs more, and it stays in the first-level cache
 
 Kernel = Callable[..., Any]
 
@@ -89,7 +89,7 @@ class Crew:
         if self._process != os.getpid():  # threads do not survive a fork
             self._inboxes, self._done, self._process = [], SimpleQueue(), os.getpid()
         while len(self._scratch) < count:
-            self._scratch.append(aligned(_SCRATCH_FLOATS))
+            self._scratch.append(aligned(SCRATCH_FLOATS))
         while len(self._inboxes) < count - 1:
             inbox: SimpleQueue[Callable[[], None]] = SimpleQueue()
             self._inboxes.append(inbox)

@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 
 from recon_cli.render.contract import EXACT, Approximation
 from recon_cli.render.numba import binning
-from recon_cli.render.numba.crew import aligned, crew
+from recon_cli.render.numba.crew import SCRATCH_FLOATS, aligned, crew
 from recon_cli.render.numba.culling import compact, cull
 from recon_cli.render.numba.layout import RECORD, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
-from recon_cli.render.numba.planes import BLOCK, Viewpoint
+from recon_cli.render.numba.planes import BLOCK, PROJECTION_FLOATS, Viewpoint
 from recon_cli.render.numba.projection import project
-from recon_cli.render.numba.projection_gradient import unproject
-from recon_cli.render.numba.raster_backward import decompose
-from recon_cli.render.numba.raster_forward import composite, tally
+from recon_cli.render.numba.projection_gradient import GRADIENT_FLOATS, unproject
+from recon_cli.render.numba.raster_backward import BACKWARD_FLOATS, decompose
+from recon_cli.render.numba.raster_forward import FORWARD_FLOATS, composite, tally
 from recon_cli.scene.camera import Camera
+
+assert max(PROJECTION_FLOATS, GRADIENT_FLOATS, FORWARD_FLOATS, BACKWARD_FLOATS) <= SCRATCH_FLOATS
 
 _MARGIN = 0.15  # of the image on each side, within which x/z and y/z are held
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba.crew import SCRATCH_FLOATS, crew
 from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.lane_functions import (
     absolute,
@@ -37,6 +37,7 @@ _ROWS = 4  # rows that a thread takes at a time
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)  # for images in [0, 1]
 _STEP = np.float32(1 / 255)
 MAPS = 3
+assert 4 * _WIDTH <= SCRATCH_FLOATS
 
 
 MIN_WIDTH = -(-LANES // CHANNELS)  # pixels; a row must fill one vector
