@@ -9,7 +9,6 @@ import pytest
 import torch
 from backends import (
     BLACK,
-    GRADIENT_TOLERANCE,
     IMAGE_TOLERANCE,
     ORACLE_SH_TOLERANCE,
     compared,
@@ -27,13 +26,15 @@ STRAIGHT = Camera(50, 37, 40.0, 44.0, 26.3, 17.8, np.eye(4))  # world and camera
 # The long axis of a needle hardly changes its picture: the gradient of its scale is a remainder
 # of large parts. Measured in float32 at 1e3 and 1e6: images 5e-6, that gradient 1e-4.
 NEEDLE_IMAGE_TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-11}
+# Measured 1.1e-5 at the near plane and at scales of e^-11.5.
+HARD_GRADIENT_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-12}
 NEEDLE_GRADIENT_TOLERANCE = {torch.float32: 1e-3, torch.float64: 1e-10}
 # A needle longer than the image amplifies the rounding of its direction, but no gradient is a
 # difference of long terms. Measured 5e-5; the oracle's inverted matrix is good for 4e-7 here.
 LONG_NEEDLE_TOLERANCE = {torch.float32: 5e-4, torch.float64: 2e-6}
 
 
-def within(case, found, image=IMAGE_TOLERANCE, gradient=GRADIENT_TOLERANCE):
+def within(case, found, image=IMAGE_TOLERANCE, gradient=HARD_GRADIENT_TOLERANCE):
     assert found.image <= image[case.dtype], f"{found.image:.1e}"
     for name, error in found.gradients.items():
         limit = max(gradient[case.dtype], ORACLE_SH_TOLERANCE if name == "means" else 0)
