@@ -1,10 +1,18 @@
 """Adam whose rows follow the Gaussians."""
 
+import pytest
 import torch
 from scenes import joined, random_splats
 
 from recon_cli.config import TrainConfig
+from recon_cli.render.numba.crew import crew
+from recon_cli.scene import Splats
 from recon_cli.train.optimizer import SplatOptimizer
+
+# float32 in another order of operations, over 20 steps: a few units in the last place.
+STEPS_TOLERANCE = 1e-6
+ROLES = "exp_avg", "exp_avg_sq"
+BYTES = 1500  # a Gaussian may take in training: what is promised for a million on a laptop
 
 
 def stepped(splats, times=3):
@@ -57,3 +65,180 @@ def test_forgetting_touches_one_parameter_only():
     tensors = optimizer.tensors()
     assert tensors["adam.logit_opacities.exp_avg_sq"].abs().max() == 0
     assert tensors["adam.means.exp_avg_sq"].abs().max() > 0
+
+
+# ---- fused: gradients in buffers, one kernel for all parameters ----
+
+CONFIG = TrainConfig(max_gaussians=50)
+both_kinds = pytest.mark.parametrize("fused", [False, True])
+
+
+def optimizer_of(n, *, fused, config=CONFIG):
+    splats = random_splats(n, dtype=torch.float32)
+    return SplatOptimizer(splats, config, extent=2.0, fused=fused)
+
+
+def gradients_of(n, step):
+    """Gradients as they are in training: of any size, many of them zero, some denormal."""
+    generator = torch.Generator().manual_seed(step)
+
+    def draw(tensor):
+        sizes = 10 ** (torch.randn(tensor.shape, generator=generator) * 4 - 6)
+        signs = torch.randint(-1, 2, tensor.shape, generator=generator)
+        return sizes * signs
+
+    return random_splats(n, dtype=torch.float32).map(draw)
+
+
+def feed(optimizer, gradients, *, fused):
+    """Leaves gradients where each kind of optimizer looks for them."""
+    for name, value in gradients.parameters().items():
+        if fused:
+            getattr(optimizer.gradients, name).copy_(value)
+        else:
+            getattr(optimizer.splats, name).grad = value.clone()
+
+
+def walk(optimizer, steps, *, fused, start=0, sh_rest=True):
+    for step in range(start, start + steps):
+        feed(optimizer, gradients_of(len(optimizer.splats), step), fused=fused)
+        optimizer.step(1e-4, sh_rest=sh_rest)
+
+
+def held(optimizer):
+    return {name: value.clone() for name, value in optimizer.tensors().items()}
+
+
+def assert_close(ours, theirs):
+    for name, value in theirs.items():
+        scale = max(1.0, value.abs().max().item()) if name.startswith("splats") else (
+            value.abs().max().item())
+        assert (ours[name] - value).abs().max() <= STEPS_TOLERANCE * scale, name
+
+
+@pytest.mark.parametrize("n", [1, 5, 37])  # numbers of values that no vector divides
+def test_fused_steps_equal_those_of_torch(n):
+    plain, fused = optimizer_of(n, fused=False), optimizer_of(n, fused=True)
+    walk(plain, 20, fused=False)
+    walk(fused, 20, fused=True)
+    assert plain.count == fused.count == 20
+    assert_close(held(fused), held(plain))
+
+
+def test_fused_steps_have_the_same_bits_with_any_number_of_threads(monkeypatch):
+    found = []
+    for threads in (1, 2, 3):
+        monkeypatch.setattr(crew, "threads", threads)
+        optimizer = optimizer_of(1200, fused=True)  # several blocks of the largest group
+        walk(optimizer, 2, fused=True)
+        found.append(held(optimizer))
+    for name, value in found[0].items():
+        assert torch.equal(value, found[1][name]), name
+        assert torch.equal(value, found[2][name]), name
+
+
+@both_kinds
+def test_higher_degrees_that_are_not_in_use_stay_as_they_are(fused):
+    optimizer = optimizer_of(7, fused=fused)
+    before = held(optimizer)
+    walk(optimizer, 3, fused=fused, sh_rest=False)
+    after = held(optimizer)
+    for name, value in before.items():
+        kept = "sh_rest" in name
+        assert torch.equal(value, after[name]) == kept, name
+
+
+def test_fused_steps_without_higher_degrees_equal_those_of_torch():
+    plain, fused = optimizer_of(9, fused=False), optimizer_of(9, fused=True)
+    for optimizer, kind in ((plain, False), (fused, True)):
+        walk(optimizer, 5, fused=kind, sh_rest=False)
+        for value in optimizer.splats.parameters().values():
+            value.grad = None
+        walk(optimizer, 5, fused=kind, start=5)
+    assert_close(held(fused), held(plain))
+
+
+SOURCES = {
+    "shrunk": torch.tensor([4, 0, 2]),
+    "grown": torch.cat([torch.arange(9), torch.tensor([1, 3, -1, -1])]),
+    "beyond capacity": torch.cat([torch.arange(9), torch.full((60,), -1)]),
+}
+
+
+@both_kinds
+@pytest.mark.parametrize("case", SOURCES)
+def test_rows_keep_values_and_moments_when_gaussians_are_replaced(case, fused):
+    source = SOURCES[case]
+    optimizer = optimizer_of(9, fused=fused)
+    walk(optimizer, 3, fused=fused)
+    before = held(optimizer)
+    new = random_splats(len(source), seed=3, dtype=torch.float32)
+    optimizer.replace(new, source)
+    after = held(optimizer)
+    assert optimizer.count == 3
+    assert len(optimizer.splats) == len(source)
+    for name, value in new.parameters().items():
+        assert torch.equal(after[f"splats.{name}"], value)
+        for role in ROLES:
+            key = f"adam.{name}.{role}"
+            expected = before[key][source.clamp_min(0)]
+            expected[source < 0] = 0
+            assert torch.equal(after[key], expected), key
+    walk(optimizer, 2, fused=fused, start=3)
+    assert all(torch.isfinite(value).all() for value in optimizer.tensors().values())
+
+
+@pytest.mark.parametrize("case", SOURCES)
+def test_both_kinds_go_on_alike_after_gaussians_were_replaced(case):
+    source, found = SOURCES[case], []
+    for fused in (False, True):
+        optimizer = optimizer_of(9, fused=fused)
+        walk(optimizer, 3, fused=fused)
+        optimizer.replace(random_splats(len(source), seed=3, dtype=torch.float32), source)
+        walk(optimizer, 5, fused=fused, start=3)
+        found.append(held(optimizer))
+    assert_close(found[1], found[0])
+
+
+def places(optimizer):
+    return {name: value.data_ptr() for name, value in optimizer.tensors().items()
+            if name != "adam.count"}
+
+
+@both_kinds
+def test_nothing_is_allocated_anew_while_the_gaussians_fit(fused):
+    optimizer = optimizer_of(9, fused=fused)
+    before = places(optimizer)
+    for n in (30, 3, 50):  # the last is the capacity
+        source = torch.full((n,), -1)
+        optimizer.replace(random_splats(n, dtype=torch.float32), source)
+        assert places(optimizer) == before
+    optimizer.replace(random_splats(51, dtype=torch.float32), torch.full((51,), -1))
+    assert places(optimizer) != before
+
+
+@both_kinds
+def test_a_gaussian_takes_as_many_bytes_as_promised(fused):
+    optimizer = optimizer_of(9, fused=fused)
+    values = sum(value[0].numel() for value in optimizer.splats.parameters().values())
+    assert optimizer.bytes_per_gaussian == 4 * 4 * values  # value, gradient and two moments
+    assert optimizer.bytes_per_gaussian <= BYTES
+
+
+@both_kinds
+@pytest.mark.parametrize("other", [False, True])
+def test_what_a_checkpoint_holds_comes_back_bit_by_bit(fused, other):
+    optimizer = optimizer_of(9, fused=fused)
+    walk(optimizer, 3, fused=fused)
+    saved = held(optimizer)
+    values = {name.removeprefix("splats."): value
+              for name, value in saved.items() if name.startswith("splats.")}
+    resumed = SplatOptimizer(Splats(**values), CONFIG, extent=2.0, fused=other)
+    resumed.restore(saved)
+    for name, value in held(resumed).items():
+        assert torch.equal(value, saved[name]), name
+    if other == fused:
+        walk(optimizer, 2, fused=fused, start=3)
+        walk(resumed, 2, fused=fused, start=3)
+        for name, value in held(resumed).items():
+            assert torch.equal(value, held(optimizer)[name]), name

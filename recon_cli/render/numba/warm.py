@@ -7,6 +7,7 @@ import pickle
 import shutil
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -47,23 +48,32 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
             seen.add(name)
             on_kernel()
 
+    folder = cache_folder()
+    # _READY may be missing although there are files: a crash can lose it and cut them short
+    found = folder is not None and any(folder.rglob("*.nbi"))
     before, crew.observer = crew.observer, observe
     try:
         _run_all()
     except _DAMAGE:
-        folder = cache_folder()
-        if folder is None or not is_warm():
+        if folder is None or not found:
             raise
         logger.warning("the compiled kernels in %s cannot be read; compiling them again", folder)
-        for path in folder.iterdir():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        _clear(folder)
         _run_all()
     finally:
         crew.observer = before
-    folder = cache_folder()
     if folder is not None:
         (folder / _READY).touch()
     return time.perf_counter() - start
+
+
+def _clear(folder: Path) -> None:
+    """Deletes what a folder holds; another process may be at it as well."""
+    for path in folder.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _run_all() -> None:

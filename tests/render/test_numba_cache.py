@@ -1,0 +1,275 @@
+"""Machine code on disk: found by the next process, for this CPU alone, never trusted blindly."""
+
+import logging
+import os
+import platform
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba_process import STATISTICS, picture
+from numba_runs import HASWELL, after_damage, after_repair, for_avx2
+
+from recon_cli.execute import Job, _context
+from recon_cli.render import registry
+from recon_cli.render.numba import kernel, lanes, warm
+from recon_cli.render.numba.crew import crew
+from recon_cli.stages import STAGES
+from recon_cli.workspace import Workspace
+
+# float32 against float32 in another order of operations; the backends' own bounds, see backends.py
+IMAGE_TOLERANCE = 1e-5
+GRADIENT_TOLERANCE = 1e-4
+# a fragment at alpha = 1/255 may be in or out by rounding, which is one hit more or less
+HITS_APART = 1e-3  # of all hits of the scene
+
+
+@pytest.fixture
+def fresh_folder(monkeypatch):
+    """Lets `cache_folder` look again, and forgets afterwards what it found."""
+    kernel.cache_folder.cache_clear()
+    yield monkeypatch
+    monkeypatch.undo()
+    kernel.cache_folder.cache_clear()
+
+
+def assert_same_picture(ours, theirs):
+    for name in ("rgb", "alpha", "depth"):
+        scale = max(1.0, np.abs(theirs[name]).max())
+        assert np.abs(ours[name] - theirs[name]).max() < IMAGE_TOLERANCE * scale, name
+    hits = ours["stat.hits"] - theirs["stat.hits"]
+    assert np.abs(hits).sum() <= HITS_APART * theirs["stat.hits"].sum()
+    # one backend may cull, and leave a radius of 0, where the other finds no pixel to draw
+    seen = (ours["stat.radii"] > 0) & (theirs["stat.radii"] > 0)
+    assert np.allclose(ours["stat.radii"][seen], theirs["stat.radii"][seen], rtol=IMAGE_TOLERANCE)
+    for name in theirs.keys() - {"rgb", "alpha", "depth", "stat.hits", "stat.radii"}:
+        apart = np.linalg.norm(ours[name] - theirs[name])
+        assert apart < GRADIENT_TOLERANCE * np.linalg.norm(theirs[name]), name
+
+
+# ---- from process to process ----
+
+def test_a_damaged_cache_is_noticed_and_compiled_again():
+    run = after_damage()
+    assert "cannot be read; compiling them again" in run.stderr
+    assert run.report["folder"] in run.stderr
+    assert set(run.report["misses"].values()) == {1}
+    assert run.report["is_warm"]
+
+
+def test_the_next_process_finds_every_kernel_and_compiles_nothing():
+    run = after_repair()
+    assert run.report["was_warm"]
+    assert set(run.report["hits"].values()) == {1}
+    assert set(run.report["misses"].values()) == {0}
+    assert "kernels" not in run.stderr
+
+
+def test_machine_code_from_the_cache_computes_the_same_bits():
+    compiled, loaded = after_damage().picture, after_repair().picture
+    for name, value in compiled.items():
+        assert np.array_equal(value, loaded[name]), name
+
+
+def test_the_progress_counts_every_kernel_that_threads_share():
+    for run in (after_damage(), after_repair()):
+        assert run.report["kernels_ready"] == warm.KERNELS
+
+
+# ---- another CPU ----
+
+def test_code_for_another_cpu_is_kept_apart():
+    assert Path(for_avx2().report["folder"]).name != kernel.fingerprint()
+    assert not for_avx2().report["was_warm"]
+    assert for_avx2().report["is_warm"]
+
+
+def test_eight_lanes_compute_the_picture_of_sixteen():
+    run = for_avx2()
+    assert (run.report["lanes"], run.report["tile"]) == (8, [8, 16])
+    assert_same_picture(run.picture, picture("numba"))
+
+
+def test_eight_lanes_compute_the_picture_of_the_torch_backend():
+    assert {name for name in for_avx2().picture if name.startswith("stat.")} == {
+        f"stat.{name}" for name in STATISTICS}
+    assert_same_picture(for_avx2().picture, picture("torch"))
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names of x86 CPUs")
+def test_name_and_features_of_the_cpu_change_the_fingerprint(monkeypatch):
+    here = kernel.fingerprint()
+    monkeypatch.setattr(kernel.config, "CPU_NAME", HASWELL["NUMBA_CPU_NAME"])
+    named = kernel.fingerprint()
+    monkeypatch.setattr(kernel.config, "CPU_FEATURES", HASWELL["NUMBA_CPU_FEATURES"])
+    assert len({here, named, kernel.fingerprint()}) == 3
+
+
+@pytest.mark.parametrize(("features", "width"), [
+    ("+avx2,+fma", 8), ("+avx2,+avx512f", 16), ("-avx512f", 8), ("", 8)])
+def test_the_number_of_lanes_follows_the_features_that_numba_compiles_for(
+        monkeypatch, features, width):
+    monkeypatch.setattr(lanes.config, "CPU_FEATURES", features)
+    assert lanes.vector_width() == width
+
+
+def test_a_change_of_any_source_changes_the_fingerprint(monkeypatch):
+    seen, read = {kernel.fingerprint()}, Path.read_bytes
+    folder = Path(kernel.__file__).parent
+    sources = [*folder.glob("*.py"), folder.parent / "contract.py"]
+    for changed in sources:
+        monkeypatch.setattr(
+            Path, "read_bytes", lambda path, changed=changed: read(path) + b"#" * (path == changed))
+        seen.add(kernel.fingerprint())
+    assert len(seen) == 1 + len(sources)
+
+
+def test_another_version_of_numba_changes_the_fingerprint(monkeypatch):
+    here = kernel.fingerprint()
+    monkeypatch.setattr(kernel.numba, "__version__", "0.0.1")
+    assert kernel.fingerprint() != here
+
+
+# ---- folders that cannot or must not be used ----
+
+def test_without_a_place_for_a_cache_kernels_are_compiled_and_run(fresh_folder, tmp_path, caplog):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    fresh_folder.setenv("RECON_CACHE_DIR", str(blocked / "cache"))
+
+    def double(values):
+        for i in range(len(values)):
+            values[i] *= 2
+
+    with caplog.at_level(logging.WARNING, "recon"):
+        compiled = kernel.kernel(double)
+    assert "RECON_CACHE_DIR" in caplog.text
+    assert not warm.is_warm()
+    values = np.ones(3, np.float32)
+    compiled(values)
+    assert values.tolist() == [2, 2, 2]
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_not_used(fresh_folder, tmp_path, caplog):
+    tmp_path.chmod(0o555)
+    fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path / "cache"))
+    with caplog.at_level(logging.WARNING, "recon"):
+        assert kernel.cache_folder() is None
+    tmp_path.chmod(0o755)
+    assert "RECON_CACHE_DIR" in caplog.text
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and modes on this system")
+@pytest.mark.parametrize("mode", [0o770, 0o702])
+def test_a_folder_that_others_can_write_is_refused(fresh_folder, tmp_path, caplog, mode):
+    fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path))
+    folder = tmp_path / "kernels" / kernel.fingerprint()
+    folder.mkdir(parents=True)
+    folder.chmod(mode)
+    with caplog.at_level(logging.WARNING, "recon"):
+        assert kernel.cache_folder() is None
+    assert "can be written by others" in caplog.text
+    assert "RECON_CACHE_DIR" in caplog.text
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and modes on this system")
+def test_a_new_folder_is_open_to_its_owner_alone(fresh_folder, tmp_path):
+    fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path))
+    folder = kernel.cache_folder()
+    assert folder == tmp_path / "kernels" / kernel.fingerprint()
+    assert folder.stat().st_mode & 0o077 == 0
+
+
+def test_the_folder_follows_the_custom_of_the_platform(monkeypatch, tmp_path):
+    monkeypatch.delenv("RECON_CACHE_DIR", raising=False)
+    monkeypatch.setattr(kernel.sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert kernel.cache_root() == tmp_path / "recon"
+    monkeypatch.setattr(kernel.sys, "platform", "darwin")
+    assert kernel.cache_root() == Path.home() / "Library" / "Caches" / "recon"
+    monkeypatch.setattr(kernel.sys, "platform", "win32")
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
+    assert kernel.cache_root() == tmp_path / "recon" / "cache"
+    monkeypatch.setenv("RECON_CACHE_DIR", str(tmp_path / "mine"))
+    assert kernel.cache_root() == tmp_path / "mine"
+
+
+# ---- damage, without the time to compile ----
+
+def test_files_that_a_crash_left_without_the_mark_of_a_full_cache_are_cleared(
+        fresh_folder, tmp_path, monkeypatch, caplog):
+    fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path))
+    folder = kernel.cache_folder()
+    (folder / "numba").mkdir()
+    cut = folder / "numba" / "composite.nbi"
+    cut.write_bytes(b"")
+    calls = []
+
+    def run_all():
+        calls.append(cut.exists())
+        if cut.exists():
+            raise EOFError("Ran out of input")
+
+    monkeypatch.setattr(warm, "_run_all", run_all)
+    with caplog.at_level(logging.WARNING, "recon"):
+        warm.warm_up()
+    assert calls == [True, False]
+    assert "compiling them again" in caplog.text
+    assert warm.is_warm()
+
+
+def test_a_fault_of_the_kernels_themselves_is_no_damage(fresh_folder, tmp_path, monkeypatch):
+    fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path))
+
+    def run_all():
+        raise ValueError("a bug")
+
+    monkeypatch.setattr(warm, "_run_all", run_all)
+    with pytest.raises(ValueError, match="a bug"):
+        warm.warm_up()
+    assert not warm.is_warm()
+
+
+# ---- what the user sees ----
+
+class Bars:
+    """A progress that remembers its bars."""
+
+    def __init__(self):
+        self.opened, self.steps = [], 0
+
+    @contextmanager
+    def bar(self, label, total, *, unit="it", done=0):
+        assert done == 0
+        self.opened.append((label, total, unit))
+        yield self
+
+    def advance(self, steps=1):
+        self.steps += steps
+
+
+def stage_context(tmp_path, monkeypatch):
+    monkeypatch.setattr(crew, "threads", 1)
+    bars = Bars()
+    row = next(row for row in STAGES if row.name == "train")
+    _context(Job(Workspace(tmp_path), progress=bars), row, lambda *_: None)
+    return bars
+
+
+def test_a_cold_start_shows_a_bar_and_says_how_long_it_took(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(registry, "kernels_to_compile", lambda _: warm.KERNELS)
+    with caplog.at_level(logging.INFO, "recon"):
+        bars = stage_context(tmp_path, monkeypatch)
+    assert bars.opened == [("compile for this CPU, once", warm.KERNELS, "kernel")]
+    assert bars.steps == warm.KERNELS
+    assert "kernels compiled in" in caplog.text
+
+
+def test_a_warm_start_shows_no_bar(tmp_path, monkeypatch):
+    monkeypatch.setattr(warm, "is_warm", lambda: True)
+    assert stage_context(tmp_path, monkeypatch).opened == []
+    monkeypatch.setattr(warm, "is_warm", lambda: False)
+    assert registry.kernels_to_compile("numba") == warm.KERNELS
+    assert registry.kernels_to_compile("torch") == 0
