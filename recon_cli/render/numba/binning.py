@@ -29,6 +29,7 @@ from recon_cli.render.numba.layout import (
 from recon_cli.render.numba.planes import BLOCK
 
 _MARGIN = np.float32(1e-3)  # pixels
+_U = np.uint64  # an index that is never negative needs no test for counting from the end
 _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0), np.float32(1)
 _W, _H = np.float32(TILE_WIDTH), np.float32(TILE_HEIGHT)
 _DIGIT = 11  # bits that a pass of the radix sort orders by
@@ -88,11 +89,15 @@ def find_spans(counter, records, rows, starts, tiles_x, spans, tiles):
                     left = slope * y - half * math.sqrt(max(_ONE - along * along, _ZERO))
                     left = max(left, -extent_x)
                     # pixel i lies at i + 1/2; the first one in is ceil(x - 1/2)
-                    left = math.ceil(mean_x + left - _HALF - _MARGIN)
-                    right = math.floor(mean_x + right - _HALF + _MARGIN)
-                    if right >= left and right >= _ZERO and left < _W * np.float32(tiles_x):
-                        first = np.int64(math.floor(max(left, _ZERO) / _W))
-                        end = np.int64(min(math.floor(right / _W) + _ONE, np.float32(tiles_x)))
+                    left = max(mean_x + left - _HALF - _MARGIN, _ZERO)
+                    right = min(mean_x + right - _HALF + _MARGIN, _W * np.float32(tiles_x) - _ONE)
+                    if left <= right:  # numbers that are not negative: the cast rounds down
+                        whole = np.int64(left)
+                        low_pixel = whole + (left > np.float32(whole))
+                        high_pixel = np.int64(right)
+                        if low_pixel <= high_pixel:
+                            first = low_pixel // TILE_WIDTH
+                            end = high_pixel // TILE_WIDTH + 1
                 spans[2 * (starts[j] + k)] = first
                 spans[2 * (starts[j] + k) + 1] = end
                 found += end - first
@@ -150,12 +155,15 @@ def count_tiles(counter, cuts, order, rows, span_starts, spans, tiles_x, counts)
         part = fetch_add(counter, 0, 1)
         if part >= parts:
             break
+        own = counts[part]
         for i in range(cuts[part], cuts[part + 1]):
-            j = order[i]
-            for k in range(rows[2 * j + 1]):
-                span, base = 2 * (span_starts[j] + k), (rows[2 * j] + k) * tiles_x
-                for x in range(spans[span], spans[span + 1]):
-                    counts[part, base + x] += 1
+            j = _U(order[i])
+            top, span = rows[_U(2) * j], _U(2) * _U(span_starts[j])
+            for k in range(rows[_U(2) * j + _U(1)]):
+                base = (top + k) * tiles_x
+                for x in range(spans[span], spans[span + _U(1)]):
+                    own[_U(base + x)] += 1
+                span += _U(2)
 
 
 @kernel
@@ -180,14 +188,16 @@ def fill_tiles(counter, cuts, order, rows, span_starts, spans, tiles_x, slot_sta
         part = fetch_add(counter, 0, 1)
         if part >= parts:
             break
+        own = places[part]
         for i in range(cuts[part], cuts[part + 1]):
-            j = order[i]
-            slot = slot_start[j]
-            for k in range(rows[2 * j + 1]):
-                span, base = 2 * (span_starts[j] + k), (rows[2 * j] + k) * tiles_x
-                for x in range(spans[span], spans[span + 1]):
-                    place = places[part, base + x]
-                    places[part, base + x] = place + 1
-                    members[place] = j
-                    slots[place] = slot
+            j = _U(order[i])
+            slot, top, span = slot_start[j], rows[_U(2) * j], _U(2) * _U(span_starts[j])
+            for k in range(rows[_U(2) * j + _U(1)]):
+                base = (top + k) * tiles_x
+                for x in range(spans[span], spans[span + _U(1)]):
+                    place = own[_U(base + x)]
+                    own[_U(base + x)] = place + 1
+                    members[_U(place)] = order[i]
+                    slots[_U(place)] = slot
                     slot += 1
+                span += _U(2)

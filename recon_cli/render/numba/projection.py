@@ -113,12 +113,12 @@ def project(counter, ids, means, quats, log_scales, logits, sh_dc, sh_rest, term
                 extent_x, extent_y = records[at + EXTENT_X], records[at + EXTENT_Y]
                 if not (mean_x + extent_x > _F(0) and mean_x - extent_x < _F(view.width)):
                     continue
-                top = math.floor((mean_y - extent_y - _F(0.5)) / _F(TILE_HEIGHT))
-                bottom = math.floor((mean_y + extent_y - _F(0.5)) / _F(TILE_HEIGHT))
+                top = max((mean_y - extent_y - _F(0.5)) / _F(TILE_HEIGHT), _F(0))
+                bottom = min((mean_y + extent_y - _F(0.5)) / _F(TILE_HEIGHT), _F(tiles_y - 1))
                 if bottom < _F(0) or top >= _F(tiles_y):
                     continue
-                rows[2 * j] = np.int32(max(top, _F(0)))
-                rows[2 * j + 1] = np.int32(min(bottom, _F(tiles_y - 1))) - rows[2 * j] + 1
+                rows[2 * j] = np.int32(top)  # not negative: the cast rounds down
+                rows[2 * j + 1] = np.int32(bottom) - rows[2 * j] + 1
                 radii[ids[j]] = scratch[P_S0 * LANES + k]
     fetch_add(broken, 0, bad)
 
