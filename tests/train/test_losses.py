@@ -75,7 +75,9 @@ def test_blur_keeps_a_constant_and_spreads_an_impulse_by_the_window():
 
 # ---- the fused loss of the numba backend ----
 
-SIZES = [(360, 640), (37, 50), (11, 6), (1, 40), (1, 6), (7, 300)]  # height, width
+# height, width; 86 and 171 end just behind a block of columns, 88 and 173 within its reach
+SIZES = [(360, 640), (37, 50), (11, 6), (1, 40), (1, 6), (7, 300), (4, 86), (9, 88), (20, 171),
+         (5, 173)]
 WEIGHTS = [0.0, 0.2, 1.0]
 
 

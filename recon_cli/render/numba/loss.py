@@ -31,13 +31,14 @@ from recon_cli.render.numba.lanes import LANES
 RADIUS = 5
 CHANNELS = 3
 _REACH = RADIUS * CHANNELS  # numbers to the outermost tap
-_COLUMNS = 512  # numbers of a row that are blurred at a time: four maps fit the first-level cache
+_ROWS = 4  # rows that are blurred together: each row of the images is read for all four
+_COLUMNS = 256  # numbers of a row that are blurred at a time: all stays in the first-level cache
 _WIDTH = LANES + _REACH + _COLUMNS + _REACH + LANES  # of a row of blurred numbers with its margins
-_ROWS = 4  # rows that a thread takes at a time
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)  # for images in [0, 1]
 _STEP = np.float32(1 / 255)
 MAPS = 3
-assert 4 * _WIDTH <= SCRATCH_FLOATS
+MOMENTS = 4  # planes of a row in scratch
+assert _ROWS * MOMENTS * _WIDTH <= SCRATCH_FLOATS
 
 
 MIN_WIDTH = -(-LANES // CHANNELS)  # pixels; a row must fill one vector
@@ -50,7 +51,8 @@ def taps() -> NDArray[np.float32]:
     return normalised
 
 
-_WINDOW = taps()
+_PAD = _ROWS - 1  # zeros at both ends of the window: what lies beyond a row's reach weighs nothing
+_WINDOW = np.pad(taps(), _PAD)
 
 
 def photometric(
@@ -86,11 +88,11 @@ def photometric(
 
 @inlined
 def blurred_across(scratch, plane, column, window):
-    """Returns one map blurred along the row, LANES numbers from `column` of the block on."""
+    """Returns one plane blurred along the row, LANES numbers from `column` of the block on."""
     at = plane * _WIDTH + LANES + column
-    result = spread(window, 0) * load(scratch, at)
+    result = spread(window, _PAD) * load(scratch, at)
     for k in range(1, 2 * RADIUS + 1):
-        result = fma(spread(window, k), load(scratch, at + CHANNELS * k), result)
+        result = fma(spread(window, _PAD + k), load(scratch, at + CHANNELS * k), result)
     return result
 
 
@@ -99,8 +101,53 @@ def clear(scratch, planes):
     """Writes zeros where the block's margins may lie beyond the image."""
     for plane in range(planes):
         for i in range(0, _WIDTH, LANES):
-            at = plane * _WIDTH + min(i, _WIDTH - LANES)
-            store(scratch, at, fill(0.0))
+            store(scratch, plane * _WIDTH + min(i, _WIDTH - LANES), fill(0.0))
+
+
+@inlined
+def keep_rows(scratch, plane, to, a, b, c, d):
+    """Writes one number of each of the four rows; a row has MOMENTS planes."""
+    store(scratch, plane * _WIDTH + to, a)
+    store(scratch, (MOMENTS + plane) * _WIDTH + to, b)
+    store(scratch, (2 * MOMENTS + plane) * _WIDTH + to, c)
+    store(scratch, (3 * MOMENTS + plane) * _WIDTH + to, d)
+
+
+@inlined
+def moments_down(image, truth, top, height, n, column, window, scratch, to):
+    """Blurs x, y, x^2 + y^2 and x y down LANES columns, for the four rows from `top` on."""
+    x0, x1, x2, x3 = fill(0.0), fill(0.0), fill(0.0), fill(0.0)
+    t0, t1, t2, t3 = x0, x0, x0, x0
+    s0, s1, s2, s3 = x0, x0, x0, x0
+    p0, p1, p2, p3 = x0, x0, x0, x0
+    for y in range(max(top - RADIUS, 0), min(top + _ROWS + RADIUS, height)):
+        x, t = load(image, y * n + column), load_bytes(truth, y * n + column) * _STEP
+        squares, product = fma(x, x, t * t), x * t
+        k = y - top + RADIUS + _PAD  # tap of the first row; one less for each row below
+        w0, w1 = spread(window, k), spread(window, k - 1)
+        w2, w3 = spread(window, k - 2), spread(window, k - 3)
+        x0, x1, x2, x3 = fma(w0, x, x0), fma(w1, x, x1), fma(w2, x, x2), fma(w3, x, x3)
+        t0, t1, t2, t3 = fma(w0, t, t0), fma(w1, t, t1), fma(w2, t, t2), fma(w3, t, t3)
+        s0, s1 = fma(w0, squares, s0), fma(w1, squares, s1)
+        s2, s3 = fma(w2, squares, s2), fma(w3, squares, s3)
+        p0, p1 = fma(w0, product, p0), fma(w1, product, p1)
+        p2, p3 = fma(w2, product, p2), fma(w3, product, p3)
+    keep_rows(scratch, 0, to, x0, x1, x2, x3)
+    keep_rows(scratch, 1, to, t0, t1, t2, t3)
+    keep_rows(scratch, 2, to, s0, s1, s2, s3)
+    keep_rows(scratch, 3, to, p0, p1, p2, p3)
+
+
+@inlined
+def map_down(maps, base, plane, top, height, n, column, window, scratch, to):
+    """Blurs one map, from `base` on, down LANES columns, for the four rows from `top` on."""
+    a, b, c, d = fill(0.0), fill(0.0), fill(0.0), fill(0.0)
+    for y in range(max(top - RADIUS, 0), min(top + _ROWS + RADIUS, height)):
+        value = load(maps, base + y * n + column)
+        k = y - top + RADIUS + _PAD
+        a, b = fma(spread(window, k), value, a), fma(spread(window, k - 1), value, b)
+        c, d = fma(spread(window, k - 2), value, c), fma(spread(window, k - 3), value, d)
+    keep_rows(scratch, plane, to, a, b, c, d)
 
 
 @kernel
@@ -111,72 +158,58 @@ def similarity(counter, image, truth, width, height, window, maps, row_sums, scr
         counter: [1] shared; groups of rows already taken.
         image: [H * W * 3] float32.
         truth: [H * W * 3] uint8.
-        width: of the image in pixels, at least LANES / 3.
+        width: of the image in pixels, at least MIN_WIDTH.
         height: in pixels.
-        window: [11] taps.
+        window: taps with _PAD zeros at both ends.
         maps: [3 * H * W * 3] out: by mean, by second moment, by product.
-        row_sums: [H] float64 out.
+        row_sums: [H] float64 out, zeros before.
         scratch: of the thread.
     """
     n = CHANNELS * width
     size = n * height
     while True:
-        group = fetch_add(counter, 0, 1)
-        if group * _ROWS >= height:
+        top = fetch_add(counter, 0, 1) * _ROWS
+        if top >= height:
             break
-        for y in range(group * _ROWS, min((group + 1) * _ROWS, height)):
-            summed = fill(0.0)
-            for c0 in range(0, n, _COLUMNS):
-                c1 = min(c0 + _COLUMNS, n)
-                if c0 == 0 or c1 == n:
-                    clear(scratch, 4)
-                origin = c0 - _REACH - LANES  # column of the first number in scratch
-                low, high = max(origin, 0), min(c1 + _REACH, n)
-                for i in range(low, high, LANES):
-                    column = min(i, high - LANES)
-                    blur_down(image, truth, y, height, n, column, window, scratch,
-                              column - origin)
-                for i in range(c0, c1, LANES):
-                    column = min(i, n - LANES)
-                    fresh = lane_numbers() >= np.float32(i - column)  # the others were counted
-                    at = column - c0
-                    mx, my = blurred_across(scratch, 0, at, window), blurred_across(
-                        scratch, 1, at, window)
-                    squares = blurred_across(scratch, 2, at, window)
-                    products = blurred_across(scratch, 3, at, window)
-                    means = fma(mx, mx, my * my)
-                    a1, a2 = 2.0 * mx * my + C1, 2.0 * (products - mx * my) + C2
-                    b1, b2 = means + C1, (squares - means) + C2
-                    per_b = 1.0 / (b1 * b2)
-                    ssim = a1 * a2 * per_b
-                    by_square = -ssim * b1 * per_b
-                    by_product = 2.0 * a1 * per_b
-                    by_mean = (2.0 * (my * a2 - mx * ssim * b2) * per_b - 2.0 * mx * by_square
-                               - my * by_product)
-                    to = y * n + column
-                    store(maps, to, by_mean)
-                    store(maps, size + to, by_square)
-                    store(maps, 2 * size + to, by_product)
-                    summed = summed + select(fresh, ssim, 0.0)
-            row_sums[y] = total(summed)
+        for c0 in range(0, n, _COLUMNS):
+            c1 = min(c0 + _COLUMNS, n)
+            origin = c0 - _REACH - LANES  # column of the first number in scratch
+            if origin < 0 or c1 + _REACH > n:  # the block before left its numbers there
+                clear(scratch, _ROWS * MOMENTS)
+            low, high = max(origin, 0), min(c1 + _REACH, n)
+            for i in range(low, high, LANES):
+                column = min(i, high - LANES)
+                moments_down(image, truth, top, height, n, column, window, scratch,
+                             column - origin)
+            for r in range(min(_ROWS, height - top)):
+                row_sums[top + r] += compare_row(
+                    scratch, MOMENTS * r, c0, c1, n, window, maps, (top + r) * n, size)
 
 
 @inlined
-def blur_down(image, truth, y, height, n, column, window, scratch, to):
-    """Blurs x, y, x^2 + y^2 and x y along LANES columns into four planes of scratch."""
-    sum_x, sum_y, squares, products = fill(0.0), fill(0.0), fill(0.0), fill(0.0)
-    for k in range(max(-RADIUS, -y), min(RADIUS, height - 1 - y) + 1):
-        at = (y + k) * n + column
-        weight = spread(window, k + RADIUS)
-        x, t = load(image, at), load_bytes(truth, at) * _STEP
-        weighted_x, weighted_t = weight * x, weight * t
-        sum_x, sum_y = sum_x + weighted_x, sum_y + weighted_t
-        squares = fma(weighted_x, x, fma(weighted_t, t, squares))
-        products = fma(weighted_x, t, products)
-    store(scratch, to, sum_x)
-    store(scratch, _WIDTH + to, sum_y)
-    store(scratch, 2 * _WIDTH + to, squares)
-    store(scratch, 3 * _WIDTH + to, products)
+def compare_row(scratch, plane, c0, c1, n, window, maps, base, size):
+    """Writes the derivatives of one row of a block; returns its sum of SSIM."""
+    summed = fill(0.0)
+    for i in range(c0, c1, LANES):
+        column = min(i, n - LANES)
+        at, to = column - c0, base + column
+        mx, my = blurred_across(scratch, plane, at, window), blurred_across(
+            scratch, plane + 1, at, window)
+        squares = blurred_across(scratch, plane + 2, at, window)
+        products = blurred_across(scratch, plane + 3, at, window)
+        means = fma(mx, mx, my * my)
+        a1, a2 = 2.0 * mx * my + C1, 2.0 * (products - mx * my) + C2
+        b1, b2 = means + C1, (squares - means) + C2
+        per_b = 1.0 / (b1 * b2)
+        ssim = a1 * a2 * per_b
+        by_square, by_product = -ssim * b1 * per_b, 2.0 * a1 * per_b
+        store(maps, to, 2.0 * (my * a2 - mx * ssim * b2) * per_b - 2.0 * mx * by_square
+              - my * by_product)
+        store(maps, size + to, by_square)
+        store(maps, 2 * size + to, by_product)
+        fresh = lane_numbers() >= np.float32(i - column)  # the others were counted
+        summed = summed + select(fresh, ssim, 0.0)
+    return total(summed)
 
 
 @kernel
@@ -185,38 +218,42 @@ def loss_gradient(counter, image, truth, width, height, window, maps, ssim_weigh
     """Writes dL/dimage, [H * W * 3], and the sum of |x - y| of each row, [H] float64."""
     n = CHANNELS * width
     size = n * height
-    by_l1 = np.float32((1 - ssim_weight) / size)
-    by_ssim = np.float32(-ssim_weight / size)
+    by_l1, by_ssim = np.float32((1 - ssim_weight) / size), np.float32(-ssim_weight / size)
     while True:
-        group = fetch_add(counter, 0, 1)
-        if group * _ROWS >= height:
+        top = fetch_add(counter, 0, 1) * _ROWS
+        if top >= height:
             break
-        for y in range(group * _ROWS, min((group + 1) * _ROWS, height)):
-            summed = fill(0.0)
-            for c0 in range(0, n, _COLUMNS):
-                c1 = min(c0 + _COLUMNS, n)
-                if c0 == 0 or c1 == n:
-                    clear(scratch, MAPS)
-                origin = c0 - _REACH - LANES
-                low, high = max(origin, 0), min(c1 + _REACH, n)
-                for i in range(low, high, LANES):
-                    column = min(i, high - LANES)
-                    for plane in range(MAPS):
-                        down = fill(0.0)
-                        for k in range(max(-RADIUS, -y), min(RADIUS, height - 1 - y) + 1):
-                            at = plane * size + (y + k) * n + column
-                            down = fma(spread(window, k + RADIUS), load(maps, at), down)
-                        store(scratch, plane * _WIDTH + column - origin, down)
-                for i in range(c0, c1, LANES):
-                    column = min(i, n - LANES)
-                    fresh = lane_numbers() >= np.float32(i - column)
-                    at, to = column - c0, y * n + column
-                    x, t = load(image, to), load_bytes(truth, to) * _STEP
-                    slope = blurred_across(scratch, 0, at, window)
-                    slope = fma(2.0 * x, blurred_across(scratch, 1, at, window), slope)
-                    slope = fma(t, blurred_across(scratch, 2, at, window), slope)
-                    off = x - t
-                    sign = select(off > 0.0, 1.0, select(off < 0.0, -1.0, fill(0.0)))
-                    store(gradient, to, fma(by_ssim, slope, by_l1 * sign))
-                    summed = summed + select(fresh, absolute(off), 0.0)
-            row_sums[y] = total(summed)
+        for c0 in range(0, n, _COLUMNS):
+            c1 = min(c0 + _COLUMNS, n)
+            origin = c0 - _REACH - LANES
+            if origin < 0 or c1 + _REACH > n:  # the block before left its numbers there
+                clear(scratch, _ROWS * MOMENTS)
+            low, high = max(origin, 0), min(c1 + _REACH, n)
+            for i in range(low, high, LANES):
+                column = min(i, high - LANES)
+                for plane in range(MAPS):
+                    map_down(maps, plane * size, plane, top, height, n, column, window, scratch,
+                             column - origin)
+            for r in range(min(_ROWS, height - top)):
+                row_sums[top + r] += slope_row(
+                    scratch, MOMENTS * r, c0, c1, n, window, image, truth, (top + r) * n, by_l1,
+                    by_ssim, gradient)
+
+
+@inlined
+def slope_row(scratch, plane, c0, c1, n, window, image, truth, base, by_l1, by_ssim, gradient):
+    """Writes the gradient of one row of a block; returns its sum of |x - y|."""
+    summed = fill(0.0)
+    for i in range(c0, c1, LANES):
+        column = min(i, n - LANES)
+        at, to = column - c0, base + column
+        x, t = load(image, to), load_bytes(truth, to) * _STEP
+        slope = blurred_across(scratch, plane, at, window)
+        slope = fma(2.0 * x, blurred_across(scratch, plane + 1, at, window), slope)
+        slope = fma(t, blurred_across(scratch, plane + 2, at, window), slope)
+        off = x - t
+        sign = select(off > 0.0, 1.0, select(off < 0.0, -1.0, fill(0.0)))
+        store(gradient, to, fma(by_ssim, slope, by_l1 * sign))
+        fresh = lane_numbers() >= np.float32(i - column)
+        summed = summed + select(fresh, absolute(off), 0.0)
+    return total(summed)
