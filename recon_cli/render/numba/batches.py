@@ -25,10 +25,11 @@ from recon_cli.render.numba.layout import (
     HALF_Y,
     LOG2_OPACITY,
     MEAN_X,
+    MEAN_X_LOW,
     MEAN_Y,
+    MEAN_Y_LOW,
     RECORD,
     RED,
-    SLOPE_X,
     SLOPE_Y,
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -56,8 +57,8 @@ def load_batch(batch, records, members, first, count, left, top):
     for k in range(count):
         at, to = np.int64(members[first + k]) * RECORD, k * LOCAL
         # in float64: far from the mean of a needle the two terms of u nearly cancel
-        dx = left + 0.5 - np.float64(records[at + MEAN_X])
-        dy = top + 0.5 - np.float64(records[at + MEAN_Y])
+        dx = left + 0.5 - records[at + MEAN_X] - np.float64(records[at + MEAN_X_LOW])
+        dy = top + 0.5 - records[at + MEAN_Y] - np.float64(records[at + MEAN_Y_LOW])
         u_x, u_y, v_y = records[at + U_X], records[at + U_Y], records[at + V_Y]
         batch[to + L_U_0] = np.float32(u_x * dx + u_y * dy)
         batch[to + L_U_X], batch[to + L_U_Y], batch[to + L_V_Y] = u_x, u_y, v_y
@@ -72,9 +73,10 @@ def load_batch(batch, records, members, first, count, left, top):
         batch[ranges + BATCH] = np.float32(dy)
         batch[ranges + 2 * BATCH] = records[at + EXTENT_X]
         batch[ranges + 3 * BATCH] = records[at + EXTENT_Y]
-        batch[ranges + 4 * BATCH] = records[at + SLOPE_X]
-        batch[ranges + 5 * BATCH] = records[at + SLOPE_Y]
-        batch[ranges + 6 * BATCH] = records[at + HALF_Y]
+        batch[ranges + 4 * BATCH] = records[at + SLOPE_Y]
+        batch[ranges + 5 * BATCH] = records[at + HALF_Y]
+        batch[ranges + 6 * BATCH] = u_x
+        batch[ranges + 7 * BATCH] = u_y
     for k in range(0, BATCH, LANES):
         find_rows(batch, k, count)
 
@@ -85,8 +87,8 @@ def find_rows(batch, k, count):
     at = _RANGES + k
     dx, dy = load(batch, at), load(batch, at + BATCH)
     extent_x, extent_y = load(batch, at + 2 * BATCH), load(batch, at + 3 * BATCH)
-    slope_x, slope_y = load(batch, at + 4 * BATCH), load(batch, at + 5 * BATCH)
-    half = load(batch, at + 6 * BATCH)
+    slope_y, half = load(batch, at + 4 * BATCH), load(batch, at + 5 * BATCH)
+    slope_x = -load(batch, at + 7 * BATCH) / load(batch, at + 6 * BATCH)
     low = maximum(dx, -extent_x)
     high = minimum(dx + (TILE_WIDTH - 1), extent_x)
     inside = (low <= high) & (lane_numbers() < count - k)

@@ -17,14 +17,16 @@ from recon_cli.render.numba.lane_memory import fetch_add
 from recon_cli.render.numba.layout import (
     EXTENT_X,
     EXTENT_Y,
-    HALF_X,
+    FAR,
     MEAN_X,
     MEAN_Y,
     RECORD,
-    SLOPE_X,
     SLOPE_Y,
     TILE_HEIGHT,
     TILE_WIDTH,
+    U_X,
+    U_Y,
+    V_Y,
 )
 from recon_cli.render.numba.planes import BLOCK
 
@@ -50,7 +52,7 @@ def row_starts(rows, starts):
 
 
 @kernel
-def find_spans(counter, records, rows, starts, tiles_x, spans, tiles):
+def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
     """Writes for each row of tiles of each Gaussian the first tile and the end.
 
     Args:
@@ -59,6 +61,7 @@ def find_spans(counter, records, rows, starts, tiles_x, spans, tiles):
         rows: [M * 2] first row of tiles, number of rows.
         starts: [M + 1] where the spans of each begin.
         tiles_x: tiles in a row.
+        square: the whole box counts, not the ellipse in it.
         spans: [S * 2] out.
         tiles: [M] out, number of tiles of each Gaussian.
     """
@@ -72,7 +75,10 @@ def find_spans(counter, records, rows, starts, tiles_x, spans, tiles):
             at, found = j * RECORD, 0
             mean_x, mean_y = records[at + MEAN_X], records[at + MEAN_Y]
             extent_x, extent_y = records[at + EXTENT_X], records[at + EXTENT_Y]
-            slope, half = records[at + SLOPE_X], records[at + HALF_X]
+            per_u = _ONE / records[at + U_X]
+            slope, half = -records[at + U_Y] * per_u, extent_y * records[at + V_Y] * per_u
+            if square:
+                slope, half = _ZERO, np.float32(FAR)
             per_extent = _ONE / extent_y
             rightmost = records[at + SLOPE_Y] * extent_x  # y offset of the rightmost point
             for k in range(rows[2 * j + 1]):

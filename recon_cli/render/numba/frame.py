@@ -87,7 +87,7 @@ class Frame:
         self.background = background
         self.cutoff = np.float32(np.log2(approximation.alpha_min))
         self._project(splats, radii, approximation)
-        self._bin()
+        self._bin(approximation.square)
         tiles = len(self.tile_start) - 1
         self.final = self.take("final", tiles * TILE_PIXELS)
         self.last = self.take("last", tiles * TILE_PIXELS)
@@ -124,7 +124,7 @@ class Frame:
                  self.rows, radii, broken)
         self.broken = int(broken[0])
 
-    def _bin(self) -> None:
+    def _bin(self, square: bool) -> None:
         m = len(self.ids)
         self.tiles_x = -(-self.view.width // TILE_WIDTH)
         tiles = self.tiles_x * -(-self.view.height // TILE_HEIGHT)
@@ -132,8 +132,8 @@ class Frame:
         binning.row_starts(self.rows, span_starts)
         spans = self.take("spans", 2 * int(span_starts[-1]), np.int32)
         per_gaussian = self.take("tiles", m, np.int32)
-        crew.run(binning.find_spans, self.records, self.rows, span_starts, self.tiles_x, spans,
-                 per_gaussian, scratch=False)
+        crew.run(binning.find_spans, self.records, self.rows, span_starts, self.tiles_x,
+                 square, spans, per_gaussian, scratch=False)
         order = self.take("order", m, np.int32)
         visible = binning.order_by_depth(
             self.depths.view(np.uint64), per_gaussian, order, self.take("spare", m, np.int32))

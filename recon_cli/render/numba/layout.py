@@ -26,9 +26,13 @@ LOG2_OPACITY = 5
 RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
 # The ellipse alpha = 1/255 in its bounding box, for culling: at an offset dx the ellipse covers
 # SLOPE_Y dx -+ HALF_Y sqrt(1 - (dx / EXTENT_X)^2), and the same with x and y exchanged.
+# With x and y exchanged the slope is b / c = -U_Y / U_X and the half EXTENT_Y V_Y / U_X.
 EXTENT_X, EXTENT_Y = 10, 11
-SLOPE_Y, SLOPE_X = 12, 13  # b / a, b / c
-HALF_Y, HALF_X = 14, 15  # pixels
+SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
+# What float32 drops of the mean: at 640 pixels it is 3e-5, and decides who reaches alpha = 1/255.
+MEAN_X_LOW, MEAN_Y_LOW = 14, 15
+
+FAR = 1e9  # pixels; the half of an ellipse that only its box cuts
 
 BATCH = 32  # instances of a tile that are prepared at a time
 

@@ -40,7 +40,7 @@ class Viewpoint(NamedTuple):
 
 # planes of a group of LANES Gaussians in scratch
 (P_X, P_Y, P_Z, P_MEAN_X, P_MEAN_Y, P_QW, P_QX, P_QY, P_QZ, P_S0, P_S1, P_S2, P_LOGIT,
- P_DX, P_DY, P_DZ, P_DC) = range(17)
+ P_DX, P_DY, P_DZ, P_MEAN_X_LOW, P_MEAN_Y_LOW, P_DC) = range(19)
 P_REST = P_DC + 3
 P_BASIS = P_REST + 45
 OUT = P_BASIS + 15
@@ -67,8 +67,11 @@ def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, 
         scratch[P_Z * LANES + k] = to_z
         if k < count:
             depths[first + k] = to_z
-        scratch[P_MEAN_X * LANES + k] = view.fx * to_x / to_z + view.cx
-        scratch[P_MEAN_Y * LANES + k] = view.fy * to_y / to_z + view.cy
+        mean_x, mean_y = view.fx * to_x / to_z + view.cx, view.fy * to_y / to_z + view.cy
+        scratch[P_MEAN_X * LANES + k] = mean_x
+        scratch[P_MEAN_Y * LANES + k] = mean_y
+        scratch[P_MEAN_X_LOW * LANES + k] = mean_x - scratch[P_MEAN_X * LANES + k]
+        scratch[P_MEAN_Y_LOW * LANES + k] = mean_y - scratch[P_MEAN_Y * LANES + k]
         scratch[P_DX * LANES + k] = x - view.center[0]
         scratch[P_DY * LANES + k] = y - view.center[1]
         scratch[P_DZ * LANES + k] = z - view.center[2]

@@ -30,16 +30,17 @@ from recon_cli.render.numba.layout import (
     DEPTH,
     EXTENT_X,
     EXTENT_Y,
+    FAR,
     GREEN,
-    HALF_X,
     HALF_Y,
     LOG2_E,
     LOG2_OPACITY,
     MEAN_X,
+    MEAN_X_LOW,
     MEAN_Y,
+    MEAN_Y_LOW,
     RECORD,
     RED,
-    SLOPE_X,
     SLOPE_Y,
     TILE_HEIGHT,
     U_X,
@@ -56,7 +57,9 @@ from recon_cli.render.numba.planes import (
     P_DZ,
     P_LOGIT,
     P_MEAN_X,
+    P_MEAN_X_LOW,
     P_MEAN_Y,
+    P_MEAN_Y_LOW,
     P_QW,
     P_QX,
     P_QY,
@@ -75,7 +78,6 @@ from recon_cli.render.numba.spherical_harmonics import C0, write_basis
 
 _SLACK = np.float32(1e-3)  # in q; culling keeps what rounding leaves in doubt
 _LARGEST = np.float32(1e30)  # a determinant beyond it has no useful inverse
-_FAR = np.float32(1e9)  # pixels; an ellipse that is cut only by its box
 _F = np.float32
 
 
@@ -181,13 +183,11 @@ def shape(scratch, view, alpha_min, square):
     unit = _F(math.sqrt(LOG2_E / 2))
     u_x = unit / root
     extent_x, extent_y = square_root(reach * a), square_root(reach * c)
-    slope_y, slope_x = b * per_a, b * per_c
-    half_y, half_x = square_root(reach * det * per_a), square_root(reach) * root
+    slope_y, half_y = b * per_a, square_root(reach * det * per_a)
     mid, half = 0.5 * (a + c), 0.5 * (a - c)
     radius = 3.0 * square_root(mid + square_root(half * half + b * b))  # along the longer axis
     if square:
-        extent_x, extent_y, slope_x, slope_y = radius, radius, 0.0 * a, 0.0 * a
-        half_x, half_y = fill(_FAR), fill(_FAR)
+        extent_x, extent_y, slope_y, half_y = radius, radius, 0.0 * a, fill(FAR)
     at = OUT * LANES
     mean_x, mean_y = load(scratch, P_MEAN_X * LANES), load(scratch, P_MEAN_Y * LANES)
     store(scratch, at + MEAN_X * LANES, mean_x)
@@ -200,9 +200,9 @@ def shape(scratch, view, alpha_min, square):
     store(scratch, at + EXTENT_X * LANES, extent_x)
     store(scratch, at + EXTENT_Y * LANES, extent_y)
     store(scratch, at + SLOPE_Y * LANES, slope_y)
-    store(scratch, at + SLOPE_X * LANES, slope_x)
     store(scratch, at + HALF_Y * LANES, half_y)
-    store(scratch, at + HALF_X * LANES, half_x)
+    store(scratch, at + MEAN_X_LOW * LANES, load(scratch, P_MEAN_X_LOW * LANES))
+    store(scratch, at + MEAN_Y_LOW * LANES, load(scratch, P_MEAN_Y_LOW * LANES))
     sum_of_all = (
         absolute(load(scratch, P_QW * LANES)) + absolute(load(scratch, P_QX * LANES))
         + absolute(load(scratch, P_QY * LANES)) + absolute(load(scratch, P_QZ * LANES))
