@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import pickle
 import shutil
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,7 @@ from recon_cli.scene.splats import Splats
 logger = logging.getLogger("recon")
 
 KERNELS = 11  # that threads share; the progress counts these
+_SCIPY = "scipy.linalg"
 _READY = "ready"  # file in the cache folder once every kernel is there
 _DAMAGE = (pickle.UnpicklingError, EOFError, ImportError, AttributeError, IndexError, KeyError,
            ValueError, TypeError, RuntimeError)
@@ -53,7 +56,8 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
     found = folder is not None and any(folder.rglob("*.nbi"))
     before, crew.observer = crew.observer, observe
     try:
-        _run_all()
+        with _without_scipy():
+            _run_all()
     except _DAMAGE:
         if folder is None or not found:
             raise
@@ -65,6 +69,22 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
     if folder is not None:
         (folder / _READY).touch()
     return time.perf_counter() - start
+
+
+@contextmanager
+def _without_scipy() -> Iterator[None]:
+    """Keeps numba from importing scipy.linalg, which takes longer than loading all kernels.
+
+    numba looks for BLAS there when it sets itself up; no kernel multiplies matrices with it.
+    """
+    if _SCIPY in sys.modules:
+        yield
+        return
+    sys.modules[_SCIPY] = None  # type: ignore[assignment]  # an import of it fails at once
+    try:
+        yield
+    finally:
+        del sys.modules[_SCIPY]
 
 
 def _clear(folder: Path) -> None:
