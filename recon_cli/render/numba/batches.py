@@ -21,6 +21,7 @@ from recon_cli.render.numba.layout import (
     DEPTH,
     EXTENT_X,
     EXTENT_Y,
+    FAR,
     GREEN,
     HALF_Y,
     LOG2_OPACITY,
@@ -89,6 +90,7 @@ def find_rows(batch, k, count):
     extent_x, extent_y = load(batch, at + 2 * BATCH), load(batch, at + 3 * BATCH)
     slope_y, half = load(batch, at + 4 * BATCH), load(batch, at + 5 * BATCH)
     slope_x = -load(batch, at + 7 * BATCH) / load(batch, at + 6 * BATCH)
+    slope_x = select(half < FAR, slope_x, 0.0)  # a box without an ellipse has no slope
     low = maximum(dx, -extent_x)
     high = minimum(dx + (TILE_WIDTH - 1), extent_x)
     inside = (low <= high) & (lane_numbers() < count - k)
