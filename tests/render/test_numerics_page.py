@@ -8,8 +8,8 @@ PAGE = (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8")
 
 
 def functions_in(pattern: str) -> set[str]:
-    files = (ROOT / "tests" / "render").glob(pattern)
-    return {name for file in files
+    folders = (ROOT / "tests" / "render", ROOT / "tests" / "train")
+    return {name for folder in folders for file in folder.glob(pattern)
             for name in re.findall(r"^def (test_\w+)", file.read_text(encoding="utf-8"), re.M)}
 
 

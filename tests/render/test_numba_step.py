@@ -1,0 +1,48 @@
+"""The training step without autograd: its memory, and that it is the same as with autograd."""
+
+import numpy as np
+import torch
+from scenes import camera_at, leaves, random_splats
+
+from recon_cli.bench.scenes import room
+from recon_cli.render import render
+from recon_cli.render.numba.step import PhotometricStep
+from recon_cli.train.losses import photometric_loss
+
+BLACK = torch.zeros(3)
+MOST_BUFFERS = 60e6  # bytes, for 100,000 Gaussians at 640x360
+
+
+def test_the_buffers_of_a_step_stay_small():
+    splats, camera = room(100_000, 640, 360)
+    step = PhotometricStep()
+    step(splats, splats.map(torch.empty_like), camera, np.zeros((360, 640, 3), np.uint8), BLACK,
+         3, 0.2)
+    assert step.bytes <= MOST_BUFFERS
+
+
+def test_the_fused_step_gives_the_gradients_of_autograd():
+    camera = camera_at(60, 41)
+    truth = np.random.default_rng(0).integers(0, 256, (41, 60, 3), np.uint8)
+    splats = leaves(random_splats(200, seed=13, dtype=torch.float32))
+    gradients = splats.map(lambda tensor: torch.full_like(tensor, torch.nan))
+    step = PhotometricStep()
+    loss = step(splats, gradients, camera, truth, BLACK, 3, 0.2)
+    output = render(splats, camera, BLACK, 3, backend="numba")
+    expected = photometric_loss(output.rgb, torch.from_numpy(truth).float() / 255, 0.2)
+    expected.backward()
+    assert abs(loss - expected.item()) < 1e-6
+    for name, value in gradients.parameters().items():
+        theirs = getattr(splats, name).grad
+        assert (value - theirs).norm() <= 1e-5 * theirs.norm(), name
+    mine, theirs = step.statistics.means2d_grad, output.statistics.means2d_grad
+    assert (mine - theirs).norm() <= 1e-5 * theirs.norm()
+
+
+def test_a_read_only_photograph_is_taken():
+    camera = camera_at(20, 20)
+    truth = np.zeros((20, 20, 3), np.uint8)
+    truth.flags.writeable = False
+    splats = random_splats(5, dtype=torch.float32)
+    assert np.isfinite(PhotometricStep()(
+        splats, splats.map(torch.empty_like), camera, truth, BLACK, 0, 0.2))
