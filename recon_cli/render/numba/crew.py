@@ -45,7 +45,7 @@ class Crew:
         self.observer: Callable[[str, float], None] | None = None
         self._lock = threading.Lock()
         self._inboxes: list[SimpleQueue[Callable[[], None]]] = []
-        self._done: SimpleQueue[BaseException | None] = SimpleQueue()
+        self._wake: SimpleQueue[None] = SimpleQueue()
         self._scratch: list[NDArray[np.float32]] = []
         self._process = os.getpid()
 
@@ -68,47 +68,66 @@ class Crew:
         with self._lock:
             self._prepare(count)
 
-            def call(number: int) -> Callable[[], None]:
+            ended: list[BaseException | None] = []  # what went wrong in each other thread
+
+            def call(number: int) -> None:
                 own = (self._scratch[number],) if scratch else ()
-                return lambda: kernel(counter, *arguments, *own)
+                kernel(counter, *arguments, *own)
+
+            def task(number: int) -> Callable[[], None]:
+                return lambda: ended.append(_failure_of(call, number))
 
             for number in range(1, count):
-                self._inboxes[number - 1].put(call(number))
-            failures: list[BaseException | None] = []
+                self._inboxes[number - 1].put(task(number))
             try:
-                call(0)()
-            finally:  # no thread may still write when the arrays are handed on
-                failures = [self._done.get() for _ in range(count - 1)]
-            for failure in failures:
+                call(0)
+            finally:
+                interrupt = self._wait(ended, count - 1)
+            for failure in (interrupt, *ended):
                 if failure is not None:
                     raise failure
         if self.observer is not None:
             self.observer(getattr(kernel, "py_func", kernel).__name__, time.perf_counter() - start)
 
+    def _wait(self, ended: list[BaseException | None], count: int) -> BaseException | None:
+        """Waits until `count` threads have ended; returns the Ctrl-C that came meanwhile.
+
+        Ctrl-C has to wait as well: no thread may still write when the arrays are handed on. What
+        counts is the list; a message on the queue only wakes, for an interrupt may lose one.
+        """
+        interrupt: BaseException | None = None
+        while len(ended) < count:
+            try:
+                self._wake.get()
+            except KeyboardInterrupt as error:
+                interrupt = error
+        return interrupt
+
     def _prepare(self, count: int) -> None:
         if self._process != os.getpid():  # threads do not survive a fork
-            self._inboxes, self._done, self._process = [], SimpleQueue(), os.getpid()
+            self._inboxes, self._wake, self._process = [], SimpleQueue(), os.getpid()
         while len(self._scratch) < count:
             self._scratch.append(aligned(SCRATCH_FLOATS))
         while len(self._inboxes) < count - 1:
             inbox: SimpleQueue[Callable[[], None]] = SimpleQueue()
             self._inboxes.append(inbox)
             threading.Thread(
-                target=_work, args=(inbox, self._done), daemon=True, name="recon-kernel").start()
+                target=_work, args=(inbox, self._wake), daemon=True, name="recon-kernel").start()
 
 
-def _work(
-    inbox: SimpleQueue[Callable[[], None]], done: SimpleQueue[BaseException | None]
-) -> None:
+def _work(inbox: SimpleQueue[Callable[[], None]], wake: SimpleQueue[None]) -> None:
     while True:
-        task = inbox.get()
-        failure: BaseException | None = None
-        try:
-            task()
-        except BaseException as error:  # handed to the caller's thread
-            failure = error
-        del task
-        done.put(failure)
+        inbox.get()()
+        wake.put(None)
+
+
+def _failure_of(call: Callable[[int], None], number: int) -> BaseException | None:
+    """Returns what a call raises: it belongs into the thread that waits."""
+    try:
+        call(number)
+    except BaseException as error:
+        return error
+    return None
 
 
 crew = Crew()
