@@ -134,7 +134,7 @@ def test_an_output_changed_by_hand_makes_its_stage_stale(job: Job) -> None:
 
 
 def test_a_newer_version_of_a_stage_makes_its_results_stale(job: Job) -> None:
-    newer = [replace(row, version=1 + (row.name == "evaluate")) for row in job.table]
+    newer = [replace(row, version=row.version + (row.name == "evaluate")) for row in job.table]
     assert stale(replace(job, table=newer)) == {"evaluate": ("stage version 1 -> 2",)}
 
 
