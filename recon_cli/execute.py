@@ -188,12 +188,21 @@ def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageC
 
     backend, device = registry.resolve(job.compute.backend, job.compute.device)
     registry.use_threads(backend, threads)
-    count = registry.kernels_to_compile(backend)
-    if count:
-        with job.progress.bar("compile for this CPU, once", count, unit="kernel") as bar:
-            seconds = registry.prepare(backend, bar.advance)
-        logger.info("kernels compiled in %.1f s", seconds)
+    _prepare_kernels(job, backend)
     return StageContext(job.progress, device, backend, threads, record)
+
+
+def _prepare_kernels(job: Job, backend: str) -> None:
+    """Loads the kernels of a backend, or compiles them with something to look at."""
+    from recon_cli.render import registry  # noqa: PLC0415 (imports torch)
+
+    count = registry.kernels_to_compile(backend)
+    if not count:  # kernels that turn out to be damaged are compiled here too
+        registry.prepare(backend, lambda: None)
+        return
+    with job.progress.bar("compile for this CPU, once", count, unit="kernel") as bar:
+        seconds = registry.prepare(backend, bar.advance)
+    logger.info("kernels compiled in %.1f s", seconds)
 
 
 def refuse_missing_backend(job: Job, stages: Sequence[str]) -> None:

@@ -26,25 +26,29 @@ class MemoryEstimate:
 
     Attributes:
         images: all views as uint8.
+        pixel_buffers: of one step, for each pixel of a view.
         gaussians: parameters, gradients, moments at the largest count.
-        buffers: of one step.
+        gaussian_buffers: of one step, for each Gaussian.
         program: everything else.
     """
 
     images: int
+    pixel_buffers: int
     gaussians: int
-    buffers: int
+    gaussian_buffers: int
     program: int
 
     @property
     def total(self) -> int:
         """Sum of all parts."""
-        return self.images + self.gaussians + self.buffers + self.program
+        return (self.images + self.pixel_buffers + self.gaussians + self.gaussian_buffers
+                + self.program)
 
     def described(self) -> str:
         """Returns the estimate in words."""
+        buffers = self.pixel_buffers + self.gaussian_buffers
         return (f"about {_megabytes(self.total)} (images {_megabytes(self.images)}, Gaussians "
-                f"{_megabytes(self.gaussians)}, buffers {_megabytes(self.buffers)})")
+                f"{_megabytes(self.gaussians)}, buffers {_megabytes(buffers)})")
 
 
 def estimate(
@@ -60,19 +64,20 @@ def estimate(
         fused: the backend computes gradients without autograd.
     """
     pixels = width * height
-    buffers = gaussians * _BUFFERS_PER_GAUSSIAN + pixels * _BUFFERS_PER_PIXEL
+    factor = 1 if fused else _TORCH_FACTOR
     return MemoryEstimate(
-        images=3 * pixels * views, gaussians=gaussians * _PER_GAUSSIAN,
-        buffers=buffers if fused else _TORCH_FACTOR * buffers, program=_PROGRAM)
+        images=3 * pixels * views, pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
+        gaussians=gaussians * _PER_GAUSSIAN,
+        gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM)
 
 
 def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
     """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes."""
     if needed.total <= free:
         return
-    largest = max(("images", needed.images), ("gaussians", needed.gaussians + needed.buffers),
-                  key=lambda part: part[1])[0]
-    lower = "--max-size" if largest == "images" else "--max-gaussians"
+    by_size = needed.images + needed.pixel_buffers
+    by_count = needed.gaussians + needed.gaussian_buffers
+    lower = "--max-size" if by_size > by_count else "--max-gaussians"
     raise TrainingError(
         f"Training needs {needed.described()}, but {_megabytes(free)} are free.",
         hint=f"Lower {lower}, or close other programs.")

@@ -125,7 +125,8 @@ class SplatOptimizer:
         """Goes on with other Gaussians.
 
         Args:
-            splats: the new Gaussians, M of them; no views of this optimizer's own.
+            splats: the new Gaussians, M of them; views of this optimizer's own only where every row
+                stays in its place.
             source: [M] the old row that each continues, whose moments it keeps; -1 for a new one,
                 which starts with zeros.
         """

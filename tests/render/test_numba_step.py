@@ -1,11 +1,15 @@
 """The training step without autograd: its memory, and that it is the same as with autograd."""
 
+import gc
+import weakref
+
 import numpy as np
 import torch
 from scenes import camera_at, leaves, random_splats
 
 from recon_cli.bench.scenes import room
 from recon_cli.render import render
+from recon_cli.render.numba import backend
 from recon_cli.render.numba.step import PhotometricStep
 from recon_cli.train.losses import photometric_loss
 
@@ -37,6 +41,28 @@ def test_the_fused_step_gives_the_gradients_of_autograd():
         assert (value - theirs).norm() <= 1e-5 * theirs.norm(), name
     mine, theirs = step.statistics.means2d_grad, output.statistics.means2d_grad
     assert (mine - theirs).norm() <= 1e-5 * theirs.norm()
+
+
+def test_a_frame_comes_back_when_the_picture_goes(monkeypatch):
+    held = []
+
+    class Watched(backend.Lease):
+        def __init__(self):
+            super().__init__()
+            held.append(weakref.ref(self))
+
+    monkeypatch.setattr(backend, "Lease", Watched)
+    splats = leaves(random_splats(20, dtype=torch.float32))
+    gc.disable()  # at once, and not when the collector comes by
+    try:
+        for _ in range(3):
+            output = render(splats, camera_at(), BLACK, 3, backend="numba")
+            output.rgb.sum().backward()
+            del output
+        assert len(held) == 3
+        assert not any(lease() for lease in held)
+    finally:
+        gc.enable()
 
 
 def test_a_read_only_photograph_is_taken():

@@ -26,6 +26,7 @@ def test_what_fits_is_not_refused():
 @pytest.mark.parametrize(("changes", "option"), [
     ({"gaussians": 50_000_000}, "--max-gaussians"),
     ({"views": 3000, "width": 4000, "height": 3000}, "--max-size"),
+    ({"views": 2, "width": 16_000, "height": 12_000}, "--max-size"),
 ])
 def test_the_error_says_what_to_lower(changes, option):
     with pytest.raises(TrainingError, match="MB are free") as caught:

@@ -65,7 +65,9 @@ class _Render(torch.autograd.Function):
         if scores:
             lease.frame.tally(statistics.hits.numpy(), flat(statistics.blend_max))
         ctx.save_for_backward(*tensors)
-        ctx.lease, ctx.statistics, ctx.scores, ctx.alpha = lease, statistics, scores, alpha
+        ctx.lease, ctx.statistics, ctx.scores = lease, statistics, scores
+        # the output itself would hold its own graph, and with it the frame, for ever
+        ctx.alpha = alpha.detach()
         return rgb, alpha, depth
 
     @staticmethod

@@ -49,7 +49,6 @@ BATCH_FLOATS = LOCAL * BATCH + (RANGE + 2) * BATCH  # the last two: first row an
 _RANGES = LOCAL * BATCH
 FIRST_ROW, END_ROW = _RANGES + RANGE * BATCH, _RANGES + (RANGE + 1) * BATCH
 _MARGIN = np.float32(1e-3)  # pixels; more than the rounding of a pixel coordinate
-_HALF = np.float32(0.5)
 
 
 @inlined

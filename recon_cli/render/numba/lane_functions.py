@@ -29,7 +29,6 @@ _LOG2 = (1.4426950216293335, -0.7213473320007324, 0.48091062903404236, -0.360703
          0.1258370578289032)
 _ROUNDER = 12582912.0  # 1.5 * 2^23: a sum with it has the nearest integer in its low bits
 _ROOT_HALF_BITS = 0x3F3504F3  # of sqrt(1/2)
-_CONTRACT = ("contract",)
 
 
 def _call(builder: Any, name: str, *args: Any) -> Any:

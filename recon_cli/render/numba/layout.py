@@ -43,5 +43,4 @@ SLOT = 16
  ABS_X, ABS_Y, S_SQUARED, COUNT, LEAVE_ONE_OUT) = range(15)
 
 LOG2_E = math.log2(math.e)
-LOG2_255 = math.log2(255.0)
 LOG2_ALPHA_MAX = math.log2(0.99)

@@ -77,8 +77,8 @@ _SUMS = PROJECTION_FLOATS // LANES
 _RECORD = _SUMS + SLOT
 _GRAD = _RECORD + RECORD  # mean 3, quaternion 4, scales 3, logit 1, base colour 3, rest 45
 G_MEAN, G_QUAT, G_SCALE, G_LOGIT, G_DC, G_REST = (_GRAD + i for i in (0, 3, 7, 10, 11, 14))
-G_MEAN2D, G_ABSOLUTE, G_VARIANCE, G_LOO = (_GRAD + 59 + i for i in (0, 2, 4, 5))
-_PULL = _GRAD + 65
+G_MEAN2D, G_ABSOLUTE, G_VARIANCE = (_GRAD + 59 + i for i in (0, 2, 4))
+_PULL = _GRAD + 64
 GRADIENT_FLOATS = (_PULL + 15) * LANES
 
 
