@@ -15,7 +15,7 @@ from recon_cli.capture.choose import (
     sharp_frames,
     travelled,
 )
-from recon_cli.capture.frames import Frame, FrameList
+from recon_cli.capture.frames import Frame, FrameList, Group
 from recon_cli.capture.images import Photo, read_photo
 from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import (
@@ -70,7 +70,8 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     take = _take_photos if source.is_dir() else _take_video
     capture = take(config, source, out, ctx)
     height, width = store.read_png(out / store.FOLDER / capture.frames[0].name).shape[:2]
-    FrameList(capture.kind, width, height, capture.focal_px, tuple(capture.frames)).write(out)
+    group = Group(inputs.sources[0].name, width, height, capture.focal_px)
+    FrameList(capture.kind, (group,), tuple(capture.frames)).write(out)
     return {
         "kind": capture.kind,
         **capture.summary,

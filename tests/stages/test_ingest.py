@@ -30,8 +30,9 @@ def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notice
         "dropped_blurred": 0, "skipped": [], "frames": len(names), "held_out": -(-len(names) // 8),
         "width": 128, "height": 96,
     }
-    assert (found["source"], found["width"], found["height"]) == ("video", 128, 96)
-    assert found["focal_px"] is None
+    assert found["source"] == "video"
+    assert found["groups"] == [
+        {"name": "walk.mp4", "width": 128, "height": 96, "focal_px": None, "lens": None}]
     assert names == sorted(names)
     assert names == sorted(path.name for path in (tmp_path / "out" / "frames").iterdir())
     for place, frame in enumerate(found["frames"]):
@@ -140,7 +141,7 @@ def test_no_metadata_is_carried_over_and_the_focal_length_is_scaled(tmp_path):
     for path in folder.iterdir():
         Image.open(path).save(path, exif=exif)
     take(folder, tmp_path / "out", config=IngestConfig(max_size=64))
-    assert listed(tmp_path / "out")["focal_px"] == pytest.approx(80 * 26 / 43.267)
+    assert listed(tmp_path / "out")["groups"][0]["focal_px"] == pytest.approx(80 * 26 / 43.267)
     for path in (tmp_path / "out" / "frames").iterdir():
         assert b"Secret" not in path.read_bytes()
         assert not Image.open(path).getexif()
