@@ -153,6 +153,25 @@ def test_an_image_of_another_size_than_its_camera_is_refused(undistorted, folder
         read(undistorted)
 
 
+def test_a_mask_belongs_to_the_view_of_its_name(undistorted):
+    (undistorted / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT)).save(undistorted / "masks" / NAMES[3])
+    masks = {view.name: view.mask for view in read(undistorted).train}
+    assert masks.pop(NAMES[3]) == undistorted / "masks" / NAMES[3]
+    assert set(masks.values()) == {None}
+
+
+def test_without_a_folder_of_masks_every_pixel_counts(undistorted):
+    assert all(view.mask is None for view in read(undistorted).train)
+
+
+def test_a_mask_of_another_size_than_its_camera_is_refused(undistorted):
+    (undistorted / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT + 1)).save(undistorted / "masks" / NAMES[3])
+    with pytest.raises(FormatError, match=r"masks.*8x7 pixels, but its camera 8x6"):
+        read(undistorted)
+
+
 def test_an_empty_model_can_be_read_as_such(tmp_path):
     pycolmap.Reconstruction().write(tmp_path)
     assert read_images(tmp_path / "images.bin") == []
