@@ -31,6 +31,10 @@ class TrainView:
     image: NDArray[np.uint8]
     mask: NDArray[np.bool_] | None = None
 
+    def __post_init__(self) -> None:
+        if self.mask is not None and self.mask.shape != self.image.shape[:2]:
+            raise ValueError(f"a mask of {self.mask.shape} for an image of {self.image.shape}")
+
     def pixels(self, device: torch.device) -> Tensor:
         """Returns the image as float32 in [0, 1], [H, W, 3]."""
         return torch.from_numpy(self.image).to(device).float() / 255

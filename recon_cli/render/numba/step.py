@@ -18,7 +18,7 @@ from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
-_FROM_BYTE = np.float32(1 / 255)  # the very factor of the loss
+_FROM_BYTE = np.float32(1 / 255)  # the very factor that loss.py takes
 
 
 class PhotometricStep:
@@ -77,14 +77,15 @@ class PhotometricStep:
         grad_rgb = frame.take("grad_rgb", CHANNELS * pixels)
         if not truth.flags.writeable:  # would be another type, and kernels compiled once more
             truth = truth.copy()
-        ignored = None if mask is None else ~mask.reshape(-1)
-        if ignored is not None:
-            _lay_truth_over(rgb, truth, ignored)
+        # numbers and not pixels: a flat mask is twice as fast as one of rows
+        ignored = None if mask is None else np.repeat(~mask.reshape(-1), CHANNELS)
+        if ignored is not None:  # the loss's own product, so that no error is left
+            rgb[ignored] = truth.reshape(-1)[ignored] * _FROM_BYTE
         loss = photometric(
             rgb, truth.reshape(-1), width, height, ssim_weight,
             maps=frame.take("maps", MAPS * len(rgb)), gradient=grad_rgb)
         if ignored is not None:
-            grad_rgb.reshape(-1, CHANNELS)[ignored] = 0
+            grad_rgb[ignored] = 0
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,
@@ -93,11 +94,3 @@ class PhotometricStep:
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))
         return loss
-
-
-def _lay_truth_over(
-    rgb: NDArray[np.float32], truth: NDArray[np.uint8], ignored: NDArray[np.bool_]
-) -> None:
-    """Gives the ignored pixels [H * W] of an image [H * W * 3] the colours of the truth."""
-    # the same product in float32 as in the loss, so that no error is left
-    rgb.reshape(-1, CHANNELS)[ignored] = truth.reshape(-1, CHANNELS)[ignored] * _FROM_BYTE
