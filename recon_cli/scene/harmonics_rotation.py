@@ -53,8 +53,12 @@ def rotated(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
     Returns:
         [N, 15, 3] of the same dtype and device; computed in float64.
     """
-    matrix = torch.block_diag(*rotation_blocks(rotation)).to(sh_rest.device)
-    return torch.einsum("ij,njc->nic", matrix, sh_rest.double()).to(sh_rest.dtype)
+    parts, start = [], 0
+    for block in rotation_blocks(rotation):
+        terms = sh_rest[:, start:start + len(block)].double()
+        parts.append(block.to(sh_rest.device) @ terms)
+        start += len(block)
+    return torch.cat(parts, dim=1).to(sh_rest.dtype)
 
 
 def _lattice(count: int) -> Tensor:

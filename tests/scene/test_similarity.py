@@ -79,5 +79,5 @@ def test_json_keeps_every_bit():
     {"translation": np.array([0.0, np.inf, 0.0])}, {"translation": np.zeros(4)},
 ])
 def test_what_is_no_similarity_is_refused(wrong):
-    with pytest.raises(ValueError, match="similarity|rotation"):
+    with pytest.raises(ValueError, match=r"similarity|rotation"):
         Similarity(**wrong)
