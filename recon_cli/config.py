@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from recon_cli.errors import ConfigError
 from recon_cli.fields import StageConfig, option
 
-
 SCALE_BETWEEN = (
     "Make one unit a metre: A and B are METRES apart. Each is a frame's name (where its camera "
     "was), x,y,z (a point of the scene as it is without this option) or FRAME:u,v (what the "

@@ -90,11 +90,11 @@ class StageConfig:
         needed = ", ".join(kind.__name__ for kind in kinds)
         if not isinstance(value, (list, tuple)) or len(value) != len(kinds):
             raise self._refused(name, value, f"{len(kinds)} values ({needed})")
-        members = tuple(
+        members: tuple[Any, ...] = tuple(
             float(one) if kind is float and type(one) is int else one
             for one, kind in zip(value, kinds, strict=True))
         for one, kind in zip(members, kinds, strict=True):
-            if type(one) is not kind or (kind is float and not math.isfinite(one)):
+            if type(one) is not kind or (isinstance(one, float) and not math.isfinite(one)):
                 raise self._refused(name, list(value), f"{len(kinds)} values ({needed})")
         return members
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from recon_cli.errors import ConfigError
 from recon_cli.io.colmap import Pinhole
 
-# How far from a pixel a sparse point may lie, as a share of the image's width: 6 pixels of 600, and
-# a surface that faces the camera keeps its depth over that. In a rendered room 10,800 points seen
-# by 75 frames of 600x340 lie 15 pixels apart in the middle, and closer at corners and texture.
-_REACH = 0.01
+# How far from a pixel a sparse point may lie, as a share of the image's width. In two rendered
+# rooms picks within two pixels of a corner had a depth 0.5% and 0.7% off in the middle, 5% in the
+# worst tenth; picks anywhere found a point within 3 pixels in a third of the cases, 1% off in the
+# middle, and one of another surface in a sixth. Taking the foremost of all points around, rather
+# than the nearest pixel, did worse: 8% in the worst tenth of the corners.
+_REACH = 0.005
 _LEAST_REACH = 4.0  # pixels
-# Of the points around a pixel those that lie further than this behind the first are hidden by it.
-_BEHIND = 1.1
 _EQUAL = 1e-6  # share of the distance to the origin; nearer than this is the same point
 _HINT = (
     "A and B are each a frame's name, x,y,z or FRAME:u,v, such as --scale-between "
@@ -188,7 +188,7 @@ def _located(
 
 
 def _depth_at(place: PixelPlace, seen: NDArray[np.float64], pinhole: Pinhole) -> float:
-    """Returns the depth of the sparse point, of those [P, 3] in camera axes, that a pixel shows."""
+    """Returns the depth of the one of `seen` [P, 3], in camera axes, that is nearest to a pixel."""
     if not (0 <= place.u <= pinhole.width and 0 <= place.v <= pinhole.height):
         raise ConfigError(
             f"The pixel {place.u:g},{place.v:g} lies outside of {place.name}, which is "
@@ -197,11 +197,9 @@ def _depth_at(place: PixelPlace, seen: NDArray[np.float64], pinhole: Pinhole) ->
     pixels = seen[:, :2] / seen[:, 2:] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
     off = np.hypot(*(pixels - (place.u, place.v)).T)
     reach = max(_LEAST_REACH, _REACH * pinhole.width)
-    near = off <= reach
-    if not near.any():
+    if not (off <= reach).any():
         raise _nothing_near(place, pixels, off, reach)
-    shown = near & (seen[:, 2] <= _BEHIND * seen[near, 2].min())
-    return float(seen[np.argmin(np.where(shown, off, np.inf)), 2])
+    return float(seen[off.argmin(), 2])
 
 
 def _nothing_near(

@@ -91,7 +91,7 @@ def find_floor(
         return None
     floor = _measured(near, normal, height, thick)
     wide = _width(near, floor, thick) >= _MIN_WIDTH * size
-    good = (
+    good = bool(
         floor.share >= _MIN_SHARE and floor.below <= _MAX_BELOW
         and floor.contrast >= _MIN_CONTRAST and wide)
     return floor if good else None
