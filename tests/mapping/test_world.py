@@ -109,8 +109,8 @@ def test_a_frame_that_does_not_exist_stops_it():
         world_of(make_room(), between=ScaleBetween("x.png", B, 1.0))
 
 
-# The rooms are rendered, so that their z axis is the truth. The points come from the depth maps,
-# with half a percent of noise, and so lie on bare walls too, where structure from motion finds none.
+# The rooms are rendered, so that their z axis is the truth. Their points come from the depth maps,
+# with half a percent of noise, and lie on bare walls too, where structure from motion finds none.
 @pytest.mark.parametrize("name", ["office", "living"])
 def test_a_rendered_room_comes_out_upright(shared_data: Path, name: str):
     room = _rendered(shared_data / "rooms" / name, Similarity(0.3, _turn(), np.array([1., 2, 3])))
