@@ -118,8 +118,9 @@ def test_a_rendered_room_comes_out_upright(shared_data: Path, name: str):
     world = world_transform(points, viewmats, gravity=True, scale_between=None, metric=False)
     assert world.evidence.floor_found
     into_room = truth.after(world.similarity.inverse())
-    assert degrees_between(into_room.rotation[2], np.array([0, 0, 1.0])) < 0.3
-    assert abs(into_room.points(np.zeros(3))[2]) < 0.03
+    # Measured: 0.016 and 0.011 degrees, 2 and 4 mm.
+    assert degrees_between(into_room.rotation[2], np.array([0, 0, 1.0])) < 0.1
+    assert abs(into_room.points(np.zeros(3))[2]) < 0.01
 
 
 def _turn() -> np.ndarray:
