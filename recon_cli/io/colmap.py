@@ -81,6 +81,20 @@ def read_scene(
     return Scene(train, chosen, test, tuple(missing), points, colors)
 
 
+def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
+    """Returns the camera of each view of an undistorted model, by name.
+
+    Raises:
+        FormatError: the model is missing or damaged, or not of pinhole cameras.
+    """
+    cameras = read_cameras(sparse / "cameras.bin")
+    views = read_images(sparse / "images.bin")
+    missing = [name for name, camera_id, _ in views if camera_id not in cameras]
+    if missing:
+        raise _damaged(sparse, f"{missing[0]} has an unknown camera")
+    return {name: cameras[camera_id] for name, camera_id, _ in views}
+
+
 def read_cameras(path: Path) -> dict[int, Pinhole]:
     """Returns the cameras of a cameras.bin by id.
 

@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from recon_cli.errors import FormatError
-from recon_cli.io.colmap import read_images, read_points, read_scene
+from recon_cli.io.colmap import read_images, read_pinholes, read_points, read_scene
 
 WIDTH, HEIGHT = 8, 6
 NAMES = [f"{index:06d}.png" for index in range(5)]
@@ -53,6 +53,12 @@ def test_the_inner_camera_is_read_unchanged(undistorted):
     camera = read(undistorted).train[0].camera
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (5.0, 5.5, 4.0, 3.0)
+
+
+def test_each_view_has_its_inner_camera_by_name(undistorted):
+    pinholes = read_pinholes(undistorted / "sparse")
+    assert sorted(pinholes) == NAMES
+    assert all(one.fy == 5.5 for one in pinholes.values())
 
 
 def test_a_turned_camera_looks_where_its_quaternion_says(undistorted):
