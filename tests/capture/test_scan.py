@@ -1,13 +1,13 @@
 import json
 
-import av
 import cv2
 import numpy as np
 import pytest
 from media import spoil_packets, texture, write_video
 
+from recon_cli.capture.picture import Picture
 from recon_cli.capture.scan import Scan, decode_threads, scan_video, sharpness
-from recon_cli.capture.video import decode, to_rgb
+from recon_cli.capture.video import decode
 
 
 def quiet():
@@ -69,8 +69,8 @@ def test_a_scan_survives_json(video):
 @pytest.mark.parametrize("packet", [1, 4, 13, 22, 35])
 def test_whole_frames_are_exactly_those_of_the_undamaged_video(video, packet, erase):
     def pixels():
-        frames = (f for f in decode(video, threads=1) if isinstance(f, av.VideoFrame))
-        return {frame.pts: to_rgb(frame) for frame in frames}
+        found = (item for item in decode(video, threads=1) if isinstance(item, Picture))
+        return {picture.frame.pts: picture.rgb() for picture in found}
 
     truth = pixels()
     spoil_packets(video, [packet], erase=erase)

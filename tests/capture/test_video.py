@@ -1,19 +1,10 @@
-import av
 import numpy as np
 import pytest
 from media import set_display_matrix, texture, write_sound, write_video
 from PIL import Image
 
-from recon_cli.capture.video import (
-    Gap,
-    claimed_length,
-    decode,
-    frames_at,
-    open_video,
-    shown_size,
-    to_gray,
-    to_rgb,
-)
+from recon_cli.capture.picture import Gap, Picture
+from recon_cli.capture.video import claimed_length, decode, frames_at, open_video
 from recon_cli.errors import InputError
 
 # Two roundings (to YUV and back) of 8-bit values, and a little loss of the codec.
@@ -39,7 +30,7 @@ def centres(picture):
 
 
 def first_frame(path):
-    return next(f for f in decode(path, threads=1) if isinstance(f, av.VideoFrame))
+    return next(f for f in decode(path, threads=1) if isinstance(f, Picture))
 
 
 # The matrices that cameras write: the picture has to be turned clockwise by so much to be upright.
@@ -52,13 +43,13 @@ def first_frame(path):
 def test_a_tagged_rotation_is_applied(tmp_path, clockwise, matrix):
     path = write_video(tmp_path / "phone.mp4", [quadrants()] * 3)
     set_display_matrix(path, (*matrix, 0, 0, 1 << 30))
-    frame = first_frame(path)
+    picture = first_frame(path)
     upright = np.rot90(quadrants(), -clockwise)
-    rgb = to_rgb(frame)
+    rgb = picture.rgb()
     assert rgb.shape == upright.shape
     assert np.abs(centres(rgb) - centres(upright)).max() <= COLOUR_TOLERANCE
-    assert to_gray(frame).shape == upright.shape[:2]
-    assert shown_size(frame) == upright.shape[1::-1]
+    assert picture.gray().shape == upright.shape[:2]
+    assert picture.size == upright.shape[1::-1]
 
 
 @pytest.mark.parametrize(("codec", "pixels", "colorspace", "color_range"), [
@@ -75,7 +66,7 @@ def test_colours_come_out_as_they_went_in(tmp_path, codec, pixels, colorspace, c
     path = write_video(
         tmp_path / "video.mkv", [quadrants()] * 3, codec=codec, pixels=pixels,
         colorspace=colorspace, color_range=color_range)
-    rgb = to_rgb(first_frame(path))
+    rgb = first_frame(path).rgb()
     assert rgb.dtype == np.uint8
     assert np.abs(centres(rgb) - COLOURS).max() <= COLOUR_TOLERANCE
 
@@ -84,14 +75,14 @@ def test_untagged_video_of_high_definition_is_taken_as_bt709(tmp_path):
     tagged = write_video(
         tmp_path / "tagged.mkv", [quadrants(720, 1280)], codec="ffv1", colorspace=BT709,
         color_range=LIMITED)
-    frame = first_frame(tagged)
-    frame.colorspace = 2  # unspecified
-    assert np.abs(centres(to_rgb(frame)) - COLOURS).max() <= COLOUR_TOLERANCE
+    picture = first_frame(tagged)
+    picture.frame.colorspace = 2  # unspecified
+    assert np.abs(centres(picture.rgb()) - COLOURS).max() <= COLOUR_TOLERANCE
 
 
 def test_gray_uses_the_full_range(tmp_path):
     path = write_video(tmp_path / "video.mp4", [np.full((64, 96, 3), 255, np.uint8)] * 3)
-    assert to_gray(first_frame(path)).min() >= 255 - COLOUR_TOLERANCE
+    assert first_frame(path).gray().min() >= 255 - COLOUR_TOLERANCE
 
 
 @pytest.mark.parametrize("name", ["text.mp4", "text.txt"])
@@ -144,7 +135,7 @@ def test_the_count_is_taken_from_the_duration_where_the_container_names_none(tmp
 def test_every_frame_is_decoded_once_and_in_order(tmp_path, threads):
     shades = [np.full((64, 96, 3), 10 * i + 20, np.uint8) for i in range(20)]
     path = write_video(tmp_path / "video.mp4", shades)
-    seen = [int(np.median(to_rgb(frame))) for frame in decode(path, threads=threads)]
+    seen = [int(np.median(frame.rgb())) for frame in decode(path, threads=threads)]
     np.testing.assert_allclose(seen, [10 * i + 20 for i in range(20)], atol=COLOUR_TOLERANCE)
 
 
@@ -171,5 +162,5 @@ def test_frames_that_change_their_size_midway_count_as_lost(tmp_path):
     path = tmp_path / "both.h264"
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
     items = list(decode(path, threads=1))
-    assert {item.width for item in items if isinstance(item, av.VideoFrame)} == {96}
+    assert {item.size[0] for item in items if isinstance(item, Picture)} == {96}
     assert any(isinstance(item, Gap) for item in items)
