@@ -18,8 +18,8 @@ from av.stream import Disposition
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from recon_cli.capture.clues import codec_name, lacks_index
 from recon_cli.capture.fields import progressive
-from recon_cli.capture.fourcc import codec_name
 from recon_cli.capture.picture import Gap, Picture, look_of
 from recon_cli.errors import InputError
 
@@ -56,9 +56,17 @@ def _unreadable(path: Path, reason: str) -> InputError:
         return InputError(f"{path} does not exist.", hint="Check the path.")
     if path.is_file() and path.stat().st_size == 0:
         return InputError(f"{path} is empty (0 bytes).", hint="Copy it from the camera again.")
+    if path.is_file() and lacks_index(path):
+        return _cut_off(path)
     return InputError(
         f"{path} cannot be read as a video: {reason}.",
         hint="Give a video, or a folder of photos; if a player shows it, try a fresh copy.")
+
+
+def _cut_off(path: Path) -> InputError:
+    return InputError(
+        f"{path} is cut off: its index (the moov box) is not there in full.",
+        hint="Copy it from the camera again; if it is no longer there, record once more.")
 
 
 def _video_stream(path: Path, container: InputContainer) -> VideoStream:
@@ -68,10 +76,12 @@ def _video_stream(path: Path, container: InputContainer) -> VideoStream:
         if stream.codec_context is not None:
             return stream
     if moving:
-        name = codec_name(path) or "that is not known"
         raise InputError(
-            f"{path} holds a video of the codec {name}, which cannot be decoded here.",
+            f"{path} holds video in {codec_name(path) or 'an unknown codec'}, which cannot be "
+            "decoded here.",
             hint=convert_hint(path))
+    if lacks_index(path):
+        raise _cut_off(path)
     kinds = {"video": "a still picture or text"}
     found = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
     raise InputError(

@@ -93,6 +93,8 @@ def _one_source(sources: Sequence[Path]) -> Path:
 
 def _take_video(config: IngestConfig, path: Path, out: Path, ctx: StageContext) -> _Capture:
     scan = _scanned(path, out, ctx)
+    for notice in scan.notices:
+        ctx.notice(notice)
     _report_lost(path, scan, ctx)
     way = travelled(scan.motion)
     sharp = sharp_frames(scan.sharpness, config.sharpness)

@@ -1,5 +1,7 @@
+import av
 import numpy as np
 import pytest
+from av.stream import Disposition
 from media import set_display_matrix, texture, write_sound, write_video
 from PIL import Image
 
@@ -164,3 +166,67 @@ def test_frames_that_change_their_size_midway_count_as_lost(tmp_path):
     items = list(decode(path, threads=1))
     assert {item.size[0] for item in items if isinstance(item, Picture)} == {96}
     assert any(isinstance(item, Gap) for item in items)
+
+
+def mixed(path, *, cover):
+    """A video of 96x64 behind a sound track and, first in the file, the cover of a song."""
+    with av.open(str(path), "w") as container:
+        if cover:
+            picture = container.add_stream("mjpeg", rate=1)
+            picture.width, picture.height, picture.pix_fmt = 32, 32, "yuvj420p"
+            picture.disposition = Disposition.attached_pic
+        sound = container.add_stream("aac", rate=16000, layout="mono")
+        video = container.add_stream("libx264", rate=10)
+        video.width, video.height, video.pix_fmt = 96, 64, "yuv420p"
+        if cover:
+            frame = av.VideoFrame.from_ndarray(quadrants(32, 32)).reformat(format="yuvj420p")
+            container.mux([*picture.encode(frame), *picture.encode()])
+        for _ in range(8):
+            container.mux(video.encode(av.VideoFrame.from_ndarray(quadrants())))
+        samples = av.AudioFrame.from_ndarray(
+            np.zeros((1, 16000), np.float32), format="fltp", layout="mono")
+        samples.sample_rate = 16000
+        container.mux([*video.encode(), *sound.encode(samples), *sound.encode()])
+    return path
+
+
+@pytest.mark.parametrize(("name", "cover"), [("a.mp4", False), ("a.mkv", False), ("c.mp4", True)])
+def test_sound_and_covers_are_passed_over(tmp_path, name, cover):
+    path = mixed(tmp_path / name, cover=cover)
+    with av.open(str(path)) as container:
+        assert len(container.streams) == (3 if cover else 2)
+    items = list(decode(path, threads=2))
+    assert [item.size for item in items] == [(96, 64)] * 8
+    assert np.abs(centres(items[3].rgb()) - COLOURS).max() <= 2 * COLOUR_TOLERANCE
+
+
+@pytest.mark.parametrize(("fourcc", "name"), [(b"evc1", "EVC"), (b"zzzz", "zzzz")])
+def test_a_codec_without_a_decoder_is_named_and_how_to_convert_it(tmp_path, fourcc, name):
+    path = write_video(tmp_path / "new.mp4", [texture(64, 96)] * 5)
+    # EVC is known to FFmpeg, but none of its own decoders reads it; zzzz is known to nobody.
+    path.write_bytes(path.read_bytes().replace(b"avc1", fourcc).replace(b"avcC", b"free"))
+    with pytest.raises(InputError, match=f"holds video in {name}, which cannot be decoded") as told:
+        list(decode(path, threads=1))
+    assert f'ffmpeg -i "{path}" -c:v libx264' in told.value.hint
+
+
+def test_noise_is_no_video(tmp_path):
+    path = tmp_path / "noise.mp4"
+    path.write_bytes(np.random.default_rng(0).bytes(20000))
+    with pytest.raises(InputError, match="cannot be read as a video"):
+        claimed_length(path)
+
+
+@pytest.mark.parametrize("faststart", [False, True])
+def test_an_mp4_whose_index_is_cut_off_is_named_as_such(tmp_path, faststart):
+    path = mixed(tmp_path / "whole.mp4", cover=False)
+    data = path.read_bytes()
+    if faststart:  # the index before the frames, as files for the web have it
+        at = data.index(b"moov") - 4
+        head = data.index(b"mdat") - 12  # an empty box lies in front of it
+        data = data[:head] + data[at:] + data[head:at]
+    for kept in (data.index(b"moov") + 10, data.index(b"moov") + 300):
+        path.write_bytes(data[:kept])
+        with pytest.raises(InputError, match="is cut off: its index") as told:
+            claimed_length(path)
+        assert "Copy it from the camera again" in told.value.hint

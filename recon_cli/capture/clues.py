@@ -1,9 +1,13 @@
-"""The name of a codec without a decoder, read from the file: PyAV names only what it can decode."""
+"""What the bytes of a file tell that PyAV does not: for errors alone, never to decode by.
+
+PyAV names a codec only where it has a decoder, and takes an MP4 without its index for any file.
+"""
 
 from __future__ import annotations
 
 import mmap
 import re
+import struct
 from pathlib import Path
 
 # How containers mark their video: MP4 and MOV in the first sample entry of a video track, Matroska
@@ -30,3 +34,22 @@ def codec_name(path: Path) -> str:
                 name = found[1].decode("ascii").strip()
                 return NAMES.get(name, name)
     return ""
+
+
+def lacks_index(path: Path) -> bool:
+    """Returns whether a file is an MP4 or MOV whose index, the moov box, is not there in full."""
+    size, at, boxes = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while len(head := file.read(16)) >= 8:
+            length, name = struct.unpack_from(">I4s", head)
+            if length == 1 and len(head) == 16:  # a length of 64 bits follows
+                length = struct.unpack_from(">Q", head, 8)[0]
+            end = at + length if length else size  # 0: to the end of the file
+            if at == 0 and name not in {b"ftyp", b"mdat", b"wide", b"moov"}:
+                return False
+            if length and length < 8:
+                break
+            boxes.add(name if end <= size else b"")
+            at = end
+            file.seek(at)
+    return bool(boxes) and b"moov" not in boxes
