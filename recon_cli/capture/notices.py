@@ -27,15 +27,15 @@ def done_to(path: Path, first: Picture, interlaced: int) -> tuple[str, ...]:
         videos = len(moving_pictures(container))
     if videos > 1:
         found.append(f"{path.name} holds {videos} videos: the first that can be decoded is used.")
-    if first.look.transfer is not None:
+    if first.tags.transfer is not None:
         found.append(
-            f"{path.name} is {first.look.transfer.value} video: tone-mapped to SDR by one curve.")
+            f"{path.name} is {first.tags.transfer.value} video: tone-mapped to SDR by one curve.")
     if interlaced:
         found.append(f"{path.name} is interlaced: {interlaced} frames are deinterlaced.")
     stored = first.frame.width, first.frame.height
     if first.square_size != stored:
         found.append(
-            f"{path.name} has pixels of aspect {first.look.aspect}: its frames of {_by(stored)} "
+            f"{path.name} has pixels of aspect {first.tags.aspect}: its frames of {_by(stored)} "
             f"are stretched to {_by(first.square_size)}.")
     return tuple(found)
 

@@ -37,7 +37,7 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Look:
+class Tags:
     """What a file says about the looks of all its frames.
 
     Attributes:
@@ -51,10 +51,10 @@ class Look:
     primaries: int = UNSPECIFIED
 
 
-def look_of(stream: VideoStream) -> Look:
+def tags_of(stream: VideoStream) -> Tags:
     """Returns what a video stream says about the looks of its frames."""
     context = stream.codec_context
-    return Look(
+    return Tags(
         # The container's word, else the codec's; 0 where neither has one.
         stream.sample_aspect_ratio or Fraction(1),
         TRANSFERS.get(int(context.color_trc)),
@@ -67,18 +67,18 @@ class Picture:
 
     Attributes:
         frame: as it was decoded, or deinterlaced.
-        look: what the file says about its looks.
+        tags: what the file says about its looks.
         interlaced: whether its two fields were taken at different times.
     """
 
     frame: av.VideoFrame
-    look: Look = Look()
+    tags: Tags = Tags()
     interlaced: bool = False
 
     @property
     def square_size(self) -> tuple[int, int]:
         """Width and height with square pixels, as it lies in the file."""
-        return max(1, round(self.frame.width * self.look.aspect)), self.frame.height
+        return max(1, round(self.frame.width * self.tags.aspect)), self.frame.height
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,19 +92,19 @@ class Picture:
         Colour matrix and range come from the frame's tags. Ten-bit frames are reduced to eight
         bits, and HDR to SDR by the one curve of `capture.tone`.
         """
-        transfer = self.look.transfer
+        transfer = self.tags.transfer
         if transfer is None:
             return self._upright(self._reformatted("rgb24", self._sdr_matrix()))
         untagged = self.frame.colorspace == UNSPECIFIED
         matrix = Colorspace.BT2020 if untagged else None
         signal = np.asarray(self._reformatted("rgb48le", matrix), np.uint16)
-        return self._upright(to_sdr(signal, transfer, primaries=self.look.primaries))
+        return self._upright(to_sdr(signal, transfer, primaries=self.tags.primaries))
 
     def gray(self) -> NDArray[np.uint8]:
         """Returns the frame's brightness, upright, [H, W]; of HDR as its neutral colours show."""
         gray = self._reformatted("gray", None)
-        if self.look.transfer is not None:
-            gray = cv2.LUT(gray, gray_table(self.look.transfer))
+        if self.tags.transfer is not None:
+            gray = cv2.LUT(gray, gray_table(self.tags.transfer))
         return self._upright(gray)
 
     def _reformatted(self, pixels: str, matrix: Colorspace | None) -> NDArray[np.generic]:

@@ -38,7 +38,7 @@ def test_a_gray_ramp_of_hdr_video_follows_the_documented_curve(tmp_path, trc, su
     path = write_luma(
         tmp_path / f"ramp{suffix}", [ramp()] * 3, trc=trc, primaries=BT2020, colorspace=BT2020_NCL)
     picture = pictures(path)[1]
-    assert picture.look.transfer is (Transfer.PQ if trc == PQ else Transfer.HLG)
+    assert picture.tags.transfer is (Transfer.PQ if trc == PQ else Transfer.HLG)
     signal = (ramp()[0] - 64) / 876
     expected = srgb_code(compressed(LIGHTS[trc](signal)) / SDR_WHITE).astype(int)
     found = picture.rgb()[32].astype(int)
@@ -50,7 +50,7 @@ def test_a_gray_ramp_of_hdr_video_follows_the_documented_curve(tmp_path, trc, su
 @pytest.mark.parametrize("trc", [1, BT2020_10])
 def test_a_ramp_of_ten_bits_is_rounded_to_eight(tmp_path, trc):
     picture = pictures(write_luma(tmp_path / "ten.mp4", [ramp()] * 2, trc=trc))[0]
-    assert picture.look.transfer is None
+    assert picture.tags.transfer is None
     signal = 255 * (ramp()[0] - 64) / 876
     # A half, and 0.01 for coefficients of 14 bits.
     assert np.abs(picture.rgb()[32] - signal[:, None]).max() <= 0.51
