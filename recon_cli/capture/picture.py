@@ -94,20 +94,20 @@ class Picture:
         """
         transfer = self.tags.transfer
         if transfer is None:
-            return self._upright(self._reformatted("rgb24", self._sdr_matrix()))
+            return self._upright(self._colours("rgb24", self._sdr_matrix()))
         untagged = self.frame.colorspace == UNSPECIFIED
         matrix = Colorspace.BT2020 if untagged else None
-        signal = np.asarray(self._reformatted("rgb48le", matrix), np.uint16)
+        signal = np.asarray(self._colours("rgb48le", matrix), np.uint16)
         return self._upright(to_sdr(signal, transfer, primaries=self.tags.primaries))
 
     def gray(self) -> NDArray[np.uint8]:
         """Returns the frame's brightness, upright, [H, W]; of HDR as its neutral colours show."""
-        gray = self._reformatted("gray", None)
+        gray = self.frame.reformat(width=self.square_size[0], format="gray").to_ndarray()
         if self.tags.transfer is not None:
             gray = cv2.LUT(gray, gray_table(self.tags.transfer))
         return self._upright(gray)
 
-    def _reformatted(self, pixels: str, matrix: Colorspace | None) -> NDArray[np.generic]:
+    def _colours(self, pixels: str, matrix: Colorspace | None) -> NDArray[np.generic]:
         width = self.square_size[0]
         short = self.frame.format.components[0].bits == 8 and width == self.frame.width
         return self.frame.reformat(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from recon_cli.capture.clues import codec_name, lacks_index
 from recon_cli.capture.fields import progressive
-from recon_cli.capture.picture import Gap, Picture, tags_of
+from recon_cli.capture.picture import Gap, Picture, Tags, tags_of
 from recon_cli.errors import InputError
 
 # FFmpeg renders text and text art as video; nobody means that by a capture.
@@ -148,11 +148,16 @@ def decode(path: Path, *, threads: int) -> Iterator[Picture | Gap]:
         InputError: as `open_video`.
     """
     with open_video(path) as (container, stream):
-        tags = tags_of(stream)
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
+        tags: Tags | None = None
         for item in progressive(_of_one_size(_frames(container, stream))):
-            yield item if isinstance(item, Gap) else Picture(item[0], tags, item[1])
+            if isinstance(item, Gap):
+                yield item
+                continue
+            # Not before the first frame: some cameras say that it is HLG within the stream alone.
+            tags = tags or tags_of(stream)
+            yield Picture(item[0], tags, item[1])
 
 
 def frames_at(

@@ -1,9 +1,10 @@
 from fractions import Fraction
 
+import av
 import cv2
 import numpy as np
 import pytest
-from media import set_display_matrix, write_luma, write_video
+from media import set_display_matrix, texture, write_luma, write_video
 
 from recon_cli.capture.picture import Picture
 from recon_cli.capture.tone import (
@@ -45,6 +46,23 @@ def test_a_gray_ramp_of_hdr_video_follows_the_documented_curve(tmp_path, trc, su
     assert np.abs(found - expected[:, None]).max() <= 1  # the tables' rounding
     # Sharpness and motion are measured on the same brightness, but from 8 bits.
     assert np.abs(picture.gray()[32].astype(int) - expected).max() <= 4
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.ts"])
+def test_hlg_that_is_declared_within_the_stream_alone_is_seen(tmp_path, name):
+    """As broadcasters do, for old receivers: the tag says SDR, an SEI message says HLG."""
+    path = tmp_path / name
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx265", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p10le"
+        context = stream.codec_context
+        context.color_trc, context.color_primaries = BT2020_10, BT2020
+        context.options = {"x265-params": f"log-level=none:atc-sei={HLG}"}
+        for _ in range(3):
+            frame = av.VideoFrame.from_ndarray(texture(64, 96)).reformat(format="yuv420p10le")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert {picture.tags.transfer for picture in pictures(path)} == {Transfer.HLG}
 
 
 @pytest.mark.parametrize("trc", [1, BT2020_10])
