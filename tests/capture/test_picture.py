@@ -80,7 +80,8 @@ def test_a_ramp_of_ten_bits_equals_that_of_eight(tmp_path):
     ten = pictures(write_luma(tmp_path / "ten.mp4", [codes] * 2))[0]
     eight = pictures(write_luma(tmp_path / "eight.mp4", [codes // 4] * 2, depth=8))[0]
     assert np.abs(ten.rgb().astype(int) - eight.rgb()).max() <= 1
-    assert np.abs(ten.gray().astype(int) - eight.gray()).max() <= 1
+    # Gray is for measuring alone and takes the short way; swscale's last rows are one darker there.
+    assert np.abs(ten.gray().astype(int) - eight.gray()).max() <= 2
 
 
 def square_video(path, aspect, *, width=120):
