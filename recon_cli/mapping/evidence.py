@@ -57,13 +57,13 @@ class Evidence:
     @cached_property
     def points(self) -> NDArray[np.int64]:
         """Points of the model that each image sees, [N]."""
-        return self.seen.sum(axis=1, dtype=np.int64)
+        return np.asarray(self.seen.sum(axis=1), np.int64)
 
     @cached_property
     def shared(self) -> NDArray[np.int64]:
         """Points that two images both see, [N, N], zero on the diagonal."""
         seen = self.seen.astype(np.float32)  # exact up to 16 million, and many times faster
-        shared: NDArray[np.int64] = (seen @ seen.T).astype(np.int64)
+        shared = np.asarray(seen @ seen.T, np.int64)
         np.fill_diagonal(shared, 0)
         return shared
 
