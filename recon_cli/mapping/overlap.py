@@ -23,12 +23,12 @@ from recon_cli.mapping.evidence import Evidence
 from recon_cli.mapping.graph import Weights
 
 # A point is expected in another image when seen there from nearly the same direction and distance,
-# where SIFT finds it again: at 50 degrees, half are lost (Lowe 2004, fig. 9), at 20 one in six.
-MAX_ANGLE_DEG = 15.0
-MAX_RATIO = 1.5
+# where SIFT finds it again: at 20 degrees one in six is lost (Lowe 2004, fig. 9). With 15 degrees
+# and 1.5 a good model of a video of low resolution fell from .78 to .66 (see MIN_OVERLAP).
+MAX_ANGLE_DEG = 10.0
+MAX_RATIO = 1.3
 # Cells along each side of an image, and points that one must expect to count. Of such points 55 to
 # 65% were found in good models, so that all six are missed by chance one time in two hundred.
-# Against 8 cells and 4 points: good models .86 to .95 became .87 to .97, folded ones kept .51.
 GRID, MIN_POINTS = 6, 6
 # Points an image stands for, evenly taken; 1000 are 28 a cell.
 MAX_POINTS = 1000
@@ -36,9 +36,9 @@ MAX_POINTS = 1000
 # alone may look through a wall, on which the other one's points then lie.
 MIN_SHARE = 0.25
 MIN_CELLS = 100  # between two groups of images: a handful of pairs
-# Share of the expected cells that must be found between two groups. Measured as the least of each
-# model: .87 to .98 in photos and walks, .76 where screens changed between the photos of a desk; .24
-# to .53 where two places with the same poster were laid over each other.
+# Share of the expected cells that must be found between two groups. The least of each model was .93
+# to .98 in photos and walks, .78 in a video of low resolution and .76 where screens changed between
+# the photos of a desk; .14 to .53 where two places with the same poster lay over each other.
 MIN_OVERLAP = 0.65
 MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
 

@@ -92,10 +92,10 @@ def test_places_that_look_alike_do_not_speak_against_a_right_model(tmp_path):
     points = np.concatenate([points, points[1600:] + away])
     looks = np.arange(len(points))
     looks[3200:] = looks[1600:3200]
-    made = MadeModel(points, along(np.arange(41) * 0.5), looks=looks)
+    made = MadeModel(points, along(np.arange(51) * 0.4), looks=looks)
     model, database = made.model(), made.write_database(tmp_path / "database.db")
     evidence = gather(model, database, made.names)
-    middle = (evidence.pairs < 20).sum(axis=1) == 1
+    middle = (evidence.pairs < 25).sum(axis=1) == 1
     assert evidence.agreeing[middle].sum() < 0.5 * evidence.matches[middle].sum()
     verdict = examine(model, database, made.names)
     assert verdict.trusted, verdict.problems
