@@ -22,7 +22,7 @@ def pose(index):
 
 def plane_depth(c2w, width=WIDTH, height=HEIGHT, focal=FOCAL, cx=CX, cy=CY):
     """Returns the z-depth of the plane in closed form."""
-    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / focal, (np.arange(height) + 0.5 - cy) / focal)
+    x, y = np.meshgrid(np.arange(width) + 0.5 - cx, np.arange(height) + 0.5 - cy) / np.array(focal)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ c2w[:3, :3].T
     return (OFFSET - NORMAL @ c2w[:3, 3]) / (rays @ NORMAL)
 
