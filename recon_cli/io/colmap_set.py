@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, model_suffix, read_model
-from recon_cli.io.listed import SUFFIXES, Listed, find_images, inside, is_file
+from recon_cli.io.colmap_names import named_in_order
+from recon_cli.io.listed import Listed, find_images, inside, is_file
 from recon_cli.io.posed import PosedSet
 
 # Where a model lies below the folder that was given, and where its images may lie, as paths from
@@ -21,7 +22,6 @@ _PLACES: tuple[tuple[str, tuple[str, ...]], ...] = (
         "sparse/0", "sparse", "sparse_text/0", "sparse_text", "colmap/sparse/0", "colmap/sparse")),
     (".", ("images", ".", "../images", "../../images")),
 )
-_Named = list[tuple[str, int, NDArray[np.float64]]]
 
 
 def is_colmap(folder: Path) -> bool:
@@ -42,8 +42,12 @@ def read_colmap(folder: Path) -> PosedSet:
     model_at, image_places = folder / place[0], place[1]
     model = read_model(model_at)
     candidates = [*(folder / name for name in image_places), *_reduced(folder)]
-    named, images, said = (
-        _named(model, candidates, folder) if model.images else _pair(model, candidates, model_at))
+    if model.images:
+        named, images, said = _named(model, candidates, folder)
+    else:
+        named, images = named_in_order(model, candidates, model_at)
+        said = (f"the model lacks the names of its {len(named)} images; they were taken in the "
+                "order of the files, and their colours agree with it",)
     listed = []
     for name, camera, viewmat in named:
         mask = folder / "masks" / f"{name}.png"  # as COLMAP's --ImageReader.mask_path names them
@@ -76,7 +80,7 @@ def _reduced(folder: Path) -> list[Path]:
 
 def _named(
     model: Model, candidates: Iterable[Path], folder: Path
-) -> tuple[_Named, Path, tuple[str, ...]]:
+) -> tuple[list[tuple[str, int, NDArray[np.float64]]], Path, tuple[str, ...]]:
     """Returns the images of the model, the folder where they are, and what to say about it."""
     for name, _, _ in model.images:
         inside(folder, name, f"the COLMAP model in {folder}")
@@ -88,34 +92,6 @@ def _named(
         f"The COLMAP model in {folder} has {len(model.images)} images, but none of their files is "
         f"there. The first is {model.images[0][0]}.",
         hint=f"Put the images into {folder / 'images'}.")
-
-
-def _pair(
-    model: Model, candidates: Iterable[Path], model_at: Path
-) -> tuple[_Named, Path, tuple[str, ...]]:
-    """Returns names for the images of a model without any, where they can only be meant so.
-
-    COLMAP numbers images from 1 in the order of their names. With as many files as images, and no
-    number left out, the n-th name is image n.
-    """
-    ids = list(model.unnamed)
-    for place in candidates:
-        names = _image_names(place)
-        if names and ids == list(range(1, len(names) + 1)):
-            named = [(name, *model.unnamed[at]) for at, name in enumerate(names, 1)]
-            return named, place, (
-                f"the model lacks the file with the names of its {len(ids)} images, so the images "
-                "were taken in the order of their names",)
-    raise FormatError(
-        f"{model_at} lacks images.bin or images.txt, which hold the names of its {len(ids)} "
-        "images.", hint="Copy that file too; the poses in frames cannot be told apart without it.")
-
-
-def _image_names(folder: Path) -> list[str]:
-    if not folder.is_dir():
-        return []
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*")
-                  if path.suffix in SUFFIXES and path.is_file())
 
 
 def _other_models(model_at: Path) -> tuple[str, ...]:
