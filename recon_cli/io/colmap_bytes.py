@@ -60,6 +60,7 @@ class Reader:
 
 def rotation(quat: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the [3, 3] rotation of a quaternion, wxyz, of any length but zero."""
+    quat = quat / np.abs(quat).max()  # so that squares stay finite
     w, x, y, z = quat / np.linalg.norm(quat)
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

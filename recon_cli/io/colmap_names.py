@@ -21,8 +21,8 @@ from recon_cli.scene.lens import MODELS, Lens
 
 _CHECKED = 5  # images, evenly spread
 _POINTS = 5000  # of the model, evenly spread; seen by one view about a tenth of them
-# On a desk with 70 photos the right pose is off by 23 to 40 of 255 and the best wrong one by 48 to
-# 70; only points that are hidden or on screens that changed speak against the right one.
+# Over 70 photos of a desk the right pose is off by 21 to 40 of 255, the best wrong one by 39 to 77,
+# and never is the right one off by more than 0.82 of the best wrong one.
 _BETTER = 0.9
 
 

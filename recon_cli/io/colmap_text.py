@@ -29,9 +29,9 @@ def read_cameras_text(path: Path) -> dict[int, Lens]:
     """
     cameras = {}
     for where, words in _rows(path):
-        camera_id, width, height = _numbers([words[0], *words[2:4]], where, 3)
+        camera_id, width, height = _integers([words[0], *words[2:4]], where, 3)
         params = _numbers(words[4:], where, len(words) - 4)
-        cameras[int(camera_id)] = checked_lens(words[1], width, height, params, where)
+        cameras[camera_id] = checked_lens(words[1], width, height, params, where)
     return cameras
 
 
@@ -50,8 +50,9 @@ def read_images_text(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
         where = f"{path}, line {at},"
         if len(words) < 10:
             raise _malformed(where, f"{len(words)} entries, needed 10 of an image")
-        _, *pose, camera_id = _numbers(words[:9], where, 9)
-        images.append((words[9], int(camera_id), _pose(pose, where)))
+        (camera_id,) = _integers(words[8:9], where, 1)
+        pose = _numbers(words[1:8], where, 7)
+        images.append((words[9], camera_id, _pose(pose, where)))
         next(lines, None)  # its observations, which may be an empty line
     return images
 
@@ -80,12 +81,12 @@ def read_rigs_text(path: Path) -> dict[int, dict[Sensor, NDArray[np.float64]]]:
     """
     rigs = {}
     for where, words in _rows(path):
-        rig_id, count = map(int, _numbers(words[:2], where, 2))
+        rig_id, count = _integers(words[:2], where, 2)
         sensors = {}
         rest = words[2:]
         for index in range(count):
             sensor, rest = _sensor(rest, where), rest[2:]
-            has_pose = index > 0 and _numbers(rest[:1], where, 1)[0] != 0
+            has_pose = index > 0 and _integers(rest[:1], where, 1)[0] != 0
             rest = rest[1:] if index > 0 else rest  # the first sensor is the origin of the rig
             if has_pose:
                 sensors[sensor] = _pose(_numbers(rest[:7], where, 7), where)
@@ -106,14 +107,15 @@ def read_frames_text(
     """
     frames = []
     for where, words in _rows(path):
-        _, rig_id, *pose = _numbers(words[:9], where, 9)
-        (count,) = _numbers(words[9:10], where, 1)
+        _, rig_id = _integers(words[:2], where, 2)
+        pose = _numbers(words[2:9], where, 7)
+        (count,) = _integers(words[9:10], where, 1)
         rest = words[10:]
-        if len(rest) != 3 * int(count):
-            raise _malformed(where, f"{len(rest)} entries after its pose, needed {3 * int(count)}")
-        data = [(_sensor(rest[at:], where), int(_numbers(rest[at + 2:at + 3], where, 1)[0]))
+        if len(rest) != 3 * count:
+            raise _malformed(where, f"{len(rest)} entries after its pose, needed {3 * count}")
+        data = [(_sensor(rest[at:], where), _integers(rest[at + 2:at + 3], where, 1)[0])
                 for at in range(0, len(rest), 3)]
-        frames.append((int(rig_id), _pose(pose, where), data))
+        frames.append((rig_id, _pose(pose, where), data))
     return frames
 
 
@@ -141,8 +143,17 @@ def _numbers(words: Sequence[str], where: str, needed: int) -> list[float]:
         raise _malformed(where, "a word where a number belongs") from error
 
 
+def _integers(words: Sequence[str], where: str, needed: int) -> list[int]:
+    if len(words) < needed:
+        raise _malformed(where, "it ends too soon")
+    try:
+        return [int(word) for word in words]
+    except ValueError as error:
+        raise _malformed(where, "a word where a whole number belongs") from error
+
+
 def _sensor(words: Sequence[str], where: str) -> Sensor:
-    return (words[0] if words else "", int(_numbers(words[1:2], where, 1)[0]))
+    return (words[0] if words else "", _integers(words[1:2], where, 1)[0])
 
 
 def _pose(numbers: Sequence[float], where: str) -> NDArray[np.float64]:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.lens import MODELS, Lens
+
+
+_FARTHEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -39,8 +44,8 @@ class DepthFile:
             FormatError: the file is missing, damaged or no depth.
         """
         values = _read(self.path)
-        depth = values.astype(np.float32) * np.float32(self.unit)
-        depth[~np.isfinite(depth) | (depth < 0)] = 0
+        exact = values.astype(np.float64) * self.unit
+        depth = np.where((exact > 0) & (exact < _FARTHEST), exact, 0).astype(np.float32)
         height, width = depth.shape
         own = self.own if self.own is not None else self.lens.resized(width, height)
         if (width, height) != (own.width, own.height):
@@ -60,16 +65,18 @@ def _read(path: Path) -> NDArray[np.generic]:
         raise FormatError(f"{path} is missing.", hint=hint)
     try:
         if path.suffix.lower() == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = np.asarray(np.load(path, allow_pickle=False))
         else:
-            values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError, EOFError, cv2.error) as error:
-        raise FormatError(f"{path} cannot be read as depth: {error}.", hint=hint) from error
-    if values is None or values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
-        found = "no image" if values is None else f"{values.dtype} of shape {values.shape}"
+            # Not OpenCV, which gives the first rows of a damaged PNG for the whole.
+            with Image.open(path, formats=("PNG", "TIFF")) as image:
+                values = np.asarray(image)
+    except (OSError, ValueError, EOFError, SyntaxError, struct.error, zlib.error) as error:
+        raise FormatError(f"{path} is no depth that can be read: {error}.", hint=hint) from error
+    if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
         raise FormatError(
-            f"{path} is no depth: {found}, needed one value a pixel.", hint=hint)
-    return np.asarray(values)
+            f"{path} is no depth: it holds {values.dtype} of shape {values.shape}, needed one "
+            "value a pixel.", hint=hint)
+    return values
 
 
 def _axis(lens: Lens, axis: int) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +98,16 @@ def _ascii_rows(data: bytes, header: _Header, path: Path) -> NDArray[np.void]:
     except ValueError as error:
         raise FormatError(f"{path} has points that are not {width} numbers.") from error
     for at, name in enumerate(header.row.names or ()):
+        kind = header.row[name]
+        if kind.kind in "ui" and not _fits(table[:, at], kind):
+            raise FormatError(f"{path} has values of {name} that are no {kind.name}.")
         rows[name] = table[:, at]
     return rows
+
+
+def _fits(values: NDArray[np.float64], kind: np.dtype[Any]) -> bool:
+    limits = np.iinfo(kind)
+    return bool(((values >= limits.min) & (values <= limits.max)).all())
 
 
 def _short(path: Path, count: int) -> FormatError:

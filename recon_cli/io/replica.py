@@ -69,7 +69,7 @@ def _read_params(folder: Path) -> tuple[Lens, float]:
         camera: dict[str, Any] = value["camera"]
         width, height, fx, fy, cx, cy, scale = (
             float(camera[key]) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(
             f"{path} lacks a number: needed are w, h, fx, fy, cx, cy and scale under camera."
         ) from error

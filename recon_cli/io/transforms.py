@@ -21,7 +21,7 @@ from recon_cli.io.depth_file import DepthFile
 from recon_cli.io.listed import SUFFIXES, Listed, find_images, image_size, inside, is_file
 from recon_cli.io.ply_points import read_ply_points
 from recon_cli.io.posed import PosedSet
-from recon_cli.io.transforms_lens import read_lens
+from recon_cli.io.transforms_lens import number, read_lens
 
 _FILE = "transforms.json"
 _PARTS = ("train", "val", "test")
@@ -207,10 +207,12 @@ def _beside(frame: _Frame, key: str) -> Path | None:
 
 
 def _unit(frame: _Frame) -> float:
-    unit = frame.entry.get("depth_unit_scale_factor", _DEPTH_UNIT)
-    if not isinstance(unit, int | float) or not np.isfinite(unit) or unit <= 0:
-        raise FormatError(f"{frame.where} has depth_unit_scale_factor = {unit!r}.", hint=_HINT)
-    return float(unit)
+    unit = number(frame.entry, "depth_unit_scale_factor", frame.where)
+    if unit is not None and unit <= 0:
+        raise FormatError(
+            f"{frame.where} has depth_unit_scale_factor = {unit:g}; needed is one above 0.",
+            hint=_HINT)
+    return _DEPTH_UNIT if unit is None else unit
 
 
 def _left_out(frames: Sequence[_Frame], kept: Sequence[_Frame]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ Both copy COLMAP's numbers, so the centre of the first pixel lies at 0.5 and not
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +21,8 @@ _PERSPECTIVE = {
 }
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # COLMAP's order in FULL_OPENCV
 
+_LARGEST = sys.float_info.max
+
 
 def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
     """Returns the lens of a frame.
@@ -32,15 +35,15 @@ def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Le
     Raises:
         FormatError: no focal length is given, the camera model is unknown, or a number is not one.
     """
-    width = _number(entry, "w", where) or float(size[0])
-    height = _number(entry, "h", where) or float(size[1])
+    width = number(entry, "w", where) or float(size[0])
+    height = number(entry, "h", where) or float(size[1])
     fx = _focal(entry, "x", width, where)
     fy = _focal(entry, "y", height, where)
     if fx is None and fy is None:
         raise FormatError(
             f"{where} has no focal length: neither fl_x nor camera_angle_x.",
             hint="Add fl_x, fl_y, cx, cy, w and h in pixels.")
-    cx, cy = _number(entry, "cx", where), _number(entry, "cy", where)
+    cx, cy = number(entry, "cx", where), number(entry, "cy", where)
     inner = (
         fx if fx is not None else fy, fy if fy is not None else fx,
         width / 2 if cx is None else cx, height / 2 if cy is None else cy)
@@ -51,10 +54,10 @@ def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Le
 
 def _focal(entry: Mapping[str, Any], axis: str, side: float, where: str) -> float | None:
     """Returns the focal length along an axis, given as such or as the angle of view."""
-    focal = _number(entry, f"fl_{axis}", where)
+    focal = number(entry, f"fl_{axis}", where)
     if focal is not None:
         return focal
-    angle = _number(entry, f"camera_angle_{axis}", where)
+    angle = number(entry, f"camera_angle_{axis}", where)
     if angle is None:
         return None
     if not 0 < angle < math.pi:
@@ -66,7 +69,7 @@ def _focal(entry: Mapping[str, Any], axis: str, side: float, where: str) -> floa
 def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float, ...]]:
     """Returns the camera model and its distortion coefficients."""
     named = entry.get("camera_model", "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV")
-    values = {key: _number(entry, key, where) or 0.0 for key in _COEFFICIENTS}
+    values = {key: number(entry, key, where) or 0.0 for key in _COEFFICIENTS}
     if named in _FISHEYE:
         if values["p1"] or values["p2"]:
             raise FormatError(f"{where}: {named} has no tangential distortion p1, p2.")
@@ -88,10 +91,16 @@ def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float,
     return "OPENCV", tuple(values[key] for key in ("k1", "k2", "p1", "p2"))
 
 
-def _number(entry: Mapping[str, Any], key: str, where: str) -> float | None:
+def number(entry: Mapping[str, Any], key: str, where: str) -> float | None:
+    """Returns the number under a key, None where there is none.
+
+    Raises:
+        FormatError: what is there is no number that is finite.
+    """
     value = entry.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise FormatError(f"{where} has {key} = {value!r}; needed is a finite number.")
+    # Whole numbers in JSON may be larger than any float.
+    if type(value) not in (int, float) or not abs(value) <= _LARGEST:
+        raise FormatError(f"{where} has {key} = {value!r:.40}; needed is a finite number.")
     return float(value)

@@ -117,9 +117,18 @@ def test_a_folder_without_frames_is_refused(tmp_path):
         read_replica(tmp_path)
 
 
-def test_a_depth_file_that_is_none_is_refused_when_it_is_read(folder):
-    (folder / "results" / "depth000000.png").write_bytes(b"no image")
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.9])
+def test_a_depth_file_cut_short_anywhere_is_refused_when_it_is_read(folder, share):
+    path = folder / "results" / "depth000000.png"
+    data = path.read_bytes()
+    path.write_bytes(data[:int(share * len(data))])
     with pytest.raises(FormatError, match="no depth"):
+        read_replica(folder).images[0].depth()
+
+
+def test_a_depth_file_of_colours_is_refused(folder):
+    posed_sets.write_image(folder / "results" / "depth000000.png")
+    with pytest.raises(FormatError, match=r"shape \(24, 32, 3\), needed one value a pixel"):
         read_replica(folder).images[0].depth()
 
 

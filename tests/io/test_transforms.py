@@ -75,7 +75,8 @@ def test_an_angle_of_view_and_the_size_of_the_image_make_a_lens(tmp_path):
 
 @pytest.mark.parametrize(("more", "said"), [
     ({"fl_x": None, "fl_y": None}, "no focal length"), ({"fl_x": "wide"}, "fl_x = 'wide'"),
-    ({"fl_x": float("nan")}, "fl_x = nan"), ({"fl_x": -3}, "no camera"),
+    ({"fl_x": float("nan")}, "fl_x = nan"), ({"fl_x": -3}, "no camera"), ({"fl_x": 10**400}, "finite number"),
+    ({"fl_x": True}, "fl_x = True"),
     ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR"),
     ({"k1": float("inf")}, "k1 = inf"), ({"k4": 0.1}, "k4 = 0.1"),
     ({"fl_x": None, "fl_y": None, "camera_angle_x": 4.0}, "radians below pi"),
