@@ -49,7 +49,7 @@ def read_colmap(folder: Path) -> PosedSet:
         said = (f"the model lacks the names of its {len(named)} images; they were taken in the "
                 "order of the files, and their colours agree with it",)
     listed = []
-    for name, camera, viewmat in named:
+    for name, camera, viewmat in sorted(named, key=lambda image: image[0]):
         mask = folder / "masks" / f"{name}.png"  # as COLMAP's --ImageReader.mask_path names them
         listed.append(Listed(
             name, images / name, model.lenses[camera], viewmat,

@@ -14,7 +14,6 @@ from PIL import Image
 from recon_cli.errors import FormatError
 from recon_cli.scene.lens import MODELS, Lens
 
-
 _FARTHEST = float(np.finfo(np.float32).max)
 
 

@@ -46,7 +46,7 @@ def read_replica(folder: Path) -> PosedSet:
     """
     lens, scale = _read_params(folder)
     listed = _list_sequence(folder, lens, scale)
-    splits = is_replica(folder / "test")
+    splits = (folder / "test" / "results").is_dir()
     if splits:
         listed += _list_sequence(folder / "test", lens, scale, held_out=True)
     found = find_images(listed, folder)
@@ -120,6 +120,9 @@ def _check_count(folder: Path, numbers: list[int], rows: int) -> None:
 
 def _read_rows(path: Path) -> list[NDArray[np.float64]]:
     """Returns the 16 numbers of each line that is not empty."""
+    if not path.is_file():
+        raise FormatError(
+            f"{path} is missing.", hint="Copy it; it has one line for each frame of results.")
     rows = []
     for at, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         if not line.strip():

@@ -78,7 +78,7 @@ def read_transforms(path: Path) -> PosedSet:
     metric = any(image.depth is not None for image in found.images)
     return PosedSet(
         "transforms", found.lenses, found.images, found.missing, metric=metric,
-        splits=held_out in parts, points=points, colors=colors,
+        splits=any(image.held_out for image in found.images), points=points, colors=colors,
         notices=(*doubled, *_left_out(frames, kept), *found.notices, *said))
 
 

@@ -14,11 +14,11 @@ from recon_cli.errors import FormatError
 from recon_cli.io.calibration import checked_lens
 from recon_cli.scene.lens import Lens
 
-_FISHEYE = {"OPENCV_FISHEYE"}
+_FISHEYE = ("OPENCV_FISHEYE",)
 # They share one meaning of k1, k2, p1, p2, and leave at zero what they do not have.
-_PERSPECTIVE = {
+_PERSPECTIVE = (
     "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV",
-}
+)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # COLMAP's order in FULL_OPENCV
 
 _LARGEST = sys.float_info.max
@@ -77,7 +77,7 @@ def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float,
     if named not in _PERSPECTIVE:
         raise FormatError(
             f"{where} has the camera model {named}, known are "
-            f"{', '.join(sorted(_PERSPECTIVE | _FISHEYE))}.",
+            f"{', '.join(_PERSPECTIVE + _FISHEYE)}.",
             hint="Undistort the images first, for example with COLMAP's image_undistorter.")
     if not any(values.values()):
         return "PINHOLE", ()

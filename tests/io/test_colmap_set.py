@@ -1,3 +1,4 @@
+import contextlib
 import shutil
 
 import numpy as np
@@ -267,9 +268,22 @@ def test_rigs_and_frames_cut_short_anywhere_are_damaged(tmp_path, name, share):
         read_colmap(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("value", [0, 127, 255])
+def test_whatever_stands_in_a_byte_is_read_or_refused(tmp_path, name, value):
+    write(tmp_path, rig_model(frames=1), "bin")
+    path = tmp_path / "sparse" / "0" / f"{name}.bin"
+    data = path.read_bytes()
+    for at in range(len(data)):
+        path.write_bytes(data[:at] + bytes([value]) + data[at + 1:])
+        with contextlib.suppress(InputError):
+            read_colmap(tmp_path)
+
+
 @pytest.mark.parametrize(("name", "old", "new", "line"), [
     ("cameras", "30 31", "30 wide", 2), ("cameras", "30 31 16.5 11", "30 31 16.5", 2),
-    ("cameras", "32 24", "32", 2), ("cameras", "30 31", "nan 31", 2), ("cameras", "32 24", "32 inf", 2),
+    ("cameras", "32 24", "32", 2), ("cameras", "30 31", "nan 31", 2),
+    ("cameras", "32 24", "32 inf", 2),
     ("images", "1 0 0 0 1 2 3", "1 0 0 zero 1 2 3", 3), ("images", "3 c.png", "", 5),
     ("images", "1 0 0 0 1 2 3", "0 0 0 0 1 2 3", 3), ("images", "0 0 1 3 c", "0 0 inf 3 c", 5),
     ("points3D", "4 5 6", "4 5 600", 2), ("points3D", "-1 -2 -3", "-1 nan -3", 3),

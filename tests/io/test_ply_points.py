@@ -63,7 +63,8 @@ def test_a_file_cut_short_anywhere_is_refused(tmp_path, kind, share):
 
 @pytest.mark.parametrize(("old", "new"), [
     ("property float x", "property list uchar int x"), ("float y", "float x"), ("1.5", "nan"),
-    ("1.5", "word"), ("255", "256"), ("255", "nan"), ("1.5 ", ""), ("element vertex", "element face"), ("vertex 2", "vertex -2"),
+    ("1.5", "word"), ("255", "256"), ("255", "nan"),
+    ("1.5 ", ""), ("element vertex", "element face"), ("vertex 2", "vertex -2"),
     ("ascii", "binary")])
 def test_a_file_that_holds_something_else_is_refused(tmp_path, old, new):
     path = write(tmp_path / "p.ply", "ascii")

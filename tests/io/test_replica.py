@@ -62,6 +62,12 @@ def test_without_a_test_folder_nothing_is_held_out(tmp_path):
     assert not any(image.held_out for image in posed.images)
 
 
+def test_novel_views_without_poses_are_not_left_out_in_silence(folder):
+    (folder / "test" / "traj.txt").unlink()
+    with pytest.raises(FormatError, match=r"test.traj\.txt is missing"):
+        read_replica(folder)
+
+
 def test_frames_left_out_in_between_are_missing_and_the_others_keep_their_poses(folder):
     (folder / "results" / "frame000001.jpg").unlink()
     posed = read_replica(folder)

@@ -75,7 +75,8 @@ def test_an_angle_of_view_and_the_size_of_the_image_make_a_lens(tmp_path):
 
 @pytest.mark.parametrize(("more", "said"), [
     ({"fl_x": None, "fl_y": None}, "no focal length"), ({"fl_x": "wide"}, "fl_x = 'wide'"),
-    ({"fl_x": float("nan")}, "fl_x = nan"), ({"fl_x": -3}, "no camera"), ({"fl_x": 10**400}, "finite number"),
+    ({"fl_x": float("nan")}, "fl_x = nan"), ({"fl_x": -3}, "no camera"),
+    ({"fl_x": 10**400}, "finite number"),
     ({"fl_x": True}, "fl_x = True"),
     ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR"),
     ({"k1": float("inf")}, "k1 = inf"), ({"k4": 0.1}, "k4 = 0.1"),
@@ -259,6 +260,42 @@ def test_a_file_that_is_no_image_is_named(tmp_path):
 def test_the_file_itself_may_be_named(tmp_path):
     posed_sets.make_transforms(tmp_path, name="transforms_mine.json")
     assert len(read_transforms(tmp_path / "transforms_mine.json").images) == 4
+
+
+def test_test_views_whose_images_are_gone_hold_out_nothing(tmp_path):
+    posed_sets.make_transforms(tmp_path, name="transforms_train.json")
+    gone = json.dumps(posed_sets.transforms()).replace("images/", "test/")
+    (tmp_path / "transforms_test.json").write_text(gone)
+    posed = read_transforms(tmp_path)
+    assert not posed.splits
+    assert len(posed.missing) == 4
+
+
+def nodes(value):
+    """Yields each place in a tree of lists and dictionaries."""
+    for key in value if isinstance(value, dict) else range(len(value)):
+        yield value, key
+        if isinstance(value[key], dict | list):
+            yield from nodes(value[key])
+
+
+def test_whatever_stands_in_a_place_of_the_file_is_read_or_refused(tmp_path):
+    posed_sets.make_transforms(tmp_path)
+    value = posed_sets.transforms(
+        2, k1=0.1, camera_model="OPENCV", train_filenames=["images/0000.png"],
+        ply_file_path="gone.ply")
+    refused = 0
+    for parent, key in list(nodes(value)):
+        kept = parent[key]
+        for junk in (None, True, -1, 10**400, float("nan"), "x", [], {}, ["../x"], {"a": []}):
+            parent[key] = junk
+            (tmp_path / "transforms.json").write_text(json.dumps(value))
+            try:
+                read_transforms(tmp_path)
+            except InputError:
+                refused += 1
+        parent[key] = kept
+    assert refused > 300
 
 
 def test_a_real_phone_capture_lists_more_than_it_holds(shared_data):
