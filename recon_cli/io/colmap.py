@@ -91,7 +91,7 @@ def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
     views = read_images(sparse / "images.bin")
     missing = [name for name, camera_id, _ in views if camera_id not in cameras]
     if missing:
-        raise _damaged(sparse, f"{missing[0]} has an unknown camera")
+        raise damaged(sparse, f"{missing[0]} has an unknown camera", _HINT)
     return {name: cameras[camera_id] for name, camera_id, _ in views}
 
 
