@@ -80,7 +80,9 @@ def take(
     check_count(path, len(folder.photos), folder.broken)
     plan = _planned(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _without_twins(folder.photos, plan, ctx)
-    masks = find_masks(home, photos)
+    masks = find_masks(path, home, photos)
+    if masks.outside:
+        ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
     if masks.unused:
         ctx.notice(f"Masks without a photo are left out: {', '.join(masks.unused)}.")
     names = [f"{prefix}{name}" for name in frame_names(photos)]

@@ -120,7 +120,7 @@ def read_alpha(photo: Photo) -> NDArray[np.uint8] | None:
     """
     if photo.is_raw or not _has_alpha(photo.path):
         return None
-    image = _upright(photo.path)
+    image = _decoded(photo.path, upright=True)
     alpha = np.array(image.convert("RGBA").getchannel("A"))
     check_size(photo, alpha)
     return alpha
@@ -132,8 +132,27 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     Raises:
         InputError: the file is truncated, damaged, or holds pixels that are no colours.
     """
-    image = _upright(path)
-    if image.has_transparency_data:  # black, as behind a splat
+    return _before_black(_decoded(path, upright=True))
+
+
+def read_as_stored(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Returns a picture's RGB, [H, W, 3], and opacity, [H, W] or None, not turned as EXIF says.
+
+    Poses that others found belong to the pixels as they lie in the file.
+
+    Raises:
+        InputError: see `read_rgb`.
+    """
+    image = _decoded(path, upright=False)
+    alpha = None
+    if image.has_transparency_data:
+        alpha = np.array(image.convert("RGBA").getchannel("A"))
+    return _before_black(image), alpha
+
+
+def _before_black(image: Image.Image) -> NDArray[np.uint8]:
+    """Returns RGB, [H, W, 3]; what is transparent shows black, as behind a splat."""
+    if image.has_transparency_data:
         black = Image.new("RGBA", image.size, (0, 0, 0, 255))
         image = Image.alpha_composite(black, image.convert("RGBA"))
     return np.array(image.convert("RGB"))
@@ -189,8 +208,8 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
     return tags.get(WIDTH, image.width), tags.get(LENGTH, image.height)
 
 
-def _upright(path: Path) -> Image.Image:
-    """Returns a picture of 8 bits a channel, in whatever mode, turned as EXIF says.
+def _decoded(path: Path, *, upright: bool) -> Image.Image:
+    """Returns a picture of 8 bits a channel, in whatever mode, if `upright` turned as EXIF says.
 
     HEIC is turned by the box irot, which libheif has done; its EXIF then says no more (HEIF,
     ISO 23008-12, holds EXIF's orientation to be without effect).
@@ -201,7 +220,7 @@ def _upright(path: Path) -> Image.Image:
         with opened(path) as image:
             eight = _eight_bits(path, image)  # first: reading the EXIF of a PNG uses up its tiles
             turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
-            return eight if turn is None else eight.transpose(turn)
+            return eight.transpose(turn) if upright and turn is not None else eight
     except BROKEN as error:
         raise refused(path, error) from error
 

@@ -1,8 +1,9 @@
 """What of a photo is to be ignored: from a folder of masks, or from the photo's own transparency.
 
-White counts, black is ignored. A mask lies in masks/ inside the folder of photos, or beside it
-where that is called images/, and has its photo's name with .png or .jpg, or, as COLMAP wants it,
-behind the photo's whole name.
+White counts, black is ignored. A mask lies in masks/ inside the folder that was given, or inside
+the one in it that holds the photos, and has its photo's name with .png or .jpg, or, as COLMAP wants
+it, behind the photo's whole name. Masks beside the folder that was given are not taken: they are no
+part of the input, and a change of theirs would go unnoticed.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from recon_cli import atomic
 from recon_cli.capture.images import Photo, read_alpha, read_rgb
 from recon_cli.errors import InputError
 
-FOLDER, IMAGES = "masks", "images"
+FOLDER = "masks"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 HALF = 128  # from here on a pixel is white, or opaque
 
@@ -31,19 +32,28 @@ class FoundMasks:
     Attributes:
         by_photo: path of the mask, by the photo's file name.
         unused: file names of masks to which no photo belongs.
+        outside: a folder of masks that lies beside the given one, None where there is none.
     """
 
     by_photo: dict[str, Path]
     unused: tuple[str, ...]
+    outside: Path | None = None
 
 
-def find_masks(folder: Path, photos: Sequence[Photo]) -> FoundMasks:
-    """Returns which masks belong to the photos of a folder; none where there is no masks/."""
-    home = next((path for path in _homes(folder) if path.is_dir()), None)
-    if home is None:
-        return FoundMasks({}, ())
+def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FoundMasks:
+    """Returns which masks belong to photos; none where there is no masks/.
+
+    Args:
+        given: the folder that the user named.
+        home: the folder that holds the photos: that one, or one in it.
+        photos: in `home`.
+    """
+    folder = next((path / FOLDER for path in (home, given) if (path / FOLDER).is_dir()), None)
+    if folder is None:
+        beside = given.resolve().parent / FOLDER
+        return FoundMasks({}, (), beside if beside.is_dir() else None)
     files = sorted(
-        path for path in home.iterdir()
+        path for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and path.is_file() and path.name[0] != ".")
     by_stem = {path.stem: path for path in reversed(files)}
     found = {}
@@ -132,11 +142,6 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(".png", mask)
     atomic.write_bytes(path, data.tobytes())
-
-
-def _homes(folder: Path) -> list[Path]:
-    inside, beside = folder / FOLDER, folder.resolve().parent / FOLDER
-    return [inside, beside] if folder.resolve().name == IMAGES else [inside]
 
 
 def _same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:

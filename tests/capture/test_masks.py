@@ -35,22 +35,23 @@ def test_masks_inside_the_folder_are_found_by_stem_and_by_whole_name(tmp_path):
     masks = tmp_path / "masks"
     touch(masks / "a.png", masks / "b.JPG", masks / "c.jpg.png", masks / "lost.png")
     touch(masks / "notes.txt", masks / ".hidden.png")
-    found = find_masks(tmp_path, photos(tmp_path, "a.jpg", "b.jpg", "c.jpg", "d.jpg"))
+    found = find_masks(tmp_path, tmp_path, photos(tmp_path, "a.jpg", "b.jpg", "c.jpg", "d.jpg"))
     assert found.by_photo == {
         "a.jpg": masks / "a.png", "b.jpg": masks / "b.JPG", "c.jpg": masks / "c.jpg.png"}
     assert found.unused == ("lost.png",)
 
 
-def test_masks_beside_a_folder_count_only_where_it_is_called_images(tmp_path):
+def test_masks_beside_the_photos_count_where_the_folder_of_both_was_given(tmp_path):
     touch(tmp_path / "masks" / "a.png")
-    for name, count in (("images", 1), ("photos", 0)):
-        (tmp_path / name).mkdir()
-        found = find_masks(tmp_path / name, photos(tmp_path / name, "a.jpg"))
-        assert len(found.by_photo) == count
+    images = tmp_path / "images"
+    images.mkdir()
+    assert len(find_masks(tmp_path, images, photos(images, "a.jpg")).by_photo) == 1
+    alone = find_masks(images, images, photos(images, "a.jpg"))
+    assert (alone.by_photo, alone.outside) == ({}, tmp_path / "masks")
 
 
 def test_without_masks_there_are_none(tmp_path):
-    assert find_masks(tmp_path, photos(tmp_path, "a.jpg")).by_photo == {}
+    assert find_masks(tmp_path, tmp_path, photos(tmp_path, "a.jpg")).by_photo == {}
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "LA", "I;16"])
