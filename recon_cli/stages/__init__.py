@@ -48,7 +48,7 @@ class Stage:
 
 STAGES: tuple[Stage, ...] = (
     Stage("ingest", "ingest", (), (), IngestConfig, 1, False, "recon_cli.stages.ingest"),
-    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 1, True,
+    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 1, True, "recon_cli.stages.sfm",
           ("database.db", "log.txt", "steps.json")),
