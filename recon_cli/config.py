@@ -84,6 +84,9 @@ class DenoiseConfig(StageConfig):
 class SfmConfig(StageConfig):
     """How cameras and points are found."""
 
+    poses: str = option(
+        "keep", "What becomes of the poses that a data set comes with: keep them, refine them "
+        "together with the points, or ignore them.", choices=("keep", "refine", "ignore"))
     pairs: str = option(
         "auto", "Image pairs to match; auto is exhaustive up to 100 images, else sequential.",
         choices=("auto", "exhaustive", "sequential"))

@@ -34,7 +34,7 @@ ALLOWED: dict[str, set[str]] = {
     "scene": set(),
     "render": {"errors", "scene"},
     "io": BOTTOM | {"scene"},
-    "capture": BOTTOM | OPTIONS | {"progress", "io"},
+    "capture": BOTTOM | OPTIONS | {"progress", "io", "scene"},
     "mapping": BOTTOM | OPTIONS | {"progress", "io", "scene"},
     "train": BOTTOM | OPTIONS | {"progress", "scene", "render"},
     "stages": BOTTOM | OPTIONS | {

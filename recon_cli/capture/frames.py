@@ -1,4 +1,8 @@
-"""The frames that ingest hands on: their files, their list frames.json, and the held-out views."""
+"""The frames that ingest hands on: their files, their list frames.json, and the held-out views.
+
+A masked frame has a twin of its name in masks/: 8-bit gray, 255 where a pixel counts, 0 where it is
+ignored by features, training and scores.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +18,9 @@ from numpy.typing import NDArray
 
 from recon_cli import atomic
 from recon_cli.errors import FormatError
+from recon_cli.scene.lens import Lens
 
-FOLDER, LIST = "frames", "frames.json"
+FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = "Delete the folder of ingest in the workspace and run recon ingest again."
 
 
@@ -28,6 +34,8 @@ class Frame:
         source: name of the file that it came from.
         sharpness: variance of its Laplacian, None for photos.
         held_out: kept for the score, never trained on.
+        group: index of the group of frames that share its intrinsics.
+        masked: it has a mask of its name in the folder of masks.
     """
 
     name: str
@@ -35,6 +43,27 @@ class Frame:
     source: str
     sharpness: float | None
     held_out: bool
+    group: int = 0
+    masked: bool = False
+
+
+@dataclass(frozen=True)
+class Group:
+    """Frames that one camera took with one setting of its lens: they share intrinsics.
+
+    Attributes:
+        name: what they came from, for messages.
+        width: of its frames in pixels, as stored.
+        height: of its frames in pixels, as stored.
+        focal_px: focal length in pixels of the stored frames by EXIF, None where unknown.
+        lens: known intrinsics of the stored frames, None where they are to be estimated.
+    """
+
+    name: str
+    width: int
+    height: int
+    focal_px: float | None = None
+    lens: Lens | None = None
 
 
 @dataclass(frozen=True)
@@ -42,17 +71,14 @@ class FrameList:
     """What frames.json holds.
 
     Attributes:
-        source: "video" or "photos".
-        width: width of every frame in pixels.
-        height: height of every frame in pixels.
-        focal_px: focal length in pixels of the stored frames by EXIF, None where unknown.
+        source: what the capture was taken for: "video", "photos", "mixed", or the layout of a data
+            set with poses.
+        groups: at least one.
         frames: sorted by name.
     """
 
     source: str
-    width: int
-    height: int
-    focal_px: float | None
+    groups: tuple[Group, ...]
     frames: tuple[Frame, ...]
 
     def write(self, stage: Path) -> None:
@@ -69,10 +95,18 @@ def read_frame_list(stage: Path) -> FrameList:
     value = atomic.read_json(stage / LIST)
     try:
         frames = tuple(Frame(**frame) for frame in value.pop("frames"))
-        return FrameList(**value, frames=frames)
-    except (AttributeError, KeyError, TypeError) as error:
+        groups = tuple(_group(group) for group in value.pop("groups"))
+        return FrameList(**value, groups=groups, frames=frames)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise FormatError(
             f"{stage / LIST} is no list of frames.", hint=AGAIN) from error
+
+
+def _group(value: dict[str, Any]) -> Group:
+    lens = value.pop("lens")
+    if lens is not None:
+        lens = Lens(**{**lens, "params": tuple(lens["params"])})
+    return Group(**value, lens=lens)
 
 
 def held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:
@@ -121,11 +155,18 @@ def read_png(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
+def fitted_size(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Returns (width, height) of an image whose longer side is reduced to `longest` at most."""
+    if max(height, width) <= longest:
+        return width, height
+    scale = longest / max(height, width)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
 def fitted(rgb: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     """Returns an image reduced by area to at most `longest` pixels on its longer side."""
     height, width = rgb.shape[:2]
-    if max(height, width) <= longest:
+    size = fitted_size(width, height, longest)
+    if size == (width, height):
         return rgb
-    scale = longest / max(height, width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -17,16 +17,16 @@ _TABLES = {"features": "descriptors", "matches": "two_view_geometries"}
 _HOMOGRAPHIES = (4, 5, 6)  # planar, panoramic, planar or panoramic
 
 
-def is_sound(path: Path, names: Sequence[str]) -> bool:
-    """Returns whether a database is intact and holds one camera and exactly the images `names`."""
+def is_sound(path: Path, names: Sequence[str], cameras: int) -> bool:
+    """Returns whether a database is intact and holds so many cameras and exactly these images."""
     try:
         with closing(_opened(path)) as connection:
             (verdict,), *_ = connection.execute("PRAGMA quick_check")
-            (cameras,), = connection.execute("SELECT count(*) FROM cameras")
+            (found,), = connection.execute("SELECT count(*) FROM cameras")
             images = sorted(name for name, in connection.execute("SELECT name FROM images"))
     except sqlite3.DatabaseError:
         return False
-    return verdict == "ok" and cameras == 1 and images == sorted(names)
+    return verdict == "ok" and found == cameras and images == sorted(names)
 
 
 def progress(path: Path, step: str) -> int:

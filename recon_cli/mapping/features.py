@@ -1,4 +1,4 @@
-"""SIFT features of every frame, all taken by one camera."""
+"""SIFT features of every frame; the frames of a group share one camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pycolmap
 from recon_cli.errors import FormatError
 from recon_cli.mapping import database, doctor
 from recon_cli.mapping.doctor import listed
-from recon_cli.mapping.job import Job
+from recon_cli.mapping.job import CameraGroup, Job
 from recon_cli.mapping.ledger import Result
 from recon_cli.mapping.protocol import Reporter
 
@@ -26,9 +26,10 @@ def extract(job: Job, report: Reporter) -> Result:
         SfmError: too few frames hold any texture.
     """
     report.phase("features", len(job.names), done=database.progress(job.database, "features"))
-    pycolmap.extract_features(
-        job.database, job.frames, list(job.names), pycolmap.CameraMode.SINGLE, _reader(job),
-        _extraction(job), pycolmap.Device.cpu)
+    for group in job.groups:
+        pycolmap.extract_features(
+            job.database, job.frames, list(group.names), pycolmap.CameraMode.SINGLE,
+            _reader(job, group), _extraction(job), pycolmap.Device.cpu)
     counts = database.keypoint_counts(job.database)
     _check_readable(job, counts)
     doctor.check_texture(counts)
@@ -36,7 +37,7 @@ def extract(job: Job, report: Reporter) -> Result:
 
 
 def create_database(job: Job) -> None:
-    """Writes a database that holds the camera and every image, whole or not at all.
+    """Writes a database that holds a camera a group and every image, whole or not at all.
 
     Their ids are given here, in the order of the names, because extraction in several threads
     would number the images as they happen to be finished.
@@ -48,8 +49,10 @@ def create_database(job: Job) -> None:
     database.remove(job.database)
     database.remove(temporary)
     pycolmap.Database.open(temporary).close()
-    pycolmap.import_images(
-        temporary, job.frames, pycolmap.CameraMode.SINGLE, list(job.names), _reader(job))
+    for group in job.groups:
+        pycolmap.import_images(
+            temporary, job.frames, pycolmap.CameraMode.SINGLE, list(group.names),
+            _reader(job, group))
     with pycolmap.Database.open(temporary) as opened:
         names = {image.name for image in opened.read_all_images()}
     _check_readable(job, names)
@@ -65,12 +68,17 @@ def _check_readable(job: Job, found: Collection[str]) -> None:
             hint="Run `recon ingest --again`.")
 
 
-def _reader(job: Job) -> pycolmap.ImageReaderOptions:
+def _reader(job: Job, group: CameraGroup) -> pycolmap.ImageReaderOptions:
     options = pycolmap.ImageReaderOptions()
     options.camera_model = CAMERA_MODEL
-    if job.focal_px is not None:
-        focal = job.focal_px
-        options.camera_params = f"{focal},{focal},{job.width / 2},{job.height / 2},0,0,0,0"
+    if job.masks is not None:
+        options.mask_path = job.masks
+    if group.lens is not None:
+        options.camera_model = group.lens.model
+        options.camera_params = ",".join(map(repr, group.lens.params))
+    elif group.focal_px is not None:
+        focal = group.focal_px
+        options.camera_params = f"{focal},{focal},{group.width / 2},{group.height / 2},0,0,0,0"
     return options
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli import atomic
+from recon_cli.scene.lens import Lens
 
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 
@@ -19,6 +20,25 @@ SEQUENTIAL_OVERLAP = 10
 
 
 @dataclass(frozen=True)
+class CameraGroup:
+    """Frames that share one camera.
+
+    Attributes:
+        names: file names of its frames, sorted.
+        width: of its frames in pixels.
+        height: of its frames in pixels.
+        focal_px: focal length in pixels where a guess is known.
+        lens: intrinsics where they are known.
+    """
+
+    names: tuple[str, ...]
+    width: int
+    height: int
+    focal_px: float | None = None
+    lens: Lens | None = None
+
+
+@dataclass(frozen=True)
 class Job:
     """One run of the mapping process.
 
@@ -26,10 +46,11 @@ class Job:
         frames: folder of the original frames; features are found in these.
         denoised: folder of their denoised twins, under the same names.
         out: the stage's folder; database, model and undistorted images go there.
-        names: file names of the frames, sorted.
-        width: of every frame in pixels.
-        height: of every frame in pixels.
-        focal_px: focal length of the frames in pixels where it is known.
+        groups: the frames by camera.
+        masks: folder of masks under the names of the frames (0 where a pixel is ignored), None
+            where no frame has one.
+        poses: file of known poses (see `io.poses`), None where there are none.
+        pose_use: "keep", "refine" or "ignore" them.
         pairs: "auto", "exhaustive" or "sequential".
         max_features: SIFT keypoints an image to aim for.
         min_registered: share of the frames that must get a camera.
@@ -40,15 +61,20 @@ class Job:
     frames: Path
     denoised: Path
     out: Path
-    names: tuple[str, ...]
-    width: int
-    height: int
-    focal_px: float | None
+    groups: tuple[CameraGroup, ...]
+    masks: Path | None
+    poses: Path | None
+    pose_use: str
     pairs: str
     max_features: int
     min_registered: float
     seed: int
     threads: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """File names of all frames, sorted."""
+        return tuple(sorted(name for group in self.groups for name in group.names))
 
     @property
     def database(self) -> Path:
@@ -88,6 +114,13 @@ class Job:
     def read(cls, path: Path) -> Job:
         """Returns the job that `write` wrote."""
         value: dict[str, Any] = atomic.read_json(path)
-        for name in ("frames", "denoised", "out"):
-            value[name] = Path(value[name])
-        return cls(**{**value, "names": tuple(value["names"])})
+        for name in ("frames", "denoised", "out", "masks", "poses"):
+            value[name] = None if value[name] is None else Path(value[name])
+        return cls(**{**value, "groups": tuple(map(_group, value["groups"]))})
+
+
+def _group(value: dict[str, Any]) -> CameraGroup:
+    lens = value["lens"]
+    return CameraGroup(**{
+        **value, "names": tuple(value["names"]),
+        "lens": None if lens is None else Lens(**{**lens, "params": tuple(lens["params"])})})

@@ -56,7 +56,7 @@ def work(job: Job, report: Reporter) -> None:
 
 def _prepare_database(job: Job, ledger: Ledger) -> None:
     """Keeps the database of an interrupted run where it is intact, else starts a new one."""
-    if not database.is_sound(job.database, job.names):
+    if not database.is_sound(job.database, job.names, len(job.groups)):
         ledger.forget_from("features")
         features.create_database(job)
     for step in ("features", "matches"):

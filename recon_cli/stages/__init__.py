@@ -47,10 +47,10 @@ class Stage:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, 1, False, "recon_cli.stages.ingest"),
+    Stage("ingest", "ingest", (), (), IngestConfig, 2, False, "recon_cli.stages.ingest"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
           "recon_cli.stages.denoise"),
-    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 1, True, "recon_cli.stages.sfm",
+    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 2, True, "recon_cli.stages.sfm",
           ("database.db", "log.txt", "steps.json")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 2, False,
           "recon_cli.stages.train", ("log.jsonl",), renders=True),

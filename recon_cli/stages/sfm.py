@@ -14,9 +14,10 @@ from recon_cli.capture.frames import FrameList
 from recon_cli.capture.pace import paced
 from recon_cli.config import SfmConfig
 from recon_cli.errors import FormatError
+from recon_cli.io.poses import POSES
 from recon_cli.mapping import process
 from recon_cli.mapping.doctor import listed
-from recon_cli.mapping.job import Job
+from recon_cli.mapping.job import CameraGroup, Job
 from recon_cli.mapping.ledger import STEPS, Ledger
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 
@@ -47,10 +48,10 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         frames=ingest / store.FOLDER,
         denoised=denoise / store.FOLDER,
         out=out.resolve(),
-        names=tuple(frame.name for frame in frames.frames),
-        width=frames.width,
-        height=frames.height,
-        focal_px=frames.focal_px,
+        groups=_groups(frames),
+        masks=ingest / store.MASKS if any(frame.masked for frame in frames.frames) else None,
+        poses=poses if (poses := ingest / POSES).exists() else None,
+        pose_use=config.poses,
         pairs=config.pairs,
         max_features=config.max_features,
         min_registered=config.min_registered,
@@ -63,6 +64,14 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     summary = _summary(frames, Ledger(out))
     _report(summary, ctx)
     return summary
+
+
+def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:
+    return tuple(
+        CameraGroup(
+            tuple(frame.name for frame in frames.frames if frame.group == index),
+            group.width, group.height, group.focal_px, group.lens)
+        for index, group in enumerate(frames.groups))
 
 
 def _check_frames(job: Job) -> None:

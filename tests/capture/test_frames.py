@@ -6,6 +6,7 @@ from media import texture
 from recon_cli.capture.frames import (
     Frame,
     FrameList,
+    Group,
     fitted,
     held_out,
     prepare,
@@ -15,6 +16,7 @@ from recon_cli.capture.frames import (
 )
 from recon_cli.config import parse_holdout
 from recon_cli.errors import FormatError
+from recon_cli.scene.lens import Lens
 
 NAMES = [f"{index:06d}.png" for index in range(20)]
 
@@ -34,9 +36,11 @@ def test_held_out_frames_go_by_sorted_name(holdout, indices):
 def test_a_frame_list_comes_back_as_it_was_written(tmp_path):
     frames = (
         Frame("000003.png", 0.3, "room.mp4", 12.5, True),
-        Frame("000009.png", None, "room.mp4", None, False),
+        Frame("000009.png", None, "b.jpg", None, False, group=1, masked=True),
     )
-    written = FrameList("video", 64, 48, None, frames)
+    lens = Lens("RADIAL", 80, 60, (70.0, 40.0, 30.0, 0.1, -0.2))
+    groups = (Group("room.mp4", 64, 48, focal_px=50.0), Group("photos", 80, 60, lens=lens))
+    written = FrameList("mixed", groups, frames)
     written.write(tmp_path)
     assert read_frame_list(tmp_path) == written
 

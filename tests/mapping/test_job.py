@@ -3,19 +3,25 @@ from pathlib import Path
 
 import pytest
 
-from recon_cli.mapping.job import Job
+from recon_cli.mapping.job import CameraGroup, Job
+from recon_cli.scene.lens import Lens
 
 
 def job(count, pairs="auto"):
     return Job(
         frames=Path("/in/frames"), denoised=Path("/in/denoised"), out=Path("/out"),
-        names=tuple(f"{index:06d}.png" for index in range(count)), width=600,
-        height=340, focal_px=None, pairs=pairs, max_features=2048, min_registered=0.5, seed=0,
+        groups=(CameraGroup(tuple(f"{index:06d}.png" for index in range(count)), 600, 340),),
+        masks=None, poses=None, pose_use="keep", pairs=pairs,
+        max_features=2048, min_registered=0.5, seed=0,
         threads=2)
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    told = replace(job(4), focal_px=812.5)
+    lens = Lens("PINHOLE", 80, 60, (70.0, 71.0, 40.5, 30.0))
+    told = replace(job(4), masks=Path("/in/masks"), poses=Path("/in/poses.json"), groups=(
+        CameraGroup(("a.png", "c.png"), 600, 340, focal_px=812.5),
+        CameraGroup(("b.png",), 80, 60, lens=lens)))
+    assert told.names == ("a.png", "b.png", "c.png")
     told.write(tmp_path / "job.json")
     assert Job.read(tmp_path / "job.json") == told
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from recon_cli.capture.frames import Frame, FrameList, write_png
+from recon_cli.capture.frames import Frame, FrameList, Group, write_png
 from recon_cli.config import SfmConfig
 from recon_cli.stages import sfm
 from recon_cli.stages.context import StageContext, StageInputs
@@ -18,7 +18,7 @@ def write_inputs(base, images, *, filtered=(), held_out=()):
         twin = cv2.GaussianBlur(rgb, (0, 0), 2) if name in filtered else rgb
         write_png(base / "denoise" / "frames" / name, np.asarray(twin))
     height, width = next(iter(images.values())).shape[:2]
-    FrameList("video", width, height, None, tuple(
+    FrameList("video", (Group("room.mp4", width, height),), tuple(
         Frame(name, None, "room.mp4", None, name in held_out) for name in sorted(images)
     )).write(base / "ingest")
     return base

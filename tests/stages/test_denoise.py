@@ -5,7 +5,7 @@ import os
 import numpy as np
 import pytest
 
-from recon_cli.capture.frames import Frame, FrameList, read_png, write_png
+from recon_cli.capture.frames import Frame, FrameList, Group, read_png, write_png
 from recon_cli.config import DenoiseConfig
 from recon_cli.errors import FormatError
 from recon_cli.stages import denoise
@@ -39,7 +39,7 @@ def ingest(tmp_path):
         write_png(
             folder / "frames" / name, np.clip(np.round(spoiled), 0, 255).astype(np.uint8))
     frames = tuple(Frame(name, None, "room.mp4", None, False) for name in SIGMAS)
-    FrameList("video", 160, 120, None, frames).write(folder)
+    FrameList("video", (Group("room.mp4", 160, 120),), frames).write(folder)
     return folder
 
 

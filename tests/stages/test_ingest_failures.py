@@ -82,9 +82,10 @@ def test_a_source_that_is_not_there_is_refused(tmp_path):
         take(tmp_path / "room.mp4", tmp_path / "out")
 
 
-def test_several_sources_are_refused_for_now(video, tmp_path):
-    with pytest.raises(InputError, match="2 sources were given, but one is taken for now"):
-        take((video, video), tmp_path / "out")
+def test_one_missing_source_of_several_is_refused(video, tmp_path):
+    with pytest.raises(InputError, match=r"gone\.mp4 does not exist"):
+        take((video, tmp_path / "gone.mp4"), tmp_path / "out")
+    assert not (tmp_path / "out" / "frames").exists()
 
 
 def test_text_named_like_a_video_is_refused(tmp_path):

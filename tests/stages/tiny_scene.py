@@ -54,5 +54,6 @@ def make_inputs(folder: Path) -> StageInputs:
         model.add_point3D(mean.astype(np.float64), pycolmap.Track(), value)
     model.write(sparse)
     write_json(folder / "ingest" / "frames.json", {
-        "source": "video", "width": WIDTH, "height": HEIGHT, "focal_px": None, "frames": frames})
+        "source": "video", "frames": frames, "groups": [{
+            "name": "tiny.mp4", "width": WIDTH, "height": HEIGHT, "focal_px": None, "lens": None}]})
     return StageInputs({name: folder / name for name in ("ingest", "sfm")})
