@@ -1,12 +1,21 @@
-"""Which frames of a video are kept: sharp for their place, and spread evenly over the motion."""
+"""Which frames of a video are kept: sharp for their place, and spread evenly over the motion.
+
+Frames that are mostly black or blown out count like blurred ones: they are passed over, but where a
+whole stretch is like that, the best of it bridge the gap.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import percentile_filter
+
+from recon_cli.capture.candidates import Reason
+from recon_cli.capture.exposure import telling, well_exposed
+from recon_cli.errors import InputError
 
 # A frame is judged against the 75th percentile of the 31 frames around it: a few sharp ones set
 # the mark, and a dark or bare stretch of the room is judged by its own frames.
@@ -23,6 +32,82 @@ MIN_AUTOMATIC = 24
 MAX_STEP = 0.1
 # A way of less than this (a third of a pixel in 320) is tracking noise of a camera on a tripod.
 NO_MOTION = 0.001
+# A way of less than this, two steps of the usual spacing, is noticed: three frames further apart
+# are the least that structure from motion starts from.
+LITTLE_MOTION = 2 * FRAME_SPACING
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Which of F frames may be taken, and why the others may not.
+
+    Attributes:
+        usable: [F] bool.
+        refused: for each frame why it is not usable, None where it is.
+    """
+
+    usable: NDArray[np.bool_]
+    refused: tuple[Reason | None, ...]
+
+    def count(self, reason: Reason) -> int:
+        """Returns how many frames were refused for a reason."""
+        return sum(one is reason for one in self.refused)
+
+
+def judged(
+    way: NDArray[np.float64],  # [F]
+    sharpness: NDArray[np.float64],  # [F]
+    exposures: NDArray[np.float64],  # [F, 3]
+    whole: NDArray[np.bool_],  # [F]
+    share: float,
+) -> Judgement:
+    """Returns which frames may be taken.
+
+    Args:
+        way: `travelled`.
+        sharpness: of each frame.
+        exposures: rows of `exposure.exposure`.
+        whole: which frames are undamaged.
+        share: of the sharpness around it that a frame must reach.
+    """
+    sharp, exposed = sharp_frames(sharpness, share), well_exposed(exposures)
+    shown = telling(exposures)
+    usable = bridged(way, sharpness, sharp & exposed & shown, whole & shown)
+    why = np.select(
+        [usable, ~whole, ~(exposed & shown)],
+        ["", Reason.DAMAGED, Reason.CLIPPED], Reason.BLURRED)
+    return Judgement(usable, tuple(Reason(one) if one else None for one in why.tolist()))
+
+
+def check_motion(
+    name: str,
+    motion: NDArray[np.float64],  # [F], NaN where unknown
+) -> str:
+    """Returns a warning where the camera hardly moves, else nothing.
+
+    Args:
+        name: of the video, for the message.
+        motion: way gained with each frame, in widths.
+
+    Raises:
+        InputError: the camera does not move at all; where its motion cannot be told, nothing is
+            said.
+    """
+    steps = motion[1:]
+    known = steps[~np.isnan(steps)]
+    if 2 * len(known) <= len(steps):
+        return ""
+    way = float(known.sum())
+    if way <= NO_MOTION:
+        raise InputError(
+            f"The camera of {name} does not move: its {len(motion)} frames all show one view, but "
+            "depth needs several.",
+            hint="Record again while you walk sideways through the room.")
+    if way < LITTLE_MOTION:
+        return (
+            f"The camera of {name} hardly moves: its view shifts by {way:.1%} of its width in all. "
+            "Depth will be poor; record a longer walk.")
+    return ""
 
 
 def sharp_frames(

@@ -13,6 +13,7 @@ import numpy as np
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
+from recon_cli.capture.exposure import exposure
 from recon_cli.capture.motion import MotionMeter
 from recon_cli.capture.video import Gap, claimed_length, decode, shown_size, to_gray
 from recon_cli.errors import InputError
@@ -37,6 +38,7 @@ class Scan:
         gaps: packets that gave no frame.
         sharpness: [F] float64 variance of the Laplacian of the 8-bit gray frame.
         motion: [F] float64 way gained since the frame before, in widths; NaN where unknown.
+        exposure: [F, 3] float64 rows of `exposure.exposure`.
         seconds: time of showing of each frame, None where the file does not say.
         whole: [F] bool; False from a lost or damaged packet to the next key frame, because all
             frames between are predicted from what was lost.
@@ -48,6 +50,7 @@ class Scan:
     gaps: int
     sharpness: NDArray[np.float64]
     motion: NDArray[np.float64]
+    exposure: NDArray[np.float64]
     seconds: tuple[float | None, ...]
     whole: NDArray[np.bool_]
 
@@ -70,6 +73,7 @@ class Scan:
             "gaps": self.gaps,
             "sharpness": self.sharpness.tolist(),
             "motion": [None if np.isnan(step) else step for step in self.motion.tolist()],
+            "exposure": self.exposure.tolist(),
             "seconds": list(self.seconds),
             "whole": self.whole.tolist(),
         }
@@ -85,6 +89,7 @@ class Scan:
             gaps=value["gaps"],
             sharpness=np.array(value["sharpness"], np.float64),
             motion=np.array(motion, np.float64),
+            exposure=np.array(value["exposure"], np.float64).reshape(-1, 3),
             seconds=tuple(value["seconds"]),
             whole=np.array(value["whole"], np.bool_),
         )
@@ -97,6 +102,7 @@ class _Look:
     size: tuple[int, int]
     sharpness: float
     motion: float
+    exposure: tuple[float, float, float]
     seconds: float | None
     pts: int | None
     key: bool
@@ -151,6 +157,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         gaps=len(gaps),
         sharpness=np.array([look.sharpness for look in looks], np.float64),
         motion=np.array([look.motion for look in looks], np.float64),
+        exposure=np.round([look.exposure for look in looks], 4),
         seconds=tuple(look.seconds for look in looks),
         whole=_whole(looks, gaps),
     )
@@ -162,6 +169,7 @@ def _look(frame: av.VideoFrame, meter: MotionMeter) -> _Look:
         size=shown_size(frame),
         sharpness=sharpness(gray),
         motion=meter.advance(gray),
+        exposure=exposure(gray),
         seconds=frame.time,
         pts=frame.pts,
         key=bool(frame.key_frame),
