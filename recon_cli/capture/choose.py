@@ -49,10 +49,6 @@ class Judgement:
     usable: NDArray[np.bool_]
     refused: tuple[Reason | None, ...]
 
-    def count(self, reason: Reason) -> int:
-        """Returns how many frames were refused for a reason."""
-        return sum(one is reason for one in self.refused)
-
 
 def judged(
     way: NDArray[np.float64],  # [F]

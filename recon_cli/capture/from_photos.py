@@ -1,11 +1,17 @@
-"""Frames of a folder of photos: all of them that can be read."""
+"""Frames of a folder of photos: all that can be read and show something of their own."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from recon_cli.capture import frames as store
+from recon_cli.capture.candidates import Candidate, Reason
+from recon_cli.capture.contact import ContactSheet
+from recon_cli.capture.duplicates import PhotoLook, choose_photos, dropped_photos, look_at_photo
 from recon_cli.capture.frames import Frame, Group
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.images import Photo, read_photo
@@ -18,7 +24,7 @@ from recon_cli.capture.photos import (
     list_photos,
     shared_focal,
 )
-from recon_cli.capture.taken import Context, Taken
+from recon_cli.capture.taken import Choice, Context, Taken
 from recon_cli.config import IngestConfig
 from recon_cli.errors import InputError
 
@@ -36,7 +42,8 @@ def take(
         prefix: of the names of the frames.
 
     Raises:
-        InputError: the photos are of mixed sizes, or too few can be read.
+        InputError: the photos are of mixed sizes, or too few can be read or show something of
+            their own.
     """
     folder = list_photos(path)
     check_count(path, len(folder.photos), folder.broken)
@@ -44,42 +51,70 @@ def take(
     first = folder.photos[0]
     report_reduced(first.width, first.height, config.max_size, ctx)
     names = [f"{prefix}{name}" for name in frame_names(folder.photos)]
-    broken = folder.broken | _write(folder.photos, names, config.max_size, out, ctx)
+    looks, broken = _write(folder.photos, names, config.max_size, out, ctx)
+    broken = folder.broken | broken
     for reason in broken.values():
         ctx.notice(f"A photo is left out: {reason}")
-    taken = [
-        (name, photo) for name, photo in zip(names, folder.photos, strict=True)
-        if photo.path.name not in broken
-    ]
-    check_count(path, len(taken), broken)
+    readable = sum(look is not None for look in looks)
+    check_count(path, readable, broken)
+    record = choose_photos(path.name, [photo.path.name for photo in folder.photos], names, looks)
+    for text in dropped_photos(record):
+        ctx.notice(text)
+    sheet = _sheet(path.name, record, names, out)
     frames = tuple(
-        Frame(name, None, photo.path.name, None, held_out=False) for name, photo in taken)
+        Frame(one.name, None, one.source, None, held_out=False)
+        for one in record if one.name is not None)
+    dropped = {one.source for one in record if one.name is None}
     size = store.fitted_size(first.width, first.height, config.max_size)
     group = Group(path.name, *size, focal_px=_stored_focal(folder, config))
     return Taken(
-        "photos", (group,), frames, declared=len(taken) + len(broken), decoded=len(taken),
-        lost=len(broken), skipped=tuple(sorted(broken)))
+        "photos", (group,), frames, declared=readable + len(broken), decoded=readable,
+        lost=len(broken), skipped=tuple(sorted(dropped | broken.keys())),
+        choice=Choice(record, sheet, prefix))
+
+
+def _sheet(
+    title: str, record: Sequence[Candidate], names: Sequence[str], out: Path
+) -> ContactSheet:
+    """Returns the contact sheet, and removes the files of photos that are not kept."""
+    files = {one.index: out / store.FOLDER / names[one.index] for one in record
+             if one.reason is not Reason.DAMAGED}
+    height, width = store.read_png(next(iter(files.values()))).shape[:2]
+    sheet = ContactSheet(title, record, width, height)
+    for index in sorted(sheet.wanted & files.keys()):
+        sheet.add(index, store.read_png(files[index]))
+    for one in record:
+        if one.index in files and one.name is None:
+            files[one.index].unlink()
+    return sheet
 
 
 def _write(
     photos: Sequence[Photo], names: Sequence[str], max_size: int, out: Path, ctx: Context
-) -> dict[str, str]:
-    """Writes the photos and returns why some could not be read after all, by file name."""
+) -> tuple[list[PhotoLook | None], dict[str, str]]:
+    """Writes the photos; returns a look at each, and why some could not be read, by file name."""
+    looks: list[PhotoLook | None] = []
     broken: dict[str, str] = {}
     record = paced(ctx.record)
     with ctx.progress.bar("photos", len(photos), unit="photo") as bar:
-        for done, (photo, name) in enumerate(zip(photos, names, strict=True), start=1):
-            target = out / store.FOLDER / name
-            if not target.exists():
-                try:
-                    rgb = read_photo(photo)
-                except InputError as error:
-                    broken[photo.path.name] = error.message
-                else:
-                    store.write_png(target, store.fitted(rgb, max_size))
+        for photo, name in zip(photos, names, strict=True):
+            try:
+                looks.append(look_at_photo(_stored(photo, out / store.FOLDER / name, max_size)))
+            except InputError as error:
+                broken[photo.path.name] = error.message
+                looks.append(None)
             bar.advance()
-            record(done, len(photos))
-    return broken
+            record(len(looks), len(photos))
+    return looks, broken
+
+
+def _stored(photo: Photo, target: Path, max_size: int) -> NDArray[np.uint8]:
+    """Returns the pixels of a photo as they are stored, from an earlier try where there was one."""
+    if target.exists():
+        return store.read_png(target)
+    rgb = store.fitted(read_photo(photo), max_size)
+    store.write_png(target, rgb)
+    return rgb
 
 
 def _stored_focal(folder: Folder, config: IngestConfig) -> float | None:

@@ -47,7 +47,8 @@ class Stage:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, 2, False, "recon_cli.stages.ingest"),
+    Stage("ingest", "ingest", (), (), IngestConfig, 3, False, "recon_cli.stages.ingest",
+          ("*contact.png", "*choice.json")),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 2, True, "recon_cli.stages.sfm",

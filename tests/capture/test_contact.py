@@ -63,11 +63,16 @@ def test_the_sheet_stays_small_however_long_the_capture(tmp_path, size):
     assert (tmp_path / "contact.png").stat().st_size <= MAX_BYTES
 
 
-def test_a_picture_that_does_not_compress_gets_fewer_colours():
-    noise = np.random.default_rng(0).integers(0, 256, (2250, 2000, 3)).astype(np.uint8)
-    data = contact._encoded(Image.fromarray(noise))
-    assert len(data) <= MAX_BYTES
-    assert Image.open(io.BytesIO(data)).size == (2000, 2250)
+def test_a_picture_that_takes_too_much_gets_fewer_colours(monkeypatch):
+    noise = np.random.default_rng(0).integers(0, 256, (200, 300, 3)).astype(np.uint8)
+    sizes = []
+    for most in (3_000_000, 50_000, 31_000):
+        monkeypatch.setattr(contact, "MAX_BYTES", most)
+        data = contact._encoded(Image.fromarray(noise))
+        assert len(data) <= most
+        sizes.append(len(data))
+        assert Image.open(io.BytesIO(data)).size == (300, 200)
+    assert sizes == sorted(set(sizes), reverse=True)
 
 
 def test_all_hundred_frames_of_the_default_are_shown_and_every_rare_reason():
