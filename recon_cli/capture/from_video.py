@@ -110,12 +110,14 @@ def take(
         InputError: too few frames are sharp, or the file has changed.
     """
     path, scan = look.path, look.scan
-    chosen = choose_frames(look.way, scan.sharpness, look.judgement.usable, count)
+    judgement = look.judgement
+    chosen = choose_frames(
+        look.way, scan.sharpness, judgement.usable, count, bridges=judgement.bridges)
     _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
     record = candidates.of_video(
-        path.name, scan.sharpness, look.judgement.refused, look.way, names, same=NO_MOTION)
+        path.name, scan.sharpness, judgement.refused, look.way, names, same=NO_MOTION)
     sheet = ContactSheet(path.name, record, scan.width, scan.height)
     _write(look, names, sheet, config.max_size, out, ctx)
     frames = tuple(
@@ -125,7 +127,7 @@ def take(
     return Taken(
         "video", (Group(path.name, width, height),), frames,
         declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
-        blurred=int((scan.whole & ~look.judgement.usable).sum()),
+        blurred=int((scan.whole & ~judgement.usable).sum()),
         choice=Choice(record, sheet, prefix))
 
 

@@ -111,12 +111,42 @@ def test_a_blurred_turn_is_bridged_by_its_least_blurred_frames():
     assert len(kept) - sharp.sum() <= 8  # not the whole turn
 
 
+def test_a_gap_is_bridged_off_its_middle_where_frames_are_much_sharper():
+    way = np.linspace(0, 2, 201)
+    sharp, sharpness = everything(201), np.full(201, 100.0)
+    sharp[80:120], sharpness[80:120] = False, 10.0
+    sharpness[82] = 40.0  # a plain view: sharp, but under the mark of the others
+    assert bridged(way, sharpness, sharp, everything(201))[82]
+    sharpness[82] = 15.0
+    assert not bridged(way, sharpness, sharp, everything(201))[82]
+
+
 def test_short_gaps_and_damaged_frames_are_not_bridged():
     way = np.linspace(0, 2, 201)
     sharp, whole = everything(201), everything(201)
     sharp[10:15] = False
     whole[80:120] = False
     assert (bridged(way, np.ones(201), sharp, whole) == (sharp & whole)).all()
+
+
+def test_a_bridge_is_taken_only_where_there_is_nothing_better():
+    # 0.2 widths of blur: among 4 frames, 0.5 apart, it needs no bridge; among 40 it does.
+    way, sharpness = np.linspace(0, 2, 201), np.full(201, 100.0)
+    sharpness[80:100] = 10.0
+    found = judged(way, sharpness, np.array([FINE] * 201), everything(201), 0.5)
+    assert found.bridges[80:100].any()
+    for count, bridges in ((4, False), (40, True)):
+        chosen = choose_frames(way, sharpness, found.usable, count, bridges=found.bridges)
+        assert len(chosen) == count
+        assert found.bridges[chosen].any() == bridges, count
+
+
+def test_where_all_is_blurred_the_sharpest_is_taken_though_it_lies_off_the_middle():
+    way, usable = np.linspace(0, 1, 100), everything(100)
+    sharpness = np.full(100, 10.0)
+    sharpness[1] = 40.0
+    assert 1 in choose_frames(way, sharpness, usable, 10, bridges=usable)
+    assert 1 not in choose_frames(way, sharpness, usable, 10, bridges=~usable)
 
 
 def test_frames_that_are_refused_have_a_reason():
