@@ -1,17 +1,18 @@
 """Edge-preserving filters that remove noise of a known level from 8-bit frames.
 
-Means over 10 crops and frames of five captures (fox, two rendered rooms, desk_monitors, snowmiku;
-photos halved first), PSNR in dB | share of the edges kept, at noise of 5, 10 and 20 of 255
+PSNR in dB and share of the edges kept (`compare.edges_kept`) at noise of 5, 10, 15 and 20 of 255:
+means over ten frames of five captures (fox, two rendered rooms, desk_monitors, snowmiku; photos
+halved first), each filter at its best strength; time relative to bilateral
 (tests/bench/bench_denoise.py):
 
-    none              34.2 | .999   28.2 | .998   22.3 | .988   0    s/MP
-    bilateral         39.5 | .995   35.4 | .975   31.0 | .917   .03
-    joint             39.8 | .999   36.1 | .995   32.4 | .967   .14
-    guided, 1.5       38.9 | .990   34.1 | .965   29.1 | .896   .06
-    non-local means   38.3 | .999   34.7 | .965   31.6 | .839   .90
+    none              34.2 1.00   28.2 1.00   24.7  .99   22.3  .99    0
+    joint, 4          40.2 1.00   36.5  .99   34.3  .98   32.7  .97   4.5
+    bilateral, 4      39.9  .99   35.8  .97   33.2  .94   31.3  .92   1
+    guided, 1.5       39.3  .99   34.5  .96   31.5  .93   29.5  .90   2.6
+    non-local means   37.6 1.00   33.7  .98   31.7  .94   30.4  .89   35
 
-joint is best or equal everywhere and is the default. The guided filter (He et al. 2010) loses to
-both others and is not offered; non-local means costs six times as much.
+joint is closest to the truth and keeps most edges at every level: it is the default. The guided
+filter (He et al. 2010) and non-local means lose to both others and are not offered.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ class Filter(Protocol):
         """Returns the filtered frame."""
 
 
-# Measured on four rendered frames and a photo of 430x770, noise of 15 added (24.8 dB): 7 pixels
-# and 2.0 gain 7.3 dB at four times the noise, 5 pixels 6.8 dB, 9 pixels 7.4 dB for twice the time.
+# For bilateral, measured on four rendered frames and a photo of 430x770, noise of 15 added
+# (24.8 dB): 7 pixels and 2.0 gain 7.3 dB at four times the noise, 5 pixels 6.8 dB, 9 pixels
+# 7.4 dB for twice the time.
 DIAMETER, SIGMA_SPACE = 7, 2.0
 # The first guide is this much blurred. .5 keeps more noise (-.2 dB at noise of 20), .7 blurs fine
 # texture (-.3 dB at noise of 5).

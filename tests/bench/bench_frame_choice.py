@@ -1,9 +1,9 @@
 """Makes a hard video of a rendered room and counts the blurred frames among those chosen.
 
 `python tests/bench/bench_frame_choice.py ROOM OUT [--frames 40] [--seed 0]`, with ROOM a folder in
-the Replica layout of NICE-SLAM (results/, traj.txt). OUT/video.mp4 gets 880 frames: the path is walked forwards
-and backwards at a changing pace, with spells where the camera rests, and 269 frames are blurred
-along the direction of motion. OUT/ws is then a workspace that `recon sfm -w OUT/ws` goes on from.
+the Replica layout of NICE-SLAM (results/, traj.txt). OUT/video.mp4 gets 880 frames: the path is
+walked forwards and backwards at a changing pace, with spells where the camera rests, and 269 frames
+are smeared along a line. OUT/ws is then a workspace that `recon sfm -w OUT/ws` goes on from.
 Printed are the blurred frames among the chosen ones, for every 22nd frame and for ours, and how
 evenly the chosen frames lie along the true path.
 """
