@@ -68,6 +68,8 @@ def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> 
         with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
             scan = scan_video(path, threads=ctx.threads, step=bar.advance)
         atomic.write_json(scan_file, scan.to_json())
+    for notice in scan.notices:
+        ctx.notice(notice)
     _report_lost(path, scan, ctx)
     check_exposure(path.name, scan.exposure[scan.whole], least=MIN_FRAMES)
     warning = check_motion(path.name, scan.motion)

@@ -1,6 +1,8 @@
 import json
 import logging
+from fractions import Fraction
 
+import media
 import numpy as np
 import pytest
 from ingest_media import blocks, files, listed, take, walk, write_photos, write_video
@@ -247,3 +249,11 @@ def test_phone_videos_come_out_upright_and_complete(shared_data, tmp_path, name,
     assert (summary["width"], summary["height"]) == size
     assert (summary["decoded_frames"], summary["lost_frames"]) == (count, 0)
     assert summary["dropped_blurred"] > 0
+
+
+def test_what_was_done_to_a_video_is_said_once_for_each_thing(tmp_path, notices):
+    path = media.write_video(tmp_path / "wide.mp4", walk(40), aspect=Fraction(4, 3))
+    summary = take(path, tmp_path / "out")
+    assert (summary["width"], summary["height"]) == (171, 96)
+    assert notices() == [
+        "wide.mp4 has pixels of aspect 4/3: its frames of 128x96 are stretched to 171x96."]

@@ -67,7 +67,7 @@ def test_a_video_that_lost_nearly_all_is_refused(tmp_path):
 def test_a_video_cut_off_before_its_index_is_refused(tmp_path, sample_video):
     data = sample_video.read_bytes()
     (tmp_path / "head.mp4").write_bytes(data[:1000])
-    with pytest.raises(InputError, match=r"cannot be read as a video|No frame"):
+    with pytest.raises(InputError, match="is cut off: its index"):
         take(tmp_path / "head.mp4", tmp_path / "out")
 
 
