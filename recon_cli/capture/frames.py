@@ -141,13 +141,6 @@ def write_png(path: Path, rgb: NDArray[np.uint8]) -> None:
     atomic.write_bytes(path, data.tobytes())
 
 
-def write_mask(stage: Path, name: str, mask: NDArray[np.uint8]) -> None:
-    """Writes the mask [H, W], 0 or 255, of the frame `name` into a stage's folder."""
-    (stage / MASKS).mkdir(exist_ok=True)
-    _, data = cv2.imencode(".png", mask)
-    atomic.write_bytes(stage / MASKS / name, data.tobytes())
-
-
 def read_png(path: Path) -> NDArray[np.uint8]:
     """Returns the pixels of a frame, RGB, [H, W, 3].
 
@@ -177,13 +170,3 @@ def fitted(rgb: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     if size == (width, height):
         return rgb
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def fitted_mask(mask: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
-    """Returns a mask reduced as `fitted` does; a pixel counts where all that it covers counts."""
-    height, width = mask.shape
-    size = fitted_size(width, height, longest)
-    if size == (width, height):
-        return mask
-    reduced = cv2.resize((mask == 255).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return np.where(reduced > 1 - 1e-4, np.uint8(255), np.uint8(0))

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from recon_cli.capture import frames as store
 from recon_cli.capture.frames import Frame, Group
-from recon_cli.capture.images import read_pixels
-from recon_cli.capture.masks import read_mask
+from recon_cli.capture.images import read_as_stored
+from recon_cli.capture.masks import opaque, read_mask, write_mask
 from recon_cli.capture.pace import paced
-from recon_cli.capture.photos import MIN_FRAMES, frame_names
+from recon_cli.capture.photos import MIN_FRAMES, names_in_order
 from recon_cli.capture.taken import Context, Taken
 from recon_cli.config import IngestConfig
 from recon_cli.errors import InputError
@@ -44,7 +44,7 @@ def take(config: IngestConfig, path: Path, out: Path, ctx: Context) -> Taken:
     for notice in posed.notices:
         ctx.notice(notice)
     images = _chosen(config, posed, ctx)
-    names = frame_names([image.name for image in images])
+    names = names_in_order([Path(image.name).stem for image in images])
     broken = _write(images, names, posed.lenses, config.max_size, out, ctx)
     for reason in broken.values():
         ctx.notice(f"An image is left out: {reason}")
@@ -93,30 +93,36 @@ def _write(
             target = out / store.FOLDER / name
             if not target.exists():
                 try:
-                    rgb, mask = _pixels(image, lenses[image.lens])
+                    rgb, mask = _pixels(image, lenses[image.lens], max_size)
                 except InputError as error:
                     broken[name] = error.message
                 else:
                     if mask is not None:  # first: a frame that is there is finished
-                        store.write_mask(out, name, store.fitted_mask(mask, max_size))
-                    store.write_png(target, store.fitted(rgb, max_size))
+                        write_mask(out / store.MASKS / name, mask)
+                    store.write_png(target, rgb)
             bar.advance()
             record(done, len(images))
     return broken
 
 
 def _pixels(
-    image: PosedImage, lens: Lens
+    image: PosedImage, lens: Lens, max_size: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Returns RGB and mask as they lie in the file: poses are those of the pixels, not of EXIF."""
-    rgb, alpha = read_pixels(image.path, upright=False)
+    """Returns RGB and mask at the stored size.
+
+    They are turned as they lie in the file: poses are those of the pixels, not of EXIF.
+    """
+    rgb, opacity = read_as_stored(image.path)
     height, width = rgb.shape[:2]
     if (width, height) != (lens.width, lens.height):
         raise InputError(
             f"{image.name} holds {width}x{height} pixels, but its camera has "
             f"{lens.width}x{lens.height}.")
-    mask = alpha if image.mask is None else read_mask(image.mask, width, height)
-    return rgb, mask
+    rgb = store.fitted(rgb, max_size)
+    height, width = rgb.shape[:2]
+    if image.mask is not None:
+        return rgb, read_mask(image.mask, width, height)
+    return rgb, opaque(opacity, image.name, width, height)
 
 
 def _known(posed: PosedSet, kept: Sequence[tuple[str, PosedImage]]) -> KnownPoses:

@@ -1,4 +1,4 @@
-"""Frames of a folder of photos: all of them that can be read."""
+"""Frames of a folder of photos: all that can be read and show something of their own."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from recon_cli import atomic
 from recon_cli.capture import frames as store
+from recon_cli.capture.candidates import Candidate, Reason
+from recon_cli.capture.contact import ContactSheet
+from recon_cli.capture.duplicates import PhotoLook, choose_photos, dropped_photos, look_at_photo
 from recon_cli.capture.frames import Frame, Group
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.groups import PhotoGroup, group_notices, group_photos
@@ -19,7 +22,7 @@ from recon_cli.capture.masks import find_masks, photo_mask, write_mask
 from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import check_count, frame_names, list_photos, photo_folder
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
-from recon_cli.capture.taken import Context, Taken
+from recon_cli.capture.taken import Choice, Context, Taken
 from recon_cli.config import IngestConfig
 from recon_cli.errors import InputError
 
@@ -42,17 +45,27 @@ class _Writer:
     masks: dict[str, Path]
     plan: RawPlan
 
-    def write(self, photo: Photo, name: str) -> None:
-        """Writes a frame, and before it its mask, so that a frame that is there is complete."""
+    def write(self, photo: Photo, name: str) -> NDArray[np.uint8]:
+        """Writes a frame, and before it its mask, so that a frame that is there is complete.
+
+        Returns:
+            the pixels as they are stored, RGB, [H, W, 3].
+        """
         target = self.out / store.FOLDER / name
         if target.exists():
-            return
+            return store.read_png(target)
         rgb = store.fitted(self._read(photo), self.max_size)
         height, width = rgb.shape[:2]
         mask = photo_mask(photo, self.masks.get(photo.path.name), width, height)
         if mask is not None:
             write_mask(self.out / store.MASKS / name, mask)
         store.write_png(target, rgb)
+        return rgb
+
+    def remove(self, name: str) -> None:
+        """Deletes a frame and its mask."""
+        for folder in (store.FOLDER, store.MASKS):
+            (self.out / folder / name).unlink(missing_ok=True)
 
     def _read(self, photo: Photo) -> NDArray[np.uint8]:
         return develop(photo, self.plan) if photo.is_raw else read_photo(photo)
@@ -71,7 +84,8 @@ def take(
         prefix: of the names of the frames.
 
     Raises:
-        InputError: too few photos can be read, or have a mask that can be.
+        InputError: too few photos can be read, have a mask that can be, or show something of their
+            own.
     """
     home = photo_folder(path)
     if home != path:
@@ -87,20 +101,41 @@ def take(
         ctx.notice(f"Masks without a photo are left out: {', '.join(masks.unused)}.")
     names = [f"{prefix}{name}" for name in frame_names(photos)]
     writer = _Writer(out, config.max_size, masks.by_photo, plan)
-    broken = folder.broken | _write(photos, names, writer, ctx)
+    looks, unreadable = _write(photos, names, writer, ctx)
+    broken = folder.broken | unreadable
     for reason in broken.values():
         ctx.notice(f"A photo is left out: {reason}")
-    taken = {
-        photo: name for name, photo in zip(names, photos, strict=True)
-        if photo.path.name not in broken}
-    check_count(path, len(taken), broken)
+    readable = sum(look is not None for look in looks)
+    check_count(path, readable, broken)
+    record = choose_photos(path.name, [photo.path.name for photo in photos], names, looks)
+    for text in dropped_photos(record):
+        ctx.notice(text)
+    sheet = _sheet(path.name, record, names, writer)
+    taken = {photos[one.index]: one.name for one in record if one.name is not None}
+    dropped = {one.source for one in record if one.name is None}
     groups = _grouped(list(taken), config.max_size, ctx)
     return Taken(
         "photos",
         _stored(groups, path, config.max_size),
         _frames(groups, taken, out),
-        declared=len(taken) + len(broken), decoded=len(taken),
-        lost=len(broken), skipped=tuple(sorted(broken)))
+        declared=readable + len(broken), decoded=readable, lost=len(broken),
+        skipped=tuple(sorted(dropped | broken.keys())), choice=Choice(record, sheet, prefix))
+
+
+def _sheet(
+    title: str, record: Sequence[Candidate], names: Sequence[str], writer: _Writer
+) -> ContactSheet:
+    """Returns the contact sheet, and removes the files of photos that are not kept."""
+    files = {one.index: writer.out / store.FOLDER / names[one.index] for one in record
+             if one.reason is not Reason.DAMAGED}
+    height, width = store.read_png(next(iter(files.values()))).shape[:2]
+    sheet = ContactSheet(title, record, width, height)
+    for index in sorted(sheet.wanted & files.keys()):
+        sheet.add(index, store.read_png(files[index]))
+    for one in record:
+        if one.index in files and one.name is None:
+            writer.remove(names[one.index])
+    return sheet
 
 
 def _planned(photos: Sequence[Photo], record: Path, ctx: Context) -> RawPlan:
@@ -135,19 +170,21 @@ def _without_twins(photos: Sequence[Photo], plan: RawPlan, ctx: Context) -> list
 
 def _write(
     photos: Sequence[Photo], names: Sequence[str], writer: _Writer, ctx: Context
-) -> dict[str, str]:
-    """Writes the photos and returns why some could not be read after all, by file name."""
+) -> tuple[list[PhotoLook | None], dict[str, str]]:
+    """Writes the photos; returns a look at each, and why some could not be read, by file name."""
+    looks: list[PhotoLook | None] = []
     broken: dict[str, str] = {}
     record = paced(ctx.record)
     with ctx.progress.bar("photos", len(photos), unit="photo") as bar:
-        for done, (photo, name) in enumerate(zip(photos, names, strict=True), start=1):
+        for photo, name in zip(photos, names, strict=True):
             try:
-                writer.write(photo, name)
+                looks.append(look_at_photo(writer.write(photo, name)))
             except InputError as error:
                 broken[photo.path.name] = error.message
+                looks.append(None)
             bar.advance()
-            record(done, len(photos))
-    return broken
+            record(len(looks), len(photos))
+    return looks, broken
 
 
 def _grouped(photos: Sequence[Photo], max_size: int, ctx: Context) -> list[PhotoGroup]:

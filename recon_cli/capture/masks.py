@@ -98,12 +98,28 @@ def alpha_mask(photo: Photo) -> NDArray[np.uint8] | None:
     Raises:
         InputError: the photo cannot be read or is transparent everywhere.
     """
-    alpha = read_alpha(photo)
+    return opaque(read_alpha(photo), photo.path.name, photo.width, photo.height)
+
+
+def opaque(
+    alpha: NDArray[np.uint8] | None, name: str, width: int, height: int
+) -> NDArray[np.uint8] | None:
+    """Returns where a picture is at least half opaque, [H, W], 255 or 0; None for everywhere.
+
+    Args:
+        alpha: its opacity, of any size; None where it holds none.
+        name: for the message.
+        width: of the mask.
+        height: of the mask.
+
+    Raises:
+        InputError: it is transparent everywhere.
+    """
     if alpha is None or alpha.min() >= HALF:
         return None
     if alpha.max() < HALF:
-        raise InputError(f"{photo.path.name} is transparent everywhere.")
-    return _fitted(alpha, photo.width, photo.height)
+        raise InputError(f"{name} is transparent everywhere.")
+    return _fitted(alpha, width, height)
 
 
 def photo_mask(

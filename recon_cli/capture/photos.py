@@ -98,15 +98,19 @@ def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
 
 
 def frame_names(photos: Sequence[Photo]) -> list[str]:
-    """Returns a PNG name for each photo, sorted as the photos are.
+    """Returns a PNG name for each photo, sorted as the photos are; see `names_in_order`."""
+    return names_in_order([photo.path.stem for photo in photos])
+
+
+def names_in_order(stems: Sequence[str]) -> list[str]:
+    """Returns a PNG name for each stem, such that the names sort as the stems are ordered.
 
     They keep their own names where those are plain, differ (also where case does not count) and
-    sort in the order of the photos; else all are numbered, for a mixture would not sort.
+    sort in this order; else all are numbered, for a mixture would not sort.
     """
-    stems = [photo.path.stem for photo in photos]
     plain = all(SAFE_STEM.fullmatch(stem) for stem in stems)
     distinct = len({stem.lower() for stem in stems}) == len(stems)
     names = [f"{stem}.png" for stem in stems]
     if plain and distinct and names == sorted(names):
         return names
-    return [f"{index:06d}.png" for index in range(len(photos))]
+    return [f"{index:06d}.png" for index in range(len(stems))]

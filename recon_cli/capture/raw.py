@@ -20,8 +20,8 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
-from recon_cli.capture.exposure import Look, exposures, look_at, nominal_ev
 from recon_cli.capture.images import Photo, check_size, refused
+from recon_cli.capture.raw_exposure import Look, exposures, look_at, nominal_ev
 from recon_cli.errors import InputError
 
 SRGB = (2.4, 12.92)  # IEC 61966-2-1: power and slope of the straight part

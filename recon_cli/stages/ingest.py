@@ -21,6 +21,8 @@ from recon_cli.stages.context import StageContext, StageInputs, Summary
 def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Writes frames/*.png and frames.json into `out` and returns what was taken and what lost.
 
+    choice.json and contact.png tell what was kept and what was dropped of each source.
+
     Args:
         config: see `IngestConfig`.
         inputs: the sources: video files and folders of photos, told apart by content. The frames
@@ -40,9 +42,13 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         if not source.exists():
             raise InputError(f"{source} does not exist.", hint="Check the path.")
     store.prepare(out)
-    taken = joined(_take(config, inputs.sources, out, ctx))
+    parts = _take(config, inputs.sources, out, ctx)
+    taken = joined(parts)
     held = store.held_out([frame.name for frame in taken.frames], parse_holdout(config.holdout))
     frames = tuple(replace(frame, held_out=frame.name in held) for frame in taken.frames)
+    for part in parts:
+        if part.choice is not None:
+            part.choice.write(out, held)
     FrameList(taken.kind, taken.groups, frames).write(out)
     largest = max(taken.groups, key=lambda group: group.width * group.height)
     return {

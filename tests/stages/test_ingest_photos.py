@@ -27,7 +27,7 @@ def mask_of(folder, name, mask):
 def test_mixed_sizes_become_groups_and_are_told(tmp_path, notices):
     folder = write_photos(tmp_path / "room", 4, size=(128, 96))
     Image.fromarray(blocks(128, 96)).save(folder / "IMG_0001.jpg")
-    Image.fromarray(blocks(128, 96)).save(folder / "IMG_0009.jpg")
+    Image.fromarray(blocks(128, 96, seed=7)).save(folder / "IMG_0009.jpg")
     summary = take(folder, tmp_path / "out", config=IngestConfig(max_size=64))
     assert (summary["groups"], summary["frames"], summary["lost_frames"]) == (2, 5, 0)
     written = listed(tmp_path / "out")
@@ -91,7 +91,8 @@ def write_raw(folder, stops):
     folder.mkdir()
     light = linear(blocks(96, 128)) * 0.3
     for index, ev in enumerate(stops):
-        write_shot(folder / f"IMG_{index:04d}.dng", light * 2.0**ev, Shot(iso=int(100 * 2.0**ev)))
+        view = np.roll(light, 8 * index, axis=1)  # another view, with the same mean
+        write_shot(folder / f"IMG_{index:04d}.dng", view * 2.0**ev, Shot(iso=int(100 * 2.0**ev)))
     return folder
 
 
