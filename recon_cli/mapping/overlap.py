@@ -6,6 +6,9 @@ was *not* matched: the two groups of cameras now seem to stand in one place and 
 but all that they have in common is the door. (Zach, Irschara and Bischof 2008 call these missing
 correspondences.)
 
+Halves that are off by a degree or by a fiftieth of the extent show as well: COLMAP has dropped the
+points that fit one of them only.
+
 The images are compared by the cells of a grid, not by points, because most points stand on whatever
 is rich in texture, and that may be the very thing that looks alike.
 """
