@@ -41,7 +41,7 @@ MIN_SHARE = 0.25
 MIN_CELLS = 100  # between two groups of images: a handful of pairs
 # Share of the expected cells that must be found between two groups. The least of each model was .93
 # to .98 in photos and walks, .78 in a video of low resolution and .76 where screens changed between
-# the photos of a desk; .14 to .53 where two places with the same poster lay over each other.
+# the photos of a desk; .11 to .53 where two places with the same poster lay over each other.
 MIN_OVERLAP = 0.65
 MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
 

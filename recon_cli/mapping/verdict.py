@@ -213,9 +213,9 @@ def _folded(doubled: Fold) -> list[str]:
     if doubled.share is None or doubled.share >= MIN_OVERLAP:
         return []
     return [
-        f"{_sides(doubled.sides)} seem to see the same, but only {doubled.share:.0%} of it is found "
-        f"in both, at least {MIN_OVERLAP:.0%} must be: the model is broken between them, or lays "
-        "two places over each other that look alike."]
+        f"{_sides(doubled.sides)} seem to see the same, but only {doubled.share:.0%} of it is "
+        f"found in both, at least {MIN_OVERLAP:.0%} must be: the model is broken between them, or "
+        "lays two places over each other that look alike."]
 
 
 def _reassurances(verdict: Verdict) -> list[str]:
