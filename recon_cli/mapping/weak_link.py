@@ -23,10 +23,10 @@ from recon_cli.mapping.evidence import Evidence
 from recon_cli.mapping.graph import Cut, Order, Weights
 from recon_cli.mapping.overlap import Overlap, borne_out
 
-# Least share measured in each model: 0.73 to 0.99 where no camera was off by 1% of the extent; 0.03,
-# 0.35 and 0.49 where 9, 7 and 8 of 50 cameras were off by two thirds of it, at reprojection errors
-# of 1.0 and 0.3 pixels. The cut that is loosest by its points alone held 0.89 in the first of
-# these: it ran elsewhere. The other two are a room with two equal posters.
+# Least share measured in each model: 0.73 to 0.99 where no camera was off by 1% of the extent;
+# 0.03, 0.35 and 0.49 where 9, 7 and 8 of 50 cameras were off by two thirds of it, at reprojection
+# errors of 1.0 and 0.3 pixels. The cut that is loosest by its points alone held 0.89 in the first
+# of these: it ran elsewhere. The other two are a room with two equal posters.
 MIN_WEAK_LINK = 0.5
 # COLMAP gives an image a camera from 30 inliers on (abs_pose_min_num_inliers), so that no part of a
 # model hangs on fewer.
