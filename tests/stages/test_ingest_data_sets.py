@@ -134,7 +134,7 @@ def test_an_image_of_another_size_than_its_camera_is_refused(tmp_path):
 def test_half_an_image_is_left_out_and_named(tmp_path, notices):
     folder = make_scannet(tmp_path / "scene", frames=6)
     half = folder / "color" / "3.jpg"
-    half.write_bytes(half.read_bytes()[:-200])
+    half.write_bytes(half.read_bytes()[:-40])
     summary = take(folder, tmp_path / "out")
     assert (summary["frames"], summary["lost_frames"], summary["skipped"]) == (4, 1, ["3.jpg"])
     assert any("3.jpg" in text for text in notices())
