@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 import pytest
-from ingest_media import listed, take, walk, write_video
+from ingest_media import blocks, listed, take, walk, write_video
 from PIL import Image
 from posed_sets import (
     FOCAL,
@@ -134,7 +134,8 @@ def test_an_image_of_another_size_than_its_camera_is_refused(tmp_path):
 def test_half_an_image_is_left_out_and_named(tmp_path, notices):
     folder = make_scannet(tmp_path / "scene", frames=6)
     half = folder / "color" / "3.jpg"
-    half.write_bytes(half.read_bytes()[:-40])
+    Image.fromarray(blocks(HEIGHT, WIDTH)).save(half, quality=100)
+    half.write_bytes(half.read_bytes()[:-400])
     summary = take(folder, tmp_path / "out")
     assert (summary["frames"], summary["lost_frames"], summary["skipped"]) == (4, 1, ["3.jpg"])
     assert any("3.jpg" in text for text in notices())
