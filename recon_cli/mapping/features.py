@@ -30,6 +30,7 @@ def extract(job: Job, report: Reporter) -> Result:
         pycolmap.extract_features(
             job.database, job.frames, list(group.names), pycolmap.CameraMode.SINGLE,
             _reader(job, group), _extraction(job), pycolmap.Device.cpu)
+    database.keep_coarsest(job.database, job.max_features)
     counts = database.keypoint_counts(job.database)
     _check_readable(job, counts)
     doctor.check_texture(counts)
@@ -85,7 +86,7 @@ def _reader(job: Job, group: CameraGroup) -> pycolmap.ImageReaderOptions:
 def _extraction(job: Job) -> pycolmap.FeatureExtractionOptions:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = job.threads
-    # No hard cap: COLMAP stops after the scale at which the count is reached, and a keypoint with
-    # two orientations counts twice.
+    # No hard cap, hence `keep_coarsest`: COLMAP stops after the scale at which the count is
+    # reached, and a keypoint with two orientations counts twice.
     options.sift.max_num_features = job.max_features
     return options

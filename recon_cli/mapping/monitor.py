@@ -11,7 +11,6 @@ from contextlib import ExitStack
 
 from recon_cli.mapping import database, protocol
 from recon_cli.mapping.job import Job
-from recon_cli.mapping.ledger import STEPS
 from recon_cli.progress import Bar, Progress
 
 _DOING = {
@@ -20,6 +19,7 @@ _DOING = {
     "mapping": ("placing cameras", "frame"),
     "undistorted": ("undistorting frames", "frame"),
 }
+_STEP = {"mapping": "sparse"}  # the step that a phase belongs to, where the names differ
 
 
 class Monitor:
@@ -39,6 +39,7 @@ class Monitor:
         self._record = record
         self._phase: protocol.Phase | None = None
         self._count = 0
+        self._durable = 0
         self._bar: Bar | None = None
         self._open = ExitStack()
 
@@ -91,7 +92,10 @@ class Monitor:
     def _note_durable(self) -> None:
         """Records finished steps, and images or pairs that the database keeps."""
         assert self._phase is not None
-        frames = len(self._job.names)
-        step = {"features": 0, "matches": 1, "mapping": 2, "undistorted": 3}[self._phase.name]
-        share = self._count / self._phase.total if step < 2 else 0.0
-        self._record(round((step + min(1.0, share)) * frames), len(STEPS) * frames)
+        frames, steps = len(self._job.names), self._job.steps
+        step = steps.index(_STEP.get(self._phase.name, self._phase.name))
+        kept = self._phase.name in ("features", "matches")
+        share = min(1.0, self._count / max(1, self._phase.total)) if kept else 0.0
+        # A further rung of the ladder matches again: what was reached before stays reached.
+        self._durable = max(self._durable, round((step + share) * frames))
+        self._record(self._durable, len(steps) * frames)

@@ -55,14 +55,25 @@ def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
 def test_models_that_are_left_aside_are_told(caplog):
     summary = {
         "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
-        "unregistered_held_out": ["3.png"], "models": [49, 28, 3],
-    }
+        "unregistered_held_out": ["3.png"], "models": [49, 3], "apart": [["5.png", "6.png", "7.png"]],
+        "rejected": {"9.png": "it shows another room"}, "lines": ["All hangs together."],
+        "rungs": [
+            {"name": "exhaustive", "reason": "", "skipped": "", "registered": 40, "kept": False},
+            {"name": "relaxed", "reason": "only 40 of 60 frames got a camera", "skipped": "",
+             "registered": 49, "kept": True},
+            {"name": "global", "reason": "the capture fell into 2 models",
+             "skipped": "it would take about 9 minutes", "registered": 0, "kept": False}]}
     sfm._report(summary, StageContext())
     told = caplog.text
     assert "11 of 60 frames have no camera" in told
     assert "and 6 more" in told
     assert "1 of them were held out and so cannot be scored: 3.png" in told
-    assert "of 49 frames, is kept; others of 28, 3 frames are left aside" in told
+    assert "of 49 frames, is kept; left aside are 3 frames (5.png, 6.png, 7.png)" in told
+    assert "9.png was taken out of the model: it shows another room." in told
+    assert ("relaxed was tried, because only 40 of 60 frames got a camera: 49 frames got a camera, "
+            "and this model is kept.") in told
+    assert "global was not tried although the capture fell into 2 models" in told
+    assert "All hangs together." in told
 
 
 def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monkeypatch):
