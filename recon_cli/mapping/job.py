@@ -14,6 +14,7 @@ from recon_cli.mapping.ledger import STEPS
 if TYPE_CHECKING:
     from recon_cli.scene.lens import Lens
 
+VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 
 @dataclass(frozen=True)
@@ -102,7 +103,8 @@ class Job:
     @property
     def steps(self) -> tuple[str, ...]:
         """The steps of `ledger.STEPS` that this job takes."""
-        if self.known_poses and self.given_points and self.pose_use == "keep":
+        kept = self.known_poses and self.pose_use == "keep"
+        if kept and self.given_points and all(group.lens for group in self.groups):
             return ("sparse", "undistorted")  # nothing is left to be found in the pixels
         return STEPS
 

@@ -19,20 +19,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pycolmap
 
 from recon_cli import atomic
 from recon_cli.mapping import candidates, database, doctor, mapper, pairs, retrieval, verdict
 from recon_cli.mapping.candidates import Candidate
-from recon_cli.mapping.job import Job
+from recon_cli.mapping.job import VERDICT, Job
 from recon_cli.mapping.ledger import Ledger, Result, fresh_folder, publish
 from recon_cli.mapping.protocol import Reporter
 
 # Exhaustive matching grows with the square: 4950 pairs of 100 images are about a minute on two
 # cores at 600x340 and still the whole graph, so that a walk around a room closes.
 EXHAUSTIVE_MAX = 100
-RUNGS, VERDICT = "rungs", "verdict.json"
+RUNGS = "rungs"
 # Share of the frames that can be placed at all which a model must hold to end the search. The
 # captures that mapped well held 97 to 100% of them, one that fell apart 82%.
 ENOUGH = 0.9
@@ -243,8 +242,8 @@ def _keep(job: Job, notes: Sequence[Note]) -> Result:
     assert chosen is not None  # three frames at least are registered
     folder = _folder(job, chosen.name)
     model = pycolmap.Reconstruction(folder / "model")
-    angle = float(np.median(mapper.triangulation_angles(model)))
-    doctor.check_parallax(angle)
+    described = mapper.described(model)
+    doctor.check_parallax(described["median_triangulation_angle_deg"])
     found = verdict.examine(
         model, job.database, job.names, sharpness=job.sharpness, times=job.times)
     verdict.check_weak_link(found, job.accept_weak)
@@ -252,20 +251,10 @@ def _keep(job: Job, notes: Sequence[Note]) -> Result:
     publish(folder / "model", job.out / "sparse")
     shutil.rmtree(job.out / RUNGS)
     return {
-        **described(model), "median_triangulation_angle_deg": angle,
+        **described, "poses": None,
         "models": chosen.models, "apart": [list(part) for part in chosen.apart],
         "rejected": chosen.rejected, "verdict": found.to_json(), "lines": list(found.lines()),
         "rungs": [note.shown(kept=note is chosen) for note in notes]}
-
-
-def described(model: pycolmap.Reconstruction) -> Result:
-    """Returns what a model holds, for the stage's summary."""
-    return {
-        "registered": mapper.names(model),
-        "points": model.num_points3D(),
-        "mean_track_length": model.compute_mean_track_length(),
-        "reprojection_error_px": model.compute_mean_reprojection_error(),
-    }
 
 
 def _write(found: Candidate, folder: Path) -> None:

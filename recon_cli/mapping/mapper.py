@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon_cli.mapping import database, doctor
 from recon_cli.mapping.job import Job
-from recon_cli.mapping.ledger import fresh_folder
+from recon_cli.mapping.ledger import Result, fresh_folder
 from recon_cli.mapping.protocol import Reporter
 
 # Threads add floating-point sums in any order: two runs then differ from the third digit of the
@@ -105,14 +105,27 @@ def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) ->
 
 
 def triangulated(
-    job: Job, model: pycolmap.Reconstruction
+    job: Job, model: pycolmap.Reconstruction, *, refine_intrinsics: bool = False
 ) -> pycolmap.Reconstruction:
-    """Returns a model of the same cameras with the points that the matches give."""
-    options = _options(job)
+    """Returns a model of the same poses with the points that the matches give."""
     found = pycolmap.triangulate_points(
-        model, job.database, job.frames, fresh_folder(job.out / WORK), True, options)
+        model, job.database, job.frames, fresh_folder(job.out / WORK), True, _options(job),
+        refine_intrinsics)
     shutil.rmtree(job.out / WORK)
     return found
+
+
+def described(model: pycolmap.Reconstruction) -> Result:
+    """Returns what a model holds, for the stage's summary; figures of tracks where it has any."""
+    tracks = model.compute_num_observations() > 0
+    return {
+        "registered": names(model),
+        "points": model.num_points3D(),
+        "mean_track_length": model.compute_mean_track_length() if tracks else None,
+        "reprojection_error_px": model.compute_mean_reprojection_error() if tracks else None,
+        "median_triangulation_angle_deg":
+            float(np.median(triangulation_angles(model))) if tracks else None,
+    }
 
 
 def names(model: pycolmap.Reconstruction) -> list[str]:

@@ -106,13 +106,14 @@ def shared_points(
 
 
 def posed(
-    database: Path, cameras: pycolmap.Reconstruction, poses: Mapping[str, pycolmap.Rigid3d]
+    database: Path, cameras: pycolmap.Reconstruction | None, poses: Mapping[str, pycolmap.Rigid3d]
 ) -> pycolmap.Reconstruction:
     """Returns a model without points: the images of a database with these poses.
 
     Args:
         database: gives the images and their keypoints.
-        cameras: gives the intrinsics, under the ids that they have in the database.
+        cameras: gives the intrinsics, under the ids that they have in the database; None takes
+            those of the database.
         poses: world to camera by name of image.
     """
     model = pycolmap.Reconstruction()
@@ -121,7 +122,7 @@ def posed(
         options.load_all_images = True
         options.image_names = set(poses)
         model.load(pycolmap.DatabaseCache.create(opened, options))
-    for camera, known in cameras.cameras.items():
+    for camera, known in cameras.cameras.items() if cameras else ():
         if camera in model.cameras:
             model.camera(camera).params = known.params
     for image in model.images.values():

@@ -20,7 +20,7 @@ from typing import BinaryIO
 import filelock
 
 from recon_cli.errors import ReconError, WorkspaceError
-from recon_cli.mapping import database, features, ladder, undistort
+from recon_cli.mapping import database, features, known, ladder, undistort
 from recon_cli.mapping.job import LOCK, Job
 from recon_cli.mapping.ledger import Ledger, Result
 from recon_cli.mapping.protocol import Reporter
@@ -56,10 +56,18 @@ def work(job: Job, report: Reporter) -> None:
 
 def _actions(job: Job, report: Reporter, deadline: float) -> dict[str, Callable[[], Result]]:
     """Returns what is done in each step."""
-    return {
-        "features": lambda: features.extract(job, report),
+    cameras: dict[str, Callable[[], Result]] = {
         "matches": lambda: ladder.match_first(job, report),
         "sparse": lambda: ladder.climb(job, report, deadline=deadline),
+    }
+    if job.known_poses:
+        cameras = {
+            "matches": lambda: known.match(job, report),
+            "sparse": lambda: known.build(job, report),
+        }
+    return {
+        "features": lambda: features.extract(job, report),
+        **cameras,
         "undistorted": lambda: undistort.undistort(job, report),
     }
 

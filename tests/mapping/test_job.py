@@ -26,10 +26,14 @@ def test_what_is_written_is_read_back(tmp_path):
 
 
 def test_poses_and_points_that_are_kept_leave_nothing_to_be_found():
-    given = replace(job(4), poses=Path("/in/poses.json"), given_points=True)
+    lens = Lens("PINHOLE", 80, 60, (70.0, 71.0, 40.5, 30.0))
+    group = replace(job(4).groups[0], lens=lens)
+    given = replace(
+        job(4), poses=Path("/in/poses.json"), given_points=True, groups=(group,))
     assert given.steps == ("sparse", "undistorted")
     assert replace(given, pose_use="refine").steps == STEPS
     assert replace(given, given_points=False).steps == STEPS
+    assert replace(given, groups=(replace(group, lens=None),)).steps == STEPS
 
 
 def test_poses_that_are_ignored_are_not_known():

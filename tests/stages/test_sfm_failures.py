@@ -55,7 +55,8 @@ def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
 def test_models_that_are_left_aside_are_told(caplog):
     summary = {
         "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
-        "unregistered_held_out": ["3.png"], "models": [49, 3], "apart": [["5.png", "6.png", "7.png"]],
+        "unregistered_held_out": ["3.png"], "models": [49, 3],
+        "apart": [["5.png", "6.png", "7.png"]],
         "rejected": {"9.png": "it shows another room"}, "lines": ["All hangs together."],
         "rungs": [
             {"name": "exhaustive", "reason": "", "skipped": "", "registered": 40, "kept": False},
