@@ -1,12 +1,14 @@
+import itertools
 import json
 
 import av
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sfm_inputs import run, write_inputs
+from sfm_inputs import run, texture, write_inputs
 
-from recon_cli.capture.frames import Frame, FrameList, Group
+from recon_cli.capture.frames import Frame, FrameList, Group, read_png, write_png
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images, read_scene
 from recon_cli.io.poses import KnownPoses
@@ -92,17 +94,18 @@ def test_refined_poses_come_nearer_to_the_truth_and_keep_its_unit(room, truth, g
     noise = np.random.default_rng(0)
     given({name: shaken(viewmat, noise) for name, viewmat in truth.items()})
     summary = run(room, tmp_path / "out", poses="refine")
-    centers = {name: -view[:3, :3].T @ view[:3, 3] for name, view in found(tmp_path / "out").items()}
-    true = {name: -view[:3, :3].T @ view[:3, 3] for name, view in truth.items()}
     # Steps between frames do not depend on where the whole was moved to: they were given with an
     # error of 2 cm and more, over a path of some 2 m.
-    names = sorted(truth)
-    steps = [np.linalg.norm(centers[a] - centers[b]) for a, b in zip(names, names[1:], strict=False)]
-    right = [np.linalg.norm(true[a] - true[b]) for a, b in zip(names, names[1:], strict=False)]
-    np.testing.assert_allclose(steps, right, rtol=0.05)
+    np.testing.assert_allclose(steps(found(tmp_path / "out")), steps(truth), rtol=0.05)
     moved = summary["poses"]
     assert 0 < moved["moved_median"] < moved["moved_max"] < 0.1
     assert summary["reprojection_error_px"] < moved["reprojection_error_px_before"]
+
+
+def steps(viewmats):
+    """Distances from each camera to the next."""
+    centers = [-viewmats[name][:3, :3].T @ viewmats[name][:3, 3] for name in sorted(viewmats)]
+    return [np.linalg.norm(one - two) for one, two in itertools.pairwise(centers)]
 
 
 def shaken(viewmat, noise):
@@ -127,3 +130,38 @@ def test_two_posed_frames_are_too_few(room, truth, given, tmp_path):
     given(dict(list(truth.items())[:2]))
     with pytest.raises(SfmError, match="Only 2 of 9 frames have a camera"):
         run(room, tmp_path / "out")
+
+
+def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(tmp_path):
+    lenses = [
+        Lens("OPENCV", 64, 48, (50.0, 50.0, 32.0, 24.0, -0.2, 0.02, 0.0, 0.0)),
+        Lens("SIMPLE_RADIAL", 80, 60, (70.0, 40.0, 30.0, 0.1))]
+    images = {f"{index}.png": texture(48, 64, index) for index in range(3)}
+    base = write_inputs(tmp_path / "in", images)
+    for stage in ("ingest", "denoise"):
+        write_png(base / stage / "frames" / "2.png", texture(60, 80, 9))
+    (base / "ingest" / "masks").mkdir()
+    half = np.zeros((48, 64), np.uint8)
+    half[:, 32:] = 255
+    (base / "ingest" / "masks" / "1.png").write_bytes(cv2.imencode(".png", half)[1].tobytes())
+    FrameList("nerfstudio", tuple(
+        Group("camera", lens.width, lens.height, lens=lens) for lens in lenses), tuple(
+        Frame(name, None, name, None, held_out=False, group=int(name == "2.png"),
+              masked=name == "1.png") for name in images)).write(base / "ingest")
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 0, 3] = range(3)
+    KnownPoses(dict(zip(images, viewmats, strict=True)), True, np.ones((4, 3)),
+               np.zeros((4, 3), np.uint8)).write(base / "ingest")
+    summary = run(base, tmp_path / "out")
+    assert [camera["frames"] for camera in summary["cameras"]] == [2, 1]
+    undistorted = tmp_path / "out" / "undistorted"
+    for name, camera in (("1.png", 0), ("2.png", 1)):
+        shape = read_png(undistorted / "images" / name).shape
+        assert shape == (*(summary["cameras"][camera][side] for side in ("height", "width")), 3)
+    assert [path.name for path in (undistorted / "masks").iterdir()] == ["1.png"]
+    mask = cv2.imread(str(undistorted / "masks" / "1.png"), cv2.IMREAD_UNCHANGED)
+    assert mask.shape == read_png(undistorted / "images" / "1.png").shape[:2]
+    assert set(np.unique(mask)) == {0, 255}
+    middle = mask.shape[1] // 2
+    assert not mask[:, :middle - 1].any()
+    assert mask[:, middle + 1:].all()
