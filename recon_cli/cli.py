@@ -154,9 +154,10 @@ _inputs = click.argument(
 @options.stage(IngestConfig)
 @pass_call
 def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
-    """Choose frames from INPUT, a video or photos.
+    """Choose frames from INPUT: videos, folders of photos, or both.
 
-    Photos come as a folder. Without INPUT, that of the last time is read again.
+    The frames of each INPUT get intrinsics of their own. Without INPUT, that of the last time is
+    read again.
     """
     _perform(call, "ingest", ["ingest"], sources=inputs)
 
@@ -233,7 +234,7 @@ def export(call: Call) -> None:
 def run_all(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
     """Do everything from INPUT to the .ply.
 
-    INPUT is a video or a folder of photos. Without it, that of the last time is read again.
+    INPUT is what `recon ingest` takes. Without it, that of the last time is read again.
     """
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
     _perform(call, "run", stages, sources=inputs, base=MID)

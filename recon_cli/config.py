@@ -11,6 +11,12 @@ from dataclasses import dataclass
 from recon_cli.errors import ConfigError
 from recon_cli.fields import StageConfig, option
 
+SCALE_BETWEEN = (
+    "Make one unit a metre: A and B are METRES apart. Each is a frame's name (where its camera "
+    "was), x,y,z (a point of the scene as it is without this option) or FRAME:u,v (what the "
+    "undistorted frame shows at that pixel).")
+_MEASURE = "For example --scale-between 000003.png:120,200 000003.png:480,210 1.5"
+
 
 @dataclass(frozen=True)
 class IngestConfig(StageConfig):
@@ -97,8 +103,31 @@ class SfmConfig(StageConfig):
     accept_weak: bool = option(
         False, "Take a model whose parts hang together by few matches, too.", hashed=False)
     seed: int = option(0, "Seed of the mapper's random sampling.", minimum=0)
+    gravity: str = option(
+        "auto", "auto turns the world so that z is up and the floor lies at 0, where cameras and "
+        "points show it; off leaves it as the mapper made it.", choices=("auto", "off"))
+    scale_between: tuple[str, str, float] | None = option(
+        None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale stays arbitrary")
     max_minutes: float = option(
         20.0, "Give up after this long.", unit="minutes", minimum=0.01, hashed=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_scale_between(self.scale_between)
+
+
+def check_scale_between(value: tuple[str, str, float] | None) -> None:
+    """Raises ConfigError where --scale-between measures nothing."""
+    if value is None:
+        return
+    a, b, metres = value
+    if a.strip() == b.strip() or not a.strip() or not b.strip():
+        raise ConfigError(
+            f"scale_between goes from {a!r} to {b!r}, but it must name two different places.",
+            hint=_MEASURE)
+    if metres <= 0:
+        raise ConfigError(
+            f"scale_between says {metres:g} metres, but it must be more than 0.", hint=_MEASURE)
 
 
 @dataclass(frozen=True)
@@ -193,6 +222,12 @@ class ExportConfig(StageConfig):
     model: str = option(
         "auto", "auto takes the pruned model where there is a fresh one.",
         choices=("auto", "base", "pruned"))
+    scale_between: tuple[str, str, float] | None = option(
+        None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale of the training stays")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_scale_between(self.scale_between)
 
 
 @dataclass(frozen=True)

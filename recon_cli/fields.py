@@ -27,6 +27,7 @@ class OptionInfo:
     hashed: bool = True
     flags: bool = False  # each choice other than the default gets a flag of its own: --force
     automatic: str = ""  # what None means
+    metavar: str = ""  # how --help names the values of a tuple
 
 
 def option(default: Any, help: str, **info: Any) -> Any:
@@ -49,6 +50,11 @@ def field_type(config: type[StageConfig], name: str) -> tuple[type, bool]:
     return hint, False
 
 
+def member_types(kind: Any) -> tuple[type, ...]:
+    """Returns the types of a tuple's members, (str, str, float); none where a field is no tuple."""
+    return get_args(kind) if get_origin(kind) is tuple else ()
+
+
 @dataclass(frozen=True)
 class StageConfig:
     """Base of every config: checks type, choices and range of each field.
@@ -67,6 +73,8 @@ class StageConfig:
         kind, optional = field_type(type(self), item.name)
         if value is None and optional:
             return None
+        if member_types(kind):
+            return self._checked_members(item.name, value, member_types(kind))
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if not isinstance(value, kind) or isinstance(value, bool) is not (kind is bool):
@@ -76,6 +84,19 @@ class StageConfig:
         if isinstance(value, float) and not math.isfinite(value):
             raise self._refused(item.name, value, "a finite number")
         return self._within(item.name, value, info)
+
+    def _checked_members(self, name: str, value: Any, kinds: tuple[type, ...]) -> Any:
+        """Returns a list or tuple as the tuple that it should be; TOML and JSON know lists only."""
+        needed = ", ".join(kind.__name__ for kind in kinds)
+        if not isinstance(value, (list, tuple)) or len(value) != len(kinds):
+            raise self._refused(name, value, f"{len(kinds)} values ({needed})")
+        members: tuple[Any, ...] = tuple(
+            float(one) if kind is float and type(one) is int else one
+            for one, kind in zip(value, kinds, strict=True))
+        for one, kind in zip(members, kinds, strict=True):
+            if type(one) is not kind or (isinstance(one, float) and not math.isfinite(one)):
+                raise self._refused(name, list(value), f"{len(kinds)} values ({needed})")
+        return members
 
     def _within(self, name: str, value: Any, info: OptionInfo) -> Any:
         if info.minimum is not None and value < info.minimum:
@@ -91,9 +112,15 @@ class StageConfig:
         )
 
     def hashed(self) -> dict[str, Any]:
-        """Returns the fields that decide what comes out: the config's part of a fingerprint."""
-        return {
+        """Returns the fields that decide what comes out, as JSON keeps them.
+
+        They are the config's part of a fingerprint. A tuple is a list there, as in a manifest.
+        """
+        values = {
             item.name: getattr(self, item.name)
             for item in dataclasses.fields(self)
             if option_info(item).hashed
         }
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in values.items()}

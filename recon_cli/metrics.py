@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,11 @@ from skimage.metrics import structural_similarity
 PSNR_CONVENTION = "mean of per-image dB, float render clamped to [0, 1] against 8-bit truth"
 SSIM_CONVENTION = (
     "scikit-image: 11x11 Gaussian window, sigma 1.5, 5 px border cropped, mean of channels")
+MASK_CONVENTION = (
+    "ignored pixels have no part in the squared error; the map of SSIM is averaged over the others")
 MIN_SIDE = 11  # pixels; the window of SSIM
+MIN_PIXELS = MIN_SIDE**2  # that a mask must leave: one window of SSIM
+_BORDER = MIN_SIDE // 2  # pixels; what scikit-image crops, where the window reaches outside
 
 
 @dataclass(frozen=True)
@@ -25,11 +30,13 @@ class ViewScore:
         name: of the view.
         psnr_db: peak signal-to-noise ratio in dB.
         ssim: structural similarity.
+        pixels_scored: share of the pixels that a mask leaves; None without a mask.
     """
 
     name: str
     psnr_db: float
     ssim: float
+    pixels_scored: float | None = None
 
 
 @dataclass(frozen=True)
@@ -63,28 +70,62 @@ class ModelScore:
         return float(np.mean([view.ssim for view in self.views]))
 
 
-def psnr(image: NDArray[np.float32], truth: NDArray[np.uint8]) -> float:
+def leaves_enough(mask: NDArray[np.bool_]) -> bool:
+    """Tells whether at least MIN_PIXELS pixels of a mask [H, W] count off the border."""
+    return int(np.count_nonzero(_cropped(mask))) >= MIN_PIXELS
+
+
+def psnr(
+    image: NDArray[np.float32], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> float:
     """Returns 10 log10(1 / MSE) in dB of an image [H, W, 3], clamped to [0, 1].
 
     Equal images would be infinite, which JSON cannot hold: they give 100 dB, less than one part
     in 10^5 of an 8-bit step.
+
+    Args:
+        image: [H, W, 3].
+        truth: [H, W, 3].
+        mask: [H, W], True where a pixel counts; None where all do.
     """
     error = np.clip(image, 0, 1).astype(np.float64) - truth / 255.0
+    if mask is not None:
+        error = error[mask]
     return float(-10 * np.log10(max(float(np.mean(error**2)), 1e-10)))
 
 
-def ssim(image: NDArray[np.float32], truth: NDArray[np.uint8]) -> float:
+def ssim(
+    image: NDArray[np.float32], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> float:
     """Returns the structural similarity of an image [H, W, 3] clamped to [0, 1].
 
+    With a mask: the mean of the map over the pixels that count, of an image that is the truth
+    elsewhere. The truth under the mask lies in their windows; `io.images.painted` makes it neutral.
+
+    Args:
+        image: [H, W, 3].
+        truth: [H, W, 3].
+        mask: [H, W], True where a pixel counts; None where all do.
+
     Raises:
-        ValueError: the image is smaller than the 11-pixel window.
+        ValueError: the image is smaller than the 11-pixel window, or the mask leaves nothing.
     """
     if min(truth.shape[:2]) < MIN_SIDE:
         raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
-    value: float = structural_similarity(
-        np.clip(image, 0, 1).astype(np.float64), truth / 255.0, gaussian_weights=True, sigma=1.5,
-        use_sample_covariance=False, data_range=1.0, channel_axis=-1)
-    return float(value)
+    shown, true = np.clip(image, 0, 1).astype(np.float64), truth / 255.0
+    if mask is not None:
+        if not _cropped(mask).any():
+            raise ValueError("SSIM of a mask that leaves no pixel off the border")
+        shown = np.where(mask[..., None], shown, true)
+    value, similarity = structural_similarity(
+        shown, true, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0,
+        channel_axis=-1, full=True)
+    return float(value if mask is None else _cropped(similarity)[_cropped(mask)].mean())
+
+
+def _cropped(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Returns [H, W, ...] without the border that SSIM leaves out."""
+    return pixels[_BORDER:-_BORDER, _BORDER:-_BORDER]
 
 
 _HEADINGS = ("model", "PSNR dB", "SSIM", "Gaussians", "MB", "ms/view", "train s")

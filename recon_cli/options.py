@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from recon_cli.config import ComputeConfig
-from recon_cli.fields import OptionInfo, StageConfig, field_type, option_info
+from recon_cli.fields import OptionInfo, StageConfig, field_type, member_types, option_info
 from recon_cli.settings import SECTIONS, Settings, merged, parse_assignment
 
 Command = Callable[..., Any]
@@ -176,12 +176,15 @@ def _field(
     return click.option(
         f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}",
         f"{section}_{name}", type=_click_type(kind, info), default=None, expose_value=False,
-        callback=keep, metavar=None if info.choices else _METAVARS.get(kind), help=text)
+        callback=keep,
+        metavar=None if info.choices else info.metavar or _METAVARS.get(kind), help=text)
 
 
 def _click_type(kind: type, info: OptionInfo) -> click.ParamType[Any]:
     if info.choices:
         return click.Choice(info.choices)
+    if member_types(kind):
+        return click.Tuple(list(member_types(kind)))
     if kind is int:
         lowest = None if info.minimum is None else int(info.minimum)
         return click.IntRange(lowest, None if info.maximum is None else int(info.maximum))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import shlex
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -21,7 +22,7 @@ from recon_cli.config import (
     TrainConfig,
 )
 from recon_cli.errors import ConfigError
-from recon_cli.fields import StageConfig, field_type, option_info
+from recon_cli.fields import StageConfig, field_type, member_types, option_info
 
 SECTIONS: dict[str, type[StageConfig]] = {
     "ingest": IngestConfig,
@@ -89,9 +90,15 @@ def _typed(section: str, name: str, text: str) -> Any:
     if optional and text == AUTOMATIC:
         return None
     try:
+        if member_types(kind):
+            words = zip(shlex.split(text), member_types(kind), strict=True)
+            return tuple(member(word) for word, member in words)
         return _TRUTH[text] if kind is bool else kind(text)
     except (KeyError, ValueError) as error:
         needed = "true or false" if kind is bool else f"a value of type {kind.__name__}"
+        if member_types(kind):
+            names = ", ".join(member.__name__ for member in member_types(kind))
+            needed = f"{len(member_types(kind))} values ({names}) with spaces between"
         raise ConfigError(
             f"{section}.{name} is {text!r}, but it must be {needed}.",
             hint="Change it in --set.") from error

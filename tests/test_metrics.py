@@ -4,11 +4,13 @@ import csv
 
 import numpy as np
 import pytest
+from skimage.metrics import structural_similarity
 
 from recon_cli.metrics import (
     ModelScore,
     ViewScore,
     csv_table,
+    leaves_enough,
     markdown_table,
     psnr,
     ssim,
@@ -48,6 +50,56 @@ def test_noise_lowers_both_scores():
 def test_an_image_smaller_than_the_window_is_refused():
     with pytest.raises(ValueError, match="11 pixels"):
         ssim(as_image(TRUTH[:5]), TRUTH[:5])
+
+
+def some_mask():
+    mask = np.ones((32, 40), bool)
+    mask[8:20, 10:25] = False
+    return mask
+
+
+def test_the_psnr_of_a_masked_view_is_over_the_pixels_that_count():
+    truth = np.full((32, 40, 3), 100, np.uint8)
+    image = np.full((32, 40, 3), 100 / 255 + 0.1, np.float32)
+    image[~some_mask()] = 1.0
+    assert psnr(image, truth, some_mask()) == pytest.approx(20.0, abs=1e-4)
+
+
+def test_a_mask_where_all_counts_changes_no_score():
+    noisy = as_image(TRUTH) + np.random.default_rng(1).normal(0, 0.1, TRUTH.shape)
+    noisy = noisy.astype(np.float32)
+    whole = np.ones((32, 40), bool)
+    assert psnr(noisy, TRUTH, whole) == pytest.approx(psnr(noisy, TRUTH), rel=1e-12)
+    assert ssim(noisy, TRUTH, whole) == pytest.approx(ssim(noisy, TRUTH), rel=1e-12)
+
+
+def test_a_render_that_is_wrong_under_the_mask_alone_scores_one():
+    image = as_image(TRUTH)
+    image[~some_mask()] = np.nan
+    assert ssim(image, TRUTH, some_mask()) == pytest.approx(1.0, abs=1e-6)
+    assert psnr(image, TRUTH, some_mask()) == 100.0
+
+
+def test_the_ssim_of_a_masked_view_is_the_mean_of_the_map_where_pixels_count():
+    noisy = as_image(TRUTH) + np.random.default_rng(1).normal(0, 0.1, TRUTH.shape)
+    mask = np.zeros((32, 40), bool)
+    mask[5:27, 5:18] = True  # the left part: what lies right of it must not be scored
+    composite = np.where(mask[..., None], noisy.clip(0, 1), TRUTH / 255.0).astype(np.float32)
+    _, similarity = structural_similarity(
+        composite.astype(np.float64), TRUTH / 255.0, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, data_range=1.0, channel_axis=-1, full=True)
+    assert ssim(noisy.astype(np.float32), TRUTH, mask) == pytest.approx(
+        similarity[5:27, 5:18].mean(), abs=1e-6)
+
+
+def test_a_mask_must_leave_a_window_off_the_border():
+    mask = np.zeros((32, 40), bool)
+    mask[:5] = True  # 200 pixels, all of them cropped
+    assert not leaves_enough(mask)
+    with pytest.raises(ValueError, match="off the border"):
+        ssim(as_image(TRUTH), TRUTH, mask)
+    mask[10:21, 10:21] = True
+    assert leaves_enough(mask)
 
 
 def scores():

@@ -7,7 +7,7 @@ import pytest
 
 from recon_cli import options
 from recon_cli.cli import cli
-from recon_cli.config import ComputeConfig, DenoiseConfig, PruneConfig, TrainConfig
+from recon_cli.config import ComputeConfig, DenoiseConfig, ExportConfig, PruneConfig, TrainConfig
 from recon_cli.fields import StageConfig, option, option_info
 from recon_cli.options import Call
 from recon_cli.settings import SECTIONS
@@ -103,6 +103,15 @@ def test_a_truth_value_gets_a_pair_of_flags(monkeypatch: pytest.MonkeyPatch) -> 
     assert parsed(Switched) == {}
     assert parsed(Switched, "--no-fine") == {"fine": False}
     assert parsed(Switched, "--fine") == {"fine": True}
+
+
+def test_a_field_of_several_values_is_one_option() -> None:
+    assert parsed(ExportConfig, "--scale-between", "a.png:1,2", "-1,2,-3", "2.5") == {
+        "scale_between": ("a.png:1,2", "-1,2,-3", 2.5)}
+    with pytest.raises(click.UsageError):
+        parsed(ExportConfig, "--scale-between", "a.png", "b.png", "far")
+    with pytest.raises(click.UsageError):
+        parsed(ExportConfig, "--scale-between", "a.png", "b.png")
 
 
 def test_some_fields_can_be_left_out() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from recon_cli import settings as layers
-from recon_cli.config import IngestConfig, PruneConfig, TrainConfig
+from recon_cli.config import ExportConfig, IngestConfig, PruneConfig, SfmConfig, TrainConfig
 from recon_cli.errors import ConfigError
 from recon_cli.settings import SECTIONS
 
@@ -22,6 +22,7 @@ def test_toml_round_trips_every_section(tmp_path: Path) -> None:
     configs = {name: config() for name, config in SECTIONS.items()}
     configs["train"] = TrainConfig(iterations=7, means_rate=1e-15, images="original")
     configs["prune"] = PruneConfig(recovery=5)
+    configs["export"] = ExportConfig(scale_between=("frame \"1\".png", "1,2,3", 2.0))
     path = tmp_path / "recon.toml"
     path.write_text(layers.to_toml(configs))
     read = layers.read_settings(path)
@@ -59,6 +60,8 @@ def test_a_missing_file_is_a_usage_error(tmp_path: Path) -> None:
     ("sfm.max_minutes=3", {"sfm": {"max_minutes": 3.0}}),
     ("ingest.holdout=segment:0.4:0.6", {"ingest": {"holdout": "segment:0.4:0.6"}}),
     ("ingest.frames=automatic", {"ingest": {"frames": None}}),
+    ("sfm.scale_between='IMG 7.jpg' 1,2,3 2", {
+        "sfm": {"scale_between": ("IMG 7.jpg", "1,2,3", 2.0)}}),
 ])
 def test_an_assignment_is_typed_as_its_field_is(text: str, expected: object) -> None:
     assert layers.parse_assignment(text) == expected
@@ -69,6 +72,9 @@ def test_an_assignment_is_typed_as_its_field_is(text: str, expected: object) -> 
     ("iterations=3", "section.field=value"),
     ("train.iterations=many", "type int"),
     ("train.iterations=automatic", "type int"),
+    ("sfm.scale_between=a.png 2", "3 values (str, str, float)"),
+    ("sfm.scale_between=a.png b.png far", "3 values (str, str, float)"),
+    ("sfm.scale_between=a.png 'b.png 2", "3 values (str, str, float)"),
     ("train.iteratons=3", "Did you mean iterations?"),
     ("trains.iterations=3", "Did you mean train?"),
 ])
@@ -84,6 +90,26 @@ def test_every_section_is_checked_not_only_the_one_that_is_used() -> None:
         layers.check({"prune": {"ratio": 2.0}})
     with pytest.raises(ConfigError, match="type int"):
         layers.check({"train": {"iterations": "many"}})
+
+
+@pytest.mark.parametrize(("value", "said"), [
+    (["a.png", "b.png"], "3 values"),
+    ("a.png b.png 2", "3 values"),
+    (["a.png", "b.png", "2"], "3 values"),
+    (["a.png", "b.png", True], "3 values"),
+    (["a.png", "b.png", float("nan")], "3 values"),
+    (["a.png", 3, 2.0], "3 values"),
+    (["a.png", "a.png", 2.0], "two different places"),
+    (["a.png", " ", 2.0], "two different places"),
+    (["a.png", "b.png", 0], "more than 0"),
+    (["a.png", "b.png", -1.0], "more than 0"),
+])
+@pytest.mark.parametrize("config", [SfmConfig, ExportConfig])
+def test_a_measurement_that_measures_nothing_is_refused(
+    config: type[SfmConfig | ExportConfig], value: object, said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        config(scale_between=value)  # type: ignore[arg-type]
 
 
 def test_build_ignores_other_sections() -> None:

@@ -155,11 +155,18 @@ def read_png(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
+def fitted_size(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Returns (width, height) of an image whose longer side is reduced to `longest` at most."""
+    if max(height, width) <= longest:
+        return width, height
+    scale = longest / max(height, width)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
 def fitted(rgb: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     """Returns an image reduced by area to at most `longest` pixels on its longer side."""
     height, width = rgb.shape[:2]
-    if max(height, width) <= longest:
+    size = fitted_size(width, height, longest)
+    if size == (width, height):
         return rgb
-    scale = longest / max(height, width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)

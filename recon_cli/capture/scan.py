@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from recon_cli.capture.motion import MotionMeter
-from recon_cli.capture.video import Gap, claimed_length, decode, shown_size, to_gray
+from recon_cli.capture.notices import done_to
+from recon_cli.capture.picture import Gap, Picture
+from recon_cli.capture.video import claimed_length, convert_hint, decode, open_video
 from recon_cli.errors import InputError
 
 # Pixels on the longest side: makes sharpness comparable and keeps sensor noise of large frames
@@ -50,6 +51,7 @@ class Scan:
     motion: NDArray[np.float64]
     seconds: tuple[float | None, ...]
     whole: NDArray[np.bool_]
+    notices: tuple[str, ...]
 
     @property
     def expected(self) -> int:
@@ -72,6 +74,7 @@ class Scan:
             "motion": [None if np.isnan(step) else step for step in self.motion.tolist()],
             "seconds": list(self.seconds),
             "whole": self.whole.tolist(),
+            "notices": list(self.notices),
         }
 
     @classmethod
@@ -87,6 +90,7 @@ class Scan:
             motion=np.array(motion, np.float64),
             seconds=tuple(value["seconds"]),
             whole=np.array(value["whole"], np.bool_),
+            notices=tuple(value["notices"]),
         )
 
 
@@ -94,7 +98,6 @@ class Scan:
 class _Look:
     """What is kept of one frame."""
 
-    size: tuple[int, int]
     sharpness: float
     motion: float
     seconds: float | None
@@ -102,6 +105,7 @@ class _Look:
     key: bool
     bidirectional: bool
     corrupt: bool
+    interlaced: bool
 
 
 def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
@@ -132,17 +136,18 @@ def decode_threads(scan: Scan, threads: int) -> int:
 def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     looks: list[_Look] = []
     gaps: list[tuple[int, int | None]] = []  # (frames seen before it, pts)
+    first: Picture | None = None
     meter = MotionMeter()
     for item in decode(path, threads=threads):
         if isinstance(item, Gap):
             gaps.append((len(looks), item.pts))
             continue
+        first = first or item
         looks.append(_look(item, meter))
         step()
-    if not looks:
-        raise InputError(
-            f"No frame of {path} can be decoded.", hint="Copy it from the camera again.")
-    width, height = looks[0].size
+    if first is None:
+        raise _undecodable(path)
+    width, height = first.size
     claim = claimed_length(path)
     return Scan(
         width=width,
@@ -153,13 +158,21 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         motion=np.array([look.motion for look in looks], np.float64),
         seconds=tuple(look.seconds for look in looks),
         whole=_whole(looks, gaps),
+        notices=done_to(path, first, sum(look.interlaced for look in looks)),
     )
 
 
-def _look(frame: av.VideoFrame, meter: MotionMeter) -> _Look:
-    gray = to_gray(frame)
+def _undecodable(path: Path) -> InputError:
+    with open_video(path) as (_, stream):
+        codec = stream.codec_context.name
+    return InputError(
+        f"No frame of {path} can be decoded; its codec is {codec}.",
+        hint=f"Copy it from the camera again. {convert_hint(path)}")
+
+
+def _look(picture: Picture, meter: MotionMeter) -> _Look:
+    gray, frame = picture.gray(), picture.frame
     return _Look(
-        size=shown_size(frame),
         sharpness=sharpness(gray),
         motion=meter.advance(gray),
         seconds=frame.time,
@@ -167,6 +180,7 @@ def _look(frame: av.VideoFrame, meter: MotionMeter) -> _Look:
         key=bool(frame.key_frame),
         bidirectional=frame.pict_type == PictureType.B,
         corrupt=bool(frame.is_corrupt),
+        interlaced=picture.interlaced,
     )
 
 
@@ -194,12 +208,17 @@ def _whole(
     for index, look in enumerate(looks):
         if look.corrupt:
             _spoil(whole, looks, index, index + 1)
+    near = np.zeros(len(looks) + 2, np.bool_)  # with a place before the first and behind the last
     for seen, pts in gaps:
         after = seen
         if pts is not None:
             after = next((i for i, look in enumerate(looks) if (look.pts or 0) > pts), len(looks))
         _spoil(whole, looks, after, after)
-    return whole
+        near[after:after + 2] = True
+    # Deinterlacing looks at the frame on either side.
+    near[2:] |= ~whole
+    near[:-2] |= ~whole
+    return whole & ~(near[1:-1] & [look.interlaced for look in looks])
 
 
 def _spoil(whole: NDArray[np.bool_], looks: Sequence[_Look], first: int, search: int) -> None:

@@ -1,12 +1,12 @@
-"""Video files through PyAV: what is a video, its frames in order, and a frame as upright RGB.
+"""Video files through PyAV: what is a video, and its frames in order.
 
-A packet that cannot be decoded is passed over and reported as a `Gap`. Interlaced frames stay
-woven and pixels that are not square stay so. A mirrored display matrix is read as its rotation.
+A packet that cannot be decoded is passed over and reported as a `Gap`. Of several videos in one
+file the first is taken; sound and covers are passed over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,26 +15,18 @@ import av
 import numpy as np
 from av.container import InputContainer
 from av.stream import Disposition
-from av.video.reformatter import Colorspace
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from recon_cli.capture.clues import codec_name, lacks_index
+from recon_cli.capture.fields import progressive
+from recon_cli.capture.picture import Gap, Picture, Tags, tags_of
 from recon_cli.errors import InputError
 
 # FFmpeg renders text and text art as video; nobody means that by a capture.
 TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
 # A demuxer that fails this often in one file makes no progress any more.
 MAX_DEMUX_ERRORS = 100
-UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
-# Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
-SD_WIDTH, SD_HEIGHT = 1280, 576
-
-
-@dataclass(frozen=True)
-class Gap:
-    """A packet that gave no frame; `pts` is its place in the stream's time base, if known."""
-
-    pts: int | None
 
 
 @contextmanager
@@ -64,23 +56,53 @@ def _unreadable(path: Path, reason: str) -> InputError:
         return InputError(f"{path} does not exist.", hint="Check the path.")
     if path.is_file() and path.stat().st_size == 0:
         return InputError(f"{path} is empty (0 bytes).", hint="Copy it from the camera again.")
+    if path.is_file() and lacks_index(path):
+        return _cut_off(path)
     return InputError(
         f"{path} cannot be read as a video: {reason}.",
         hint="Give a video, or a folder of photos; if a player shows it, try a fresh copy.")
 
 
+def _cut_off(path: Path) -> InputError:
+    return InputError(
+        f"{path} is cut off: its index (the moov box) is not there in full.",
+        hint="Copy it from the camera again; if it is no longer there, record once more.")
+
+
 def _video_stream(path: Path, container: InputContainer) -> VideoStream:
     """Returns the first moving picture; the cover of a song is none."""
-    for stream in container.streams.video:
-        if stream.disposition & Disposition.attached_pic:
-            continue
-        if stream.codec_context is not None and stream.codec_context.name not in TEXT_CODECS:
+    moving = moving_pictures(container)
+    for stream in moving:
+        if stream.codec_context is not None:
             return stream
-    kinds = {"video": "a still picture, text or an unknown codec"}
+    if moving:
+        raise InputError(
+            f"{path} holds video in {codec_name(path) or 'an unknown codec'}, which cannot be "
+            "decoded here.",
+            hint=convert_hint(path))
+    if lacks_index(path):
+        raise _cut_off(path)
+    kinds = {"video": "a still picture or text"}
     found = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
     raise InputError(
         f"{path} holds no video that can be decoded, only {', '.join(found) or 'nothing'}.",
         hint="Give a video or a folder of photos.")
+
+
+def moving_pictures(container: InputContainer) -> list[VideoStream]:
+    """Returns the video streams without covers and text."""
+    return [
+        stream for stream in container.streams.video
+        if not stream.disposition & Disposition.attached_pic
+        and (stream.codec_context is None or stream.codec_context.name not in TEXT_CODECS)
+    ]
+
+
+def convert_hint(path: Path) -> str:
+    """Returns what to type to make a file of a codec that every build decodes."""
+    return (
+        "Convert it where a player shows it, such as by "
+        f'ffmpeg -i "{path}" -c:v libx264 -crf 16 "{path.stem}-h264.mp4"')
 
 
 @dataclass(frozen=True)
@@ -116,11 +138,11 @@ def claimed_length(path: Path) -> Claim:
         return Claim(stream.frames, seconds, float(stream.average_rate or 0))
 
 
-def decode(path: Path, *, threads: int) -> Iterator[av.VideoFrame | Gap]:
+def decode(path: Path, *, threads: int) -> Iterator[Picture | Gap]:
     """Yields every frame of a video in the order of showing, and a `Gap` for each lost packet.
 
     The frames of an undamaged video do not depend on `threads`; around damage they do. A frame of
-    another size than the first counts as lost.
+    another size than the first counts as lost. Interlaced frames come out deinterlaced.
 
     Raises:
         InputError: as `open_video`.
@@ -128,13 +150,14 @@ def decode(path: Path, *, threads: int) -> Iterator[av.VideoFrame | Gap]:
     with open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
-        size: tuple[int, int] | None = None
-        for item in _frames(container, stream):
-            if isinstance(item, av.VideoFrame):
-                size = size or (item.width, item.height)
-                if (item.width, item.height) != size:
-                    item = Gap(item.pts)
-            yield item
+        tags: Tags | None = None
+        for item in progressive(_of_one_size(_frames(container, stream))):
+            if isinstance(item, Gap):
+                yield item
+                continue
+            # Not before the first frame: some cameras say that it is HLG within the stream alone.
+            tags = tags or tags_of(stream)
+            yield Picture(item[0], tags, item[1])
 
 
 def frames_at(
@@ -148,16 +171,27 @@ def frames_at(
     missing = set(indices)
     if not missing:
         return
-    frames = (item for item in decode(path, threads=threads) if isinstance(item, av.VideoFrame))
-    for index, frame in enumerate(frames):
+    pictures = (item for item in decode(path, threads=threads) if isinstance(item, Picture))
+    for index, picture in enumerate(pictures):
         if index in missing:
-            yield index, to_rgb(frame)
+            yield index, picture.rgb()
             missing.remove(index)
         if not missing:
             return
     raise InputError(
         f"{path} ended before frame {min(missing)}, which was there on the first reading.",
         hint="Leave the file alone while it is read, then run the same command again.")
+
+
+def _of_one_size(items: Iterable[av.VideoFrame | Gap]) -> Iterator[av.VideoFrame | Gap]:
+    size: tuple[int, int] | None = None
+    for item in items:
+        if isinstance(item, av.VideoFrame):
+            size = size or (item.width, item.height)
+            if (item.width, item.height) != size:
+                yield Gap(item.pts)
+                continue
+        yield item
 
 
 def _frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame | Gap]:
@@ -181,32 +215,3 @@ def _packets(
             return
         except av.error.FFmpegError:
             yield Gap(None)
-
-
-def to_rgb(frame: av.VideoFrame) -> NDArray[np.uint8]:
-    """Returns a frame as it is shown: upright, full-range RGB, [H, W, 3].
-
-    Colour matrix and range come from the frame's tags. Ten-bit frames are reduced to eight bits.
-    """
-    untagged = frame.colorspace == UNSPECIFIED
-    large = frame.width >= SD_WIDTH or frame.height > SD_HEIGHT
-    matrix = Colorspace.ITU709 if untagged and large else None
-    rgb = frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()
-    # Both count counterclockwise.
-    return np.ascontiguousarray(np.rot90(rgb, _quarter_turns(frame)))
-
-
-def shown_size(frame: av.VideoFrame) -> tuple[int, int]:
-    """Returns width and height of a frame once it is upright."""
-    size = frame.width, frame.height
-    return size[::-1] if _quarter_turns(frame) % 2 else size
-
-
-def _quarter_turns(frame: av.VideoFrame) -> int:
-    return round(frame.rotation / 90) % 4
-
-
-def to_gray(frame: av.VideoFrame) -> NDArray[np.uint8]:
-    """Returns a frame's brightness, upright, [H, W]."""
-    gray = np.asarray(frame.reformat(format="gray").to_ndarray(), np.uint8)
-    return np.ascontiguousarray(np.rot90(gray, _quarter_turns(frame)))

@@ -48,14 +48,15 @@ def read_scene(
     """Returns the registered views and the points of an undistorted model.
 
     Args:
-        undistorted: folder with images/ and sparse/, as COLMAP's image_undistorter lays it out.
+        undistorted: folder with images/ and sparse/, as COLMAP's image_undistorter lays it out,
+            and masks/ where frames are masked: a gray image of the frame's name for each of them.
         held_out: names of the frames kept for the score, registered or not.
         validation: share of the other views that is set apart.
         denoised: folder of the denoised twins; None for the denoised/ beside images/.
 
     Raises:
         FormatError: the model is missing, damaged, empty or not of pinhole cameras, or an image is
-            missing or not of its camera's size.
+            missing or it or its mask is not of its camera's size.
     """
     cameras = read_cameras(undistorted / "sparse" / "cameras.bin")
     twins = undistorted / "denoised" if denoised is None else denoised
@@ -66,9 +67,11 @@ def read_scene(
         inner = cameras[camera_id]
         camera = Camera(
             inner.width, inner.height, inner.fx, inner.fy, inner.cx, inner.cy, viewmat)
-        view = View(name, camera, undistorted / "images" / name, twins / name)
-        _check_size(view.original, camera)
-        _check_size(view.denoised, camera)
+        mask = undistorted / "masks" / name
+        view = View(name, camera, undistorted / "images" / name, twins / name,
+                    mask if mask.exists() else None)
+        for path in filter(None, (view.original, view.denoised, view.mask)):
+            _check_size(path, camera)
         views.append(view)
     points, colors = read_points(undistorted / "sparse" / "points3D.bin")
     train, chosen, test = split_views(views, held_out, validation=validation)
@@ -76,6 +79,20 @@ def read_scene(
         raise _damaged(undistorted / "sparse", f"{len(views)} views and {len(points)} points")
     missing = sorted(held_out - {view.name for view in views})
     return Scene(train, chosen, test, tuple(missing), points, colors)
+
+
+def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
+    """Returns the camera of each view of an undistorted model, by name.
+
+    Raises:
+        FormatError: the model is missing or damaged, or not of pinhole cameras.
+    """
+    cameras = read_cameras(sparse / "cameras.bin")
+    views = read_images(sparse / "images.bin")
+    missing = [name for name, camera_id, _ in views if camera_id not in cameras]
+    if missing:
+        raise _damaged(sparse, f"{missing[0]} has an unknown camera")
+    return {name: cameras[camera_id] for name, camera_id, _ in views}
 
 
 def read_cameras(path: Path) -> dict[int, Pinhole]:

@@ -12,6 +12,8 @@ from recon_cli.atomic import write_bytes
 from recon_cli.errors import FormatError
 from recon_cli.scene import Camera
 
+_COUNTS = 255  # in the file of a mask; anything less is ignored, half-covered edges included
+
 
 def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
     """Returns (width, height) reduced so that the longer side is at most `max_size`."""
@@ -36,6 +38,57 @@ def read_image(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     if data.shape[:2] != (height, width):
         data = cv2.resize(data, (width, height), interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(data[:, :, ::-1], dtype=np.uint8)
+
+
+def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
+    """Returns a mask as [height, width], True where a pixel counts.
+
+    A pixel of the reduced mask counts only if all that it covers does: the same pixel of the
+    image then holds nothing that is to be ignored.
+
+    Raises:
+        FormatError: the file is missing or no image.
+    """
+    data = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if data is None:
+        raise FormatError(f"{path} cannot be read as a mask.", hint="Run `recon sfm --again`.")
+    ignored = (data < _COUNTS).astype(np.float32)
+    if data.shape != (height, width):
+        # zeros alone average to exactly 0; the mean of bytes would round a sliver away
+        ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(ignored == 0)
+
+
+def painted(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Returns an image [H, W, 3] whose ignored pixels have the mean colour of those that count.
+
+    SSIM looks at windows, so a pixel that counts sees its neighbours under the mask. What they
+    held must not matter, and black would be an edge that outweighs all contrast beside it.
+
+    Args:
+        image: [H, W, 3].
+        mask: [H, W], True where a pixel counts.
+    """
+    result = image.copy()
+    result[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else 0
+    return result
+
+
+def read_masked_image(
+    path: Path, mask: Path | None, width: int, height: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """Returns an image [height, width, 3], painted under its mask, and the mask [height, width].
+
+    The mask is None where every pixel counts.
+
+    Raises:
+        FormatError: a file is missing or no image.
+    """
+    image = read_image(path, width, height)
+    if mask is None:
+        return image, None
+    counts = read_mask(mask, width, height)
+    return (image, None) if counts.all() else (painted(image, counts), counts)
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:

@@ -58,8 +58,9 @@ def best(job: Job, models: Sequence[pycolmap.Reconstruction]) -> Candidate | Non
 def _without_wrong_images(job: Job, model: pycolmap.Reconstruction) -> Candidate:
     """Takes the images that the verdict suspects out of a model and adjusts what is left."""
     first = _examined(job, model)
-    wrong = {name: first.suspicious[name] for name in sorted(first.suspicious)
-             if model.find_image_with_name(name) is not None}
+    wrong = {
+        item.name: f"{item.share:.0%} of its {item.matches} matches agree with where it was placed"
+        for item in first.astray}
     if not wrong or len(wrong) > MAX_REJECTED * model.num_reg_images():
         return Candidate(model, first, (), {})
     for name in wrong:

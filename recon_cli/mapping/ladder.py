@@ -224,7 +224,7 @@ def _tried(
     return Note(
         rung.name, reason, seconds, "", tuple(mapper.names(found.model)), found.apart,
         dict(found.rejected), found.verdict.trusted, tuple(found.verdict.problems),
-        found.verdict.weak_link, found.model.compute_mean_reprojection_error())
+        found.verdict.weak_link.share, found.model.compute_mean_reprojection_error())
 
 
 def _expected(job: Job, count: int, before: Sequence[Note]) -> float:

@@ -2,6 +2,7 @@
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats
 
-__all__ = ["Camera", "Scene", "Splats", "View"]
+__all__ = ["Camera", "Scene", "Similarity", "Splats", "View"]

@@ -21,12 +21,14 @@ class View:
         camera: pinhole camera at the size of the undistorted image.
         original: the undistorted image; scores are against these pixels.
         denoised: the undistorted denoised twin; equal to `original` where nothing was denoised.
+        mask: the undistorted mask, 255 where a pixel counts; None where all of them do.
     """
 
     name: str
     camera: Camera
     original: Path
     denoised: Path
+    mask: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)

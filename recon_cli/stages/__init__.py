@@ -58,7 +58,7 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 1, False,
           "recon_cli.stages.evaluate", renders=True),
-    Stage("export", "export", ("train",), ("prune",), ExportConfig, 1, False,
+    Stage("export", "export", ("sfm", "train"), ("prune",), ExportConfig, 2, False,
           "recon_cli.stages.export"),
 )
 

@@ -1,4 +1,7 @@
-"""export: a .ply that other viewers open, read back and compared before it counts as written."""
+"""export: a .ply that other viewers open, read back and compared before it counts as written.
+
+transform.json says how the scene that was trained became the scene that is handed out.
+"""
 
 from __future__ import annotations
 
@@ -6,31 +9,63 @@ from pathlib import Path
 
 import torch
 
+from recon_cli.atomic import write_json
 from recon_cli.config import ExportConfig
 from recon_cli.errors import StageError, WorkspaceError
+from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.scene import Splats
+from recon_cli.mapping.measure import Measurement, ScaleBetween, measure
+from recon_cli.scene import Similarity, Splats
+from recon_cli.scene.transformed import transformed
 from recon_cli.stages.context import StageContext, StageInputs, Summary
+
+TRANSFORM = "transform.json"
 
 
 def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
-    """Writes splats.ply and returns what it holds."""
+    """Writes splats.ply and transform.json and returns what they hold."""
     if config.model == "pruned" and "prune" not in inputs.folders:
         raise StageError(
             "The pruned model was asked for, but there is none that is fresh.",
             hint="Run `recon prune` first, or export with --model base.")
     pruned = "prune" in inputs.folders and config.model != "base"
+    measured = _measured(config, inputs)
+    similarity = Similarity(scale=measured.scale) if measured else Similarity()
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
+    if not similarity.is_identity:
+        splats = transformed(splats, similarity)
     path = out / "splats.ply"
     with ctx.progress.bar("export", 2, unit="file") as bar:
         write_ply(path, splats)
         bar.advance()
         verify(path, splats)
         bar.advance()
+    _write_transform(out / TRANSFORM, similarity, measured)
     return {
         "model": "pruned" if pruned else "base", "file": "splats.ply", "gaussians": len(splats),
-        "bytes": path.stat().st_size,
+        "bytes": path.stat().st_size, "transform": similarity.to_json(),
     }
+
+
+def _measured(config: ExportConfig, inputs: StageInputs) -> Measurement | None:
+    """Returns how long a metre is in the scene that was trained, where the user says so."""
+    if config.scale_between is None:
+        return None
+    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    points, _ = read_points(sparse / "points3D.bin")
+    viewmats = {name: viewmat for name, _, viewmat in read_images(sparse / "images.bin")}
+    return measure(ScaleBetween(*config.scale_between), points, viewmats, read_pinholes(sparse))
+
+
+def _write_transform(
+    path: Path, similarity: Similarity, measured: Measurement | None
+) -> None:
+    write_json(path, {
+        "from": "the world of sfm, in which the scene was trained",
+        "to": "splats.ply beside this file",
+        "similarity": similarity.to_json(),
+        "measurement": measured.to_json() if measured else None,
+    })
 
 
 def verify(path: Path, splats: Splats) -> None:

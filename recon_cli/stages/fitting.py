@@ -17,10 +17,11 @@ from recon_cli.capture.frames import read_frame_list
 from recon_cli.config import TrainConfig
 from recon_cli.errors import TrainingError
 from recon_cli.io.colmap import read_scene
-from recon_cli.io.images import fitted_camera, read_image
+from recon_cli.io.images import fitted_camera, read_masked_image
 from recon_cli.machine import free_memory_bytes
-from recon_cli.scene import Scene, View
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.metrics import MIN_PIXELS, leaves_enough
+from recon_cli.scene import Camera, Scene, View
+from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.train.fit import Report, Task, fit
 from recon_cli.train.memory import estimate, refuse_what_does_not_fit
 from recon_cli.train.schedule import Schedule
@@ -29,6 +30,7 @@ from recon_cli.train.step import TrainView, fuses
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
+MASK_HINT = "Run `recon ingest` with masks that hide less."
 
 logger = logging.getLogger("recon")
 
@@ -49,7 +51,7 @@ def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
     """Returns the training task at the training size, images in memory as uint8.
 
     Raises:
-        TrainingError: fewer than two views are left to train on.
+        TrainingError: fewer than two views are left to train on, or memory is short.
     """
     if len(scene.train) < 2:
         raise TrainingError(
@@ -57,18 +59,51 @@ def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
             hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
 
     _check_memory(scene, config, ctx)
-
-    def views(chosen: Sequence[View]) -> list[TrainView]:
-        loaded = []
-        for view in chosen:
-            camera = fitted_camera(view.camera, config.max_size)
-            path = view.denoised if config.images == "denoised" else view.original
-            loaded.append(TrainView(camera, read_image(path, camera.width, camera.height)))
-        return loaded
-
+    train = _load_views(scene.train, config, ctx)
+    if len(train) < 2:
+        raise TrainingError(
+            f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
+            hint=MASK_HINT)
     return Task(
-        views(scene.train), views(scene.validation), Schedule(config), scene.extent,
+        train, _load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device))
+
+
+def _load_views(
+    views: Sequence[View], config: TrainConfig, ctx: StageContext
+) -> list[TrainView]:
+    """Returns the views at the training size, without those whose mask leaves next to nothing."""
+    loaded, hidden = [], []
+    for view in views:
+        camera = fitted_camera(view.camera, config.max_size)
+        path = view.denoised if config.images == "denoised" else view.original
+        image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
+        if mask is None or leaves_enough(mask):
+            loaded.append(TrainView(camera, image, mask))
+        else:
+            hidden.append(view.name)
+    notice_hidden(hidden, "not trained on", ctx)
+    return loaded
+
+
+def notice_hidden(names: Sequence[str], what: str, ctx: StageContext) -> None:
+    """Says which views are left out because of their masks, and what that means for them."""
+    if names:
+        ctx.notice(f"{len(names)} views are {what}, for their masks leave fewer than {MIN_PIXELS} "
+                   f"pixels: {', '.join(names)}")
+
+
+def size_summary(cameras: Sequence[Camera]) -> Summary:
+    """Returns width and height of the largest camera; where sizes differ also all as `sizes`."""
+    sizes = sizes_of(cameras)
+    summary: Summary = {"width": sizes[0][0], "height": sizes[0][1]}
+    return summary if len(sizes) == 1 else {**summary, "sizes": [list(size) for size in sizes]}
+
+
+def sizes_of(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    """Returns the different (width, height) of cameras, the one of most pixels first."""
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    return sorted(sizes, key=lambda size: (size[0] * size[1], size), reverse=True)
 
 
 def _check_memory(scene: Scene, config: TrainConfig, ctx: StageContext) -> None:
@@ -77,10 +112,11 @@ def _check_memory(scene: Scene, config: TrainConfig, ctx: StageContext) -> None:
     Raises:
         TrainingError: there is not enough memory.
     """
-    camera = fitted_camera(scene.train[0].camera, config.max_size)
+    views = (*scene.train, *scene.validation)
+    width, height = sizes_of([fitted_camera(view.camera, config.max_size) for view in views])[0]
     needed = estimate(
-        views=len(scene.train) + len(scene.validation), width=camera.width, height=camera.height,
-        gaussians=config.max_gaussians, fused=fuses(ctx.backend))
+        views=len(views), width=width, height=height, gaussians=config.max_gaussians,
+        fused=fuses(ctx.backend), masks=sum(view.mask is not None for view in views))
     free = free_memory_bytes()
     if ctx.device == "cuda":
         free = torch.cuda.mem_get_info()[0]

@@ -134,7 +134,7 @@ def _left_out(summary: Summary) -> Iterator[str]:
     missing, held_out = summary["unregistered"], summary["unregistered_held_out"]
     for name, reason in summary["rejected"].items():
         yield f"{name} was taken out of the model: {reason}."
-    if missing:
+    if missing and not summary["lines"]:  # the verdict names them, and why
         yield (f"{len(missing)} of {summary['frames']} frames have no camera and are left out: "
                f"{listed(missing)}.")
     if held_out:

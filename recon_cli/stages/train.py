@@ -20,6 +20,7 @@ from recon_cli.stages.fitting import (
     load_scene,
     load_task,
     run_fit,
+    size_summary,
     write_config,
 )
 from recon_cli.train.initialize import splats_from_points
@@ -49,12 +50,11 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     write_ply(out / "splats.ply", state.splats)
     checkpoint.unlink(missing_ok=True)
     last = json.loads((out / LOG).read_text(encoding="utf-8").splitlines()[-1])
-    size = task.train[0].camera
     return {
         "iterations": state.iteration, "gaussians": len(state.splats),
         "initial_gaussians": min(len(scene.points), config.max_gaussians),
-        "training_views": len(scene.train), "validation_views": len(scene.validation),
-        "width": size.width, "height": size.height,
+        "training_views": len(task.train), "validation_views": len(task.validation),
+        **size_summary([view.camera for view in task.train]),
         "validation_psnr_db": last["validation_psnr_db"], "train_seconds": last["seconds"],
         "cuda_peak_bytes": torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,
     }

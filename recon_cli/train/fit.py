@@ -140,7 +140,10 @@ def _control_density(state: TrainState, task: Task) -> None:
 
 
 def validation_psnr(state: TrainState, task: Task) -> float | None:
-    """Returns the mean PSNR over the validation views in dB, None where there are none."""
+    """Returns the mean PSNR over the validation views in dB, None where there are none.
+
+    Of a masked view the pixels that count are scored.
+    """
     if not task.validation:
         return None
     degree = task.schedule.sh_degree(max(1, state.iteration))
@@ -149,6 +152,8 @@ def validation_psnr(state: TrainState, task: Task) -> float | None:
         for view in task.validation:
             rgb = render(state.splats, view.camera, torch.zeros(3, device=task.device), degree,
                          backend=task.backend).rgb
-            error = (rgb.clamp(0, 1) - view.pixels(task.device)).square().mean().item()
+            errors = (rgb.clamp(0, 1) - view.pixels(task.device)).square()
+            counting = view.counting(task.device)
+            error = (errors if counting is None else errors[counting]).mean().item()
             values.append(-10 * np.log10(max(error, 1e-10)))
     return float(np.mean(values))

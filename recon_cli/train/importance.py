@@ -46,6 +46,9 @@ def significance(
 ) -> Tensor:
     """Returns the score [N] by which Gaussians are ranked; the lowest go first.
 
+    Masks are left out: hits, blend weights and leave-one-out errors come from the rasterizer, which
+    knows no masks, so pixels that training ignores count here like any other.
+
     Args:
         name: paper, blend_max, loo, opacity or random.
         splats: N Gaussians.

@@ -17,14 +17,22 @@ _RADIUS = 5
 _C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
 
 
-def photometric_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor:
+def photometric_loss(
+    image: Tensor, truth: Tensor, ssim_weight: float, *, mask: Tensor | None = None
+) -> Tensor:
     """Returns (1 - w) L1 + w (1 - SSIM) (Kerbl et al. 2023, eq. 7).
+
+    A pixel that the mask ignores counts as one without error, and gets no gradient. The truth
+    there still lies in the windows of its neighbours: paint it with something neutral.
 
     Args:
         image: [H, W, 3] rendered, gradients flow here.
         truth: [H, W, 3] in [0, 1], same dtype and device.
         ssim_weight: w in [0, 1].
+        mask: [H, W] bool, True where a pixel counts; None where all do.
     """
+    if mask is not None:
+        image = torch.where(mask[..., None], image, truth)
     loss = (image - truth).abs().mean()
     if ssim_weight == 0:
         return loss

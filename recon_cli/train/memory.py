@@ -25,7 +25,7 @@ class MemoryEstimate:
     """The bytes that a run needs at its peak.
 
     Attributes:
-        images: all views as uint8.
+        images: all views as uint8, and their masks.
         pixel_buffers: of one step, for each pixel of a view.
         gaussians: parameters, gradients, moments at the largest count.
         gaussian_buffers: of one step, for each Gaussian.
@@ -52,21 +52,22 @@ class MemoryEstimate:
 
 
 def estimate(
-    *, views: int, width: int, height: int, gaussians: int, fused: bool
+    *, views: int, width: int, height: int, gaussians: int, fused: bool, masks: int = 0
 ) -> MemoryEstimate:
     """Returns the memory that training takes.
 
     Args:
         views: held in memory.
-        width: of a view in pixels.
-        height: of a view in pixels.
+        width: of the largest view in pixels.
+        height: of the largest view in pixels.
         gaussians: the most that there will be.
         fused: the backend computes gradients without autograd.
+        masks: held in memory.
     """
     pixels = width * height
     factor = 1 if fused else _TORCH_FACTOR
     return MemoryEstimate(
-        images=3 * pixels * views, pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
+        images=pixels * (3 * views + masks), pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
         gaussians=gaussians * _PER_GAUSSIAN,
         gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM)
 

@@ -22,19 +22,33 @@ class TrainView:
 
     Attributes:
         camera: at the size of the image.
-        image: [H, W, 3] uint8; a fourth of the memory of float32.
+        image: [H, W, 3] uint8; a fourth of the memory of float32. Under the mask it holds one
+            colour that stands for nothing (`io.images.painted`).
+        mask: [H, W], True where a pixel counts; None where all do.
     """
 
     camera: Camera
     image: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        if self.mask is not None and self.mask.shape != self.image.shape[:2]:
+            raise ValueError(f"a mask of {self.mask.shape} for an image of {self.image.shape}")
 
     def pixels(self, device: torch.device) -> Tensor:
         """Returns the image as float32 in [0, 1], [H, W, 3]."""
         return torch.from_numpy(self.image).to(device).float() / 255
 
+    def counting(self, device: torch.device) -> Tensor | None:
+        """Returns the mask, [H, W] bool."""
+        return None if self.mask is None else torch.from_numpy(self.mask).to(device)
+
 
 class GradientStep(Protocol):
-    """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of one view in an optimizer."""
+    """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of one view in an optimizer.
+
+    Pixels that the view's mask ignores have no error and no gradient.
+    """
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float
@@ -70,7 +84,7 @@ class _FusedStep:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
-            sh_degree, ssim_weight)
+            sh_degree, ssim_weight, mask=view.mask)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -87,7 +101,9 @@ class _AutogradStep:
         splats = optimizer.splats
         output = render(
             splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend)
-        loss = photometric_loss(output.rgb, view.pixels(splats.means.device), ssim_weight)
+        device = splats.means.device
+        loss = photometric_loss(
+            output.rgb, view.pixels(device), ssim_weight, mask=view.counting(device))
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -19,7 +20,7 @@ def texture(height, width, *, seed=0, coarseness=4):
 
 def write_video(
     path: Path, frames: Iterable[np.ndarray], *, codec="libx264", pixels="yuv420p", rate=10,
-    colorspace=None, color_range=None, options=None, muxer=None,
+    colorspace=None, color_range=None, options=None, muxer=None, aspect=None,
 ):
     """Writes RGB frames; with the default options almost without loss."""
     with av.open(str(path), "w", format=muxer) as container:
@@ -30,6 +31,8 @@ def write_video(
                 stream.height, stream.width = rgb.shape[:2]
                 stream.pix_fmt = pixels
                 stream.codec_context.options = options or ({"qp": "4"} if "264" in codec else {})
+                if aspect is not None:
+                    stream.codec_context.sample_aspect_ratio = aspect
                 if colorspace is not None:
                     stream.codec_context.colorspace = colorspace
                     stream.codec_context.color_range = color_range
@@ -40,6 +43,60 @@ def write_video(
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
+    return path
+
+
+def write_luma(path: Path, lumas, *, depth=10, trc=1, primaries=1, colorspace=1):
+    """Writes gray frames of these code values [H, W], limited range, without loss."""
+    pixels = "yuv420p10le" if depth == 10 else "yuv420p"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.height, stream.width = lumas[0].shape
+        stream.pix_fmt = pixels
+        context = stream.codec_context
+        context.options = {"qp": "0"}
+        context.color_trc, context.color_primaries = trc, primaries
+        context.colorspace, context.color_range = colorspace, 1
+        for luma in lumas:
+            chroma = np.full((luma.shape[0] // 2, luma.shape[1]), 1 << (depth - 1))
+            planes = np.concatenate([luma, chroma]).astype(np.uint16 if depth == 10 else np.uint8)
+            frame = av.VideoFrame.from_ndarray(planes, format=pixels)
+            frame.colorspace, frame.color_range = colorspace, 1
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path
+
+
+def woven(moments, order="tff"):
+    """Returns frames whose rows come from two moments in turn: the top ones first, or last."""
+    later = 1 if order == "tff" else 0
+    frames = [first.copy() for first in moments[::2]]
+    for frame, second in zip(frames, moments[1::2], strict=True):
+        frame[later::2] = second[later::2]
+    return frames
+
+
+def write_interlaced(path: Path, frames, *, order="tff", options=None, rate=25, muxer=None):
+    """Writes RGB frames as interlaced H.264, flagged with the order of their fields."""
+    graph = av.filter.Graph()
+    height, width = frames[0].shape[:2]
+    source = graph.add_buffer(
+        width=width, height=height, format="yuv420p", time_base=Fraction(1, rate))
+    # x264 takes the order from the frames, and only a filter can flag those.
+    graph.link_nodes(source, graph.add("setfield", order), graph.add("buffersink")).configure()
+    with av.open(str(path), "w", format=muxer) as container:
+        stream = container.add_stream("libx264", rate=rate)
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+        stream.codec_context.options = {
+            "qp": "4", "x264-params": f"{order}=1", **(options or {})}
+        for index, rgb in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(rgb).reformat(format="yuv420p")
+            frame.pts, frame.time_base = index, Fraction(1, rate)
+            graph.vpush(frame)
+            container.mux(stream.encode(graph.vpull()))
+        container.mux(stream.encode())
     return path
 
 

@@ -1,13 +1,17 @@
+import dataclasses
 import json
+from fractions import Fraction
 
 import av
 import cv2
 import numpy as np
 import pytest
-from media import spoil_packets, texture, write_video
+from media import set_display_matrix, spoil_packets, texture, write_video
 
+from recon_cli.capture.picture import Picture
 from recon_cli.capture.scan import Scan, decode_threads, scan_video, sharpness
-from recon_cli.capture.video import decode, to_rgb
+from recon_cli.capture.video import decode, frames_at
+from recon_cli.errors import InputError
 
 
 def quiet():
@@ -60,6 +64,7 @@ def test_a_container_without_a_count_is_checked_by_its_duration(tmp_path):
 def test_a_scan_survives_json(video):
     scan = scan_video(video, threads=1, step=quiet)
     scan.motion[3] = np.nan
+    scan = dataclasses.replace(scan, notices=("It is so.", "And so."))
     again = Scan.from_json(json.loads(json.dumps(scan.to_json(), allow_nan=False)))
     assert again.to_json() == scan.to_json()
     assert np.isnan(again.motion[3])
@@ -69,8 +74,8 @@ def test_a_scan_survives_json(video):
 @pytest.mark.parametrize("packet", [1, 4, 13, 22, 35])
 def test_whole_frames_are_exactly_those_of_the_undamaged_video(video, packet, erase):
     def pixels():
-        frames = (f for f in decode(video, threads=1) if isinstance(f, av.VideoFrame))
-        return {frame.pts: to_rgb(frame) for frame in frames}
+        found = (item for item in decode(video, threads=1) if isinstance(item, Picture))
+        return {picture.frame.pts: picture.rgb() for picture in found}
 
     truth = pixels()
     spoil_packets(video, [packet], erase=erase)
@@ -89,3 +94,43 @@ def test_damage_is_told_alike_by_any_number_of_threads(video):
     scans = [scan_video(video, threads=threads, step=quiet) for threads in (1, 2, 4)]
     assert scans[0].lost > 0
     assert scans[0].to_json() == scans[1].to_json() == scans[2].to_json()
+
+
+def test_times_follow_the_stamps_where_the_frame_rate_varies(tmp_path):
+    stamps = [0, 10, 15, 40, 45, 50, 100, 130]  # hundredths of a second
+    path = tmp_path / "phone.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=100)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
+        for stamp, rgb in zip(stamps, walk(), strict=False):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb))
+            frame.pts, frame.time_base = stamp, Fraction(1, 100)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    scan = scan_video(path, threads=2, step=quiet)
+    np.testing.assert_allclose(scan.seconds, np.array(stamps) / 100)
+    assert (scan.lost, scan.notices) == (0, ())
+
+
+def test_a_video_without_one_frame_that_decodes_names_its_codec(video):
+    spoil_packets(video, range(40), erase=True)
+    with pytest.raises(InputError, match="its codec is h264") as told:
+        scan_video(video, threads=1, step=quiet)
+    assert "libx264" in told.value.hint
+
+
+def test_half_a_file_gives_the_frames_of_its_half(tmp_path):
+    path = write_video(tmp_path / "walk.ts", walk())
+    data = path.read_bytes()
+    path.write_bytes(data[:len(data) * 4 // 5])
+    scan = scan_video(path, threads=1, step=quiet)
+    assert 3 <= scan.whole.sum() < 40
+
+
+def test_a_scan_is_of_the_upright_square_frame(tmp_path):
+    path = write_video(tmp_path / "a.mp4", walk(5), aspect=Fraction(4, 3))
+    set_display_matrix(path, (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30))
+    scan = scan_video(path, threads=1, step=quiet)
+    assert (scan.width, scan.height) == (96, 213)
+    shapes = {rgb.shape for _, rgb in frames_at(path, range(5), threads=1)}
+    assert shapes == {(213, 96, 3)}

@@ -1,19 +1,12 @@
 import av
 import numpy as np
 import pytest
+from av.stream import Disposition
 from media import set_display_matrix, texture, write_sound, write_video
 from PIL import Image
 
-from recon_cli.capture.video import (
-    Gap,
-    claimed_length,
-    decode,
-    frames_at,
-    open_video,
-    shown_size,
-    to_gray,
-    to_rgb,
-)
+from recon_cli.capture.picture import Gap, Picture
+from recon_cli.capture.video import claimed_length, decode, frames_at, open_video
 from recon_cli.errors import InputError
 
 # Two roundings (to YUV and back) of 8-bit values, and a little loss of the codec.
@@ -39,7 +32,7 @@ def centres(picture):
 
 
 def first_frame(path):
-    return next(f for f in decode(path, threads=1) if isinstance(f, av.VideoFrame))
+    return next(f for f in decode(path, threads=1) if isinstance(f, Picture))
 
 
 # The matrices that cameras write: the picture has to be turned clockwise by so much to be upright.
@@ -52,13 +45,13 @@ def first_frame(path):
 def test_a_tagged_rotation_is_applied(tmp_path, clockwise, matrix):
     path = write_video(tmp_path / "phone.mp4", [quadrants()] * 3)
     set_display_matrix(path, (*matrix, 0, 0, 1 << 30))
-    frame = first_frame(path)
+    picture = first_frame(path)
     upright = np.rot90(quadrants(), -clockwise)
-    rgb = to_rgb(frame)
+    rgb = picture.rgb()
     assert rgb.shape == upright.shape
     assert np.abs(centres(rgb) - centres(upright)).max() <= COLOUR_TOLERANCE
-    assert to_gray(frame).shape == upright.shape[:2]
-    assert shown_size(frame) == upright.shape[1::-1]
+    assert picture.gray().shape == upright.shape[:2]
+    assert picture.size == upright.shape[1::-1]
 
 
 @pytest.mark.parametrize(("codec", "pixels", "colorspace", "color_range"), [
@@ -75,7 +68,7 @@ def test_colours_come_out_as_they_went_in(tmp_path, codec, pixels, colorspace, c
     path = write_video(
         tmp_path / "video.mkv", [quadrants()] * 3, codec=codec, pixels=pixels,
         colorspace=colorspace, color_range=color_range)
-    rgb = to_rgb(first_frame(path))
+    rgb = first_frame(path).rgb()
     assert rgb.dtype == np.uint8
     assert np.abs(centres(rgb) - COLOURS).max() <= COLOUR_TOLERANCE
 
@@ -84,14 +77,14 @@ def test_untagged_video_of_high_definition_is_taken_as_bt709(tmp_path):
     tagged = write_video(
         tmp_path / "tagged.mkv", [quadrants(720, 1280)], codec="ffv1", colorspace=BT709,
         color_range=LIMITED)
-    frame = first_frame(tagged)
-    frame.colorspace = 2  # unspecified
-    assert np.abs(centres(to_rgb(frame)) - COLOURS).max() <= COLOUR_TOLERANCE
+    picture = first_frame(tagged)
+    picture.frame.colorspace = 2  # unspecified
+    assert np.abs(centres(picture.rgb()) - COLOURS).max() <= COLOUR_TOLERANCE
 
 
 def test_gray_uses_the_full_range(tmp_path):
     path = write_video(tmp_path / "video.mp4", [np.full((64, 96, 3), 255, np.uint8)] * 3)
-    assert to_gray(first_frame(path)).min() >= 255 - COLOUR_TOLERANCE
+    assert first_frame(path).gray().min() >= 255 - COLOUR_TOLERANCE
 
 
 @pytest.mark.parametrize("name", ["text.mp4", "text.txt"])
@@ -144,7 +137,7 @@ def test_the_count_is_taken_from_the_duration_where_the_container_names_none(tmp
 def test_every_frame_is_decoded_once_and_in_order(tmp_path, threads):
     shades = [np.full((64, 96, 3), 10 * i + 20, np.uint8) for i in range(20)]
     path = write_video(tmp_path / "video.mp4", shades)
-    seen = [int(np.median(to_rgb(frame))) for frame in decode(path, threads=threads)]
+    seen = [int(np.median(frame.rgb())) for frame in decode(path, threads=threads)]
     np.testing.assert_allclose(seen, [10 * i + 20 for i in range(20)], atol=COLOUR_TOLERANCE)
 
 
@@ -171,5 +164,69 @@ def test_frames_that_change_their_size_midway_count_as_lost(tmp_path):
     path = tmp_path / "both.h264"
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
     items = list(decode(path, threads=1))
-    assert {item.width for item in items if isinstance(item, av.VideoFrame)} == {96}
+    assert {item.size[0] for item in items if isinstance(item, Picture)} == {96}
     assert any(isinstance(item, Gap) for item in items)
+
+
+def mixed(path, *, cover):
+    """A video of 96x64 behind a sound track and, first in the file, the cover of a song."""
+    with av.open(str(path), "w") as container:
+        if cover:
+            picture = container.add_stream("mjpeg", rate=1)
+            picture.width, picture.height, picture.pix_fmt = 32, 32, "yuvj420p"
+            picture.disposition = Disposition.attached_pic
+        sound = container.add_stream("aac", rate=16000, layout="mono")
+        video = container.add_stream("libx264", rate=10)
+        video.width, video.height, video.pix_fmt = 96, 64, "yuv420p"
+        if cover:
+            frame = av.VideoFrame.from_ndarray(quadrants(32, 32)).reformat(format="yuvj420p")
+            container.mux([*picture.encode(frame), *picture.encode()])
+        for _ in range(8):
+            container.mux(video.encode(av.VideoFrame.from_ndarray(quadrants())))
+        samples = av.AudioFrame.from_ndarray(
+            np.zeros((1, 16000), np.float32), format="fltp", layout="mono")
+        samples.sample_rate = 16000
+        container.mux([*video.encode(), *sound.encode(samples), *sound.encode()])
+    return path
+
+
+@pytest.mark.parametrize(("name", "cover"), [("a.mp4", False), ("a.mkv", False), ("c.mp4", True)])
+def test_sound_and_covers_are_passed_over(tmp_path, name, cover):
+    path = mixed(tmp_path / name, cover=cover)
+    with av.open(str(path)) as container:
+        assert len(container.streams) == (3 if cover else 2)
+    items = list(decode(path, threads=2))
+    assert [item.size for item in items] == [(96, 64)] * 8
+    assert np.abs(centres(items[3].rgb()) - COLOURS).max() <= 2 * COLOUR_TOLERANCE
+
+
+@pytest.mark.parametrize(("fourcc", "name"), [(b"evc1", "EVC"), (b"zzzz", "zzzz")])
+def test_a_codec_without_a_decoder_is_named_and_how_to_convert_it(tmp_path, fourcc, name):
+    path = write_video(tmp_path / "new.mp4", [texture(64, 96)] * 5)
+    # EVC is known to FFmpeg, but none of its own decoders reads it; zzzz is known to nobody.
+    path.write_bytes(path.read_bytes().replace(b"avc1", fourcc).replace(b"avcC", b"free"))
+    with pytest.raises(InputError, match=f"holds video in {name}, which cannot be decoded") as told:
+        list(decode(path, threads=1))
+    assert f'ffmpeg -i "{path}" -c:v libx264' in told.value.hint
+
+
+def test_noise_is_no_video(tmp_path):
+    path = tmp_path / "noise.mp4"
+    path.write_bytes(np.random.default_rng(0).bytes(20000))
+    with pytest.raises(InputError, match="cannot be read as a video"):
+        claimed_length(path)
+
+
+@pytest.mark.parametrize("faststart", [False, True])
+def test_an_mp4_whose_index_is_cut_off_is_named_as_such(tmp_path, faststart):
+    path = mixed(tmp_path / "whole.mp4", cover=False)
+    data = path.read_bytes()
+    if faststart:  # the index before the frames, as files for the web have it
+        at = data.index(b"moov") - 4
+        head = data.index(b"mdat") - 12  # an empty box lies in front of it
+        data = data[:head] + data[at:] + data[head:at]
+    for kept in (data.index(b"moov") + 10, data.index(b"moov") + 300):
+        path.write_bytes(data[:kept])
+        with pytest.raises(InputError, match="is cut off: its index") as told:
+            claimed_length(path)
+        assert "Copy it from the camera again" in told.value.hint

@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from recon_cli.errors import FormatError
-from recon_cli.io.colmap import read_images, read_points, read_scene
+from recon_cli.io.colmap import read_images, read_pinholes, read_points, read_scene
 
 WIDTH, HEIGHT = 8, 6
 NAMES = [f"{index:06d}.png" for index in range(5)]
@@ -53,6 +53,12 @@ def test_the_inner_camera_is_read_unchanged(undistorted):
     camera = read(undistorted).train[0].camera
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (5.0, 5.5, 4.0, 3.0)
+
+
+def test_each_view_has_its_inner_camera_by_name(undistorted):
+    pinholes = read_pinholes(undistorted / "sparse")
+    assert sorted(pinholes) == NAMES
+    assert all(one.fy == 5.5 for one in pinholes.values())
 
 
 def test_a_turned_camera_looks_where_its_quaternion_says(undistorted):
@@ -150,6 +156,25 @@ def test_a_missing_image_is_named(undistorted, folder):
 def test_an_image_of_another_size_than_its_camera_is_refused(undistorted, folder):
     Image.new("RGB", (WIDTH + 1, HEIGHT)).save(undistorted / folder / NAMES[3])
     with pytest.raises(FormatError, match="9x6 pixels, but its camera 8x6"):
+        read(undistorted)
+
+
+def test_a_mask_belongs_to_the_view_of_its_name(undistorted):
+    (undistorted / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT)).save(undistorted / "masks" / NAMES[3])
+    masks = {view.name: view.mask for view in read(undistorted).train}
+    assert masks.pop(NAMES[3]) == undistorted / "masks" / NAMES[3]
+    assert set(masks.values()) == {None}
+
+
+def test_without_a_folder_of_masks_every_pixel_counts(undistorted):
+    assert all(view.mask is None for view in read(undistorted).train)
+
+
+def test_a_mask_of_another_size_than_its_camera_is_refused(undistorted):
+    (undistorted / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT + 1)).save(undistorted / "masks" / NAMES[3])
+    with pytest.raises(FormatError, match=r"masks.*8x7 pixels, but its camera 8x6"):
         read(undistorted)
 
 

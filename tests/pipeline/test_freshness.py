@@ -37,6 +37,8 @@ def test_again_runs_what_is_fresh(job: Job) -> None:
     ("prune", "ratio", 0.25, AFTER["prune"]),
     ("evaluate", "max_size", 99, ["evaluate"]),
     ("export", "model", "base", ["export"]),
+    ("export", "scale_between", ("a.png", "b.png", 2.0), ["export"]),
+    ("sfm", "gravity", "off", AFTER["sfm"]),
     ("sfm", "max_minutes", 1.0, []),
     ("train", "checkpoint_every", 7, []),
     ("compute", "threads", 1, []),
@@ -132,3 +134,12 @@ def test_ingest_without_any_input_is_a_usage_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="needs an input") as caught:
         bring(job_at(tmp_path / "ws"), "ingest")
     assert caught.value.exit_code == 2
+
+
+def test_a_result_made_with_several_values_stays_fresh(job: Job) -> None:
+    """A tuple comes back from the manifest as a list."""
+    between = {"export": {"scale_between": ("a.png", "1,2,3", 2)}}
+    assert bring(job, "export", changes=between) == ["export"]
+    assert bring(job, "export", changes=between) == []
+    assert stale(job) == {}
+    assert list(stale(job_at(job.workspace.root, {"export": {"model": "base"}}))) == ["export"]

@@ -1,13 +1,15 @@
 import logging
+from fractions import Fraction
 
+import media
 import numpy as np
 import pytest
 from ingest_media import blocks, files, listed, take, walk, write_photos, write_video
 from PIL import Image
 
 from recon_cli.capture import frames as store
+from recon_cli.capture import from_video
 from recon_cli.config import IngestConfig
-from recon_cli.stages import ingest
 
 
 @pytest.fixture
@@ -28,7 +30,7 @@ def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notice
     assert summary == {
         "kind": "video", "declared_frames": 40, "decoded_frames": 40, "lost_frames": 0,
         "dropped_blurred": 0, "skipped": [], "frames": len(names), "held_out": -(-len(names) // 8),
-        "width": 128, "height": 96,
+        "groups": 1, "width": 128, "height": 96,
     }
     assert found["source"] == "video"
     assert found["groups"] == [
@@ -107,9 +109,25 @@ def test_a_flat_video_passes_for_structure_from_motion_to_judge(tmp_path):
     video = write_video(tmp_path / "flat.mp4", [np.full((96, 128, 3), 128, np.uint8)] * 40)
     assert take(video, tmp_path / "out")["frames"] == 24
 
-# What is damaged
+def test_several_sources_are_kept_apart_and_share_the_budget(video, tmp_path):
+    other = write_video(tmp_path / "slow.mp4", walk(40, step=2, height=64))
+    folder = write_photos(tmp_path / "room", 4)
+    config = IngestConfig(frames=30, holdout="every:4")
+    summary = take((video, folder, other), tmp_path / "out", config=config)
+    assert (summary["kind"], summary["groups"], summary["frames"]) == ("mixed", 3, 34)
+    assert (summary["width"], summary["height"]) == (128, 96)
+    found = listed(tmp_path / "out")
+    assert [(group["name"], group["width"], group["height"]) for group in found["groups"]] == [
+        ("walk.mp4", 128, 96), ("room", 64, 48), ("slow.mp4", 128, 64)]
+    names = [frame["name"] for frame in found["frames"]]
+    assert names == sorted(names)
+    by_group = [[n for n, f in zip(names, found["frames"], strict=True) if f["group"] == group]
+                for group in range(3)]
+    assert [len(group) for group in by_group] == [20, 4, 10]  # one video walks twice as far
+    assert [{name[:3] for name in group} for group in by_group] == [{"01_"}, {"02_"}, {"03_"}]
+    assert [place for place, frame in enumerate(found["frames"]) if frame["held_out"]] == list(
+        range(0, 34, 4))
 
-# What is no capture
 
 # Photos
 
@@ -119,8 +137,8 @@ def test_photos_become_frames_that_keep_their_names(tmp_path, notices):
     summary = take(folder, tmp_path / "out")
     assert summary == {
         "kind": "photos", "declared_frames": 9, "decoded_frames": 9, "lost_frames": 0,
-        "dropped_blurred": 0, "skipped": [], "frames": 9, "held_out": 2, "width": 64,
-        "height": 48,
+        "dropped_blurred": 0, "skipped": [], "frames": 9, "held_out": 2, "groups": 1,
+        "width": 64, "height": 48,
     }
     found = listed(tmp_path / "out")
     assert found["source"] == "photos"
@@ -185,7 +203,7 @@ def test_a_second_try_does_not_scan_the_video_again(video, tmp_path, monkeypatch
     take(video, tmp_path / "out")
     before = files(tmp_path / "out")
     (tmp_path / "out" / "frames.json").unlink()
-    monkeypatch.setattr(ingest, "scan_video", None)
+    monkeypatch.setattr(from_video, "scan_video", None)
     take(video, tmp_path / "out")
     assert files(tmp_path / "out") == before
 
@@ -210,3 +228,11 @@ def test_phone_videos_come_out_upright_and_complete(shared_data, tmp_path, name,
     assert (summary["width"], summary["height"]) == size
     assert (summary["decoded_frames"], summary["lost_frames"]) == (count, 0)
     assert summary["dropped_blurred"] > 0
+
+
+def test_what_was_done_to_a_video_is_said_once_for_each_thing(tmp_path, notices):
+    path = media.write_video(tmp_path / "wide.mp4", walk(40), aspect=Fraction(4, 3))
+    summary = take(path, tmp_path / "out")
+    assert (summary["width"], summary["height"]) == (171, 96)
+    assert notices() == [
+        "wide.mp4 has pixels of aspect 4/3: its frames of 128x96 are stretched to 171x96."]

@@ -73,6 +73,39 @@ def test_blur_keeps_a_constant_and_spreads_an_impulse_by_the_window():
     assert np.allclose(blur(impulse)[0, 5:16, 5:16].numpy(), np.outer(window, window), atol=1e-15)
 
 
+def test_the_gradient_under_a_mask_is_zero_and_exact_elsewhere():
+    image, truth = images()
+    mask = torch.ones(24, 31, dtype=torch.bool)
+    mask[5:12, 8:20] = False
+    assert torch.autograd.gradcheck(
+        lambda x: photometric_loss(x, truth, 0.5, mask=mask), (image,), eps=1e-6, atol=1e-7,
+        fast_mode=True)
+    photometric_loss(image, truth, 0.5, mask=mask).backward()
+    assert not image.grad[~mask].any()
+    assert image.grad[mask].all()
+
+
+def test_a_masked_pixel_counts_as_one_without_error():
+    image, truth = images()
+    mask = torch.zeros(24, 31, dtype=torch.bool)
+    mask[3, 4] = True
+    error = (image - truth).abs()[3, 4].sum().item()
+    assert photometric_loss(image, truth, 0.0, mask=mask).item() == pytest.approx(
+        error / truth.numel(), rel=1e-12)
+
+
+def test_a_value_that_is_not_finite_does_no_harm_under_a_mask():
+    image, truth = images()
+    mask = torch.ones(24, 31, dtype=torch.bool)
+    mask[10, 10] = False
+    with torch.no_grad():
+        image[10, 10] = torch.nan
+    loss = photometric_loss(image, truth, 0.2, mask=mask)
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert torch.isfinite(image.grad).all()
+
+
 # ---- the fused loss of the numba backend ----
 
 # height, width; 86 and 171 end just behind a block of columns, 88 and 173 within its reach

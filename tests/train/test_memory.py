@@ -15,6 +15,10 @@ def test_images_are_counted_as_bytes():
     assert needed(gaussians=0).images == 100 * 640 * 360 * 3
 
 
+def test_a_mask_is_a_byte_a_pixel():
+    assert needed(masks=7).images - needed().images == 7 * 640 * 360
+
+
 def test_a_gaussian_takes_at_most_one_and_a_half_kilobytes():
     assert needed().gaussians <= 1500 * 100_000
 

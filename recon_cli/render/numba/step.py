@@ -18,6 +18,8 @@ from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
+_FROM_BYTE = np.float32(1 / 255)  # the very factor that loss.py takes
+
 
 class PhotometricStep:
     """Renders a view, compares it with the truth and carries the gradient back.
@@ -42,9 +44,12 @@ class PhotometricStep:
 
     def __call__(
         self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
-        background: Tensor, sh_degree: int, ssim_weight: float,
+        background: Tensor, sh_degree: int, ssim_weight: float, *,
+        mask: NDArray[np.bool_] | None = None,
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
+
+        A pixel that the mask ignores counts as one without error, and gets no gradient.
 
         Args:
             splats: N Gaussians, float32 on the CPU.
@@ -54,6 +59,7 @@ class PhotometricStep:
             background: [3].
             sh_degree: in use.
             ssim_weight: w in [0, 1].
+            mask: [H, W], True where a pixel counts; None where all do.
         """
         height, width, n = camera.height, camera.width, len(splats)
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
@@ -71,9 +77,15 @@ class PhotometricStep:
         grad_rgb = frame.take("grad_rgb", CHANNELS * pixels)
         if not truth.flags.writeable:  # would be another type, and kernels compiled once more
             truth = truth.copy()
+        # numbers and not pixels: a flat mask is twice as fast as one of rows
+        ignored = None if mask is None else np.repeat(~mask.reshape(-1), CHANNELS)
+        if ignored is not None:  # the loss's own product, so that no error is left
+            rgb[ignored] = truth.reshape(-1)[ignored] * _FROM_BYTE
         loss = photometric(
             rgb, truth.reshape(-1), width, height, ssim_weight,
             maps=frame.take("maps", MAPS * len(rgb)), gradient=grad_rgb)
+        if ignored is not None:
+            grad_rgb[ignored] = 0
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,

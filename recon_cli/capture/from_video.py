@@ -1,0 +1,172 @@
+"""Frames of a video: scanned once, chosen, and written at a second pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli import atomic
+from recon_cli.capture import frames as store
+from recon_cli.capture.choose import (
+    automatic_count,
+    bridged,
+    choose_frames,
+    sharp_frames,
+    travelled,
+)
+from recon_cli.capture.frames import Frame, Group
+from recon_cli.capture.pace import paced
+from recon_cli.capture.photos import MIN_FRAMES
+from recon_cli.capture.scan import Scan, decode_threads, scan_video
+from recon_cli.capture.taken import Context, Taken
+from recon_cli.capture.video import claimed_length, frames_at
+from recon_cli.config import IngestConfig
+from recon_cli.errors import InputError
+
+# A count that was made from the duration is off by this much, as a share or in frames (sound that
+# ends a little later), without anything being lost.
+COUNT_SHARE, COUNT_FRAMES = 0.02, 10
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What the first pass over a video found.
+
+    Attributes:
+        path: the video.
+        scan: of its F frames.
+        way: [F] float64 way travelled up to each frame, in widths.
+        usable: [F] bool; whole, and sharp or needed to bridge a gap.
+    """
+
+    path: Path
+    scan: Scan
+    way: NDArray[np.float64]
+    usable: NDArray[np.bool_]
+
+
+def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> Look:
+    """Returns what a pass over all frames of a video finds; `scan_file` keeps it for a next try.
+
+    Raises:
+        InputError: the file is no video, or gives too few whole frames.
+    """
+    if scan_file.exists():
+        scan = Scan.from_json(atomic.read_json(scan_file))
+    else:
+        claim = claimed_length(path)
+        with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
+            scan = scan_video(path, threads=ctx.threads, step=bar.advance)
+        atomic.write_json(scan_file, scan.to_json())
+    for notice in scan.notices:
+        ctx.notice(notice)
+    _report_lost(path, scan, ctx)
+    way = travelled(scan.motion)
+    sharp = sharp_frames(scan.sharpness, config.sharpness)
+    return Look(path, scan, way, bridged(way, scan.sharpness, sharp, scan.whole))
+
+
+def shares(config: IngestConfig, looks: Sequence[Look]) -> list[int]:
+    """Returns how many frames to take of each video.
+
+    --frames, or what the motion asks for up to --max-frames, is divided by the ways travelled; a
+    part gets `MIN_FRAMES` at least.
+    """
+    wanted = [automatic_count(look.way, most=config.max_frames) for look in looks]
+    total = config.frames or min(config.max_frames, sum(wanted))
+    if len(looks) <= 1:
+        return [total] * len(looks)
+    ways = np.cumsum([look.way[-1] for look in looks])
+    cuts = np.round(ways / ways[-1] * total).astype(int)
+    return [max(MIN_FRAMES, int(count)) for count in np.diff(cuts, prepend=0)]
+
+
+def take(
+    config: IngestConfig, look: Look, count: int, out: Path, ctx: Context, *, prefix: str = ""
+) -> Taken:
+    """Writes `count` frames of a video into ingest's folder `out` and returns them.
+
+    Args:
+        config: see `IngestConfig`.
+        look: what `look_at` found.
+        count: how many frames to take, if there are as many.
+        out: frames already in it are kept.
+        ctx: for notices and progress.
+        prefix: of the names of the frames.
+
+    Raises:
+        InputError: too few frames are sharp, or the file has changed.
+    """
+    path, scan = look.path, look.scan
+    chosen = choose_frames(look.way, scan.sharpness, look.usable, count)
+    _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
+    report_reduced(scan.width, scan.height, config.max_size, ctx)
+    names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
+    _write(look, names, config.max_size, out, ctx)
+    frames = tuple(
+        Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False)
+        for index, name in names.items())
+    width, height = store.fitted_size(scan.width, scan.height, config.max_size)
+    return Taken(
+        "video", (Group(path.name, width, height),), frames,
+        declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
+        blurred=int((scan.whole & ~look.usable).sum()))
+
+
+def _report_lost(path: Path, scan: Scan, ctx: Context) -> None:
+    """Says how many frames are missing or damaged; refuses a video that has too few left."""
+    decoded, whole = len(scan.whole), int(scan.whole.sum())
+    if whole < MIN_FRAMES:
+        raise InputError(
+            f"{path} gives {whole} whole frames of {scan.expected}, but at least {MIN_FRAMES} are "
+            "needed.",
+            hint="Give a longer video, or copy it from the camera again if it should be longer.")
+    inexact = max(COUNT_SHARE * scan.declared, COUNT_FRAMES)
+    if whole < decoded or scan.gaps or scan.lost > inexact:
+        ctx.notice(
+            f"{path.name} is damaged or cut off: {scan.lost} of {scan.expected} frames are lost, "
+            f"{whole} can be used.")
+    elif 0 < scan.declared < decoded - inexact:
+        ctx.notice(f"{path.name} declares {scan.declared} frames but holds {decoded}.")
+
+
+def _report_short(scan: Scan, chosen: int, asked: int | None, ctx: Context) -> None:
+    """Says why fewer frames were chosen than asked for; refuses too few."""
+    whole = int(scan.whole.sum())
+    if chosen < MIN_FRAMES:
+        raise InputError(
+            f"Only {chosen} of {whole} frames are sharp, but at least {MIN_FRAMES} are needed.",
+            hint="Lower --sharpness, or record again with slower movements.")
+    if asked is None or chosen == asked:
+        return
+    if whole < asked:
+        ctx.notice(f"{asked} frames were asked for, but the video has {whole}.")
+    if chosen < whole:
+        ctx.notice(
+            f"{chosen} of {whole} frames are sharp enough and all of them are taken; "
+            "--sharpness 0 takes blurred ones too.")
+
+
+def report_reduced(width: int, height: int, max_size: int, ctx: Context) -> None:
+    """Says that frames are stored smaller than they are."""
+    if max(height, width) > max_size:
+        ctx.notice(
+            f"Frames of {width}x{height} are reduced to {max_size} pixels on the longer side; "
+            "--max-size changes that.")
+
+
+def _write(look: Look, names: dict[int, str], max_size: int, out: Path, ctx: Context) -> None:
+    folder = out / store.FOLDER
+    missing = [index for index, name in names.items() if not (folder / name).exists()]
+    done, record = len(names) - len(missing), paced(ctx.record)
+    threads = decode_threads(look.scan, ctx.threads)
+    with ctx.progress.bar("frames", len(names), unit="frame", done=done) as bar:
+        for index, rgb in frames_at(look.path, missing, threads=threads):
+            store.write_png(folder / names[index], store.fitted(rgb, max_size))
+            done += 1
+            bar.advance()
+            record(done, len(names))

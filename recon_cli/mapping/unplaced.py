@@ -1,0 +1,50 @@
+"""Why an image has no camera, as far as its features and matches tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from recon_cli.mapping.evidence import Evidence
+
+# COLMAP gives an image a camera from 30 inliers on; of an image's keypoints in good models a fifth
+# at least are in verified matches.
+MIN_KEYPOINTS = 150
+# Share of the median sharpness below which an image is called blurred: the bound that `recon
+# ingest` sets itself (IngestConfig.sharpness).
+BLURRED = 0.5
+
+
+def reasons(evidence: Evidence, sharpness: Mapping[str, float | None]) -> dict[str, str]:
+    """Returns a reason for every image without a camera, the most telling one of each.
+
+    Args:
+        evidence: of the model.
+        sharpness: variance of the Laplacian by name; None or absent where it is not known.
+    """
+    known = [value for value in sharpness.values() if value is not None]
+    usual = float(np.median(known)) if known else None
+    return {
+        evidence.names[index]: _reason(evidence, int(index), sharpness, usual)
+        for index in np.flatnonzero(~evidence.registered)
+    }
+
+
+def _reason(
+    evidence: Evidence, index: int, sharpness: Mapping[str, float | None], usual: float | None
+) -> str:
+    own = sharpness.get(evidence.names[index])
+    if own is not None and usual is not None and own < BLURRED * usual:
+        return f"blurred: sharpness {own:.0f}, {usual:.0f} is usual"
+    if evidence.keypoints[index] < MIN_KEYPOINTS:
+        return f"too few features: {evidence.keypoints[index]} keypoints"
+    of = (evidence.pairs == index).any(axis=1)
+    others = evidence.pairs[of].sum(axis=1) - index
+    placed = evidence.registered[others]
+    if not placed.any():
+        where = f", only with {len(others)} that have none" if len(others) else ""
+        return f"no overlap: no verified match with an image that has a camera{where}"
+    count = np.count_nonzero(placed)
+    matches = evidence.matches[of][placed].sum()
+    return f"matched but not placed: {matches} matches to {count} images that have a camera"

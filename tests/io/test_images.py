@@ -1,0 +1,77 @@
+"""Images and their masks as training and scores read them."""
+
+import cv2
+import numpy as np
+import pytest
+
+from recon_cli.errors import FormatError
+from recon_cli.io.images import painted, read_mask, read_masked_image, write_png
+
+
+def written(path, mask):
+    """Writes a mask [H, W], True where a pixel counts, as sfm does."""
+    cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
+    return path
+
+
+def test_a_mask_of_the_right_size_is_read_as_it_is(tmp_path):
+    mask = np.random.default_rng(0).random((6, 9)) < 0.5
+    assert np.array_equal(read_mask(written(tmp_path / "m.png", mask), 9, 6), mask)
+
+
+def test_a_pixel_of_a_reduced_mask_counts_only_if_all_that_it_covers_does(tmp_path):
+    mask = np.ones((60, 90), bool)
+    mask[10, 31] = False
+    reduced = read_mask(written(tmp_path / "m.png", mask), 9, 6)
+    assert np.argwhere(~reduced).tolist() == [[1, 3]]
+
+
+@pytest.mark.parametrize("width", [45, 47, 61, 89])
+def test_no_ignored_pixel_leaks_into_a_reduced_image(tmp_path, width):
+    mask = np.random.default_rng(width).random((60, 90)) < 0.97
+    images = []
+    for shade in (0, 255):
+        image = np.full((60, 90, 3), 128, np.uint8)
+        image[~mask] = shade
+        write_png(tmp_path / f"{shade}.png", image)
+        images.append(read_masked_image(
+            tmp_path / f"{shade}.png", written(tmp_path / "m.png", mask), width, 40))
+    assert not images[0][1].all()
+    assert (images[0][0] == 128).all()
+    assert np.array_equal(images[0][0], images[1][0])
+
+
+def test_half_covered_edges_of_a_mask_are_ignored(tmp_path):
+    cv2.imwrite(str(tmp_path / "m.png"), np.array([[0, 128, 254, 255]], np.uint8))
+    assert read_mask(tmp_path / "m.png", 4, 1).tolist() == [[False, False, False, True]]
+
+
+def test_ignored_pixels_are_painted_in_the_mean_of_the_others():
+    image = np.array([[[10, 20, 30], [30, 40, 51], [255, 0, 255]]], np.uint8)
+    result = painted(image, np.array([[True, True, False]]))
+    assert result.tolist() == [[[10, 20, 30], [30, 40, 51], [20, 30, 40]]]
+    assert image[0, 2].tolist() == [255, 0, 255]
+
+
+def test_a_mask_that_ignores_nothing_is_none(tmp_path):
+    image = np.random.default_rng(1).integers(0, 256, (6, 9, 3), np.uint8)
+    write_png(tmp_path / "i.png", image)
+    read, mask = read_masked_image(
+        tmp_path / "i.png", written(tmp_path / "m.png", np.ones((6, 9), bool)), 9, 6)
+    assert mask is None
+    assert np.array_equal(read, image)
+
+
+def test_a_mask_that_ignores_everything_leaves_nothing(tmp_path):
+    image = np.full((6, 9, 3), 7, np.uint8)
+    write_png(tmp_path / "i.png", image)
+    read, mask = read_masked_image(
+        tmp_path / "i.png", written(tmp_path / "m.png", np.zeros((6, 9), bool)), 9, 6)
+    assert not mask.any()
+    assert not read.any()
+
+
+def test_a_file_that_is_no_mask_is_named(tmp_path):
+    (tmp_path / "m.png").write_text("no picture")
+    with pytest.raises(FormatError, match=r"m\.png cannot be read as a mask"):
+        read_mask(tmp_path / "m.png", 4, 1)
