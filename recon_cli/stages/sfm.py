@@ -115,7 +115,7 @@ def _summary(frames: FrameList, job: Job) -> Summary:
 
 def _report(summary: Summary, ctx: StageContext) -> None:
     """Says what was tried, which frames have no camera and which models were left aside."""
-    for text in (*_tried(summary["rungs"]), *_left_out(summary), *summary["lines"]):
+    for text in (*_tried(summary["rungs"]), *summary["lines"], *_left_out(summary)):
         ctx.notice(text)
 
 
@@ -138,7 +138,8 @@ def _left_out(summary: Summary) -> Iterator[str]:
         yield (f"{len(missing)} of {summary['frames']} frames have no camera and are left out: "
                f"{listed(missing)}.")
     if held_out:
-        yield f"{len(held_out)} of them were held out and so cannot be scored: {listed(held_out)}."
+        yield (f"{len(held_out)} frames without a camera were held out and so cannot be scored: "
+               f"{listed(held_out)}.")
     if summary["apart"]:
         parts = "; ".join(f"{len(part)} frames ({listed(part, 3)})" for part in summary["apart"])
         yield (f"The capture fell apart: the largest model, of {summary['models'][0]} frames, is "

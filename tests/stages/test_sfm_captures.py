@@ -1,4 +1,4 @@
-"""Captures that are hard to map: parts that do not meet, wrong images among right ones, no steps."""
+"""Captures that are hard to map: parts that do not meet, wrong images, no steps."""
 
 import av
 import numpy as np

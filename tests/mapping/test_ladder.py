@@ -1,0 +1,157 @@
+import io
+import json
+import math
+from dataclasses import replace
+
+import pycolmap
+import pytest
+from synthetic import center_error, make_capture
+
+from recon_cli.errors import SfmError
+from recon_cli.mapping import ladder, mapper
+from recon_cli.mapping.ladder import Note, best, rungs, shortfall
+from recon_cli.mapping.ledger import Ledger
+from recon_cli.mapping.protocol import Reporter
+
+NAMES = tuple(f"{index:06d}.png" for index in range(60))
+GOOD = Note("exhaustive", "", registered=NAMES, trusted=True, weak_link=0.95,
+            reprojection_error_px=0.5)
+
+
+def climb(job, deadline=math.inf):
+    return ladder.climb(job, Reporter(io.BytesIO()), deadline=deadline)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Twenty cameras around 300 points, all of them matched."""
+    return make_capture(tmp_path)
+
+
+def sized(job, count):
+    return replace(job, groups=(replace(
+        job.groups[0], names=tuple(f"{index}.png" for index in range(count))),))
+
+
+def test_a_small_capture_begins_with_all_pairs_and_a_large_one_with_some(capture):
+    job, _ = capture
+    assert [rung.name for rung in rungs(sized(job, 100))] == ["exhaustive", "relaxed", "global"]
+    assert [rung.name for rung in rungs(sized(job, 101))] == [
+        "retrieval", "exhaustive", "relaxed", "global"]
+
+
+@pytest.mark.parametrize("pairs", ["exhaustive", "retrieval", "sequential"])
+def test_a_named_way_is_the_only_one(capture, pairs):
+    job, _ = capture
+    assert [rung.name for rung in rungs(replace(job, pairs=pairs))] == [pairs]
+
+
+def test_a_good_model_falls_short_of_nothing():
+    assert shortfall(GOOD, 60) == ""
+    assert shortfall(replace(GOOD, registered=NAMES[:54]), 60) == ""
+
+
+def test_each_shortfall_is_said():
+    assert shortfall(Note("exhaustive", ""), 60) == "no model was found"
+    assert shortfall(replace(GOOD, registered=NAMES[:53]), 60) == (
+        "only 53 of 60 frames got a camera")
+    assert shortfall(replace(GOOD, apart=(NAMES[57:],)), 60) == (
+        "the capture fell into 2 models")
+    assert shortfall(replace(GOOD, trusted=False, problems=("The model is broken.",)), 60) == (
+        "The model is broken.")
+
+
+def test_more_frames_that_hang_together_are_the_better_model():
+    fewer = replace(GOOD, name="relaxed", registered=NAMES[:40])
+    assert best([fewer, GOOD]) is GOOD
+
+
+def test_a_broken_model_of_all_frames_is_worse_than_a_sound_one_of_most():
+    sound = replace(GOOD, name="relaxed", registered=NAMES[:50])
+    broken = replace(GOOD, name="global", trusted=False, weak_link=0.1)
+    assert best([broken, sound]) is sound
+
+
+def test_of_two_alike_the_smaller_error_decides_and_then_the_order():
+    sharper = replace(GOOD, name="global", reprojection_error_px=0.3)
+    assert best([GOOD, sharper]) is sharper
+    assert best([GOOD, replace(GOOD, name="relaxed")]) is GOOD
+
+
+def test_where_no_rung_found_a_model_none_is_best():
+    assert best([Note("exhaustive", ""), Note("relaxed", "")]) is None
+
+
+def test_a_good_capture_stops_at_the_first_rung(capture):
+    job, truth = capture
+    result = climb(job)
+    rung, = result["rungs"]
+    assert rung["name"] == "exhaustive"
+    assert rung["reason"] == "20 frames are few enough to match all pairs"
+    assert rung["registered"] == 20
+    assert rung["kept"]
+    assert result["registered"] == list(job.names)
+    assert result["models"] == [20]
+    assert not (job.out / ladder.RUNGS).exists()
+    assert center_error(pycolmap.Reconstruction(job.out / "sparse"), truth) < 1e-3
+    assert json.loads((job.out / "verdict.json").read_text()) == json.loads(
+        json.dumps(result["verdict"]))
+    assert json.loads(json.dumps(result, allow_nan=False))
+
+
+def nothing(*_, **__):
+    return []
+
+
+def test_every_rung_is_tried_until_one_finds_a_model(capture, monkeypatch):
+    job, _ = capture
+    monkeypatch.setattr(mapper, "incremental", nothing)
+    result = climb(job)
+    assert [(rung["name"], rung["reason"], rung["kept"]) for rung in result["rungs"]] == [
+        ("exhaustive", "20 frames are few enough to match all pairs", False),
+        ("relaxed", "no model was found", False),
+        ("global", "no model was found", True)]
+
+
+def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
+    job, _ = capture
+    monkeypatch.setattr(mapper, "incremental", nothing)
+    monkeypatch.setattr(mapper, "globally", nothing)
+    with pytest.raises(SfmError, match="Only 0 of 20 frames have a camera"):
+        climb(job)
+    assert not (job.out / "sparse").exists()
+
+
+def test_a_rung_that_would_take_longer_than_there_is_time_is_passed_over(capture, monkeypatch):
+    job, _ = capture
+    monkeypatch.setattr(ladder, "shortfall", lambda *_: "the model cannot be trusted")
+    result = climb(job, deadline=0.0)
+    assert [bool(rung["skipped"]) for rung in result["rungs"]] == [False, True, True]
+    assert result["registered"] == list(job.names)
+
+
+def test_an_interrupted_climb_goes_on_behind_the_last_finished_rung(capture, monkeypatch):
+    job, _ = capture
+    monkeypatch.setattr(mapper, "incremental", nothing)
+    monkeypatch.setattr(mapper, "globally", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        climb(job)
+    assert Ledger(job.out / ladder.RUNGS).result("relaxed") is not None
+    monkeypatch.undo()
+    monkeypatch.setattr(mapper, "incremental", interrupt)
+    result = climb(job)
+    assert [rung["name"] for rung in result["rungs"]] == ["exhaustive", "relaxed", "global"]
+    assert result["rungs"][2]["kept"]
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_frames_without_matches_are_not_waited_for(tmp_path):
+    job, _ = make_capture(tmp_path)
+    assert ladder.placeable(job) == 20
+    with pycolmap.Database.open(job.database) as opened:
+        for other in range(2, 21):
+            opened.delete_inlier_matches(1, other)
+    assert ladder.placeable(job) == 19
