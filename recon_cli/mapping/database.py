@@ -84,11 +84,29 @@ def scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def inlier_counts(path: Path) -> tuple[int, int, int]:
     """Returns (verified pairs, verified matches, those of pairs that a homography explains)."""
+    pairs, matches, flat = np.array(inlier_counts_by_distance(path)).reshape(-1, 3).sum(axis=0)
+    return int(pairs), int(matches), int(flat)
+
+
+def inlier_counts_by_distance(path: Path) -> list[tuple[int, int, int]]:
+    """Returns what `inlier_counts` does for pairs 1, 2 to 3, 4 to 7, ... apart in order of names.
+
+    Distances without a verified pair are left out.
+    """
     with closing(_opened(path)) as connection:
+        images = [image for image, in connection.execute(
+            "SELECT image_id FROM images ORDER BY name")]
         rows = connection.execute(
-            "SELECT config, rows FROM two_view_geometries WHERE rows > 0").fetchall()
-    flat = sum(matches for config, matches in rows if config in _HOMOGRAPHIES)
-    return len(rows), sum(matches for _, matches in rows), flat
+            "SELECT pair_id, config, rows FROM two_view_geometries WHERE rows > 0").fetchall()
+    place = {image: index for index, image in enumerate(images)}
+    counts: dict[int, tuple[int, int, int]] = {}
+    for pair, config, matches in rows:
+        one, two = (place[image] for image in divmod(pair, _PAIR_BASE))
+        apart = abs(one - two).bit_length()
+        pairs, total, flat = counts.get(apart, (0, 0, 0))
+        counts[apart] = (
+            pairs + 1, total + matches, flat + (matches if config in _HOMOGRAPHIES else 0))
+    return [counts[apart] for apart in sorted(counts)]
 
 
 def pair_names(path: Path) -> set[tuple[str, str]]:

@@ -18,6 +18,8 @@ SEQUENTIAL_OVERLAP = 10
 # show nothing in common. 2000 took a third off the verification of five captures; of their 5700
 # verified pairs 8 got lost, all with few matches, and every model kept its images.
 MAX_TRIALS = 2000
+# Share of the verified matches from which pairs at some distance can tell whether there is depth.
+MIN_SHARE = 0.01
 
 Pair = tuple[str, str]  # file names in order
 
@@ -63,8 +65,18 @@ def counted(job: Job) -> Result:
 
 
 def check_motion(job: Job) -> None:
-    """Raises SfmError when no pair matches, or none of them shows depth."""
-    doctor.check_motion(*database.inlier_counts(job.database))
+    """Raises SfmError when no pair matches, or none of them shows depth.
+
+    Frames that lie near each other in a slow video always look flat, and the more of them there
+    are, the more they outweigh the others. So pairs are judged by how far apart they are in the
+    order of their names, and the ones that show most depth decide: in a walk with small steps 0.91
+    of all matches were flat, 0.22 of those 64 frames apart; in a turn on the spot all are.
+    """
+    found = database.inlier_counts_by_distance(job.database)
+    every = sum(matches for _, matches, _ in found)
+    telling = [counts for counts in found if counts[1] >= MIN_SHARE * every]
+    deepest = min(telling, key=lambda counts: counts[2] / counts[1], default=(0, 0, 0))
+    doctor.check_motion(*deepest)
 
 
 def _matching(job: Job) -> pycolmap.FeatureMatchingOptions:
