@@ -6,6 +6,7 @@ soon as it has it. So the parent counts those.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 
@@ -86,7 +87,10 @@ class Monitor:
         if name in ("features", "matches"):
             return database.progress(self._job.database, name)
         if name == "undistorted":
-            return sum(1 for _ in self._job.undistorting.rglob("*.png"))
+            # os.walk, not rglob: the process removes folders as it goes, and walk passes over them.
+            return sum(
+                name.endswith(".png")
+                for _, _, files in os.walk(self._job.undistorting) for name in files)
         return 0
 
     def _note_durable(self) -> None:

@@ -249,3 +249,27 @@ def test_an_interrupt_ends_the_mapping_process_and_goes_on(room, tmp_path):
         run(room, tmp_path / "out", ctx=StageContext(record=interrupt))
     assert not workers()
     assert not (tmp_path / "out" / "job.json").exists()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs signals")
+def test_ctrl_c_in_every_step_ends_the_mapping_process_at_once(room, tmp_path):
+    """The waiting has a bound only so that the test ends; it came to 0.5 to 0.6 seconds."""
+    out = tmp_path / "out"
+    out.mkdir()
+    for reached in (
+        lambda: database.progress(out / "database.db", "features") >= 3,
+        lambda: database.progress(out / "database.db", "matches") >= 5,
+        lambda: noted(out, "matches"),
+        lambda: noted(out, "sparse") and any((out / "undistorted.partial").rglob("*.png")),
+    ):
+        parent = subprocess.Popen(
+            [sys.executable, "-c", RUN, str(room), str(out), str(FEATURES)],
+            stderr=subprocess.DEVNULL)
+        while not reached():
+            assert parent.poll() is None, "the run ended before it could be interrupted"
+            time.sleep(0.005)
+        family = [parent, *psutil.Process(parent.pid).children(recursive=True)]
+        parent.send_signal(signal.SIGINT)
+        assert parent.wait(timeout=60) != 0
+        _, alive = psutil.wait_procs(family[1:], timeout=60)
+        assert not alive
