@@ -1,3 +1,4 @@
+import errno
 import io
 import json
 import math
@@ -142,6 +143,26 @@ def test_an_interrupted_climb_goes_on_behind_the_last_finished_rung(capture, mon
     result = climb(job)
     assert [rung["name"] for rung in result["rungs"]] == ["exhaustive", "relaxed", "global"]
     assert result["rungs"][2]["kept"]
+
+
+@pytest.mark.parametrize("place", ["match", "models", "model", "note", "verdict", "publish"])
+def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monkeypatch, place):
+    job, truth = capture
+    owner, name = {
+        "match": (ladder.database, "pair_names"), "models": (mapper, "incremental"),
+        "model": (ladder, "_write"), "note": (Ledger, "finish"),
+        "verdict": (ladder.atomic, "write_json"), "publish": (ladder, "publish")}[place]
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(owner, name, full)
+    with pytest.raises(OSError, match="No space left"):
+        climb(job)
+    assert not (job.out / "sparse").exists()
+    monkeypatch.undo()
+    assert climb(job)["registered"] == list(job.names)
+    assert center_error(pycolmap.Reconstruction(job.out / "sparse"), truth) < 1e-3
 
 
 def interrupt(*_, **__):
