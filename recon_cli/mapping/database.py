@@ -118,15 +118,6 @@ def pair_names(path: Path) -> set[tuple[str, str]]:
     return {(min(pair), max(pair)) for pair in pairs}
 
 
-def linked_images(path: Path) -> set[str]:
-    """Returns the images that have verified matches with any other."""
-    with closing(_opened(path)) as connection:
-        names = dict(connection.execute("SELECT image_id, name FROM images"))
-        ids = connection.execute(
-            "SELECT pair_id FROM two_view_geometries WHERE rows > 0").fetchall()
-    return {names[image] for pair, in ids for image in divmod(pair, _PAIR_BASE)}
-
-
 def remove(path: Path) -> None:
     """Deletes a database together with SQLite's side files."""
     for suffix in ("", "-wal", "-shm", "-journal"):

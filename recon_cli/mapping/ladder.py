@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from typing import Any
 import pycolmap
 
 from recon_cli import atomic
+from recon_cli.errors import SfmError
 from recon_cli.mapping import candidates, database, doctor, mapper, pairs, retrieval, verdict
 from recon_cli.mapping.candidates import Candidate
 from recon_cli.mapping.job import VERDICT, Job
@@ -67,10 +68,10 @@ class Note:
         seconds: that it took with its matching, 0 where it was passed over.
         skipped: why it was passed over, empty where it was tried.
         registered: frames with a camera.
+        shortfall: why that is not good enough, empty where it is.
         apart: frames that only other models hold, a tuple each.
         rejected: why frames were taken out of the model, by name.
         trusted: whether the verdict trusts the model.
-        problems: that the verdict names.
         weak_link: the verdict's, None where it has none.
         reprojection_error_px: mean, None without a model.
     """
@@ -80,10 +81,10 @@ class Note:
     seconds: float = 0.0
     skipped: str = ""
     registered: tuple[str, ...] = ()
+    shortfall: str = "no model was found"
     apart: tuple[tuple[str, ...], ...] = ()
     rejected: dict[str, str] = dataclasses.field(default_factory=dict)
     trusted: bool = False
-    problems: tuple[str, ...] = ()
     weak_link: float | None = None
     reprojection_error_px: float | None = None
 
@@ -154,37 +155,39 @@ def climb(job: Job, report: Reporter, *, deadline: float) -> Result:
             ledger.finish(rung.name, dataclasses.asdict(note), _folder(job, rung.name))
         notes.append(note)
         if not note.skipped:
-            reason = shortfall(note, placeable(job))
+            reason = note.shortfall
             if not reason:
                 break
     return _keep(job, notes)
 
 
-def placeable(job: Job) -> int:
-    """Returns how many frames could get a camera: those with features and, as far as all pairs are
-    matched, with matches."""
+def reachable(job: Job, found: Candidate) -> set[str]:
+    """Returns the frames that a model could hold: those with features and, once all pairs are
+    matched, those that matches tie to it, directly or through others."""
     counts = database.keypoint_counts(job.database)
     textured = {name for name, count in counts.items() if count >= doctor.MIN_KEYPOINTS}
-    if database.progress(job.database, "matches") == len(counts) * (len(counts) - 1) // 2:
-        textured &= database.linked_images(job.database)
-    return len(textured)
+    if database.progress(job.database, "matches") < len(counts) * (len(counts) - 1) // 2:
+        return textured
+    held = set(mapper.names(found.model))
+    tied = max(found.verdict.match_parts, key=lambda part: len(held.intersection(part)))
+    return textured.intersection(tied)
 
 
-def shortfall(note: Note, frames: int) -> str:
-    """Returns why the model of a rung is not good enough, empty where it is.
+def shortfall(found: Candidate, reach: Collection[str]) -> str:
+    """Returns why a model is not good enough, empty where it is.
 
     Args:
-        note: on the rung.
-        frames: that could get a camera.
+        found: the model.
+        reach: frames that it could hold.
     """
-    if not note.registered:
-        return "no model was found"
-    if len(note.registered) < ENOUGH * frames:
-        return f"only {len(note.registered)} of {frames} frames got a camera"
-    if note.apart:
-        return f"the capture fell into {len(note.models)} models"
-    if not note.trusted:
-        return "; ".join(note.problems) or "the model cannot be trusted"
+    held = found.model.num_reg_images()
+    if held < ENOUGH * len(reach):
+        return f"only {held} of {len(reach)} frames that can be placed got a camera"
+    parts = [part for part in found.apart if set(part).intersection(reach)]
+    if parts:
+        return f"the capture fell into {1 + len(parts)} models"
+    if not found.verdict.trusted:
+        return " ".join(found.verdict.problems)
     return ""
 
 
@@ -222,9 +225,10 @@ def _tried(
         return Note(rung.name, reason, seconds)
     _write(found, folder)
     return Note(
-        rung.name, reason, seconds, "", tuple(mapper.names(found.model)), found.apart,
-        dict(found.rejected), found.verdict.trusted, tuple(found.verdict.problems),
-        found.verdict.weak_link.share, found.model.compute_mean_reprojection_error())
+        rung.name, reason, seconds, "", tuple(mapper.names(found.model)),
+        shortfall(found, reachable(job, found)), found.apart, dict(found.rejected),
+        found.verdict.trusted, found.verdict.weak_link.share,
+        found.model.compute_mean_reprojection_error())
 
 
 def _expected(job: Job, count: int, before: Sequence[Note]) -> float:
@@ -238,7 +242,10 @@ def _keep(job: Job, notes: Sequence[Note]) -> Result:
     """Publishes the best model, if it passes, and returns what the stage tells of it."""
     chosen = best(notes)
     registered = chosen.registered if chosen else ()
-    doctor.check_registered(job.names, registered, job.min_registered)
+    try:
+        doctor.check_registered(job.names, registered, job.min_registered)
+    except SfmError as error:
+        raise SfmError(f"{error.message} {_attempts(notes)}", hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
     folder = _folder(job, chosen.name)
     model = pycolmap.Reconstruction(folder / "model")
@@ -257,6 +264,13 @@ def _keep(job: Job, notes: Sequence[Note]) -> Result:
         "rungs": [note.shown(kept=note is chosen) for note in notes]}
 
 
+def _attempts(notes: Sequence[Note]) -> str:
+    """Returns a sentence on how many cameras each way found."""
+    counts = (f"{note.name} found {len(note.registered)}" if not note.skipped else
+              f"{note.name} was passed over for want of time" for note in notes)
+    return f"Cameras by way of mapping: {', '.join(counts)}."
+
+
 def _write(found: Candidate, folder: Path) -> None:
     (folder / "model").mkdir()
     found.model.write(folder / "model")
@@ -269,7 +283,7 @@ def _folder(job: Job, name: str) -> Path:
 def _read(value: Result) -> Note:
     return Note(**{
         **value, "registered": tuple(value["registered"]),
-        "apart": tuple(map(tuple, value["apart"])), "problems": tuple(value["problems"])})
+        "apart": tuple(map(tuple, value["apart"]))})
 
 
 def _no_more(_job: Job) -> set[pairs.Pair]:
@@ -279,7 +293,7 @@ def _no_more(_job: Job) -> set[pairs.Pair]:
 def _near_or_alike(job: Job) -> set[pairs.Pair]:
     """Returns the neighbours among the frames of each camera, and frames that look alike."""
     near = set().union(*(pairs.sequential(group.names) for group in job.groups))
-    return near | retrieval.similar(job.database, job.names, seed=job.seed)
+    return near | retrieval.similar(job.database, job.names, seed=job.seed, besides=near)
 
 
 _PAIRS: dict[str, Callable[[Job], set[pairs.Pair]]] = {

@@ -122,12 +122,13 @@ def _report(summary: Summary, ctx: StageContext) -> None:
 def _tried(rungs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yields a sentence for each way to a model behind the first."""
     for rung in rungs[1:]:
+        reason = rung["reason"].rstrip(".")
         if rung["skipped"]:
-            yield (f"{rung['name']} was not tried although {rung['reason']}: {rung['skipped']}, "
-                   "more than is left of --max-minutes.")
+            yield (f"{rung['name']} was not tried although {reason}: {rung['skipped']}, more than "
+                   "is left of --max-minutes.")
         else:
-            yield (f"{rung['name']} was tried, because {rung['reason']}: {rung['registered']} "
-                   f"frames got a camera{', and this model is kept' if rung['kept'] else ''}.")
+            yield (f"{rung['name']} was tried, because {reason}: {rung['registered']} frames got a "
+                   f"camera{', and this model is kept' if rung['kept'] else ''}.")
 
 
 def _left_out(summary: Summary) -> Iterator[str]:

@@ -2,15 +2,17 @@ import errno
 import io
 import json
 import math
-from dataclasses import replace
+import sqlite3
+from dataclasses import dataclass, replace
 
 import pycolmap
 import pytest
-from synthetic import center_error, make_capture
+from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
 from recon_cli.mapping import ladder, mapper
-from recon_cli.mapping.ladder import Note, best, rungs, shortfall
+from recon_cli.mapping.candidates import Candidate
+from recon_cli.mapping.ladder import Note, best, reachable, rungs, shortfall
 from recon_cli.mapping.ledger import Ledger
 from recon_cli.mapping.protocol import Reporter
 
@@ -47,19 +49,58 @@ def test_a_named_way_is_the_only_one(capture, pairs):
     assert [rung.name for rung in rungs(replace(job, pairs=pairs))] == [pairs]
 
 
-def test_a_good_model_falls_short_of_nothing():
-    assert shortfall(GOOD, 60) == ""
-    assert shortfall(replace(GOOD, registered=NAMES[:54]), 60) == ""
+@dataclass(frozen=True)
+class Opinion:
+    """As much of a verdict as is looked at."""
+
+    trusted: bool = True
+    problems: tuple[str, ...] = ()
+    match_parts: tuple[tuple[str, ...], ...] = ()
 
 
-def test_each_shortfall_is_said():
-    assert shortfall(Note("exhaustive", ""), 60) == "no model was found"
-    assert shortfall(replace(GOOD, registered=NAMES[:53]), 60) == (
-        "only 53 of 60 frames got a camera")
-    assert shortfall(replace(GOOD, apart=(NAMES[57:],)), 60) == (
+def candidate(capture, count=20, *, apart=(), opinion=None):
+    job, truth = capture
+    return Candidate(part(truth, job.names[:count]), opinion or Opinion(), apart, {})
+
+
+def test_a_good_model_falls_short_of_nothing(capture):
+    names = capture[0].names
+    assert shortfall(candidate(capture), names) == ""
+    assert shortfall(candidate(capture, 18), names) == ""
+
+
+def test_each_shortfall_is_said(capture):
+    names = capture[0].names
+    assert Note("exhaustive", "").shortfall == "no model was found"
+    assert shortfall(candidate(capture, 17), names) == (
+        "only 17 of 20 frames that can be placed got a camera")
+    assert shortfall(candidate(capture, 18, apart=(("a", "b", names[19]),)), names) == (
         "the capture fell into 2 models")
-    assert shortfall(replace(GOOD, trusted=False, problems=("The model is broken.",)), 60) == (
-        "The model is broken.")
+    broken = Opinion(trusted=False, problems=("The model is broken.",))
+    assert shortfall(candidate(capture, opinion=broken), names) == "The model is broken."
+
+
+def test_a_part_that_no_match_ties_to_the_model_is_no_shortfall(capture):
+    names = capture[0].names
+    assert shortfall(candidate(capture, 17, apart=(names[17:],)), names[:17]) == ""
+
+
+def test_frames_that_cannot_be_placed_are_not_waited_for(capture):
+    job, _ = capture
+    opinion = Opinion(match_parts=(job.names[12:], job.names[:12]))
+    assert reachable(job, candidate(capture, 10, opinion=opinion)) == set(job.names[:12])
+    with sqlite3.connect(job.database) as connection:  # the bare frame has no matches either
+        connection.execute("UPDATE keypoints SET rows = 5 WHERE image_id = 1")
+    connection.close()
+    assert reachable(job, candidate(capture, 10, opinion=opinion)) == set(job.names[1:12])
+
+
+def test_before_all_pairs_are_matched_every_frame_with_features_counts(capture):
+    job, _ = capture
+    with pycolmap.Database.open(job.database) as opened:
+        opened.delete_two_view_geometry(1, 2)
+    opinion = Opinion(match_parts=(job.names[12:], job.names[:12]))
+    assert reachable(job, candidate(capture, 10, opinion=opinion)) == set(job.names)
 
 
 def test_more_frames_that_hang_together_are_the_better_model():
@@ -118,8 +159,9 @@ def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "incremental", nothing)
     monkeypatch.setattr(mapper, "globally", nothing)
-    with pytest.raises(SfmError, match="Only 0 of 20 frames have a camera"):
+    with pytest.raises(SfmError, match="Only 0 of 20 frames have a camera") as caught:
         climb(job)
+    assert "exhaustive found 0, relaxed found 0, global found 0" in caught.value.message
     assert not (job.out / "sparse").exists()
 
 
@@ -167,12 +209,3 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
 
 def interrupt(*_, **__):
     raise KeyboardInterrupt
-
-
-def test_frames_without_matches_are_not_waited_for(tmp_path):
-    job, _ = make_capture(tmp_path)
-    assert ladder.placeable(job) == 20
-    with pycolmap.Database.open(job.database) as opened:
-        for other in range(2, 21):
-            opened.delete_inlier_matches(1, other)
-    assert ladder.placeable(job) == 19

@@ -2,6 +2,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from recon_cli.mapping.pairs import exhaustive
 from recon_cli.mapping.retrieval import similar
 
 GROUPS, EACH = 4, 5
@@ -38,6 +39,17 @@ def test_images_of_one_place_are_paired(database):
     assert found == {
         (one, two) for one in NAMES for two in NAMES
         if one < two and int(one[:2]) % GROUPS == int(two[:2]) % GROUPS}
+
+
+def test_pairs_that_are_known_make_room_for_others(database):
+    known = {("00.png", "04.png"), ("00.png", "08.png")}
+    found = similar(database, NAMES, seed=0, nearest=2, besides=known)
+    assert not found & known
+    assert {("00.png", "12.png"), ("00.png", "16.png")} <= found
+
+
+def test_where_all_pairs_are_known_nothing_is_left(database):
+    assert similar(database, NAMES, seed=0, besides=exhaustive(NAMES)) == set()
 
 
 def test_the_same_pairs_come_out_every_time(database):

@@ -28,8 +28,8 @@ def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
     assert summary["unregistered"] == sorted(living)
     assert summary["apart"] == [sorted(living)]
     assert summary["models"] == [10, 6]
-    assert [rung["name"] for rung in summary["rungs"]] == ["exhaustive", "relaxed", "global"]
-    assert sum(rung["kept"] for rung in summary["rungs"]) == 1
+    # No match ties the two together, so that no further way is worth trying.
+    assert [rung["name"] for rung in summary["rungs"]] == ["exhaustive"]
     assert "The capture fell apart: the largest model, of 10 frames, is kept" in caplog.text
     assert "living000000.png" in caplog.text
 
