@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from recon_cli.scene.lens import Lens
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
+RUNGS = "rungs"  # in the stage's folder: what is needed only until there is a model
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 
 @dataclass(frozen=True)
@@ -89,6 +90,11 @@ class Job:
     def database(self) -> Path:
         """COLMAP's database of features and matches."""
         return self.out / "database.db"
+
+    @property
+    def rungs(self) -> Path:
+        """Where models are gathered until one of them is kept."""
+        return self.out / RUNGS
 
     @property
     def undistorting(self) -> Path:

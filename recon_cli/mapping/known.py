@@ -6,6 +6,7 @@ the matches.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -85,6 +86,7 @@ def build(job: Job, report: Reporter) -> Result:
     folder = fresh_folder(job.out / "sparse.partial")
     model.write(folder)
     publish(folder, job.out / "sparse")
+    shutil.rmtree(job.rungs, ignore_errors=True)
     return {
         **mapper.described(model), "models": [model.num_reg_images()], "apart": [], "rejected": {},
         "rungs": [], "verdict": found.to_json() if found else None,

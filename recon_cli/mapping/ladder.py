@@ -32,7 +32,6 @@ from recon_cli.mapping.protocol import Reporter
 # Exhaustive matching grows with the square: 4950 pairs of 100 images are about a minute on two
 # cores at 600x340 and still the whole graph, so that a walk around a room closes.
 EXHAUSTIVE_MAX = 100
-RUNGS = "rungs"
 # Share of the frames that can be placed at all which a model must hold to end the search. The
 # captures that mapped well held 97 to 100% of them, one that fell apart 82%.
 ENOUGH = 0.9
@@ -145,7 +144,7 @@ def climb(job: Job, report: Reporter, *, deadline: float) -> Result:
         SfmError: too few frames have a camera, they see the points from one place, or the verdict
             is that the model hangs together by too little.
     """
-    ledger = Ledger(job.out / RUNGS)
+    ledger = Ledger(job.rungs)
     notes: list[Note] = []
     reason = rungs(job)[0].reason
     for rung in rungs(job):
@@ -256,7 +255,7 @@ def _keep(job: Job, notes: Sequence[Note]) -> Result:
     verdict.check_weak_link(found, job.accept_weak)
     atomic.write_json(job.out / VERDICT, found.to_json())
     publish(folder / "model", job.out / "sparse")
-    shutil.rmtree(job.out / RUNGS)
+    shutil.rmtree(job.rungs)
     return {
         **described, "poses": None,
         "models": chosen.models, "apart": [list(part) for part in chosen.apart],
@@ -277,7 +276,7 @@ def _write(found: Candidate, folder: Path) -> None:
 
 
 def _folder(job: Job, name: str) -> Path:
-    return job.out / RUNGS / name
+    return job.rungs / name
 
 
 def _read(value: Result) -> Note:

@@ -24,7 +24,8 @@ GLOBAL_RATIO = 1.2
 # Images of a camera from which its principal point is free in the last adjustment: COLMAP calls
 # a model of fewer small (min_model_size), and a few images cannot tell it from a turn.
 MIN_IMAGES_PRINCIPAL = 10
-WORK = "models.partial"  # where COLMAP writes models that are read from memory
+# Where COLMAP writes models that are read from memory, and finds one that it shall go on with.
+FOUND, BEGUN = "found.partial", "begun.partial"
 
 
 def incremental(job: Job, report: Reporter, *, relaxed: bool = False
@@ -42,22 +43,21 @@ def incremental(job: Job, report: Reporter, *, relaxed: bool = False
     images = itertools.count(3)  # the first call comes with the third image of a model
     report.phase("mapping", len(job.names))
     models = pycolmap.incremental_mapping(
-        job.database, job.frames, fresh_folder(job.out / WORK), options,
+        job.database, job.frames, fresh_folder(job.rungs / FOUND), options,
         next_image_callback=lambda: report.done(min(next(images), len(job.names))))
-    shutil.rmtree(job.out / WORK)
+    shutil.rmtree(job.rungs / FOUND)
     return list(models.values())
 
 
 def extended(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Returns a model with the images that the mapper can add to it, adjusted as a whole."""
-    given, options = fresh_folder(job.out / WORK), _options(job)
-    model.write(given)
+    begun, options = fresh_folder(job.rungs / BEGUN), _options(job)
+    model.write(begun)
     options.multiple_models = False
     found = pycolmap.incremental_mapping(
-        job.database, job.frames, fresh_folder(job.out / f"{WORK}.more"), options,
-        input_path=given)
-    shutil.rmtree(given)
-    shutil.rmtree(job.out / f"{WORK}.more")
+        job.database, job.frames, fresh_folder(job.rungs / FOUND), options, input_path=begun)
+    shutil.rmtree(begun)
+    shutil.rmtree(job.rungs / FOUND)
     return max(found.values(), key=_size, default=model)
 
 
@@ -68,7 +68,8 @@ def globally(job: Job, report: Reporter) -> list[pycolmap.Reconstruction]:
     is done in a copy of the database: it changes the cameras and what a pair is taken for.
     """
     report.phase("mapping", len(job.names))
-    copy = job.out / "global.db"
+    copy = job.rungs / "global.db"
+    job.rungs.mkdir(exist_ok=True)
     database.remove(copy)
     shutil.copyfile(job.database, copy)
     if any(group.lens is None and group.focal_px is None for group in job.groups):
@@ -76,8 +77,8 @@ def globally(job: Job, report: Reporter) -> list[pycolmap.Reconstruction]:
         calibration.random_seed = job.seed
         pycolmap.calibrate_view_graph(copy, calibration)
     models = pycolmap.global_mapping(
-        copy, job.frames, fresh_folder(job.out / WORK), _global_options(job))
-    shutil.rmtree(job.out / WORK)
+        copy, job.frames, fresh_folder(job.rungs / FOUND), _global_options(job))
+    shutil.rmtree(job.rungs / FOUND)
     database.remove(copy)
     return list(models.values())
 
@@ -109,9 +110,9 @@ def triangulated(
 ) -> pycolmap.Reconstruction:
     """Returns a model of the same poses with the points that the matches give."""
     found = pycolmap.triangulate_points(
-        model, job.database, job.frames, fresh_folder(job.out / WORK), True, _options(job),
+        model, job.database, job.frames, fresh_folder(job.rungs / FOUND), True, _options(job),
         refine_intrinsics)
-    shutil.rmtree(job.out / WORK)
+    shutil.rmtree(job.rungs / FOUND)
     return found
 
 

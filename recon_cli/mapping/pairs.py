@@ -46,7 +46,8 @@ def match(job: Job, pairs: Iterable[Pair], report: Reporter) -> None:
     """Matches and verifies image pairs in the database; those that are there are not done again."""
     wanted, there = set(pairs), database.pair_names(job.database)
     report.phase("matches", len(wanted | there), done=len(there))
-    listed = job.out / "pairs.txt"
+    listed = job.rungs / "pairs.txt"
+    job.rungs.mkdir(exist_ok=True)
     listed.write_text("".join(
         f"{one} {two}\n" for one, two in sorted(wanted - there)), encoding="utf-8")
     options = pycolmap.ImportedPairingOptions()

@@ -47,7 +47,7 @@ def work(job: Job, report: Reporter) -> None:
             continue
         ledger.forget_from(step)
         if step in ("features", "matches"):  # the models of finished rungs build on these
-            shutil.rmtree(job.out / ladder.RUNGS, ignore_errors=True)
+            shutil.rmtree(job.rungs, ignore_errors=True)
         start = time.monotonic()
         result = actions[step]()
         result["seconds"] = round(time.monotonic() - start, 2)

@@ -134,7 +134,7 @@ def test_a_good_capture_stops_at_the_first_rung(capture):
     assert rung["kept"]
     assert result["registered"] == list(job.names)
     assert result["models"] == [20]
-    assert not (job.out / ladder.RUNGS).exists()
+    assert not job.rungs.exists()
     assert center_error(pycolmap.Reconstruction(job.out / "sparse"), truth) < 1e-3
     assert json.loads((job.out / "verdict.json").read_text()) == json.loads(
         json.dumps(result["verdict"]))
@@ -179,7 +179,7 @@ def test_an_interrupted_climb_goes_on_behind_the_last_finished_rung(capture, mon
     monkeypatch.setattr(mapper, "globally", interrupt)
     with pytest.raises(KeyboardInterrupt):
         climb(job)
-    assert Ledger(job.out / ladder.RUNGS).result("relaxed") is not None
+    assert Ledger(job.rungs).result("relaxed") is not None
     monkeypatch.undo()
     monkeypatch.setattr(mapper, "incremental", interrupt)
     result = climb(job)
