@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from recon_cli import __version__, cleaning, console, doctor, options, pipeline, report
+from recon_cli import __version__, cleaning, comparing, console, doctor, options, pipeline, report
 from recon_cli import settings as layers
 from recon_cli.bench.command import bench
 from recon_cli.config import (
@@ -163,10 +163,16 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 
 
 @cli.command()
+@options.compare()
 @options.stage(DenoiseConfig)
 @pass_call
-def denoise(call: Call) -> None:
+def denoise(call: Call, compare: bool) -> None:
     """Filter noisy frames and pass the others through."""
+    if compare:
+        config = layers.build(DenoiseConfig, layers.merged([_explicit(call), call.settings]))
+        job = Job(Workspace(call.workspace), _explicit(call), progress=TqdmProgress(), table=STAGES)
+        click.echo(comparing.compare_filters(job, config))
+        return
     _perform(call, "denoise", ["denoise"])
 
 

@@ -34,8 +34,14 @@ class Source:
     files: Mapping[str, FileDigest]
 
     def contents(self) -> list[str]:
-        """Returns the digests alone, in order: names and times are no part of a fingerprint."""
-        return [file.sha256 for file in self.files.values()]
+        """Returns the digests, in order, and what the files below a folder are called there.
+
+        Within a folder names tell masks from photos and give the frames theirs. The name of the
+        folder, or of a single file, and times are no part of a fingerprint.
+        """
+        if len(self.files) == 1:
+            return [file.sha256 for file in self.files.values()]
+        return [f"{name} {file.sha256}" for name, file in self.files.items()]
 
 
 def sha256_json(value: Any) -> str:

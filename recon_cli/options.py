@@ -100,6 +100,14 @@ def print_config() -> Decorator:
         help="Print the options that would be used as TOML, and stop.  [default: off]")
 
 
+def compare() -> Decorator:
+    """Returns a decorator that adds --compare."""
+    return click.option(
+        "--compare", is_flag=True,
+        help="Print what each filter would gain and lose on this capture, write compare.json into "
+             "the workspace, and stop.  [default: off]")
+
+
 def assignments() -> Decorator:
     """Returns a decorator that adds --set, for the verbs that run many stages."""
     def keep(ctx: click.Context, _parameter: click.Parameter, values: tuple[str, ...]) -> None:

@@ -44,14 +44,15 @@ ALLOWED: dict[str, set[str]] = {
         "settings", "stages", "freshness", "machine", "progress", "render"},
     "pipeline": OPTIONS | RECORDS | {"settings", "stages", "freshness", "execute"},
     "cleaning": RECORDS | {"errors", "execute"},
+    "comparing": OPTIONS | BOTTOM | {"capture", "execute", "pipeline", "workspace"},
     "doctor": {"errors", "machine", "render"},
     "report": {"doctor", "pipeline"},
     "options": OPTIONS | {"settings"},
     "bench": BOTTOM | OPTIONS | {
         "settings", "options", "machine", "progress", "scene", "render", "train"},
     "cli": OPTIONS | {
-        "settings", "options", "pipeline", "cleaning", "report", "doctor", "console", "progress",
-        "stages", "workspace", "bench"},
+        "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
+        "progress", "stages", "workspace", "bench"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import

@@ -10,19 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli import atomic
+from recon_cli.capture import candidates
 from recon_cli.capture import frames as store
 from recon_cli.capture.choose import (
+    NO_MOTION,
+    Judgement,
     automatic_count,
-    bridged,
+    check_motion,
     choose_frames,
-    sharp_frames,
+    judged,
     travelled,
 )
+from recon_cli.capture.contact import ContactSheet
+from recon_cli.capture.exposure import check_exposure
 from recon_cli.capture.frames import Frame, Group
 from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import MIN_FRAMES
 from recon_cli.capture.scan import Scan, decode_threads, scan_video
-from recon_cli.capture.taken import Context, Taken
+from recon_cli.capture.taken import Choice, Context, Taken
 from recon_cli.capture.video import claimed_length, frames_at
 from recon_cli.config import IngestConfig
 from recon_cli.errors import InputError
@@ -40,20 +45,21 @@ class Look:
         path: the video.
         scan: of its F frames.
         way: [F] float64 way travelled up to each frame, in widths.
-        usable: [F] bool; whole, and sharp or needed to bridge a gap.
+        judgement: which frames may be taken, and why the others may not.
     """
 
     path: Path
     scan: Scan
     way: NDArray[np.float64]
-    usable: NDArray[np.bool_]
+    judgement: Judgement
 
 
 def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> Look:
     """Returns what a pass over all frames of a video finds; `scan_file` keeps it for a next try.
 
     Raises:
-        InputError: the file is no video, or gives too few whole frames.
+        InputError: the file is no video, gives too few whole frames, shows nothing, or was taken
+            by a camera that does not move.
     """
     if scan_file.exists():
         scan = Scan.from_json(atomic.read_json(scan_file))
@@ -65,9 +71,13 @@ def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> 
     for notice in scan.notices:
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
+    check_exposure(path.name, scan.exposure[scan.whole], least=MIN_FRAMES)
+    warning = check_motion(path.name, scan.motion)
+    if warning:
+        ctx.notice(warning)
     way = travelled(scan.motion)
-    sharp = sharp_frames(scan.sharpness, config.sharpness)
-    return Look(path, scan, way, bridged(way, scan.sharpness, sharp, scan.whole))
+    return Look(path, scan, way, judged(
+        way, scan.sharpness, scan.exposure, scan.whole, config.sharpness))
 
 
 def shares(config: IngestConfig, looks: Sequence[Look]) -> list[int]:
@@ -102,11 +112,16 @@ def take(
         InputError: too few frames are sharp, or the file has changed.
     """
     path, scan = look.path, look.scan
-    chosen = choose_frames(look.way, scan.sharpness, look.usable, count)
+    judgement = look.judgement
+    chosen = choose_frames(
+        look.way, scan.sharpness, judgement.usable, count, bridges=judgement.bridges)
     _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
-    _write(look, names, config.max_size, out, ctx)
+    record = candidates.of_video(
+        path.name, scan.sharpness, judgement.refused, look.way, names, same=NO_MOTION)
+    sheet = ContactSheet(path.name, record, scan.width, scan.height)
+    _write(look, names, sheet, config.max_size, out, ctx)
     frames = tuple(
         Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False)
         for index, name in names.items())
@@ -114,7 +129,8 @@ def take(
     return Taken(
         "video", (Group(path.name, width, height),), frames,
         declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
-        blurred=int((scan.whole & ~look.usable).sum()))
+        blurred=int((scan.whole & ~judgement.usable).sum()),
+        choice=Choice(record, sheet, prefix))
 
 
 def _report_lost(path: Path, scan: Scan, ctx: Context) -> None:
@@ -159,13 +175,19 @@ def report_reduced(width: int, height: int, max_size: int, ctx: Context) -> None
             "--max-size changes that.")
 
 
-def _write(look: Look, names: dict[int, str], max_size: int, out: Path, ctx: Context) -> None:
+def _write(
+    look: Look, names: dict[int, str], sheet: ContactSheet, max_size: int, out: Path, ctx: Context
+) -> None:
+    """Writes the frames that are not there yet, and gives the sheet the pixels that it shows."""
     folder = out / store.FOLDER
-    missing = [index for index, name in names.items() if not (folder / name).exists()]
+    missing = {index for index, name in names.items() if not (folder / name).exists()}
     done, record = len(names) - len(missing), paced(ctx.record)
     threads = decode_threads(look.scan, ctx.threads)
     with ctx.progress.bar("frames", len(names), unit="frame", done=done) as bar:
-        for index, rgb in frames_at(look.path, missing, threads=threads):
+        for index, rgb in frames_at(look.path, missing | sheet.wanted, threads=threads):
+            sheet.add(index, rgb)
+            if index not in missing:
+                continue
             store.write_png(folder / names[index], store.fitted(rgb, max_size))
             done += 1
             bar.advance()

@@ -11,12 +11,16 @@ import warnings
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import pillow_heif
 import rawpy
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image
 
+from recon_cli.capture.exif import Lens, read_lens
 from recon_cli.errors import InputError
 
 RAW_SUFFIXES = frozenset({
@@ -25,20 +29,29 @@ RAW_SUFFIXES = frozenset({
     ".srf", ".srw", ".x3f",
 })
 # What cameras and converters write. Pillow also opens documents (EPS by way of Ghostscript).
-FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "JPEG2000", "PPM")
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM")
 # A file so named that cannot be read is a broken photo; any other that cannot is no photo.
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
     ".ppm", ".tif", ".tiff", ".webp",
 }
-# What Pillow raises on damaged files, by format; OSError includes what it cannot identify.
+# What Pillow raises on damaged files, by format; OSError includes what it cannot identify, and
+# pillow_heif raises RuntimeError for what libheif refuses.
 BROKEN = (
     OSError, SyntaxError, ValueError, EOFError, IndexError, OverflowError, struct.error,
-    Image.DecompressionBombError,
+    RuntimeError, Image.DecompressionBombError,
 )
-QUARTER_TURNS = frozenset({5, 6, 7, 8})  # EXIF orientations that swap width and height
+# What undoes each orientation of EXIF 2.32, section 4.6.4; 1 is upright.
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_90,
+}
+QUARTER_TURNS = frozenset({5, 6, 7, 8})  # those of them that swap width and height
 RAW_QUARTER_TURNS = frozenset({5, 6})  # LibRaw: flip
-FILM_DIAGONAL = 43.267  # mm; CIPA DCG-001 defines the 35 mm equivalent by the diagonal
+# TIFF 6.0: ImageWidth, ImageLength, BitsPerSample, and PlanarConfiguration with its value for
+# planes of their own.
+WIDTH, LENGTH, BITS, PLANAR, APART = 256, 257, 258, 284, 2
 
 
 @dataclass(frozen=True)
@@ -49,119 +62,228 @@ class Photo:
         path: its file.
         width: width in pixels once upright.
         height: height in pixels once upright.
-        focal_px: focal length in pixels by EXIF's 35 mm equivalent, None where it is not given.
+        focal_px: focal length in pixels by EXIF, None where it does not follow.
+        camera: maker and model by EXIF, empty where not given.
+        focal_mm: focal length in mm by EXIF, None where not given.
     """
 
     path: Path
     width: int
     height: int
     focal_px: float | None
+    camera: str = ""
+    focal_mm: float | None = None
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether it holds sensor values, which `raw.develop` turns into colours."""
+        return self.path.suffix.lower() in RAW_SUFFIXES
 
 
 def inspect_photo(path: Path) -> Photo:
-    """Returns a photo's size and focal length from its header.
+    """Returns a photo's size, camera and focal length from its header.
 
     Raises:
-        InputError: the header cannot be read.
+        InputError: the header cannot be read, or promises more pixels than memory is spent on.
     """
     if path.suffix.lower() in RAW_SUFFIXES:
         return _inspect_raw(path)
     try:
-        with _opened(path) as image:
-            exif = image.getexif()
-            width, height = image.size
+        with opened(path) as image:
+            exif, (width, height) = image.getexif(), _stored_size(image)
+            lens = read_lens(exif, width, height)
             if exif.get(ExifTags.Base.Orientation) in QUARTER_TURNS:
                 width, height = height, width
-            equivalent = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
     except BROKEN as error:
-        raise _refused(path, error) from error
-    focal = float(np.hypot(width, height)) * equivalent / FILM_DIAGONAL if equivalent else None
-    return Photo(path, width, height, focal)
+        raise refused(path, error) from error
+    return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm)
 
 
 def read_photo(photo: Photo) -> NDArray[np.uint8]:
-    """Returns a photo's pixels, upright RGB, [H, W, 3].
+    """Returns a photo's pixels, upright RGB, [H, W, 3]; not of RAW, which `raw.develop` reads.
 
     Raises:
         InputError: the file is truncated, damaged, or holds pixels that are no colours.
     """
-    rgb = _pixels(photo.path)
-    height, width = rgb.shape[:2]
-    if (width, height) != (photo.width, photo.height):
-        raise InputError(
-            f"{photo.path.name} holds {width}x{height} pixels, but its header says "
-            f"{photo.width}x{photo.height}.")
+    if photo.is_raw:
+        raise ValueError(f"{photo.path.name} is to be developed")
+    rgb = read_rgb(photo.path)
+    check_size(photo, rgb)
     return rgb
 
 
-def _pixels(path: Path) -> NDArray[np.uint8]:
-    if path.suffix.lower() in RAW_SUFFIXES:
-        return _read_raw(path)
-    try:
-        with _opened(path) as image:
-            image.verify()  # checksums, which loading passes over; uses the image up
-        with _opened(path) as image:
-            return _as_rgb(ImageOps.exif_transpose(image))
-    except BROKEN as error:
-        raise _refused(path, error) from error
+def read_alpha(photo: Photo) -> NDArray[np.uint8] | None:
+    """Returns a photo's opacity, upright, [H, W], 255 for opaque; None where it holds none.
+
+    Raises:
+        InputError: see `read_photo`.
+    """
+    if photo.is_raw or not _has_alpha(photo.path):
+        return None
+    image = _decoded(photo.path, upright=True)
+    alpha = np.array(image.convert("RGBA").getchannel("A"))
+    check_size(photo, alpha)
+    return alpha
 
 
-@cache
-def _formats() -> tuple[str, ...]:
-    """Returns those of `FORMATS` that this Pillow knows; AVIF came late."""
-    Image.init()
-    return tuple(name for name in FORMATS if name in Image.OPEN)
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """Returns any picture's pixels, upright, as RGB, [H, W, 3]; what is transparent shows black.
+
+    Raises:
+        InputError: the file is truncated, damaged, or holds pixels that are no colours.
+    """
+    return _before_black(_decoded(path, upright=True))
 
 
-def _opened(path: Path) -> Image.Image:
-    with warnings.catch_warnings():
-        # Pillow warns from 89 megapixels, which phones reach, and refuses from twice that.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(path, formats=_formats())
+def read_as_stored(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Returns a picture's RGB, [H, W, 3], and opacity, [H, W] or None, not turned as EXIF says.
+
+    Poses that others found belong to the pixels as they lie in the file.
+
+    Raises:
+        InputError: see `read_rgb`.
+    """
+    image = _decoded(path, upright=False)
+    alpha = None
+    if image.has_transparency_data:
+        alpha = np.array(image.convert("RGBA").getchannel("A"))
+    return _before_black(image), alpha
 
 
-def _as_rgb(image: Image.Image) -> NDArray[np.uint8]:
-    """Returns any mode as RGB; what is transparent shows black, as behind a splat."""
-    if image.mode.startswith("I"):
-        wide = np.asarray(image).astype(np.float64)  # 16 bits, whatever the mode could hold
-        gray = np.clip(np.round(wide * (255 / 65535)), 0, 255).astype(np.uint8)
-        return np.repeat(gray[:, :, None], 3, axis=2)
-    if image.mode == "F":
-        raise ValueError("its pixels are floating point, of unknown range")
+def _before_black(image: Image.Image) -> NDArray[np.uint8]:
+    """Returns RGB, [H, W, 3]; what is transparent shows black, as behind a splat."""
     if image.has_transparency_data:
         black = Image.new("RGBA", image.size, (0, 0, 0, 255))
         image = Image.alpha_composite(black, image.convert("RGBA"))
     return np.array(image.convert("RGB"))
 
 
-def _inspect_raw(path: Path) -> Photo:
-    try:
-        with rawpy.imread(str(path)) as raw:
-            sizes = raw.sizes
-    except rawpy.LibRawError as error:
-        raise _refused(path, error) from error
-    width, height = sizes.iwidth, sizes.iheight
-    if sizes.flip in RAW_QUARTER_TURNS:
-        width, height = height, width
-    return Photo(path, width, height, None)
+def check_size(photo: Photo, pixels: NDArray[np.uint8]) -> None:
+    """Raises InputError when pixels [H, W, ...] are not as many as a photo's header says."""
+    height, width = pixels.shape[:2]
+    if (width, height) != (photo.width, photo.height):
+        raise InputError(
+            f"{photo.path.name} holds {width}x{height} pixels, but its header says "
+            f"{photo.width}x{photo.height}.")
 
 
-def _read_raw(path: Path) -> NDArray[np.uint8]:
-    """Returns a developed RAW; brightness stays as exposed, so that photos match each other."""
-    try:
-        with rawpy.imread(str(path)) as raw:
-            rgb = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8)
-    except rawpy.LibRawError as error:
-        raise _refused(path, error) from error
-    if not rgb.any():  # how LibRaw answers a compression that it does not know
-        raise InputError(f"{path.name} holds only black pixels.")
-    return np.asarray(rgb, np.uint8)
+def opened(path: Path) -> Image.Image:
+    """Returns a picture of which Pillow has read the header."""
+    with warnings.catch_warnings():
+        # Pillow warns from 89 megapixels, which phones reach, and refuses from twice that.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(path, formats=_formats())
 
 
-def _refused(path: Path, error: Exception) -> InputError:
+def refused(path: Path, error: Exception) -> InputError:
+    """Returns what to raise for a picture that a library does not read."""
     reason = error.args[0] if error.args else type(error).__name__
     if isinstance(error, OSError) and error.strerror:
         reason = error.strerror
     if isinstance(reason, bytes):
         reason = reason.decode(errors="replace")
     return InputError(f"{path.name} cannot be read: {reason}.")
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """Returns those of `FORMATS` that this Pillow knows, AVIF came late, with HEIF made known."""
+    Image.init()
+    pillow_heif.register_heif_opener()
+    return tuple(name for name in FORMATS if name in Image.OPEN)
+
+
+def _has_alpha(path: Path) -> bool:
+    """Returns whether a picture holds opacity, from its header: most do not, and decoding costs."""
+    try:
+        with opened(path) as image:
+            return image.has_transparency_data
+    except BROKEN as error:
+        raise refused(path, error) from error
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    """Returns width and height before turning; of a TIFF, Pillow tells those after it."""
+    tags = getattr(image, "tag_v2", {})
+    return tags.get(WIDTH, image.width), tags.get(LENGTH, image.height)
+
+
+def _decoded(path: Path, *, upright: bool) -> Image.Image:
+    """Returns a picture of 8 bits a channel, in whatever mode, if `upright` turned as EXIF says.
+
+    HEIC is turned by the box irot, which libheif has done; its EXIF then says no more (HEIF,
+    ISO 23008-12, holds EXIF's orientation to be without effect).
+    """
+    try:
+        with opened(path) as image:
+            image.verify()  # checksums, which loading passes over; uses the image up
+        with opened(path) as image:
+            eight = _eight_bits(path, image)  # first: reading the EXIF of a PNG uses up its tiles
+            turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
+            return eight.transpose(turn) if upright and turn is not None else eight
+    except BROKEN as error:
+        raise refused(path, error) from error
+
+
+def _eight_bits(path: Path, image: Image.Image) -> Image.Image:
+    if image.mode == "F":
+        raise ValueError("its pixels are floating point, of unknown range")
+    if image.mode.startswith("I"):
+        return Image.fromarray(_reduced(np.asarray(image)))
+    if _is_wide(image):
+        return _decoded_wide(path, image)
+    image.load()
+    return image
+
+
+def _is_wide(image: Image.Image) -> bool:
+    """Returns whether colours have 16 bits, of which Pillow would cut the lower half off."""
+    if max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
+        return True
+    return any(";16" in str(tile.args) for tile in getattr(image, "tile", ()))
+
+
+def _decoded_wide(path: Path, image: Image.Image) -> Image.Image:
+    if getattr(image, "tag_v2", {}).get(PLANAR) == APART:  # read wrongly by Pillow and OpenCV
+        raise ValueError("its colours have 16 bits and lie in planes of their own")
+    wide = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if wide is None or wide.dtype != np.uint16 or wide.ndim != 3:
+        raise ValueError(f"its pixels of {image.mode} with 16 bits cannot be decoded")
+    if image.format == "TIFF":  # OpenCV has turned it, whatever the flags
+        image.getexif()[ExifTags.Base.Orientation] = 1
+    order = cv2.COLOR_BGR2RGB if wide.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
+    return Image.fromarray(_reduced(cv2.cvtColor(wide, order)))
+
+
+def _reduced(wide: NDArray[Any]) -> NDArray[np.uint8]:
+    """Returns 16-bit values in 8 bits: 65535 is 257 times 255."""
+    if wide.size and (wide.min() < 0 or wide.max() > 65535):  # a mode of 32 bits
+        raise ValueError(f"its pixels reach from {wide.min()} to {wide.max()}, not to 65535")
+    return ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def _inspect_raw(path: Path) -> Photo:
+    try:
+        with rawpy.imread(str(path)) as raw:
+            sizes, focal = raw.sizes, raw.other.focal_length
+    except rawpy.LibRawError as error:
+        raise refused(path, error) from error
+    width, height = sizes.iwidth, sizes.iheight
+    lens = _raw_lens(path, width, height)
+    if sizes.flip in RAW_QUARTER_TURNS:
+        width, height = height, width
+    return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm or focal or None)
+
+
+def _raw_lens(path: Path, width: int, height: int) -> Lens:
+    """Returns what a RAW file says that is built like a TIFF, as most are; else nothing.
+
+    LibRaw's binding tells neither the 35 mm equivalent nor the camera.
+    """
+    exif = Image.Exif()
+    try:
+        with path.open("rb") as file:
+            exif.load_from_fp(file)
+            return read_lens(exif, width, height)
+    except BROKEN:
+        return Lens()

@@ -1,15 +1,18 @@
-"""How noisy a frame is, and the edge-preserving filter that removes that much.
+"""How noisy a frame is.
 
 The estimate looks at the flat parts of a frame alone. Taken over whole frames, the same estimator
 reads up to 4/255 off clean frames of a richly textured room, as much as off truly noisy ones;
 over the flat parts it reads at most 2.5/255 there, and 4.6 to 5.5 where noise of 5 was added.
+
+A threshold of 3 leaves noise alone that a video codec has already smoothed: decoded frames of two
+noisy room videos read .8 to 2.4, and no filter at any strength brings them more than .2 dB closer
+to their clean originals (tests/bench/bench_denoise.py --decoded).
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from skimage.restoration import estimate_sigma
@@ -20,9 +23,6 @@ GRID, SMALLEST_TILE = 8, 16
 FLAT_PERCENTILE = 10
 # Tiles with more pixels than this at 0 or 255 are left out: clipping cuts the noise in half.
 CLIPPED_SHARE = 0.02
-# Measured on four rendered frames and a photo of 430x770, noise of 15 added (24.8 dB): 7 pixels
-# and 2.0 gain 7.3 dB at four times the noise, 5 pixels 6.8 dB, 9 pixels 7.4 dB for twice the time.
-DIAMETER, SIGMA_SPACE = 7, 2.0
 
 
 def estimate_noise(
@@ -44,18 +44,6 @@ def estimate_noise(
             clipped.append(np.mean((tile == 0) | (tile == 255)) > CLIPPED_SHARE)
     telling = np.array(sigmas)[~np.array(clipped)] if not all(clipped) else np.array(sigmas)
     return float(np.percentile(telling, FLAT_PERCENTILE)) * 255
-
-
-def denoised(
-    rgb: NDArray[np.uint8],  # [H, W, 3]
-    range_sigma: float,  # 1/255
-) -> NDArray[np.uint8]:  # [H, W, 3]
-    """Returns a frame after a bilateral filter (Tomasi and Manduchi 1998).
-
-    OpenCV compares colours by the sum of the three channels' differences, which for pure noise is
-    3.4 times its sigma; a range of about four times the noise is therefore no wide one.
-    """
-    return np.asarray(cv2.bilateralFilter(rgb, DIAMETER, range_sigma, SIGMA_SPACE), np.uint8)
 
 
 def _edges(length: int) -> NDArray[np.int64]:

@@ -1,9 +1,8 @@
-"""A folder of photos: which files are photos, whether they fit together, and their frame names."""
+"""A folder of photos: which files are photos, whether they suffice, and their frame names."""
 
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,7 @@ from recon_cli.errors import InputError
 
 MIN_FRAMES = 3  # two views leave nothing to check a reconstruction with
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
-# Focal lengths that agree this well are one setting of the lens; EXIF rounds to whole mm.
-SAME_FOCAL = 0.01
+NO_PHOTOS = frozenset({"masks"})  # subfolders that hold pictures, but none of the scene
 
 
 @dataclass(frozen=True)
@@ -44,6 +42,43 @@ def list_photos(folder: Path) -> Folder:
     return Folder(tuple(photos), broken)
 
 
+def photo_folder(folder: Path) -> Path:
+    """Returns where the photos of a folder lie: in itself, in images/, or in its one subfolder.
+
+    Raises:
+        InputError: it holds none, but several of its subfolders do.
+    """
+    if _holds_photos(folder):
+        return folder
+    inner = [
+        path for path in sorted(folder.iterdir())
+        if path.is_dir() and path.name[0] != "." and path.name.lower() not in NO_PHOTOS
+        and _holds_photos(path)]
+    images = [path for path in inner if path.name == "images"]
+    if len(inner) > 1 and not images:
+        raise InputError(
+            f"{folder} holds no photos itself, but {len(inner)} of its folders do: "
+            f"{', '.join(path.name for path in inner)}.",
+            hint=f"Give one of them, such as {inner[0]}.")
+    return (images or inner or [folder])[0]
+
+
+def _holds_photos(folder: Path) -> bool:
+    """Returns whether a folder holds photos, be they broken."""
+    files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
+    if any(path.suffix.lower() in PHOTO_SUFFIXES for path in files):
+        return True
+    return any(_is_photo(path) for path in files)
+
+
+def _is_photo(path: Path) -> bool:
+    try:
+        inspect_photo(path)
+    except InputError:
+        return False
+    return True
+
+
 def _counting(stem: str) -> list[tuple[int, str]]:
     """Returns a sort key by which 2 comes before 10."""
     parts = re.split(r"(\d+)", stem)
@@ -59,38 +94,23 @@ def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
         f"{folder}: {readable} photos, {len(broken)} more that cannot be read, but at least "
         f"{MIN_FRAMES} are needed. {first}".rstrip(),
         hint="Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, "
-        "camera RAW; HEIC has to be converted first).")
-
-
-def check_sizes(photos: Sequence[Photo]) -> None:
-    """Raises InputError when photos differ in size, for they then differ in camera or zoom."""
-    sizes = Counter((photo.width, photo.height) for photo in photos)
-    if len(sizes) > 1:
-        listed = ", ".join(f"{n} of {w}x{h}" for (w, h), n in sizes.most_common())
-        raise InputError(
-            f"The photos differ in size: {listed}.",
-            hint="Give photos of one size and orientation; move the others to another folder.")
-
-
-def shared_focal(photos: Sequence[Photo]) -> float | None:
-    """Returns the focal length in pixels on which all photos agree, else None."""
-    focals = [photo.focal_px for photo in photos]
-    known = [focal for focal in focals if focal is not None]
-    if len(known) < len(focals) or max(known) > min(known) * (1 + SAME_FOCAL):
-        return None
-    return known[0]
+        "HEIC, camera RAW).")
 
 
 def frame_names(photos: Sequence[Photo]) -> list[str]:
-    """Returns a PNG name for each photo, sorted as the photos are.
+    """Returns a PNG name for each photo, sorted as the photos are; see `names_in_order`."""
+    return names_in_order([photo.path.stem for photo in photos])
+
+
+def names_in_order(stems: Sequence[str]) -> list[str]:
+    """Returns a PNG name for each stem, such that the names sort as the stems are ordered.
 
     They keep their own names where those are plain, differ (also where case does not count) and
-    sort in the order of the photos; else all are numbered, for a mixture would not sort.
+    sort in this order; else all are numbered, for a mixture would not sort.
     """
-    stems = [photo.path.stem for photo in photos]
     plain = all(SAFE_STEM.fullmatch(stem) for stem in stems)
     distinct = len({stem.lower() for stem in stems}) == len(stems)
     names = [f"{stem}.png" for stem in stems]
     if plain and distinct and names == sorted(names):
         return names
-    return [f"{index:06d}.png" for index in range(len(photos))]
+    return [f"{index:06d}.png" for index in range(len(stems))]

@@ -12,6 +12,7 @@ import numpy as np
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
+from recon_cli.capture.exposure import exposure
 from recon_cli.capture.motion import MotionMeter
 from recon_cli.capture.notices import done_to
 from recon_cli.capture.picture import Gap, Picture
@@ -38,6 +39,7 @@ class Scan:
         gaps: packets that gave no frame.
         sharpness: [F] float64 variance of the Laplacian of the 8-bit gray frame.
         motion: [F] float64 way gained since the frame before, in widths; NaN where unknown.
+        exposure: [F, 3] float64 rows of `exposure.exposure`.
         seconds: time of showing of each frame, None where the file does not say.
         whole: [F] bool; False from a lost or damaged packet to the next key frame, because all
             frames between are predicted from what was lost.
@@ -49,6 +51,7 @@ class Scan:
     gaps: int
     sharpness: NDArray[np.float64]
     motion: NDArray[np.float64]
+    exposure: NDArray[np.float64]
     seconds: tuple[float | None, ...]
     whole: NDArray[np.bool_]
     notices: tuple[str, ...]
@@ -72,6 +75,7 @@ class Scan:
             "gaps": self.gaps,
             "sharpness": self.sharpness.tolist(),
             "motion": [None if np.isnan(step) else step for step in self.motion.tolist()],
+            "exposure": self.exposure.tolist(),
             "seconds": list(self.seconds),
             "whole": self.whole.tolist(),
             "notices": list(self.notices),
@@ -88,6 +92,7 @@ class Scan:
             gaps=value["gaps"],
             sharpness=np.array(value["sharpness"], np.float64),
             motion=np.array(motion, np.float64),
+            exposure=np.array(value["exposure"], np.float64).reshape(-1, 3),
             seconds=tuple(value["seconds"]),
             whole=np.array(value["whole"], np.bool_),
             notices=tuple(value["notices"]),
@@ -100,6 +105,7 @@ class _Look:
 
     sharpness: float
     motion: float
+    exposure: tuple[float, float, float]
     seconds: float | None
     pts: int | None
     key: bool
@@ -156,6 +162,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         gaps=len(gaps),
         sharpness=np.array([look.sharpness for look in looks], np.float64),
         motion=np.array([look.motion for look in looks], np.float64),
+        exposure=np.round([look.exposure for look in looks], 4),
         seconds=tuple(look.seconds for look in looks),
         whole=_whole(looks, gaps),
         notices=done_to(path, first, sum(look.interlaced for look in looks)),
@@ -175,6 +182,7 @@ def _look(picture: Picture, meter: MotionMeter) -> _Look:
     return _Look(
         sharpness=sharpness(gray),
         motion=meter.advance(gray),
+        exposure=exposure(gray),
         seconds=frame.time,
         pts=frame.pts,
         key=bool(frame.key_frame),

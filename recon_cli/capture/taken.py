@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
+from recon_cli.capture.candidates import CHOICE, Candidate, write_choice
+from recon_cli.capture.contact import SHEET, ContactSheet
 from recon_cli.capture.frames import Frame, Group
 from recon_cli.io.poses import KnownPoses
 from recon_cli.progress import Progress
@@ -29,6 +32,31 @@ class Context(Protocol):
         """Notes how much would survive a crash."""
 
 
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What a source was chosen from.
+
+    Attributes:
+        candidates: every frame or photo, in order.
+        sheet: with the thumbnails that it wants.
+        prefix: of the names of the frames, and of the files about the choice.
+    """
+
+    candidates: tuple[Candidate, ...]
+    sheet: ContactSheet
+    prefix: str
+
+    def write(self, stage: Path, held_out: Collection[str]) -> None:
+        """Writes the record and the contact sheet into ingest's folder.
+
+        Args:
+            stage: the folder.
+            held_out: names of the frames that are kept for the score.
+        """
+        write_choice(stage / f"{self.prefix}{CHOICE}", self.candidates)
+        self.sheet.write(stage / f"{self.prefix}{SHEET}", held_out)
+
+
 @dataclass(frozen=True)
 class Taken:
     """The stored frames of one source.
@@ -40,11 +68,12 @@ class Taken:
         declared: how many images the source claims to hold, 0 where it does not say.
         decoded: how many whole ones it gave.
         lost: how many are broken or missing.
-        blurred: how many were passed over for blur.
+        blurred: how many were passed over for blur or exposure.
         skipped: names of files that were left out.
         details: further facts for the summary, JSON values.
         splits: the source says itself which frames are held out.
         poses: known poses, by the names of the frames.
+        choice: what it was chosen from, None where nothing was to be chosen.
     """
 
     kind: str
@@ -58,6 +87,7 @@ class Taken:
     details: dict[str, Any] | None = None
     splits: bool = False
     poses: KnownPoses | None = None
+    choice: Choice | None = None
 
 
 def joined(parts: Sequence[Taken]) -> Taken:

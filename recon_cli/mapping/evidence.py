@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -74,10 +75,14 @@ def gather(
     """Returns what the database and the model say about the images `names`.
 
     Raises:
-        ValueError: the database lacks one of the names.
+        ValueError: the database lacks one of the names, or the model holds another.
     """
     row = {name: index for index, name in enumerate(names)}
-    placed = {row[model.image(i).name]: model.image(i) for i in model.reg_image_ids()}
+    images = [model.image(i) for i in model.reg_image_ids()]
+    strange = sorted(image.name for image in images if image.name not in row)
+    if strange:
+        raise ValueError(f"the model holds other images: {strange}")
+    placed = {row[image.name]: image for image in images}
     with pycolmap.Database.open(database) as opened:
         ids = {image.image_id: row[image.name] for image in opened.read_all_images()
                if image.name in row}
@@ -103,10 +108,11 @@ def gather(
 
 
 def _tried(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
+    """Returns which pairs were matched, [N, N]."""
     tried = np.zeros((len(ids), len(ids)), np.bool_)
-    for pair_id in opened.read_num_matches()[0]:
-        first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        if first in ids and second in ids:
+    for first, second in combinations(ids, 2):
+        # Not read_num_matches: it leaves out the pairs in which nothing was found.
+        if opened.exists_matches(first, second):
             tried[ids[first], ids[second]] = tried[ids[second], ids[first]] = True
     return tried
 

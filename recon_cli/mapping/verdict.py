@@ -1,8 +1,10 @@
 """Whether a finished model can be trusted, and everything known about why not.
 
 The share of registered images and the reprojection error do not see the worst failures: two good
-halves set wrongly to each other (`weak_link`), and two places laid over each other (`fold`). This
-only looks; what follows from it, the mapper and the stage decide.
+halves set wrongly to each other (`weak_link`), and two places laid over each other (`fold`). Where
+only neighbours were matched, neither sees a half that has the wrong size and nothing else wrong.
+
+This only looks; what follows from it, the mapper and the stage decide.
 """
 
 from __future__ import annotations
@@ -211,9 +213,9 @@ def _folded(doubled: Fold) -> list[str]:
     if doubled.share is None or doubled.share >= MIN_OVERLAP:
         return []
     return [
-        f"Two places that look alike lie over each other: {_sides(doubled.sides)} seem to see the "
-        f"same, but only {doubled.share:.0%} of it is found in both, at least {MIN_OVERLAP:.0%} "
-        "must be."]
+        f"{_sides(doubled.sides)} seem to see the same, but only {doubled.share:.0%} of it is "
+        f"found in both, at least {MIN_OVERLAP:.0%} must be: the model is broken between them, or "
+        "lays two places over each other that look alike."]
 
 
 def _reassurances(verdict: Verdict) -> list[str]:

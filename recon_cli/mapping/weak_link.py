@@ -4,6 +4,10 @@ A mapper that takes the wrong turn at one frame builds two good halves and sets 
 other. Every image has a camera then, and the reprojection error, which is taken over the matches
 that the mapper kept, is small. The matches that it had to leave out tell: those across the break
 disagree with the poses. All matches together hardly show it, since few lie across.
+
+Matches can also be wrong and rightly be left out: two places that look alike match each other. So a
+cut is passed over when its two sides show what they should (`overlap`), which those of a broken
+model do not.
 """
 
 from __future__ import annotations
@@ -19,6 +23,10 @@ from recon_cli.mapping.evidence import Evidence
 from recon_cli.mapping.graph import Cut, Order, Weights
 from recon_cli.mapping.overlap import Overlap, borne_out
 
+# Least share measured in each model: 0.73 to 0.99 where no camera was off by 1% of the extent;
+# 0.03, 0.35 and 0.49 where 9, 7 and 8 of 50 cameras were off by two thirds of it, at reprojection
+# errors of 1.0 and 0.3 pixels. The cut that is loosest by its points alone held 0.89 in the first
+# of these: it ran elsewhere. The other two are a room with two equal posters.
 MIN_WEAK_LINK = 0.5
 # COLMAP gives an image a camera from 30 inliers on (abs_pose_min_num_inliers), so that no part of a
 # model hangs on fewer.

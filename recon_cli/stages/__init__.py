@@ -47,8 +47,8 @@ class Stage:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, 2, False, "recon_cli.stages.ingest"),
-    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 1, True,
+    Stage("ingest", "ingest", (), (), IngestConfig, 3, False, "recon_cli.stages.ingest"),
+    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 3, True, "recon_cli.stages.sfm",
           ("database.db", "log.txt", "steps.json", "verdict.json")),

@@ -15,7 +15,8 @@ import numpy as np
 
 from recon_cli import atomic
 from recon_cli.capture import frames as store
-from recon_cli.capture.noise import denoised, estimate_noise
+from recon_cli.capture.filters import FILTERS
+from recon_cli.capture.noise import estimate_noise
 from recon_cli.capture.pace import paced
 from recon_cli.config import DenoiseConfig
 from recon_cli.stages.context import StageContext, StageInputs, Summary
@@ -40,7 +41,7 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
         ctx: for progress; the result does not depend on its threads.
 
     Returns:
-        mode, frames, denoised (count), median_sigma_255.
+        mode, filter, frames, denoised (count), median_sigma_255.
 
     Raises:
         FormatError: ingest's folder does not hold what its list says.
@@ -54,6 +55,7 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
     })
     return {
         "mode": config.mode,
+        "filter": config.filter,
         "frames": len(outcomes),
         "denoised": sum(outcome.filtered for outcome in outcomes),
         "median_sigma_255": round(float(np.median([item.sigma for item in outcomes])), 4),
@@ -87,7 +89,7 @@ def _frame(config: DenoiseConfig, source: Path, target: Path) -> _Outcome:
         if filtered:
             # Whoever forces the filter says that the estimate is too low.
             noise = max(sigma, config.threshold)
-            store.write_png(target, denoised(rgb, config.strength * noise))
+            store.write_png(target, FILTERS[config.filter](rgb, noise, config.strength))
         else:
             _copy(source, target)
     return _Outcome(source.name, sigma, filtered)

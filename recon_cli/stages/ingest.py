@@ -5,32 +5,36 @@ Which frames are held out is frozen here, before anything is estimated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from recon_cli.capture import frames as store
-from recon_cli.capture import from_photos, from_video
+from recon_cli.capture import from_data_set, from_photos, from_video
 from recon_cli.capture.frames import FrameList
 from recon_cli.capture.taken import Taken, joined
 from recon_cli.config import IngestConfig, parse_holdout
 from recon_cli.errors import InputError
+from recon_cli.io.layouts import recognise
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 
 
 def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Writes frames/*.png and frames.json into `out` and returns what was taken and what lost.
 
+    choice.json and contact.png tell what was kept and what was dropped of each source.
+
     Args:
         config: see `IngestConfig`.
-        inputs: the sources: video files and folders of photos, told apart by content. The frames
-            of each get intrinsics of their own.
+        inputs: the sources: video files and folders of photos, told apart by content, or one data
+            set with poses, told by its layout. The frames of each get intrinsics of their own.
         out: the stage's partial folder; frames already in it are kept.
         ctx: for notices and progress.
 
     Returns:
-        kind, declared_frames (0 where unknown), decoded_frames (whole ones), lost_frames,
-        dropped_blurred, skipped (file names), frames, held_out, groups, width, height (of the
+        kind ("video", "photos", "mixed" or the layout of a data set), declared_frames (0 where
+        unknown), decoded_frames (whole ones), lost_frames, dropped_blurred, skipped (file names),
+        of a data set points and metric, frames, held_out, groups, width, height (of the
         largest group).
 
     Raises:
@@ -40,9 +44,13 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         if not source.exists():
             raise InputError(f"{source} does not exist.", hint="Check the path.")
     store.prepare(out)
-    taken = joined(_take(config, inputs.sources, out, ctx))
-    held = store.held_out([frame.name for frame in taken.frames], parse_holdout(config.holdout))
+    parts = _take(config, inputs.sources, out, ctx)
+    taken = joined(parts)
+    held = _held_out(taken, config, ctx)
     frames = tuple(replace(frame, held_out=frame.name in held) for frame in taken.frames)
+    for part in parts:
+        if part.choice is not None:
+            part.choice.write(out, held)
     FrameList(taken.kind, taken.groups, frames).write(out)
     largest = max(taken.groups, key=lambda group: group.width * group.height)
     return {
@@ -61,10 +69,23 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     }
 
 
+def _held_out(taken: Taken, config: IngestConfig, ctx: StageContext) -> frozenset[str]:
+    """Returns the names of the frames kept for the score: the data set's choice, else ours."""
+    if not taken.splits:
+        return store.held_out(
+            [frame.name for frame in taken.frames], parse_holdout(config.holdout))
+    held = frozenset(frame.name for frame in taken.frames if frame.held_out)
+    ctx.notice(f"The data set itself holds out {len(held)} views; --holdout has no effect.")
+    return held
+
+
 def _take(
     config: IngestConfig, sources: Sequence[Path], out: Path, ctx: StageContext
 ) -> list[Taken]:
     """Writes the frames of every source; the names of several are told apart by a number."""
+    layouts = {path: layout for path in sources if (layout := recognise(path))}
+    if layouts:
+        return [from_data_set.take(config, _alone(sources, layouts), out, ctx)]
     prefixes = ["" if len(sources) == 1 else f"{index + 1:02d}_" for index in range(len(sources))]
     videos = [(path, prefix) for path, prefix in zip(sources, prefixes, strict=True)
               if not path.is_dir()]
@@ -82,3 +103,13 @@ def _take(
         else:
             taken.append(from_photos.take(config, path, out, ctx, prefix=prefix))
     return taken
+
+
+def _alone(sources: Sequence[Path], layouts: Mapping[Path, str]) -> Path:
+    """Returns the one data set, for its poses have no common world with anything else."""
+    path, layout = next(iter(layouts.items()))
+    if len(sources) > 1:
+        raise InputError(
+            f"{path} is a data set with poses ({layout}), but {len(sources)} inputs were given.",
+            hint="Give it alone, or give the folder of its images for photos without poses.")
+    return path

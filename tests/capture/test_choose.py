@@ -1,16 +1,22 @@
 import numpy as np
 import pytest
 
+from recon_cli.capture.candidates import Reason
 from recon_cli.capture.choose import (
     FRAME_SPACING,
     MAX_GAP,
     MIN_AUTOMATIC,
     automatic_count,
     bridged,
+    check_motion,
     choose_frames,
+    judged,
     sharp_frames,
     travelled,
 )
+from recon_cli.errors import InputError
+
+FINE, DARK, HALF_DARK = (0.0, 0.0, 40.0), (1.0, 0.0, 0.0), (0.7, 0.0, 20.0)
 
 
 def everything(count):
@@ -105,9 +111,77 @@ def test_a_blurred_turn_is_bridged_by_its_least_blurred_frames():
     assert len(kept) - sharp.sum() <= 8  # not the whole turn
 
 
+def test_a_gap_is_bridged_off_its_middle_where_frames_are_much_sharper():
+    way = np.linspace(0, 2, 201)
+    sharp, sharpness = everything(201), np.full(201, 100.0)
+    sharp[80:120], sharpness[80:120] = False, 10.0
+    sharpness[82] = 40.0  # a plain view: sharp, but under the mark of the others
+    assert bridged(way, sharpness, sharp, everything(201))[82]
+    sharpness[82] = 15.0
+    assert not bridged(way, sharpness, sharp, everything(201))[82]
+
+
 def test_short_gaps_and_damaged_frames_are_not_bridged():
     way = np.linspace(0, 2, 201)
     sharp, whole = everything(201), everything(201)
     sharp[10:15] = False
     whole[80:120] = False
     assert (bridged(way, np.ones(201), sharp, whole) == (sharp & whole)).all()
+
+
+def test_a_bridge_is_taken_only_where_there_is_nothing_better():
+    # 0.2 widths of blur: among 4 frames, 0.5 apart, it needs no bridge; among 40 it does.
+    way, sharpness = np.linspace(0, 2, 201), np.full(201, 100.0)
+    sharpness[80:100] = 10.0
+    found = judged(way, sharpness, np.array([FINE] * 201), everything(201), 0.5)
+    assert found.bridges[80:100].any()
+    for count, bridges in ((4, False), (40, True)):
+        chosen = choose_frames(way, sharpness, found.usable, count, bridges=found.bridges)
+        assert len(chosen) == count
+        assert found.bridges[chosen].any() == bridges, count
+
+
+def test_where_all_is_blurred_the_sharpest_is_taken_though_it_lies_off_the_middle():
+    way, usable = np.linspace(0, 1, 100), everything(100)
+    sharpness = np.full(100, 10.0)
+    sharpness[1] = 40.0
+    assert 1 in choose_frames(way, sharpness, usable, 10, bridges=usable)
+    assert 1 not in choose_frames(way, sharpness, usable, 10, bridges=~usable)
+
+
+def test_frames_that_are_refused_have_a_reason():
+    sharpness, whole = np.full(40, 100.0), everything(40)
+    sharpness[5], whole[20:22] = 10.0, False
+    exposures = np.array([FINE] * 40)
+    exposures[30], exposures[5] = HALF_DARK, HALF_DARK
+    found = judged(np.linspace(0, 0.4, 40), sharpness, exposures, whole, 0.5)
+    refused = {index: one for index, one in enumerate(found.refused) if one}
+    assert refused == {
+        5: Reason.CLIPPED, 20: Reason.DAMAGED, 21: Reason.DAMAGED, 30: Reason.CLIPPED}
+    assert np.flatnonzero(~found.usable).tolist() == [5, 20, 21, 30]
+
+
+def test_a_dim_stretch_is_bridged_but_a_black_one_is_not():
+    way = np.linspace(0, 2, 201)
+    for row, bridges in ((HALF_DARK, True), (DARK, False)):
+        exposures = np.array([FINE] * 201)
+        exposures[80:120] = row
+        found = judged(way, np.full(201, 100.0), exposures, everything(201), 0.5)
+        assert found.usable[80:120].any() == bridges
+        assert found.usable[80:120].sum() <= 8
+
+
+def test_a_camera_that_does_not_move_is_refused():
+    with pytest.raises(InputError, match=r"room\.mp4 does not move: its 50 frames") as caught:
+        check_motion("room.mp4", np.zeros(50))
+    assert "walk sideways" in caught.value.hint
+
+
+def test_twelve_adjacent_frames_are_warned_of():
+    warning = check_motion("room.mp4", np.full(12, 0.003))
+    assert "hardly moves: its view shifts by 3.3% of its width" in warning
+
+
+def test_a_walk_and_a_motion_that_cannot_be_told_pass_in_silence():
+    assert check_motion("room.mp4", np.full(50, 0.01)) == ""
+    assert check_motion("room.mp4", np.r_[0.0, np.full(49, np.nan)]) == ""

@@ -7,10 +7,9 @@ from PIL import Image
 from recon_cli.capture.images import Photo
 from recon_cli.capture.photos import (
     check_count,
-    check_sizes,
     frame_names,
     list_photos,
-    shared_focal,
+    photo_folder,
 )
 from recon_cli.errors import InputError
 
@@ -58,13 +57,6 @@ def test_other_names_are_numbered(names):
         "000000.png", "000001.png", "000002.png"]
 
 
-def test_mixed_sizes_are_listed_with_their_counts():
-    check_sizes([photo("a"), photo("b")])
-    with pytest.raises(InputError, match="2 of 64x48, 1 of 48x64") as caught:
-        check_sizes([photo("a"), photo("b", 48, 64), photo("c")])
-    assert "one size" in caught.value.hint
-
-
 def test_too_few_photos_are_refused_with_the_reason():
     check_count(Path("room"), 3, {})
     with pytest.raises(InputError, match="1 photos, 0 more"):
@@ -73,7 +65,36 @@ def test_too_few_photos_are_refused_with_the_reason():
         check_count(Path("room"), 0, {"a.jpg": "a.jpg cannot be read.", "b.jpg": "?"})
 
 
-def test_a_focal_length_counts_only_when_all_photos_share_it():
-    assert shared_focal([photo("a", focal=1000.0), photo("b", focal=1004.0)]) == 1000.0
-    assert shared_focal([photo("a", focal=1000.0), photo("b", focal=2000.0)]) is None
-    assert shared_focal([photo("a", focal=1000.0), photo("b")]) is None
+def small(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (8, 8)).save(path)
+
+
+def test_a_folder_with_photos_is_taken_itself(tmp_path):
+    small(tmp_path / "a.png")
+    small(tmp_path / "images" / "b.png")
+    assert photo_folder(tmp_path) == tmp_path
+
+
+def test_the_one_folder_with_photos_inside_is_taken(tmp_path):
+    small(tmp_path / "DCIM" / "a.png")
+    small(tmp_path / "masks" / "a.png")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").write_text("none")
+    assert photo_folder(tmp_path) == tmp_path / "DCIM"
+
+
+def test_among_several_inner_folders_the_one_called_images_is_taken(tmp_path):
+    for name in ("images", "images_2", "renders"):
+        small(tmp_path / name / "a.png")
+    assert photo_folder(tmp_path) == tmp_path / "images"
+    (tmp_path / "images").rename(tmp_path / "other")
+    with pytest.raises(InputError, match="3 of its folders do: images_2, other, renders") as caught:
+        photo_folder(tmp_path)
+    assert "images_2" in caught.value.hint
+
+
+def test_a_folder_of_broken_photos_is_not_left_for_another(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"")
+    small(tmp_path / "thumbnails" / "a.png")
+    assert photo_folder(tmp_path) == tmp_path

@@ -56,6 +56,14 @@ def test_the_order_of_the_names_decides_not_that_of_the_database(tmp_path):
     assert back.keypoints.tolist() == forward.keypoints[::-1].tolist()
 
 
+def test_a_pair_that_was_matched_in_vain_counts_as_tried(tmp_path):
+    world = MadeModel(
+        np.concatenate([wall(-3, 4, count=400), wall(97, 103, count=400)]), along([0.0, 0.5, 100]))
+    found = gather(world.model(), world.write_database(tmp_path / "db"), world.names)
+    assert found.pairs.tolist() == [[0, 1]]
+    assert found.tried.sum() == 6
+
+
 def test_only_pairs_that_were_matched_count_as_tried(tmp_path):
     world = made(reach=1)
     found = gather(world.model(), world.write_database(tmp_path / "db"), world.names)

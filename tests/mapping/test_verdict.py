@@ -181,3 +181,14 @@ def test_an_image_that_the_database_lacks_is_a_mistake_of_the_program(tmp_path):
     database = made.write_database(tmp_path / "database.db")
     with pytest.raises(ValueError, match="holds 16 of 17"):
         examine(made.model(), database, [*made.names, "other.png"])
+    with pytest.raises(ValueError, match="000015"):
+        examine(made.model(), database, made.names[:-1])
+
+
+def test_a_model_without_cameras_cannot_be_told(tmp_path):
+    made = walk(unregistered=frozenset(range(16)))
+    verdict = verdict_on(made, tmp_path)
+    assert (verdict.registered, verdict.model_parts) == (0, ())
+    assert len(verdict.unregistered) == 16
+    assert verdict.weak_link.share is None
+    assert len(verdict.lines()) == 7, "five of the sixteen are listed"

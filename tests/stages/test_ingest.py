@@ -1,3 +1,4 @@
+import json
 import logging
 from fractions import Fraction
 
@@ -83,6 +84,30 @@ def test_the_automatic_number_stays_under_its_bound(video, tmp_path):
     assert take(video, tmp_path / "out", config=IngestConfig(max_frames=9))["frames"] == 9
 
 
+@pytest.mark.parametrize("kind", ["video", "photos"])
+def test_what_was_kept_and_dropped_is_recorded_and_drawn(video, tmp_path, kind):
+    source = video if kind == "video" else write_photos(tmp_path / "room", 6)
+    take(source, tmp_path / "out", config=IngestConfig(max_frames=9))
+    record = json.loads((tmp_path / "out" / "choice.json").read_text())
+    kept = [one["name"] for one in record["candidates"] if one["reason"] == "kept"]
+    assert kept == [frame["name"] for frame in listed(tmp_path / "out")["frames"]]
+    assert len(record["candidates"]) == (40 if kind == "video" else 6)
+    assert Image.open(tmp_path / "out" / "contact.png").size[0] > 400
+
+
+def test_photos_of_the_same_view_are_left_out_and_named(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 6)
+    (folder / "IMG_0007.jpg").write_bytes((folder / "IMG_0002.jpg").read_bytes())
+    summary = take(folder, tmp_path / "out")
+    assert (summary["frames"], summary["skipped"]) == (6, ["IMG_0007.jpg"])
+    assert not (tmp_path / "out" / "frames" / "IMG_0007.png").exists()
+    assert notices() == [
+        "1 photos are left out, for others show the same: IMG_0007.jpg (like IMG_0002.jpg)."]
+    before = files(tmp_path / "out")
+    take(folder, tmp_path / "out")
+    assert files(tmp_path / "out") == before
+
+
 @pytest.mark.parametrize(("holdout", "expected"), [
     ("every:8", [0, 8, 16]), ("segment:0.25:0.5", [5, 6, 7, 8, 9]), ("none", [])])
 def test_held_out_frames_are_frozen_here(video, tmp_path, holdout, expected):
@@ -104,10 +129,6 @@ def test_the_number_of_threads_changes_nothing(video, tmp_path):
     take(video, tmp_path / "four", threads=4)
     assert files(tmp_path / "one") == files(tmp_path / "four")
 
-
-def test_a_flat_video_passes_for_structure_from_motion_to_judge(tmp_path):
-    video = write_video(tmp_path / "flat.mp4", [np.full((96, 128, 3), 128, np.uint8)] * 40)
-    assert take(video, tmp_path / "out")["frames"] == 24
 
 def test_several_sources_are_kept_apart_and_share_the_budget(video, tmp_path):
     other = write_video(tmp_path / "slow.mp4", walk(40, step=2, height=64))

@@ -1,0 +1,171 @@
+"""What of a photo is to be ignored: from a folder of masks, or from the photo's own transparency.
+
+White counts, black is ignored. A mask lies in masks/ inside the folder that was given, or inside
+the one in it that holds the photos, and has its photo's name with .png or .jpg, or, as COLMAP wants
+it, behind the photo's whole name. Masks beside the folder that was given are not taken: they are no
+part of the input, and a change of theirs would go unnoticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli import atomic
+from recon_cli.capture.images import Photo, read_alpha, read_rgb
+from recon_cli.errors import InputError
+
+FOLDER = "masks"
+SUFFIXES = (".png", ".jpg", ".jpeg")
+HALF = 128  # from here on a pixel is white, or opaque
+
+
+@dataclass(frozen=True)
+class FoundMasks:
+    """The masks of a folder of photos.
+
+    Attributes:
+        by_photo: path of the mask, by the photo's file name.
+        unused: file names of masks to which no photo belongs.
+        outside: a folder of masks that lies beside the given one, None where there is none.
+    """
+
+    by_photo: dict[str, Path]
+    unused: tuple[str, ...]
+    outside: Path | None = None
+
+
+def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FoundMasks:
+    """Returns which masks belong to photos; none where there is no masks/.
+
+    Args:
+        given: the folder that the user named.
+        home: the folder that holds the photos: that one, or one in it.
+        photos: in `home`.
+    """
+    folder = next((path / FOLDER for path in (home, given) if (path / FOLDER).is_dir()), None)
+    if folder is None:
+        beside = given.resolve().parent / FOLDER
+        return FoundMasks({}, (), beside if beside.is_dir() else None)
+    files = sorted(
+        path for path in folder.iterdir()
+        if path.suffix.lower() in SUFFIXES and path.is_file() and path.name[0] != ".")
+    by_stem = {path.stem: path for path in reversed(files)}
+    found = {}
+    for photo in photos:
+        mask = by_stem.get(photo.path.name) or by_stem.get(photo.path.stem)
+        if mask is not None:
+            found[photo.path.name] = mask
+    used = set(found.values())
+    return FoundMasks(found, tuple(path.name for path in files if path not in used))
+
+
+def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
+    """Returns a mask for width x height pixels, [H, W], 255 where they count, else 0.
+
+    Its own EXIF orientation is applied; a mask of the same shape but another size is resampled to
+    the nearest pixel.
+
+    Raises:
+        InputError: it cannot be read, has another shape, or ignores every pixel.
+    """
+    gray = read_rgb(path).max(axis=2)
+    if not _same_shape(gray.shape[1], gray.shape[0], width, height):
+        raise InputError(
+            f"The mask {path.name} has {gray.shape[1]}x{gray.shape[0]} pixels, but {width}x{height}"
+            " or the same shape in another size is needed.",
+            hint="Make masks from the photos as they are shown, upright.")
+    mask = _fitted(gray, width, height)
+    if not mask.any():
+        raise InputError(
+            f"The mask {path.name} ignores every pixel: its brightest value is {gray.max()}, but "
+            "255 is to stand for what counts.",
+            hint="Write masks with 0 and 255, or remove the photo.")
+    return mask
+
+
+def alpha_mask(photo: Photo) -> NDArray[np.uint8] | None:
+    """Returns what a photo's transparency ignores, [H, W], 0 below half opacity, else 255.
+
+    Returns:
+        None where nothing is ignored.
+
+    Raises:
+        InputError: the photo cannot be read or is transparent everywhere.
+    """
+    return opaque(read_alpha(photo), photo.path.name, photo.width, photo.height)
+
+
+def opaque(
+    alpha: NDArray[np.uint8] | None, name: str, width: int, height: int
+) -> NDArray[np.uint8] | None:
+    """Returns where a picture is at least half opaque, [H, W], 255 or 0; None for everywhere.
+
+    Args:
+        alpha: its opacity, of any size; None where it holds none.
+        name: for the message.
+        width: of the mask.
+        height: of the mask.
+
+    Raises:
+        InputError: it is transparent everywhere.
+    """
+    if alpha is None or alpha.min() >= HALF:
+        return None
+    if alpha.max() < HALF:
+        raise InputError(f"{name} is transparent everywhere.")
+    return _fitted(alpha, width, height)
+
+
+def photo_mask(
+    photo: Photo, path: Path | None, width: int, height: int
+) -> NDArray[np.uint8] | None:
+    """Returns what counts of a photo stored with width x height pixels, [H, W], 255 or 0.
+
+    Args:
+        photo: whose transparency is asked.
+        path: its mask, None where it has none.
+        width: of the stored frame.
+        height: of the stored frame.
+
+    Returns:
+        None where all of it counts.
+
+    Raises:
+        InputError: see `read_mask` and `alpha_mask`; or the two leave nothing together.
+    """
+    alpha = alpha_mask(photo)
+    own = None if alpha is None else _fitted(alpha, width, height)
+    given = None if path is None else read_mask(path, width, height)
+    if own is None or given is None:
+        mask = given if own is None else own
+    else:
+        mask = np.minimum(own, given)
+    if mask is None or mask.all():
+        return None
+    if not mask.any():
+        raise InputError(f"The mask and the transparency of {photo.path.name} leave no pixel.")
+    return mask
+
+
+def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
+    """Writes a mask [H, W] as 8-bit gray PNG, whole or not at all, and the folder it lies in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _, data = cv2.imencode(".png", mask)
+    atomic.write_bytes(path, data.tobytes())
+
+
+def _same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
+    """Returns whether one size is the other times one factor, but for rounding to whole pixels."""
+    small, large = sorted([(width, height), (other_width, other_height)])
+    return abs(large[1] * small[0] / large[0] - small[1]) <= 1
+
+
+def _fitted(values: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    nearest = cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return np.where(nearest >= HALF, 255, 0).astype(np.uint8)

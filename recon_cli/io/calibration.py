@@ -1,0 +1,133 @@
+"""Numbers of a data set, checked and brought to our conventions: poses and intrinsics.
+
+What is wrong in a file is said with `where`, words that name the file and the frame or line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.errors import FormatError
+from recon_cli.scene.lens import MODELS, Lens
+
+# Entries written with three decimals are off by up to 5e-4, so R R^T by up to
+# 2 * sqrt(3) * 5e-4 = 1.7e-3. A scale that is left in a pose is larger by far.
+ORTHONORMAL = 2e-3
+MAX_SIDE = 1 << 16  # pixels; no image format in use holds a longer side
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # y up and z backward, from y down and z forward
+_HINT = "Export the poses again, or take the image out of the list."
+
+
+def viewmat_from_pose(value: Any, where: str, *, opengl: bool = False) -> NDArray[np.float64]:
+    """Returns [4, 4] world to camera, OpenCV axes, of a camera-to-world matrix.
+
+    A rotation that rounding left slightly askew is replaced by the nearest rotation.
+
+    Args:
+        value: 16 numbers row by row, or [4, 4], or [3, 4] without its last row.
+        where: what a message calls the matrix.
+        opengl: its camera looks along -z with y up, as in OpenGL and Blender.
+
+    Raises:
+        FormatError: it is no matrix, not finite, or not rigid.
+    """
+    pose = _matrix(value, where)
+    rotation = pose[:3, :3]
+    askew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if askew > ORTHONORMAL or np.linalg.det(rotation) < 0:
+        raise FormatError(
+            f"{where} is no rigid pose: {_fault(rotation, askew)}. Needed is a rotation with a "
+            "place, without scale or reflection.", hint=_HINT)
+    left, _, right = np.linalg.svd(rotation)
+    nearest = left @ right
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = nearest.T
+    viewmat[:3, 3] = -nearest.T @ pose[:3, 3]
+    return _OPENGL @ viewmat if opengl else viewmat
+
+
+def _matrix(value: Any, where: str) -> NDArray[np.float64]:
+    """Returns a finite [4, 4] matrix whose last row is 0 0 0 1."""
+    try:
+        pose = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise FormatError(f"{where} is no matrix of numbers.", hint=_HINT) from error
+    if pose.size == 12 and pose.shape == (3, 4):
+        pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+    if pose.size != 16:
+        raise FormatError(f"{where} has {pose.size} numbers, needed 16 of a 4x4 pose.", hint=_HINT)
+    pose = pose.reshape(4, 4)
+    if not np.isfinite(pose).all():
+        raise FormatError(f"{where} holds a number that is not finite.", hint=_HINT)
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHONORMAL:
+        raise FormatError(
+            f"{where} is no rigid pose: its last row is {_numbers(pose[3])}, needed 0 0 0 1.",
+            hint=_HINT)
+    return pose
+
+
+def _fault(rotation: NDArray[np.float64], askew: float) -> str:
+    sizes = np.linalg.norm(rotation, axis=0)
+    scale = float(sizes.mean())
+    if scale > 0 and np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() <= ORTHONORMAL:
+        return f"scaled by {scale:.4g}" if askew > ORTHONORMAL else "a reflection"
+    return f"its axes are {_numbers(sizes)} long or not at right angles"
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.4g}" for value in values)
+
+
+def checked_lens(
+    model: str, width: float, height: float, params: Sequence[float], where: str
+) -> Lens:
+    """Returns the intrinsics of a file once they can be true.
+
+    Raises:
+        FormatError: the model is unknown, or a number is missing, not finite or out of range.
+    """
+    if model not in MODELS:
+        raise FormatError(
+            f"{where} has the camera model {model}, known are {', '.join(MODELS)}.",
+            hint="Undistort the images first, for example with COLMAP's image_undistorter.")
+    focals, count = MODELS[model]
+    if len(params) != count:
+        raise FormatError(
+            f"{where}: {model} takes {count} parameters, but there are {len(params)}.")
+    if not all(map(math.isfinite, [width, height, *params])):
+        raise FormatError(f"{where} has intrinsics that are not finite.")
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE) or min(params[:focals]) <= 0:
+        raise FormatError(
+            f"{where} has a camera of {width:g}x{height:g} pixels with the focal length "
+            f"{min(params[:focals]):g}: no camera.")
+    return Lens(model, round(width), round(height), tuple(float(value) for value in params))
+
+
+def lens_from_matrix(
+    matrix: NDArray[np.float64], width: int, height: int, where: str, *, first_center: float
+) -> Lens:
+    """Returns the PINHOLE intrinsics of a [3, 3] or [4, 4] matrix K.
+
+    Args:
+        matrix: fx 0 cx, 0 fy cy, 0 0 1 in its upper left.
+        width: image width in pixels.
+        height: image height in pixels.
+        where: what a message calls the matrix.
+        first_center: where the file's convention puts the centre of the first pixel, 0 or 0.5;
+            ours is 0.5.
+
+    Raises:
+        FormatError: the matrix is skewed, or its numbers cannot be those of a camera.
+    """
+    shift = 0.5 - first_center
+    if matrix.shape[0] < 3 or matrix.shape[1] < 3 or not np.isfinite(matrix).all():
+        raise FormatError(f"{where} is no finite 3x3 or 4x4 matrix.")
+    if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]) or abs(matrix[2, 2] - 1) > ORTHONORMAL:
+        raise FormatError(f"{where} is no matrix of intrinsics without skew.")
+    params = (matrix[0, 0], matrix[1, 1], matrix[0, 2] + shift, matrix[1, 2] + shift)
+    return checked_lens("PINHOLE", width, height, params, where)

@@ -1,0 +1,98 @@
+"""Which data sets with poses are known, how each is recognised, and what reads it.
+
+Recognition looks at names of files and folders alone; nothing is opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon_cli.errors import FormatError, InputError
+from recon_cli.io.colmap_set import is_colmap, read_colmap
+from recon_cli.io.posed import PosedSet
+from recon_cli.io.replica import is_replica, read_replica
+from recon_cli.io.scannet import is_scannet, read_scannet
+from recon_cli.io.transforms import is_transforms, read_transforms
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A layout that is known.
+
+    Attributes:
+        name: as `PosedSet.layout` has it.
+        words: what it is called in a sentence.
+        needs: the files that make it, for help texts.
+        fits: whether a path has the layout; opens nothing.
+        read: returns the data set at such a path.
+    """
+
+    name: str
+    words: str
+    needs: str
+    fits: Callable[[Path], bool]
+    read: Callable[[Path], PosedSet]
+
+
+# The first that fits is taken. transforms.json comes before COLMAP, because nerfstudio leaves the
+# model that it was made from beside it, and the file on top is the one that is meant.
+LAYOUTS: tuple[Layout, ...] = (
+    Layout("replica", "a Replica sequence (NICE-SLAM layout)",
+           "results/frame%06d.jpg, traj.txt and cam_params.json", is_replica, read_replica),
+    Layout("scannet", "a ScanNet scene (exported)",
+           "color/, pose/ and intrinsic/, with depth/ or without", is_scannet, read_scannet),
+    Layout("transforms", "a transforms.json data set (nerfstudio, instant-ngp)",
+           "transforms.json, or transforms_train.json, and the images", is_transforms,
+           read_transforms),
+    Layout("colmap", "a COLMAP model", "images/ and sparse/0/", is_colmap, read_colmap),
+)
+
+
+def recognise(path: Path) -> str | None:
+    """Returns the name of the layout that a path has, None where it has no known one."""
+    layout = _find(path)
+    return None if layout is None else layout.name
+
+
+def read_posed(path: Path) -> PosedSet:
+    """Returns the data set with poses at a path.
+
+    Raises:
+        InputError: the path has no known layout, or none of its images is there.
+        FormatError: a file of the data set is missing or damaged.
+    """
+    layout = _find(path)
+    if layout is None:
+        known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
+        raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
+    try:
+        return layout.read(path)
+    except OSError as error:  # a folder where a file belongs, or a file that may not be read
+        raise FormatError(f"{path} cannot be read: {error}.") from error
+
+
+def describe(posed: PosedSet) -> str:
+    """Returns in words what a data set was taken for, without the notices."""
+    words = next(row.words for row in LAYOUTS if row.name == posed.layout)
+    held_out = sum(image.held_out for image in posed.images)
+    depth = sum(image.depth is not None for image in posed.images if not image.held_out)
+    parts = [_count(len(posed.images) - held_out, "frame" if posed.sequence else "image")]
+    if depth:
+        parts.append(f"{depth} with depth")
+    if held_out:
+        parts.append(_count(held_out, "held-out view"))
+    if posed.points is not None:
+        parts.append(_count(len(posed.points), "point"))
+    if posed.missing:
+        parts.append(f"{_count(len(posed.missing), 'image')} missing")
+    return f"{words}: {', '.join(parts)}"
+
+
+def _find(path: Path) -> Layout | None:
+    return next((row for row in LAYOUTS if row.fits(path)), None)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"

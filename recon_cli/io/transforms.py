@@ -1,0 +1,239 @@
+"""transforms.json of nerfstudio and instant-ngp; transforms_train/val/test.json of NeRF's scenes.
+
+Camera-to-world matrices with OpenGL axes become world to camera with OpenCV axes; the world stays
+as it is. nerfstudio's applied_transform was applied to poses and points alike and is not undone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.atomic import read_json
+from recon_cli.errors import FormatError
+from recon_cli.io.calibration import viewmat_from_pose
+from recon_cli.io.depth_file import DepthFile
+from recon_cli.io.listed import SUFFIXES, Listed, find_images, image_size, inside, is_file
+from recon_cli.io.ply_points import read_ply_points
+from recon_cli.io.posed import PosedSet
+from recon_cli.io.transforms_lens import number, read_lens
+
+_FILE = "transforms.json"
+_PARTS = ("train", "val", "test")
+_DEPTH_UNIT = 1e-3  # nerfstudio's default: depth in millimetres
+_HINT = "Export it again from the program that it came from."
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """One entry of a file. `part` is train, val, test, "" for none of them, or None if not said."""
+
+    entry: Mapping[str, Any]
+    where: str
+    folder: Path
+    path: Path
+    part: str | None
+
+    @property
+    def listed(self) -> PurePosixPath:
+        """The path below the folder."""
+        return PurePosixPath(self.path.relative_to(self.folder).as_posix())
+
+
+def is_transforms(path: Path) -> bool:
+    """Returns whether a folder has the layout, or a file is such a .json by its name."""
+    if path.suffix == ".json" and path.is_file():
+        return path.name.startswith("transforms")
+    return (path / _FILE).is_file() or (path / "transforms_train.json").is_file()
+
+
+def read_transforms(path: Path) -> PosedSet:
+    """Returns the frames of a transforms.json, or of transforms_train/val/test.json.
+
+    Where the set names test views, these are held out and its validation views are left out, as the
+    literature scores it; where it names validation views alone, those are held out.
+
+    Raises:
+        InputError: no image is there.
+        FormatError: the file is no JSON, or a frame lacks a rigid pose, a lens or a file name.
+    """
+    frames: list[_Frame] = []
+    for file, part in _files(path):
+        frames += _read_frames(file, part)
+    frames, doubled = _without_copies(frames)
+    parts = {frame.part for frame in frames}
+    held_out = "test" if "test" in parts else "val"
+    kept = [frame for frame in frames if frame.part in (None, "train", held_out)]
+    names = _short_names(kept)
+    listed = [_list_frame(frame, name, held_out) for frame, name in zip(kept, names, strict=True)
+              if is_file(frame.path)]
+    gone = [name for frame, name in zip(kept, names, strict=True) if not is_file(frame.path)]
+    found = find_images(listed, path, gone=gone)
+    points, colors, said = _read_points(path if path.is_file() else path / _FILE)
+    metric = any(image.depth is not None for image in found.images)
+    return PosedSet(
+        "transforms", found.lenses, found.images, found.missing, metric=metric,
+        splits=any(image.held_out for image in found.images), points=points, colors=colors,
+        notices=(*doubled, *_left_out(frames, kept), *found.notices, *said))
+
+
+def _files(path: Path) -> list[tuple[Path, str | None]]:
+    """Returns the files to read, each with the part of the set that it holds."""
+    if path.is_file():
+        return [(path, None)]
+    if (path / _FILE).is_file():
+        return [(path / _FILE, None)]
+    files = [(path / f"transforms_{part}.json", part) for part in _PARTS]
+    return [(file, part) for file, part in files if file.is_file()]
+
+
+def _read_frames(file: Path, part: str | None) -> list[_Frame]:
+    value = read_json(file)
+    entries = value.get("frames") if isinstance(value, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise FormatError(f"{file} lists no frames.", hint=_HINT)
+    shared = {key: item for key, item in value.items() if key != "frames"}
+    parts = _read_parts(shared, file)
+    frames = []
+    for at, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise FormatError(f"{file}, frame {at}, is no entry with names.", hint=_HINT)
+        text = entry.get("file_path")
+        path = _with_suffix(inside(file.parent, text, f"{file}, frame {at},"))
+        own = part if parts is None else parts.get(_plain(text), "")
+        frames.append(_Frame(
+            {**shared, **entry}, f"{file}, frame {text},", file.parent, path, own))
+    return frames
+
+
+def _read_parts(shared: Mapping[str, Any], file: Path) -> dict[str, str] | None:
+    """Returns the part of each file name that nerfstudio's lists give, None without lists.
+
+    A name in several lists belongs to the last of train, val and test: what is scored is not
+    trained on. Without a list of training views every other frame is one.
+    """
+    lists = {part: shared.get(f"{part}_filenames") for part in _PARTS}
+    if all(names is None for names in lists.values()):
+        return None
+    parts: dict[str, str] = {}
+    if lists["train"] is None:
+        raise FormatError(
+            f"{file} has val_filenames or test_filenames, but no train_filenames.", hint=_HINT)
+    for part, names in lists.items():
+        if names is not None and not isinstance(names, list):
+            raise FormatError(f"{file}: {part}_filenames is no list.", hint=_HINT)
+        parts.update({_plain(name): part for name in names or ()})
+    return parts
+
+
+def _plain(name: object) -> str:
+    return PurePosixPath(str(name)).as_posix()
+
+
+def _with_suffix(path: Path) -> Path:
+    """Returns the file that a path without its suffix stands for, as NeRF's own scenes write it."""
+    if is_file(path):
+        return path
+    named = (path.with_name(path.name + suffix) for suffix in SUFFIXES)
+    return next((file for file in named if is_file(file)), path)
+
+
+def _without_copies(frames: Sequence[_Frame]) -> tuple[list[_Frame], tuple[str, ...]]:
+    """Returns the frames without those said twice with one pose, and a notice about them."""
+    kept: dict[Path, _Frame] = {}
+    copies = []
+    for frame in frames:
+        first = kept.setdefault(frame.path, frame)
+        if first is frame:
+            continue
+        if first.entry.get("transform_matrix") != frame.entry.get("transform_matrix"):
+            raise FormatError(
+                f"{frame.where} is listed more than once with different poses.",
+                hint="Leave one pose for each image.")
+        copies.append(frame.listed)
+        if _rank(frame.part) > _rank(first.part):
+            kept[frame.path] = frame
+    if not copies:
+        return list(kept.values()), ()
+    return list(kept.values()), (
+        f"{len(copies)} images are listed more than once, the first is {copies[0]}",)
+
+
+def _rank(part: str | None) -> int:
+    return _PARTS.index(part) if part in _PARTS else -1
+
+
+def _short_names(frames: Sequence[_Frame]) -> list[str]:
+    """Returns the listed paths without the folders that all of them share."""
+    parts = [frame.listed.parts for frame in frames]
+    folders = [path[:-1] for path in parts]
+    shared = 0
+    while folders and all(len(path) > shared and path[shared] == folders[0][shared]
+                          for path in folders):
+        shared += 1
+    return ["/".join(path[shared:]) for path in parts]
+
+
+def _list_frame(frame: _Frame, name: str, held_out: str) -> Listed:
+    viewmat = viewmat_from_pose(
+        frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
+    lens = read_lens(frame.entry, image_size(frame.path), frame.where)
+    depth, unit = _beside(frame, "depth_file_path"), _unit(frame)
+    return Listed(
+        name, frame.path, lens, viewmat, frame.part == held_out,
+        None if depth is None else DepthFile(depth, unit, lens),
+        _beside(frame, "mask_path"))
+
+
+def _beside(frame: _Frame, key: str) -> Path | None:
+    """Returns the file of depth or mask that a frame names.
+
+    Raises:
+        FormatError: it is named, but not there.
+    """
+    if frame.entry.get(key) is None:
+        return None
+    path = inside(frame.folder, frame.entry[key], f"{frame.where} {key}")
+    if not is_file(path):
+        raise FormatError(
+            f"{frame.where} names the {key} {path}, which is missing.",
+            hint=f"Copy the file, or take {key} out of the list.")
+    return path
+
+
+def _unit(frame: _Frame) -> float:
+    unit = number(frame.entry, "depth_unit_scale_factor", frame.where)
+    if unit is not None and unit <= 0:
+        raise FormatError(
+            f"{frame.where} has depth_unit_scale_factor = {unit:g}; needed is one above 0.",
+            hint=_HINT)
+    return _DEPTH_UNIT if unit is None else unit
+
+
+def _left_out(frames: Sequence[_Frame], kept: Sequence[_Frame]) -> tuple[str, ...]:
+    rest = len(frames) - len(kept)
+    return (f"{rest} frames are left out: the set keeps them for validation, or lists them in no "
+            "part",) * bool(rest)
+
+
+def _read_points(
+    file: Path,
+) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None, tuple[str, ...]]:
+    """Returns nerfstudio's sparse points and their colours, and what to say about them."""
+    if not file.is_file():
+        return None, None, ()
+    name = read_json(file).get("ply_file_path")
+    if name is None:
+        return None, None, ()
+    path = inside(file.parent, name, f"{file}, ply_file_path,")
+    if not is_file(path):
+        return None, None, (f"its points {name} are missing",)
+    points, colors = read_ply_points(path)
+    if colors is None:
+        return points, np.full(points.shape, 128, np.uint8), (f"its points {name} have no colours",)
+    return points, colors, ()

@@ -1,0 +1,163 @@
+"""ingest of data sets that come with poses."""
+
+import logging
+
+import numpy as np
+import pytest
+from ingest_media import blocks, listed, take, walk, write_video
+from PIL import Image
+from posed_sets import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    make_replica,
+    make_scannet,
+    make_transforms,
+    pose,
+    transforms,
+    write_image,
+)
+
+from recon_cli.config import IngestConfig
+from recon_cli.errors import FormatError, InputError
+from recon_cli.io.poses import POSES, read_poses
+
+
+@pytest.fixture
+def notices(caplog):
+    caplog.set_level(logging.WARNING, logger="recon")
+    return lambda: [record.getMessage() for record in caplog.records]
+
+
+def known(out):
+    return read_poses(out / POSES)
+
+
+def test_a_replica_sequence_brings_poses_points_and_its_own_test_views(tmp_path, notices):
+    summary = take(make_replica(tmp_path / "room"), tmp_path / "out")
+    assert (summary["kind"], summary["frames"], summary["held_out"]) == ("replica", 6, 2)
+    assert summary["metric"]
+    assert "a Replica sequence" in notices()[0]
+    assert "--holdout has no effect" in notices()[-1]
+    found, poses = listed(tmp_path / "out"), known(tmp_path / "out")
+    names = [frame["name"] for frame in found["frames"]]
+    assert names == sorted(names) == sorted(poses.viewmats)
+    held = [frame["name"] for frame in found["frames"] if frame["held_out"]]
+    assert all("test" in name for name in held)
+    np.testing.assert_allclose(
+        np.linalg.inv(poses.viewmats[held[0]]), pose(10), atol=1e-8)
+    assert found["groups"][0]["lens"]["params"][2:] == [16.5, 11.0]  # half a pixel from the file's
+    assert poses.metric
+    assert summary["points"] == len(poses.points) > 100
+
+
+def test_depth_of_views_that_are_held_out_lends_no_points(tmp_path):
+    folder = make_replica(tmp_path / "room")
+    take(folder, tmp_path / "one")
+    for path in (folder / "test" / "results").glob("depth*"):
+        path.unlink()
+    take(folder, tmp_path / "two")
+    np.testing.assert_array_equal(known(tmp_path / "one").points, known(tmp_path / "two").points)
+
+
+def test_a_long_sequence_is_thinned_evenly_and_its_test_views_are_not(tmp_path, notices):
+    folder = make_replica(tmp_path / "room", frames=12, tests=3)
+    summary = take(folder, tmp_path / "out", config=IngestConfig(frames=4))
+    assert (summary["frames"], summary["held_out"]) == (7, 3)
+    poses = known(tmp_path / "out").viewmats
+    places = [np.linalg.inv(poses[name])[:3, 3] for name in sorted(poses)][:4]
+    np.testing.assert_allclose(places, [pose(index)[:3, 3] for index in (1, 4, 7, 10)], atol=1e-8)
+    assert any("4 of 12 frames are taken" in text for text in notices())
+
+
+def test_missing_images_of_a_transforms_file_are_counted_and_told(tmp_path, notices):
+    folder = make_transforms(tmp_path / "fox", transforms(frames=6))
+    (folder / "images" / "0002.png").unlink()
+    summary = take(folder, tmp_path / "out", config=IngestConfig(holdout="every:4"))
+    assert (summary["declared_frames"], summary["frames"], summary["lost_frames"]) == (6, 5, 1)
+    assert "0002.png" in summary["skipped"][0]
+    assert any("missing" in text for text in notices())
+    assert [frame["held_out"] for frame in listed(tmp_path / "out")["frames"]] == [
+        True, False, False, False, True]
+    found = known(tmp_path / "out").viewmats["0003.png"]
+    np.testing.assert_allclose(found, np.linalg.inv(pose(3)), atol=1e-12)
+
+
+def test_a_reduced_image_takes_its_lens_along(tmp_path):
+    folder = make_transforms(tmp_path / "set", transforms(k1=0.05))
+    take(folder, tmp_path / "out", config=IngestConfig(max_size=64))
+    lens = listed(tmp_path / "out")["groups"][0]["lens"]
+    assert lens["width"] == WIDTH  # small enough already
+    for path in (folder / "images").iterdir():
+        Image.open(path).resize((4 * WIDTH, 4 * HEIGHT)).save(path)
+    value = transforms(k1=0.05, fl_x=4 * FOCAL, fl_y=4 * FOCAL, cx=66, cy=44,
+                       w=4 * WIDTH, h=4 * HEIGHT)
+    images = {path: path.read_bytes() for path in (folder / "images").iterdir()}
+    make_transforms(folder, value)
+    for path, data in images.items():
+        path.write_bytes(data)
+    take(folder, tmp_path / "two", config=IngestConfig(max_size=64))
+    reduced = listed(tmp_path / "two")["groups"][0]["lens"]
+    assert (reduced["width"], reduced["height"]) == (64, 48)
+    np.testing.assert_allclose(reduced["params"][:5], [60, 60, 33, 22, 0.05])
+
+
+def test_exif_turns_no_image_whose_pose_is_known(tmp_path):
+    folder = make_transforms(tmp_path / "set")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for path in sorted((folder / "images").iterdir()):
+        Image.open(path).save(path, exif=exif)
+    summary = take(folder, tmp_path / "out")
+    assert (summary["width"], summary["height"], summary["lost_frames"]) == (WIDTH, HEIGHT, 0)
+
+
+def test_transparent_pixels_become_a_mask(tmp_path):
+    folder = make_transforms(tmp_path / "set")
+    rgba = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    rgba[:, :8, 3] = 0
+    Image.fromarray(rgba).save(folder / "images" / "0001.png")
+    take(folder, tmp_path / "out")
+    frames = listed(tmp_path / "out")["frames"]
+    assert [frame["masked"] for frame in frames] == [False, True, False, False]
+    mask = np.asarray(Image.open(tmp_path / "out" / "masks" / "0001.png"))
+    np.testing.assert_array_equal(mask, rgba[:, :, 3])
+
+
+def test_an_image_of_another_size_than_its_camera_is_refused(tmp_path):
+    folder = make_scannet(tmp_path / "scene", frames=6)
+    write_image(folder / "color" / "3.jpg", width=WIDTH + 2)
+    with pytest.raises(FormatError, match=r"3\.jpg is 34x24 pixels, but its camera 32x24"):
+        take(folder, tmp_path / "out")
+
+
+def test_half_an_image_is_left_out_and_named(tmp_path, notices):
+    folder = make_scannet(tmp_path / "scene", frames=6)
+    half = folder / "color" / "3.jpg"
+    Image.fromarray(blocks(HEIGHT, WIDTH)).save(half, quality=100)
+    half.write_bytes(half.read_bytes()[:-400])
+    summary = take(folder, tmp_path / "out")
+    assert (summary["frames"], summary["lost_frames"], summary["skipped"]) == (4, 1, ["3.jpg"])
+    assert any("3.jpg" in text for text in notices())
+
+
+def test_a_data_set_is_taken_alone(tmp_path):
+    folder = make_transforms(tmp_path / "set")
+    video = write_video(tmp_path / "walk.mp4", walk(10))
+    with pytest.raises(InputError, match=r"data set with poses \(transforms\), but 2 inputs"):
+        take((folder, video), tmp_path / "out")
+
+
+def test_an_interrupted_run_ends_the_same(tmp_path):
+    folder = make_replica(tmp_path / "room")
+    take(folder, tmp_path / "whole")
+    take(folder, tmp_path / "out")
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()
+            if path.is_file()}
+    for name in ("frames.json", "poses.json", "points.safetensors"):
+        (tmp_path / "out" / name).unlink()
+    first = sorted((tmp_path / "out" / "frames").iterdir())[0]
+    first.unlink()
+    take(folder, tmp_path / "out")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()
+            if path.is_file()} == kept
