@@ -94,14 +94,18 @@ class SfmConfig(StageConfig):
         "keep", "What becomes of the poses that a data set comes with: keep them, refine them "
         "together with the points, or ignore them.", choices=("keep", "refine", "ignore"))
     pairs: str = option(
-        "auto", "Image pairs to match; auto is exhaustive up to 100 images, else sequential.",
-        choices=("auto", "exhaustive", "sequential"))
+        "auto", "Image pairs to match: auto takes all of up to 100 images, else neighbours and "
+        "images that look alike, and goes on to more pairs and other ways of mapping where the "
+        "model is not good enough; a named way is the only one tried.",
+        choices=("auto", "exhaustive", "retrieval", "sequential"))
     max_features: int = option(
-        2048, "SIFT keypoints an image to aim for, coarse ones first; an image may get up to "
-        "twice as many.", unit="keypoints", minimum=100)
+        2048, "Most SIFT keypoints of an image; the coarsest are kept.", unit="keypoints",
+        minimum=100)
     min_registered: float = option(
         0.5, "Fail when fewer images than this share get a camera.", unit="share",
         minimum=0.0, maximum=1.0)
+    accept_weak: bool = option(
+        False, "Take a model whose parts hang together by few matches, too.", hashed=False)
     seed: int = option(0, "Seed of the mapper's random sampling.", minimum=0)
     gravity: str = option(
         "auto", "auto turns the world so that z is up and the floor lies at 0, where cameras and "

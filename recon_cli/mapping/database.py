@@ -12,7 +12,13 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+KEYPOINT_COLUMNS = 6  # x, y and the 2x2 matrix of its shape, which COLMAP writes for SIFT
 _TABLES = {"features": "descriptors", "matches": "two_view_geometries"}
+# A pair of images is numbered first * this + second (COLMAP, src/colmap/util/types.h).
+_PAIR_BASE = 2**31 - 1
 # Values of COLMAP's TwoViewGeometry::ConfigurationType that say "a homography explains this pair".
 _HOMOGRAPHIES = (4, 5, 6)  # planar, panoramic, planar or panoramic
 
@@ -49,13 +55,67 @@ def keypoint_counts(path: Path) -> dict[str, int]:
             "SELECT name, rows FROM images JOIN keypoints USING (image_id)"))
 
 
+def keep_coarsest(path: Path, most: int) -> None:
+    """Removes the finest keypoints of images that have more than `most`, all or none of them.
+
+    The coarsest ones are seen from the most places. Of equal ones the first are kept, so that the
+    same image always keeps the same ones.
+    """
+    with closing(_opened(path)) as connection, connection:
+        many = connection.execute(
+            "SELECT image_id, k.data, d.data FROM keypoints k JOIN descriptors d USING (image_id)"
+            " WHERE k.rows > ?", (most,)).fetchall()
+        for image, keypoints, descriptors in many:
+            shapes = np.frombuffer(keypoints, np.float32).reshape(-1, KEYPOINT_COLUMNS)
+            kept = np.sort(np.argsort(-scales(shapes), kind="stable")[:most])
+            rows = np.frombuffer(descriptors, np.uint8).reshape(len(shapes), -1)[kept]
+            for table, data in (("keypoints", shapes[kept]), ("descriptors", rows)):
+                connection.execute(
+                    f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
+                    (len(kept), data.tobytes(), image))
+
+
+def scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Returns the size of keypoints [K, 6] (x, y and a 2x2 shape), in pixels, [K]."""
+    _, _, a, b, c, d = keypoints.astype(np.float64).T
+    size: NDArray[np.float64] = np.sqrt(np.abs(a * d - b * c))
+    return size
+
+
 def inlier_counts(path: Path) -> tuple[int, int, int]:
     """Returns (verified pairs, verified matches, those of pairs that a homography explains)."""
+    pairs, matches, flat = np.array(inlier_counts_by_distance(path)).reshape(-1, 3).sum(axis=0)
+    return int(pairs), int(matches), int(flat)
+
+
+def inlier_counts_by_distance(path: Path) -> list[tuple[int, int, int]]:
+    """Returns what `inlier_counts` does for pairs 1, 2 to 3, 4 to 7, ... apart in order of names.
+
+    Distances without a verified pair are left out.
+    """
     with closing(_opened(path)) as connection:
+        images = [image for image, in connection.execute(
+            "SELECT image_id FROM images ORDER BY name")]
         rows = connection.execute(
-            "SELECT config, rows FROM two_view_geometries WHERE rows > 0").fetchall()
-    flat = sum(matches for config, matches in rows if config in _HOMOGRAPHIES)
-    return len(rows), sum(matches for _, matches in rows), flat
+            "SELECT pair_id, config, rows FROM two_view_geometries WHERE rows > 0").fetchall()
+    place = {image: index for index, image in enumerate(images)}
+    counts: dict[int, tuple[int, int, int]] = {}
+    for pair, config, matches in rows:
+        one, two = (place[image] for image in divmod(pair, _PAIR_BASE))
+        apart = abs(one - two).bit_length()
+        pairs, total, flat = counts.get(apart, (0, 0, 0))
+        counts[apart] = (
+            pairs + 1, total + matches, flat + (matches if config in _HOMOGRAPHIES else 0))
+    return [counts[apart] for apart in sorted(counts)]
+
+
+def pair_names(path: Path) -> set[tuple[str, str]]:
+    """Returns the pairs of images that are finished, verified or not, each in order of names."""
+    with closing(_opened(path)) as connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        ids = connection.execute("SELECT pair_id FROM two_view_geometries").fetchall()
+    pairs = ((names[pair // _PAIR_BASE], names[pair % _PAIR_BASE]) for pair, in ids)
+    return {(min(pair), max(pair)) for pair in pairs}
 
 
 def remove(path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from pathlib import Path
 
 import pycolmap
 
@@ -27,9 +28,16 @@ def extract(job: Job, report: Reporter) -> Result:
     """
     report.phase("features", len(job.names), done=database.progress(job.database, "features"))
     for group in job.groups:
-        pycolmap.extract_features(
-            job.database, job.frames, list(group.names), pycolmap.CameraMode.SINGLE,
-            _reader(job, group), _extraction(job), pycolmap.Device.cpu)
+        masked = [name for name in group.names if job.masks and (job.masks / name).exists()]
+        # COLMAP takes no image that has no mask where it is given a folder of masks.
+        for names, masks in (
+            (masked, job.masks), (sorted(set(group.names).difference(masked)), None)
+        ):
+            if names:  # an empty list would mean all
+                pycolmap.extract_features(
+                    job.database, job.frames, names, pycolmap.CameraMode.SINGLE,
+                    _reader(group, masks), _extraction(job), pycolmap.Device.cpu)
+    database.keep_coarsest(job.database, job.max_features)
     counts = database.keypoint_counts(job.database)
     _check_readable(job, counts)
     doctor.check_texture(counts)
@@ -52,7 +60,7 @@ def create_database(job: Job) -> None:
     for group in job.groups:
         pycolmap.import_images(
             temporary, job.frames, pycolmap.CameraMode.SINGLE, list(group.names),
-            _reader(job, group))
+            _reader(group))
     with pycolmap.Database.open(temporary) as opened:
         names = {image.name for image in opened.read_all_images()}
     _check_readable(job, names)
@@ -68,11 +76,11 @@ def _check_readable(job: Job, found: Collection[str]) -> None:
             hint="Run `recon ingest --again`.")
 
 
-def _reader(job: Job, group: CameraGroup) -> pycolmap.ImageReaderOptions:
+def _reader(group: CameraGroup, masks: Path | None = None) -> pycolmap.ImageReaderOptions:
     options = pycolmap.ImageReaderOptions()
     options.camera_model = CAMERA_MODEL
-    if job.masks is not None:
-        options.mask_path = job.masks
+    if masks is not None:
+        options.mask_path = masks
     if group.lens is not None:
         options.camera_model = group.lens.model
         options.camera_params = ",".join(map(repr, group.lens.params))
@@ -85,7 +93,7 @@ def _reader(job: Job, group: CameraGroup) -> pycolmap.ImageReaderOptions:
 def _extraction(job: Job) -> pycolmap.FeatureExtractionOptions:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = job.threads
-    # No hard cap: COLMAP stops after the scale at which the count is reached, and a keypoint with
-    # two orientations counts twice.
+    # No hard cap, hence `keep_coarsest`: COLMAP stops after the scale at which the count is
+    # reached, and a keypoint with two orientations counts twice.
     options.sift.max_num_features = job.max_features
     return options

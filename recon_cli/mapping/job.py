@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recon_cli import atomic
-from recon_cli.scene.lens import Lens
+from recon_cli.mapping.ledger import STEPS
 
+if TYPE_CHECKING:
+    from recon_cli.scene.lens import Lens
+
+VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
+RUNGS = "rungs"  # in the stage's folder: what is needed only until there is a model
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
-
-# Exhaustive matching grows with the square: 4950 pairs of 100 images are about a minute on two
-# cores at 600x340 and still the whole graph, so that a walk around a room closes.
-EXHAUSTIVE_MAX = 100
-# COLMAP's default. With the quadratic overlap an image also meets those 16, 32, ... 512 further.
-SEQUENTIAL_OVERLAP = 10
-
 
 @dataclass(frozen=True)
 class CameraGroup:
@@ -51,11 +50,17 @@ class Job:
             where no frame has one.
         poses: file of known poses (see `io.poses`), None where there are none.
         pose_use: "keep", "refine" or "ignore" them.
-        pairs: "auto", "exhaustive" or "sequential".
-        max_features: SIFT keypoints an image to aim for.
+        given_points: the file of poses comes with points.
+        pairs: "auto", "exhaustive", "retrieval" or "sequential".
+        max_features: SIFT keypoints that an image keeps at most.
         min_registered: share of the frames that must get a camera.
+        accept_weak: a model with a weak link is taken too.
+        max_minutes: after which the parent ends the process; further rungs of the ladder are begun
+            only where they are expected to fit in.
         seed: of every random sampling.
         threads: for features, matching and undistortion.
+        sharpness: of frames by name, where it is known (see `capture.frames`).
+        times: of showing in seconds by name, where they are known.
     """
 
     frames: Path
@@ -65,11 +70,16 @@ class Job:
     masks: Path | None
     poses: Path | None
     pose_use: str
+    given_points: bool
     pairs: str
     max_features: int
     min_registered: float
+    accept_weak: bool
+    max_minutes: float
     seed: int
     threads: int
+    sharpness: Mapping[str, float]
+    times: Mapping[str, float]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -82,26 +92,27 @@ class Job:
         return self.out / "database.db"
 
     @property
+    def rungs(self) -> Path:
+        """Where models are gathered until one of them is kept."""
+        return self.out / RUNGS
+
+    @property
     def undistorting(self) -> Path:
         """Where undistorted images are gathered until all of them are there."""
         return self.out / "undistorted.partial"
 
     @property
-    def exhaustive(self) -> bool:
-        """Whether each image is matched with every other one."""
-        if self.pairs == "auto":
-            return len(self.names) <= EXHAUSTIVE_MAX
-        return self.pairs == "exhaustive"
+    def known_poses(self) -> bool:
+        """Whether the cameras are given and not to be found."""
+        return self.poses is not None and self.pose_use != "ignore"
 
     @property
-    def pair_count(self) -> int:
-        """How many image pairs are matched."""
-        count = len(self.names)
-        if self.exhaustive:
-            return count * (count - 1) // 2
-        near = range(1, SEQUENTIAL_OVERLAP + 1)
-        far = (2**power for power in range(SEQUENTIAL_OVERLAP))
-        return sum(max(0, count - step) for step in {*near, *far})
+    def steps(self) -> tuple[str, ...]:
+        """The steps of `ledger.STEPS` that this job takes."""
+        kept = self.known_poses and self.pose_use == "keep"
+        if kept and self.given_points and all(group.lens for group in self.groups):
+            return ("sparse", "undistorted")  # nothing is left to be found in the pixels
+        return STEPS
 
     def write(self, path: Path) -> None:
         """Writes the job for the mapping process."""
@@ -122,5 +133,11 @@ class Job:
 def _group(value: dict[str, Any]) -> CameraGroup:
     lens = value["lens"]
     return CameraGroup(**{
-        **value, "names": tuple(value["names"]),
-        "lens": None if lens is None else Lens(**{**lens, "params": tuple(lens["params"])})})
+        **value, "names": tuple(value["names"]), "lens": None if lens is None else _lens(lens)})
+
+
+def _lens(value: dict[str, Any]) -> Lens:
+    # The scene imports torch: seconds and 200 MB that the mapping process would pay for nothing.
+    from recon_cli.scene.lens import Lens  # noqa: PLC0415
+
+    return Lens(**{**value, "params": tuple(value["params"])})

@@ -22,10 +22,10 @@ Result = dict[str, Any]  # JSON values only
 
 
 class Ledger:
-    """The finished steps in a stage's folder; every change reaches the disk at once.
+    """The finished steps in a folder; every change reaches the disk at once.
 
     Args:
-        out: the stage's folder.
+        out: the stage's folder, or one in it.
     """
 
     def __init__(self, out: Path) -> None:

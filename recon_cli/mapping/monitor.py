@@ -6,12 +6,12 @@ soon as it has it. So the parent counts those.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 
 from recon_cli.mapping import database, protocol
 from recon_cli.mapping.job import Job
-from recon_cli.mapping.ledger import STEPS
 from recon_cli.progress import Bar, Progress
 
 _DOING = {
@@ -20,6 +20,7 @@ _DOING = {
     "mapping": ("placing cameras", "frame"),
     "undistorted": ("undistorting frames", "frame"),
 }
+_STEP = {"mapping": "sparse"}  # the step that a phase belongs to, where the names differ
 
 
 class Monitor:
@@ -39,6 +40,7 @@ class Monitor:
         self._record = record
         self._phase: protocol.Phase | None = None
         self._count = 0
+        self._durable = 0
         self._bar: Bar | None = None
         self._open = ExitStack()
 
@@ -85,13 +87,19 @@ class Monitor:
         if name in ("features", "matches"):
             return database.progress(self._job.database, name)
         if name == "undistorted":
-            return sum(1 for _ in self._job.undistorting.rglob("*.png"))
+            # os.walk, not rglob: the process removes folders as it goes, and walk passes over them.
+            return sum(
+                name.endswith(".png")
+                for _, _, files in os.walk(self._job.undistorting) for name in files)
         return 0
 
     def _note_durable(self) -> None:
         """Records finished steps, and images or pairs that the database keeps."""
         assert self._phase is not None
-        frames = len(self._job.names)
-        step = {"features": 0, "matches": 1, "mapping": 2, "undistorted": 3}[self._phase.name]
-        share = self._count / self._phase.total if step < 2 else 0.0
-        self._record(round((step + min(1.0, share)) * frames), len(STEPS) * frames)
+        frames, steps = len(self._job.names), self._job.steps
+        step = steps.index(_STEP.get(self._phase.name, self._phase.name))
+        kept = self._phase.name in ("features", "matches")
+        share = min(1.0, self._count / max(1, self._phase.total)) if kept else 0.0
+        # A further rung of the ladder matches again: what was reached before stays reached.
+        self._durable = max(self._durable, round((step + share) * frames))
+        self._record(self._durable, len(steps) * frames)

@@ -32,15 +32,13 @@ _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, threa
 def run_job(
     job: Job,
     *,
-    max_minutes: float,
     progress: Progress,
     record: Callable[[int, int], None],
 ) -> None:
     """Runs a job in a process of its own; its results stand in the ledger.
 
     Args:
-        job: what to do.
-        max_minutes: after which the process is killed.
+        job: what to do, and after how many minutes the process is killed.
         progress: for a bar a phase.
         record: called with (done, total) of what would survive a crash.
 
@@ -50,6 +48,7 @@ def run_job(
         WorkspaceError: another process works in the same folder.
         OSError: as met in the process: the disk is full or not writable.
     """
+    max_minutes = job.max_minutes
     deadline = time.monotonic() + 60 * max_minutes
     file = job.out / "job.json"
     job.write(file)

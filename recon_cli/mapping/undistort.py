@@ -8,33 +8,42 @@ from __future__ import annotations
 
 import filecmp
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pycolmap
 
 from recon_cli.mapping.job import Job
 from recon_cli.mapping.ledger import Result, fresh_folder, publish
 from recon_cli.mapping.protocol import Reporter
 
-IMAGES, TWINS, SPARSE = "images", "denoised", "sparse"
+IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 
 
 def undistort(job: Job, report: Reporter) -> Result:
-    """Writes out/undistorted/{images,denoised,sparse} and returns its one camera."""
+    """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
     model = pycolmap.Reconstruction(job.out / "sparse")
     names = sorted(model.image(i).name for i in model.reg_image_ids())
     report.phase("undistorted", 2 * len(names))
     work = fresh_folder(job.undistorting)
     _undistorted(job, job.frames, names, work)
     _write_twins(job, names, work)
-    camera, = pycolmap.Reconstruction(work / SPARSE).cameras.values()
+    _write_masks(job, names, work)
+    cameras = _cameras(pycolmap.Reconstruction(work / SPARSE))
     publish(work, job.out / "undistorted")
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "focal_px": camera.mean_focal_length(),
-    }
+    return {"cameras": cameras}
+
+
+def _cameras(model: pycolmap.Reconstruction) -> list[dict[str, float]]:
+    """Returns width, height, focal length in pixels and frames of each camera, in its order."""
+    used = Counter(model.image(i).camera_id for i in model.reg_image_ids())
+    return [
+        {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
+         "frames": used[index]}
+        for index, camera in sorted(model.cameras.items())]
 
 
 def _write_twins(job: Job, names: Sequence[str], work: Path) -> None:
@@ -52,6 +61,24 @@ def _write_twins(job: Job, names: Sequence[str], work: Path) -> None:
         shutil.rmtree(work / "twins")
     for name in set(names).difference(changed):
         shutil.copyfile(work / IMAGES / name, twins / name)
+
+
+def _write_masks(job: Job, names: Sequence[str], work: Path) -> None:
+    """Writes the masks of masked frames through the same cameras: 255 where a pixel counts.
+
+    A pixel that is made of one that counts and one that does not takes the side of the larger part.
+    """
+    masked = [name for name in names if job.masks and (job.masks / name).exists()]
+    if job.masks is None or not masked:
+        return
+    (work / MASKS).mkdir()
+    _undistorted(job, job.masks, masked, work / "between")
+    for name in masked:
+        data = np.frombuffer((work / "between" / IMAGES / name).read_bytes(), np.uint8)
+        gray = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))
+        _, packed = cv2.imencode(".png", np.where(gray < 128, 0, 255).astype(np.uint8))
+        (work / MASKS / name).write_bytes(packed.tobytes())
+    shutil.rmtree(work / "between")
 
 
 def _undistorted(job: Job, source: Path, names: Sequence[str], target: Path) -> None:

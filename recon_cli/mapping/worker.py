@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -19,19 +20,13 @@ from typing import BinaryIO
 import filelock
 
 from recon_cli.errors import ReconError, WorkspaceError
-from recon_cli.mapping import database, features, mapper, pairs, undistort
+from recon_cli.mapping import database, features, known, ladder, undistort
 from recon_cli.mapping.job import LOCK, Job
 from recon_cli.mapping.ledger import Ledger, Result
 from recon_cli.mapping.protocol import Reporter
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
-_ACTIONS: dict[str, Callable[[Job, Reporter], Result]] = {
-    "features": features.extract,
-    "matches": pairs.match,
-    "sparse": mapper.build,
-    "undistorted": undistort.undistort,
-}
 _FOLDERS = ("sparse", "undistorted")  # steps that write a folder of their name
 
 
@@ -42,16 +37,39 @@ def work(job: Job, report: Reporter) -> None:
         SfmError: no model came out, or none to trust.
         FormatError: a frame cannot be read.
     """
+    deadline = time.monotonic() + 60 * job.max_minutes
+    actions = _actions(job, report, deadline)
     ledger = Ledger(job.out)
-    _prepare_database(job, ledger)
-    for step, action in _ACTIONS.items():
+    if "features" in job.steps:
+        _prepare_database(job, ledger)
+    for step in job.steps:
         if ledger.result(step) is not None:
             continue
         ledger.forget_from(step)
+        if step in ("features", "matches"):  # the models of finished rungs build on these
+            shutil.rmtree(job.rungs, ignore_errors=True)
         start = time.monotonic()
-        result = action(job, report)
+        result = actions[step]()
         result["seconds"] = round(time.monotonic() - start, 2)
         ledger.finish(step, result, job.out / step if step in _FOLDERS else None)
+
+
+def _actions(job: Job, report: Reporter, deadline: float) -> dict[str, Callable[[], Result]]:
+    """Returns what is done in each step."""
+    cameras: dict[str, Callable[[], Result]] = {
+        "matches": lambda: ladder.match_first(job, report),
+        "sparse": lambda: ladder.climb(job, report, deadline=deadline),
+    }
+    if job.known_poses:
+        cameras = {
+            "matches": lambda: known.match(job, report),
+            "sparse": lambda: known.build(job, report),
+        }
+    return {
+        "features": lambda: features.extract(job, report),
+        **cameras,
+        "undistorted": lambda: undistort.undistort(job, report),
+    }
 
 
 def _prepare_database(job: Job, ledger: Ledger) -> None:
@@ -61,7 +79,8 @@ def _prepare_database(job: Job, ledger: Ledger) -> None:
         features.create_database(job)
     for step in ("features", "matches"):
         result = ledger.result(step)
-        if result is not None and result["rows"] != database.progress(job.database, step):
+        # Further rungs of the ladder add pairs.
+        if result is not None and result["rows"] > database.progress(job.database, step):
             ledger.forget_from(step)
 
 

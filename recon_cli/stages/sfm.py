@@ -6,6 +6,7 @@ cameras of their originals.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ from recon_cli.capture.frames import FrameList
 from recon_cli.capture.pace import paced
 from recon_cli.config import SfmConfig
 from recon_cli.errors import FormatError
-from recon_cli.io.poses import POSES
+from recon_cli.io.poses import POSES, read_poses
 from recon_cli.mapping import process
 from recon_cli.mapping.doctor import listed
 from recon_cli.mapping.job import CameraGroup, Job
-from recon_cli.mapping.ledger import STEPS, Ledger
+from recon_cli.mapping.ledger import Ledger
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 
 
@@ -32,10 +33,12 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         ctx: for notices, progress and threads; the model does not depend on the threads.
 
     Returns:
-        frames, registered (counts), unregistered, unregistered_held_out (names), points,
-        mean_track_length, reprojection_error_px, median_triangulation_angle_deg, models (number of
-        frames in each model that was found), width, height, focal_px (undistorted), seconds (by
-        step).
+        frames, registered (counts), unregistered, unregistered_held_out (names), rejected (why
+        frames were taken out of the model, by name), points, mean_track_length,
+        reprojection_error_px, median_triangulation_angle_deg, models (number of frames in the model
+        and in what is left of others), rungs (what was tried; see `mapping.ladder.Note`), verdict,
+        poses (of known poses: see `mapping.known`), cameras (width, height, focal_px undistorted
+        and frames of each), seconds (by step).
 
     Raises:
         SfmError: there are too few cameras, the model cannot be trusted, the time is up, or the
@@ -44,24 +47,31 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     """
     ingest, denoise = inputs.folders["ingest"].resolve(), inputs.folders["denoise"].resolve()
     frames = store.read_frame_list(ingest)
+    poses = ingest / POSES
     job = Job(
         frames=ingest / store.FOLDER,
         denoised=denoise / store.FOLDER,
         out=out.resolve(),
         groups=_groups(frames),
         masks=ingest / store.MASKS if any(frame.masked for frame in frames.frames) else None,
-        poses=poses if (poses := ingest / POSES).exists() else None,
+        poses=poses if poses.exists() else None,
         pose_use=config.poses,
+        given_points=poses.exists() and read_poses(poses).points is not None,
         pairs=config.pairs,
         max_features=config.max_features,
         min_registered=config.min_registered,
+        accept_weak=config.accept_weak,
+        max_minutes=config.max_minutes,
         seed=config.seed,
         threads=ctx.threads,
+        sharpness={frame.name: frame.sharpness for frame in frames.frames
+                   if frame.sharpness is not None},
+        times={frame.name: frame.time_seconds for frame in frames.frames
+               if frame.time_seconds is not None},
     )
     _check_frames(job)
-    process.run_job(
-        job, max_minutes=config.max_minutes, progress=ctx.progress, record=paced(ctx.record))
-    summary = _summary(frames, Ledger(out))
+    process.run_job(job, progress=ctx.progress, record=paced(ctx.record))
+    summary = _summary(frames, job)
     _report(summary, ctx)
     return summary
 
@@ -83,44 +93,55 @@ def _check_frames(job: Job) -> None:
                 hint=f"Run `recon {verb} --again`.")
 
 
-def _summary(frames: FrameList, ledger: Ledger) -> Summary:
+def _summary(frames: FrameList, job: Job) -> Summary:
     results: dict[str, dict[str, Any]] = {}
-    for step in STEPS:
-        result = ledger.result(step)
+    for step in job.steps:
+        result = Ledger(job.out).result(step)
         assert result is not None, f"the mapping process ended without {step}"
         results[step] = result
-    sparse, camera = results["sparse"], results["undistorted"]
+    sparse = results["sparse"]
     unregistered = sorted({frame.name for frame in frames.frames} - set(sparse["registered"]))
     held_out = {frame.name for frame in frames.frames if frame.held_out}
     return {
         "frames": len(frames.frames),
+        **sparse,
         "registered": len(sparse["registered"]),
         "unregistered": unregistered,
         "unregistered_held_out": [name for name in unregistered if name in held_out],
-        "points": sparse["points"],
-        "mean_track_length": sparse["mean_track_length"],
-        "reprojection_error_px": sparse["reprojection_error_px"],
-        "median_triangulation_angle_deg": sparse["median_triangulation_angle_deg"],
-        "models": sparse["models"],
-        "width": camera["width"],
-        "height": camera["height"],
-        "focal_px": camera["focal_px"],
+        "cameras": results["undistorted"]["cameras"],
         "seconds": {step: result["seconds"] for step, result in results.items()},
     }
 
 
 def _report(summary: Summary, ctx: StageContext) -> None:
-    """Says which frames have no camera and which models were left aside."""
+    """Says what was tried, which frames have no camera and which models were left aside."""
+    for text in (*_tried(summary["rungs"]), *summary["lines"], *_left_out(summary)):
+        ctx.notice(text)
+
+
+def _tried(rungs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yields a sentence for each way to a model behind the first."""
+    for rung in rungs[1:]:
+        reason = rung["reason"].rstrip(".")
+        if rung["skipped"]:
+            yield (f"{rung['name']} was not tried although {reason}: {rung['skipped']}, more than "
+                   "is left of --max-minutes.")
+        else:
+            yield (f"{rung['name']} was tried, because {reason}: {rung['registered']} frames got a "
+                   f"camera{', and this model is kept' if rung['kept'] else ''}.")
+
+
+def _left_out(summary: Summary) -> Iterator[str]:
     missing, held_out = summary["unregistered"], summary["unregistered_held_out"]
-    if missing:
-        ctx.notice(
-            f"{len(missing)} of {summary['frames']} frames have no camera and are left out: "
-            f"{listed(missing)}.")
+    for name, reason in summary["rejected"].items():
+        yield f"{name} was taken out of the model: {reason}."
+    if missing and not summary["lines"]:  # the verdict names them, and why
+        yield (f"{len(missing)} of {summary['frames']} frames have no camera and are left out: "
+               f"{listed(missing)}.")
     if held_out:
-        ctx.notice(
-            f"{len(held_out)} of them were held out and so cannot be scored: {listed(held_out)}.")
-    if len(summary["models"]) > 1:
-        sizes = ", ".join(str(size) for size in summary["models"][1:])
-        ctx.notice(
-            f"The capture fell apart: the largest model, of {summary['models'][0]} frames, is "
-            f"kept; others of {sizes} frames are left aside.")
+        yield (f"{len(held_out)} frames without a camera were held out and so cannot be scored: "
+               f"{listed(held_out)}.")
+    if summary["apart"]:
+        parts = "; ".join(f"{len(part)} frames ({listed(part, 3)})" for part in summary["apart"])
+        yield (f"The capture fell apart: the largest model, of {summary['models'][0]} frames, is "
+               f"kept; left aside are {parts}.")

@@ -1,3 +1,5 @@
+import io
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
@@ -5,11 +7,14 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from sfm_inputs import texture
 
+from recon_cli.capture.frames import write_png
 from recon_cli.errors import FormatError
 from recon_cli.mapping import database
-from recon_cli.mapping.features import create_database
+from recon_cli.mapping.features import create_database, extract
 from recon_cli.mapping.job import CameraGroup, Job
+from recon_cli.mapping.protocol import Reporter
 from recon_cli.scene.lens import Lens
 
 NAMES = ("a.png", "b.png", "c.png")
@@ -25,8 +30,9 @@ def job(tmp_path):
     return Job(
         frames=tmp_path / "frames", denoised=tmp_path / "frames", out=tmp_path / "out",
         groups=(CameraGroup(NAMES, 64, 48),), masks=None, poses=None,
-        pose_use="keep", pairs="auto", max_features=500,
-        min_registered=0.5, seed=0, threads=1)
+        pose_use="keep", given_points=False, pairs="auto", max_features=500,
+        min_registered=0.5, accept_weak=False, max_minutes=1.0, seed=0, threads=1,
+        sharpness={}, times={})
 
 
 def camera(job):
@@ -114,3 +120,81 @@ def test_a_broken_database_is_replaced_with_its_side_files(job):
     create_database(job)
     assert database.is_sound(job.database, NAMES, 1)
     assert not side.exists()
+
+
+def textured(job, **changes):
+    """The same job with frames full of keypoints, and its database."""
+    for seed, name in enumerate(NAMES):
+        write_png(job.frames / name, texture(180, 240, seed))
+    group = replace(job.groups[0], width=240, height=180)
+    job = replace(job, groups=(group,), **changes)
+    create_database(job)
+    return job
+
+
+def keypoints(job):
+    with pycolmap.Database.open(job.database) as opened:
+        return {image.name: opened.read_keypoints(image.image_id)
+                for image in opened.read_all_images()}
+
+
+def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
+    job = textured(job, max_features=100)
+    extract(job, Reporter(io.BytesIO()))
+    few = keypoints(job)
+    assert [len(found) for found in few.values()] == [100, 100, 100]
+    database.remove(job.database)
+    create_database(job)
+    extract(replace(job, max_features=5000), Reporter(io.BytesIO()))
+    for name, every in keypoints(job).items():
+        coarsest = np.sort(database.scales(every))[-100:]
+        np.testing.assert_array_equal(np.sort(database.scales(few[name])), coarsest)
+
+
+def test_descriptors_stay_with_their_keypoints(job):
+    job = textured(job, max_features=5000)
+    extract(job, Reporter(io.BytesIO()))
+    before, every = keypoints(job), descriptors(job)
+    database.keep_coarsest(job.database, 60)
+    for name, rows in descriptors(job).items():
+        places = [int(np.flatnonzero((before[name] == point).all(axis=1))[0])
+                  for point in keypoints(job)[name]]
+        np.testing.assert_array_equal(rows, every[name][places])
+
+
+def descriptors(job):
+    with pycolmap.Database.open(job.database) as opened:
+        return {image.name: np.asarray(opened.read_descriptors(image.image_id).data)
+                for image in opened.read_all_images()}
+
+
+def test_nothing_is_found_where_the_mask_is_black(job, tmp_path):
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((180, 240), np.uint8)
+    mask[:, 120:] = 255
+    Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
+    job = textured(job, masks=tmp_path / "masks")
+    extract(job, Reporter(io.BytesIO()))
+    found = keypoints(job)
+    assert len(found["b.png"]) > 20
+    assert found["b.png"][:, 0].min() >= 120
+    assert found["a.png"][:, 0].min() < 120
+
+
+def test_an_extraction_that_goes_on_keeps_the_cameras(job):
+    job = textured(job)
+    one, two = replace(job.groups[0], names=NAMES[:1]), replace(job.groups[0], names=NAMES[1:])
+    job = replace(job, groups=(one, two))
+    create_database(job)
+    extract(job, Reporter(io.BytesIO()))
+    whole = keypoints(job)
+    with sqlite3.connect(job.database) as connection:  # as a kill before the last image leaves it
+        for table in ("keypoints", "descriptors"):
+            connection.execute(f"DELETE FROM {table} WHERE image_id = 3")
+    connection.close()
+    extract(job, Reporter(io.BytesIO()))
+    assert database.is_sound(job.database, NAMES, 2)
+    with pycolmap.Database.open(job.database) as opened:
+        assert [image.camera_id for image in opened.read_all_images()] == [1, 2, 2]
+    for name, found in keypoints(job).items():
+        np.testing.assert_array_equal(found, whole[name])

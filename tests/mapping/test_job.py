@@ -1,9 +1,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from recon_cli.mapping.job import CameraGroup, Job
+from recon_cli.mapping.ledger import STEPS
 from recon_cli.scene.lens import Lens
 
 
@@ -11,9 +10,9 @@ def job(count, pairs="auto"):
     return Job(
         frames=Path("/in/frames"), denoised=Path("/in/denoised"), out=Path("/out"),
         groups=(CameraGroup(tuple(f"{index:06d}.png" for index in range(count)), 600, 340),),
-        masks=None, poses=None, pose_use="keep", pairs=pairs,
-        max_features=2048, min_registered=0.5, seed=0,
-        threads=2)
+        masks=None, poses=None, pose_use="keep", given_points=False, pairs=pairs,
+        max_features=2048, min_registered=0.5, accept_weak=False, max_minutes=1.0,
+        seed=0, threads=2, sharpness={"000000.png": 12.5}, times={"000000.png": 0.25})
 
 
 def test_what_is_written_is_read_back(tmp_path):
@@ -26,20 +25,19 @@ def test_what_is_written_is_read_back(tmp_path):
     assert Job.read(tmp_path / "job.json") == told
 
 
-@pytest.mark.parametrize(("count", "exhaustive"), [(100, True), (101, False)])
-def test_auto_is_exhaustive_up_to_a_hundred_images(count, exhaustive):
-    assert job(count).exhaustive is exhaustive
+def test_poses_and_points_that_are_kept_leave_nothing_to_be_found():
+    lens = Lens("PINHOLE", 80, 60, (70.0, 71.0, 40.5, 30.0))
+    group = replace(job(4).groups[0], lens=lens)
+    given = replace(
+        job(4), poses=Path("/in/poses.json"), given_points=True, groups=(group,))
+    assert given.steps == ("sparse", "undistorted")
+    assert replace(given, pose_use="refine").steps == STEPS
+    assert replace(given, given_points=False).steps == STEPS
+    assert replace(given, groups=(replace(group, lens=None),)).steps == STEPS
 
 
-def test_a_named_way_of_pairing_is_taken():
-    assert job(300, "exhaustive").exhaustive
-    assert not job(5, "sequential").exhaustive
-
-
-def test_exhaustive_pairs_are_counted():
-    assert job(100).pair_count == 4950
-
-
-def test_sequential_pairs_are_neighbours_and_powers_of_two():
-    # 20 images: 19 + 18 + ... + 10 neighbours at 1 to 10, and 4 pairs that are 16 apart.
-    assert job(20, "sequential").pair_count == sum(range(10, 20)) + 4
+def test_poses_that_are_ignored_are_not_known():
+    given = replace(job(4), poses=Path("/in/poses.json"), given_points=True)
+    assert given.known_poses
+    assert not replace(given, pose_use="ignore").known_poses
+    assert replace(given, pose_use="ignore").steps == STEPS

@@ -83,7 +83,9 @@ def test_the_summary_is_json_and_has_plausible_figures(mapped):
     assert summary["median_triangulation_angle_deg"] > 5
     assert summary["models"][0] == COUNT
     assert set(summary["seconds"]) == {"features", "matches", "sparse", "undistorted"}
-    assert summary["focal_px"] == pytest.approx(300, rel=0.03)  # the room was rendered with 300
+    camera, = summary["cameras"]
+    assert camera["frames"] == COUNT
+    assert camera["focal_px"] == pytest.approx(300, rel=0.03)  # the room was rendered with 300
 
 
 def test_camera_centres_agree_with_the_rendered_path(mapped, shared_data):
@@ -116,7 +118,7 @@ def test_the_scene_can_be_read_with_its_twins(mapped):
     assert scene.unregistered_test == (BLANK,)
     assert len(scene.points) == summary["points"]
     assert (scene.train[0].camera.width, scene.train[0].camera.height) == (
-        summary["width"], summary["height"])
+        summary["cameras"][0]["width"], summary["cameras"][0]["height"])
 
 
 def test_twins_are_identical_exactly_where_nothing_was_denoised(mapped):
@@ -140,7 +142,7 @@ def test_undistortion_keeps_pixels_and_has_no_blank_border(mapped):
 def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
     out, _, _ = mapped
     assert sorted(path.name for path in out.iterdir()) == [
-        "database.db", "log.txt", "sparse", "steps.json", "undistorted"]
+        "database.db", "log.txt", "sparse", "steps.json", "undistorted", "verdict.json"]
     assert sorted(path.name for path in (out / "undistorted").iterdir()) == [
         "denoised", "images", "sparse"]
     for folder in (out / "sparse", out / "undistorted" / "sparse"):
@@ -247,3 +249,27 @@ def test_an_interrupt_ends_the_mapping_process_and_goes_on(room, tmp_path):
         run(room, tmp_path / "out", ctx=StageContext(record=interrupt))
     assert not workers()
     assert not (tmp_path / "out" / "job.json").exists()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs signals")
+def test_ctrl_c_in_every_step_ends_the_mapping_process_at_once(room, tmp_path):
+    """The waiting has a bound only so that the test ends; it came to 0.5 to 0.6 seconds."""
+    out = tmp_path / "out"
+    out.mkdir()
+    for reached in (
+        lambda: database.progress(out / "database.db", "features") >= 3,
+        lambda: database.progress(out / "database.db", "matches") >= 5,
+        lambda: noted(out, "matches"),
+        lambda: noted(out, "sparse") and any((out / "undistorted.partial").rglob("*.png")),
+    ):
+        parent = subprocess.Popen(
+            [sys.executable, "-c", RUN, str(room), str(out), str(FEATURES)],
+            stderr=subprocess.DEVNULL)
+        while not reached():
+            assert parent.poll() is None, "the run ended before it could be interrupted"
+            time.sleep(0.005)
+        family = [parent, *psutil.Process(parent.pid).children(recursive=True)]
+        parent.send_signal(signal.SIGINT)
+        assert parent.wait(timeout=60) != 0
+        _, alive = psutil.wait_procs(family[1:], timeout=60)
+        assert not alive

@@ -52,17 +52,51 @@ def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
         run(base, tmp_path / "out")
 
 
-def test_models_that_are_left_aside_are_told(caplog):
+def told(caplog, **changes):
+    """What the stage says of a summary."""
     summary = {
         "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
-        "unregistered_held_out": ["3.png"], "models": [49, 28, 3],
-    }
-    sfm._report(summary, StageContext())
-    told = caplog.text
-    assert "11 of 60 frames have no camera" in told
-    assert "and 6 more" in told
-    assert "1 of them were held out and so cannot be scored: 3.png" in told
-    assert "of 49 frames, is kept; others of 28, 3 frames are left aside" in told
+        "unregistered_held_out": [], "models": [49], "apart": [], "rejected": {}, "lines": [],
+        "rungs": [{"name": "exhaustive", "skipped": "", "registered": 40, "kept": False}]}
+    sfm._report(summary | changes, StageContext())
+    return caplog.text
+
+
+def test_models_that_are_left_aside_are_told(caplog):
+    text = told(caplog, models=[49, 3], apart=[["5.png", "6.png", "7.png"]])
+    assert "of 49 frames, is kept; left aside are 3 frames (5.png, 6.png, 7.png)" in text
+
+
+def test_frames_without_a_camera_are_told(caplog):
+    text = told(caplog, unregistered_held_out=["3.png"])
+    assert "11 of 60 frames have no camera" in text
+    assert "and 6 more" in text
+    assert "1 frames without a camera were held out and so cannot be scored: 3.png" in text
+
+
+def test_where_there_is_a_verdict_it_speaks_of_the_missing_frames(caplog):
+    text = told(caplog, lines=["All but eleven hang together."])
+    assert "All but eleven hang together." in text
+    assert "11 of 60" not in text
+
+
+def test_frames_that_were_taken_out_of_the_model_are_told_with_the_reason(caplog):
+    text = told(caplog, rejected={"9.png": "5% of its 200 matches agree"})
+    assert "9.png was taken out of the model: 5% of its 200 matches agree." in text
+
+
+def test_every_further_way_to_a_model_is_told_with_its_reason(caplog):
+    text = told(caplog, rungs=[
+        {"name": "exhaustive", "reason": "", "skipped": "", "registered": 40, "kept": False},
+        {"name": "relaxed", "reason": "only 40 of 60 frames got a camera", "skipped": "",
+         "registered": 49, "kept": True},
+        {"name": "global", "reason": "the capture fell into 2 models",
+         "skipped": "it would take about 9 minutes", "registered": 0, "kept": False}])
+    assert ("relaxed was tried, because only 40 of 60 frames got a camera: 49 frames got a camera, "
+            "and this model is kept.") in text
+    assert ("global was not tried although the capture fell into 2 models: it would take about 9 "
+            "minutes") in text
+    assert "exhaustive" not in text
 
 
 def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monkeypatch):

@@ -1,0 +1,84 @@
+"""Captures that are hard to map: parts that do not meet, wrong images, no steps."""
+
+import av
+import numpy as np
+import pytest
+from sfm_inputs import run, texture, write_inputs
+
+from recon_cli.errors import SfmError
+
+
+def frames(path, *, first=0, step=4, count=8, prefix=""):
+    """Every `step`-th frame of a video by name."""
+    found = {}
+    for index, frame in enumerate(av.open(str(path)).decode(video=0)):
+        if index == first + step * len(found):
+            found[f"{prefix}{index:06d}.png"] = frame.to_ndarray(format="rgb24")
+            if len(found) == count:
+                return found
+    raise AssertionError(f"{path} is too short")
+
+
+def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
+    sample_video, shared_data, tmp_path, caplog
+):
+    office = frames(sample_video, count=10, prefix="office")
+    living = frames(shared_data / "rooms" / "living" / "video.mp4", count=6, prefix="living")
+    summary = run(write_inputs(tmp_path / "in", office | living), tmp_path / "out")
+    assert summary["unregistered"] == sorted(living)
+    assert summary["apart"] == [sorted(living)]
+    assert summary["models"] == [10, 6]
+    # No match ties the two together, so that no further way is worth trying.
+    assert [rung["name"] for rung in summary["rungs"]] == ["exhaustive"]
+    assert "The capture fell apart: the largest model, of 10 frames, is kept" in caplog.text
+    assert "living000000.png" in caplog.text
+
+
+def test_two_clips_of_one_length_are_not_passed_off_as_a_room(sample_video, shared_data, tmp_path):
+    office = frames(sample_video, count=6, prefix="office")
+    living = frames(shared_data / "rooms" / "living" / "video.mp4", count=6, prefix="living")
+    with pytest.raises(SfmError, match="of 12 frames have a camera, but at least 9 are needed"):
+        run(write_inputs(tmp_path / "in", office | living), tmp_path / "out", min_registered=0.75)
+
+
+def test_photos_of_other_things_are_named_and_not_in_the_model(sample_video, tmp_path):
+    wrong = {f"wrong{seed}.png": texture(340, 600, seed) for seed in range(3)}
+    images = frames(sample_video, count=12) | wrong
+    summary = run(write_inputs(tmp_path / "in", images), tmp_path / "out")
+    assert summary["registered"] == 12
+    assert summary["unregistered"] == sorted(wrong)
+    assert [rung["name"] for rung in summary["rungs"]] == ["exhaustive"]
+
+
+def test_one_frame_many_times_over_is_no_capture(sample_video, tmp_path):
+    still, = frames(sample_video, count=1).values()
+    images = {f"{index}.png": still for index in range(6)}
+    with pytest.raises(SfmError, match="The camera did not move"):
+        run(write_inputs(tmp_path / "in", images), tmp_path / "out")
+
+
+def test_frames_given_twice_do_no_harm(sample_video, tmp_path):
+    once = frames(sample_video, count=8)
+    twice = {f"copy{name}": image for name, image in once.items()}
+    summary = run(write_inputs(tmp_path / "in", once | twice), tmp_path / "out")
+    assert summary["registered"] == 16
+
+
+def test_twelve_neighbours_of_a_fast_video_show_too_little_parallax(shared_data, tmp_path):
+    """A fifth of a second: the camera moved by a few millimetres."""
+    images = frames(shared_data / "video_bedroom" / "room.mp4", first=200, step=1, count=12)
+    with pytest.raises(SfmError) as caught:
+        run(write_inputs(tmp_path / "in", images), tmp_path / "out")
+    assert np.any([text in caught.value.message for text in (
+        "did not move", "have a camera, but at least")])
+    assert caught.value.hint
+
+
+def test_the_frames_of_every_way_of_pairing_meet(sample_video, tmp_path):
+    images = frames(sample_video, count=8)
+    for pairs in ("retrieval", "sequential"):
+        summary = run(write_inputs(tmp_path / pairs, images), tmp_path / f"{pairs}.out",
+                      pairs=pairs)
+        assert summary["registered"] == 8
+        rung, = summary["rungs"]
+        assert (rung["name"], rung["reason"], rung["kept"]) == (pairs, "it was asked for", True)
