@@ -91,8 +91,13 @@ def dng(data: Path, out: Path) -> Path:
 
 
 def large_walk(_data: Path, out: Path) -> Path:
-    """200 views of 1280x720 of the trained demo."""
-    called("make_large_walk.py", out / "photos")
+    """200 views of 1280x720 of office, once that is trained."""
+    workspace = out.parent / "office" / "ws"
+    if not (workspace / "train" / "splats.ply").exists():
+        code, error = ran(workspace, "train")
+        if code:
+            raise click.ClickException(f"office, which is to be mapped before: {error}")
+    called("make_large_walk.py", workspace, out / "photos")
     return out / "photos"
 
 
