@@ -1,7 +1,8 @@
-"""Frames of a folder of photos: all that can be read and show something of their own."""
+"""Frames of photos: all that can be read and show something of their own."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,9 @@ from recon_cli.capture.frames import Frame, Group
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.groups import PhotoGroup, group_notices, group_photos
 from recon_cli.capture.images import Photo, read_photo
-from recon_cli.capture.masks import find_masks, photo_mask, write_mask
+from recon_cli.capture.masks import FoundMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.pace import paced
-from recon_cli.capture.photos import check_count, frame_names, list_photos, photo_folder
+from recon_cli.capture.photos import Folder, check_count, frame_names, list_photos, photo_folder
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
 from recon_cli.capture.taken import Choice, Context, Taken
 from recon_cli.config import IngestConfig
@@ -72,13 +73,13 @@ class _Writer:
 
 
 def take(
-    config: IngestConfig, path: Path, out: Path, ctx: Context, *, prefix: str = ""
+    config: IngestConfig, paths: Sequence[Path], out: Path, ctx: Context, *, prefix: str = ""
 ) -> Taken:
-    """Writes the photos of a folder into ingest's folder `out` and returns them.
+    """Writes photos into ingest's folder `out` and returns them.
 
     Args:
         config: see `IngestConfig`.
-        path: the folder; where it holds no photos itself, one in it may.
+        paths: a folder, which holds photos itself or in a folder of its own; or photos.
         out: frames already in it are kept.
         ctx: for notices and progress.
         prefix: of the names of the frames.
@@ -87,18 +88,11 @@ def take(
         InputError: too few photos can be read, have a mask that can be, or show something of their
             own.
     """
-    home = photo_folder(path)
-    if home != path:
-        ctx.notice(f"{path} holds no photos itself: those in {home.name}/ are taken.")
-    folder = list_photos(home)
+    path, folder = _listed(paths, ctx)
     check_count(path, len(folder.photos), folder.broken)
     plan = _planned(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _without_twins(folder.photos, plan, ctx)
-    masks = find_masks(path, home, photos)
-    if masks.outside:
-        ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
-    if masks.unused:
-        ctx.notice(f"Masks without a photo are left out: {', '.join(masks.unused)}.")
+    masks = _masks(paths, photos, ctx)
     names = [f"{prefix}{name}" for name in frame_names(photos)]
     writer = _Writer(out, config.max_size, masks.by_photo, plan)
     looks, unreadable = _write(photos, names, writer, ctx)
@@ -120,6 +114,39 @@ def take(
         _frames(groups, taken, out),
         declared=readable + len(broken), decoded=readable, lost=len(broken),
         skipped=tuple(sorted(dropped | broken.keys())), choice=Choice(record, sheet, prefix))
+
+
+def _listed(paths: Sequence[Path], ctx: Context) -> tuple[Path, Folder]:
+    """Returns the folder that stands for the photos in messages, and what they are."""
+    path = paths[0]
+    if not path.is_dir():
+        _refuse_namesakes(paths)
+        return path.absolute().parent, list_photos(paths)
+    home = photo_folder(path)
+    if home != path:
+        ctx.notice(f"{path} holds no photos itself: those in {home.name}/ are taken.")
+    return path, list_photos(home.iterdir())
+
+
+def _refuse_namesakes(paths: Sequence[Path]) -> None:
+    counts = Counter(path.name for path in paths)
+    name, count = counts.most_common(1)[0]
+    if count > 1:
+        raise InputError(
+            f"{count} photos are called {name}.",
+            hint="Give the folders that they lie in instead of the files.")
+
+
+def _masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: Context) -> FoundMasks:
+    """Returns the masks in a folder that was given; files that were given bring none."""
+    if not paths[0].is_dir():
+        return FoundMasks({}, ())
+    masks = find_masks(paths[0], photo_folder(paths[0]), photos)
+    if masks.outside:
+        ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
+    if masks.unused:
+        ctx.notice(f"Masks without a photo are left out: {', '.join(masks.unused)}.")
+    return masks
 
 
 def _sheet(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,11 +28,11 @@ class Folder:
     broken: dict[str, str]
 
 
-def list_photos(folder: Path) -> Folder:
-    """Returns the photos in a folder, by content; hidden files and subfolders are left out."""
+def list_photos(paths: Iterable[Path]) -> Folder:
+    """Returns the photos among files, by content; hidden files and folders are left out."""
     photos: list[Photo] = []
     broken: dict[str, str] = {}
-    files = (path for path in folder.iterdir() if path.is_file() and path.name[0] != ".")
+    files = (path for path in paths if path.is_file() and path.name[0] != ".")
     for path in sorted(files, key=lambda path: (_counting(path.stem), path.name)):
         try:
             photos.append(inspect_photo(path))

@@ -12,6 +12,7 @@ from pathlib import Path
 from recon_cli.capture import frames as store
 from recon_cli.capture import from_data_set, from_photos, from_video
 from recon_cli.capture.frames import FrameList
+from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.taken import Taken, joined
 from recon_cli.config import IngestConfig, parse_holdout
 from recon_cli.errors import InputError
@@ -86,9 +87,10 @@ def _take(
     layouts = {path: layout for path in sources if (layout := recognise(path))}
     if layouts:
         return [from_data_set.take(config, _alone(sources, layouts), out, ctx)]
-    prefixes = ["" if len(sources) == 1 else f"{index + 1:02d}_" for index in range(len(sources))]
-    videos = [(path, prefix) for path, prefix in zip(sources, prefixes, strict=True)
-              if not path.is_dir()]
+    parts = _parts(sources)
+    prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
+    videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)
+              if not _of_photos(part[0])]
     looks = [
         from_video.look_at(config, path, out / f"{prefix}scan.json", ctx)
         for path, prefix in videos]
@@ -96,13 +98,24 @@ def _take(
         (prefix for _, prefix in videos),
         zip(looks, from_video.shares(config, looks), strict=True), strict=True))
     taken = []
-    for path, prefix in zip(sources, prefixes, strict=True):
+    for part, prefix in zip(parts, prefixes, strict=True):
         if prefix in counts:
             look, count = counts[prefix]
             taken.append(from_video.take(config, look, count, out, ctx, prefix=prefix))
         else:
-            taken.append(from_photos.take(config, path, out, ctx, prefix=prefix))
+            taken.append(from_photos.take(config, part, out, ctx, prefix=prefix))
     return taken
+
+
+def _parts(sources: Sequence[Path]) -> list[list[Path]]:
+    """Returns the sources one by one, but files that are photos together in place of the first."""
+    files = [path for path in sources if not path.is_dir() and _of_photos(path)]
+    parts = [files if path in files else [path] for path in sources]
+    return [part for index, part in enumerate(parts) if part not in parts[:index]]
+
+
+def _of_photos(path: Path) -> bool:
+    return path.is_dir() or path.suffix.lower() in PHOTO_SUFFIXES
 
 
 def _alone(sources: Sequence[Path], layouts: Mapping[Path, str]) -> Path:

@@ -90,7 +90,7 @@ def main(
     photos: Path, out: Path, white: float, size: int, limit: int | None, seed: int, checks: bool
 ) -> None:
     """See the module."""
-    taken = list(list_photos(photos).photos)[:limit]
+    taken = list(list_photos(photos.iterdir()).photos)[:limit]
     out.mkdir(parents=True, exist_ok=True)
     make(taken, out, white, size, seed)
     click.echo(f"{len(taken)} photos in {out}")

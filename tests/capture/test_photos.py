@@ -27,7 +27,7 @@ def test_photos_are_told_from_other_files_by_content(tmp_path):
     (tmp_path / "broken.JPG").write_bytes(b"not a photo either")
     (tmp_path / "IMG_1.HEIC").write_bytes(b"cannot be read here")
     (tmp_path / "more").mkdir()
-    folder = list_photos(tmp_path)
+    folder = list_photos(tmp_path.iterdir())
     assert [found.path.name for found in folder.photos] == ["a.jpg", "b.jpg", "no_suffix"]
     assert sorted(folder.broken) == ["IMG_1.HEIC", "broken.JPG"]
     assert "broken.JPG cannot be read" in folder.broken["broken.JPG"]
@@ -36,7 +36,7 @@ def test_photos_are_told_from_other_files_by_content(tmp_path):
 def test_photos_are_listed_as_a_person_counts(tmp_path):
     for name in ("IMG_10.png", "IMG_9.png", "IMG_100.png"):
         Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / name)
-    names = [found.path.name for found in list_photos(tmp_path).photos]
+    names = [found.path.name for found in list_photos(tmp_path.iterdir()).photos]
     assert names == ["IMG_9.png", "IMG_10.png", "IMG_100.png"]
 
 

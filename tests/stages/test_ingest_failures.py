@@ -137,7 +137,7 @@ def test_an_empty_file_is_refused(tmp_path):
 
 def test_one_photo_is_refused(tmp_path):
     folder = write_photos(tmp_path / "room", 1)
-    with pytest.raises(InputError, match="single picture"):
+    with pytest.raises(InputError, match="1 photos"):
         take(folder / "IMG_0000.jpg", tmp_path / "out")
     with pytest.raises(InputError, match="1 photos"):
         take(folder, tmp_path / "out")

@@ -140,3 +140,18 @@ def test_a_jpeg_takes_the_place_of_its_broken_raw(tmp_path):
     take(folder, tmp_path / "out")
     assert [frame["source"] for frame in listed(tmp_path / "out")["frames"]] == [
         "IMG_0000.jpg", "IMG_0001.dng", "IMG_0002.dng"]
+
+
+def test_photos_may_be_given_one_by_one(tmp_path):
+    folder = write_photos(tmp_path / "room", 5)
+    take(folder, tmp_path / "folder")
+    take(tuple(sorted(folder.iterdir(), reverse=True)), tmp_path / "files")
+    assert listed(tmp_path / "files")["frames"] == listed(tmp_path / "folder")["frames"]
+
+
+def test_photos_of_one_name_are_not_told_apart(tmp_path):
+    paths = []
+    for name in ("a", "b"):
+        paths += sorted(write_photos(tmp_path / name, 2).iterdir())
+    with pytest.raises(InputError, match=r"2 photos are called IMG_0000\.jpg"):
+        take(tuple(paths), tmp_path / "out")
