@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon_cli.scene import Camera, Splats
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 
 _ROOM = np.array([6.0, 4.0, 3.0])  # metres; z is up
 _BOXES = 12  # pieces of furniture

@@ -9,7 +9,8 @@ from torch import Tensor
 from recon_cli.render import registry
 from recon_cli.render.contract import ALPHA_MIN, EXACT, Approximation, Renderer, RenderOutput
 from recon_cli.render.numba import backend as numba_backend
-from recon_cli.scene import Camera, Splats
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from PIL import Image, UnidentifiedImageError
 
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap_bytes import Reader, damaged, rigid
-from recon_cli.scene import Camera, Scene, View
-from recon_cli.scene.scene import split_views
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.scene import Scene, View, split_views
 
 _PINHOLE = 1  # COLMAP's id of the model with fx, fy, cx, cy
 _HINT = "Run `recon sfm --again`."

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from recon_cli.atomic import write_bytes
 from recon_cli.errors import FormatError
-from recon_cli.scene import Camera
+from recon_cli.scene.camera import Camera
 
 _COUNTS = 255  # in the file of a mask; anything less is ignored, half-covered edges included
 

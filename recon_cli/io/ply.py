@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recon_cli.atomic import replacing
 from recon_cli.errors import FormatError
-from recon_cli.scene import Splats
+from recon_cli.scene.splats import Splats
 
 _HEADER_LIMIT = 1 << 16  # bytes; a header that does not end by then is none
 _TYPES = {

@@ -6,13 +6,11 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from recon_cli import atomic
 from recon_cli.mapping.ledger import STEPS
-
-if TYPE_CHECKING:
-    from recon_cli.scene.lens import Lens
+from recon_cli.scene.lens import Lens
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 RUNGS = "rungs"  # in the stage's folder: what is needed only until there is a model
@@ -55,6 +53,9 @@ class Job:
         max_features: SIFT keypoints that an image keeps at most.
         min_registered: share of the frames that must get a camera.
         accept_weak: a model with a weak link is taken too.
+        gravity: the world is turned upright where there is evidence for up.
+        scale_between: two places and their distance in metres (see `mapping.measure`), None where
+            the scale is not known.
         max_minutes: after which the parent ends the process; further rungs of the ladder are begun
             only where they are expected to fit in.
         seed: of every random sampling.
@@ -75,6 +76,8 @@ class Job:
     max_features: int
     min_registered: float
     accept_weak: bool
+    gravity: bool
+    scale_between: tuple[str, str, float] | None
     max_minutes: float
     seed: int
     threads: int
@@ -90,6 +93,11 @@ class Job:
     def database(self) -> Path:
         """COLMAP's database of features and matches."""
         return self.out / "database.db"
+
+    @property
+    def model(self) -> Path:
+        """The model in the mapper's own frame."""
+        return self.out / "model"
 
     @property
     def rungs(self) -> Path:
@@ -111,7 +119,7 @@ class Job:
         """The steps of `ledger.STEPS` that this job takes."""
         kept = self.known_poses and self.pose_use == "keep"
         if kept and self.given_points and all(group.lens for group in self.groups):
-            return ("sparse", "undistorted")  # nothing is left to be found in the pixels
+            return ("model", "sparse", "undistorted")  # nothing is left to be found in the pixels
         return STEPS
 
     def write(self, path: Path) -> None:
@@ -127,7 +135,10 @@ class Job:
         value: dict[str, Any] = atomic.read_json(path)
         for name in ("frames", "denoised", "out", "masks", "poses"):
             value[name] = None if value[name] is None else Path(value[name])
-        return cls(**{**value, "groups": tuple(map(_group, value["groups"]))})
+        measured = value["scale_between"]
+        return cls(**{
+            **value, "groups": tuple(map(_group, value["groups"])),
+            "scale_between": None if measured is None else tuple(measured)})
 
 
 def _group(value: dict[str, Any]) -> CameraGroup:
@@ -137,7 +148,4 @@ def _group(value: dict[str, Any]) -> CameraGroup:
 
 
 def _lens(value: dict[str, Any]) -> Lens:
-    # The scene imports torch: seconds and 200 MB that the mapping process would pay for nothing.
-    from recon_cli.scene.lens import Lens  # noqa: PLC0415
-
     return Lens(**{**value, "params": tuple(value["params"])})

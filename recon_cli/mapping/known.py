@@ -63,7 +63,7 @@ def near(viewmats: Mapping[str, NDArray[np.float64]]) -> set[pairs.Pair]:
 
 
 def build(job: Job, report: Reporter) -> Result:
-    """Writes the model of the given cameras into out/sparse and returns what it holds.
+    """Writes the model of the given cameras into out/model and returns what it holds.
 
     Raises:
         SfmError: too few frames have a pose, or the poses do not fit the images.
@@ -83,9 +83,9 @@ def build(job: Job, report: Reporter) -> Result:
             model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times)
         verdict.check_weak_link(found, job.accept_weak)
         atomic.write_json(job.out / VERDICT, found.to_json())
-    folder = fresh_folder(job.out / "sparse.partial")
+    folder = fresh_folder(job.out / "model.partial")
     model.write(folder)
-    publish(folder, job.out / "sparse")
+    publish(folder, job.model)
     shutil.rmtree(job.rungs, ignore_errors=True)
     return {
         **mapper.described(model), "models": [model.num_reg_images()], "apart": [], "rejected": {},

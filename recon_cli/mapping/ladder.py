@@ -130,7 +130,7 @@ def match_first(job: Job, report: Reporter) -> Result:
 
 
 def climb(job: Job, report: Reporter, *, deadline: float) -> Result:
-    """Writes the best model of all rungs that were needed into out/sparse.
+    """Writes the best model of all rungs that were needed into out/model.
 
     Args:
         job: whose database holds the matches of the first rung.
@@ -254,7 +254,7 @@ def _keep(job: Job, notes: Sequence[Note]) -> Result:
         model, job.database, job.names, sharpness=job.sharpness, times=job.times)
     verdict.check_weak_link(found, job.accept_weak)
     atomic.write_json(job.out / VERDICT, found.to_json())
-    publish(folder / "model", job.out / "sparse")
+    publish(folder / "model", job.model)
     shutil.rmtree(job.rungs)
     return {
         **described, "poses": None,

@@ -15,7 +15,7 @@ from typing import Any
 from recon_cli import atomic
 from recon_cli.errors import FormatError
 
-STEPS = ("features", "matches", "sparse", "undistorted")
+STEPS = ("features", "matches", "model", "sparse", "undistorted")
 FILE = "steps.json"
 
 Result = dict[str, Any]  # JSON values only

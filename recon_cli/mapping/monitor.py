@@ -20,7 +20,7 @@ _DOING = {
     "mapping": ("placing cameras", "frame"),
     "undistorted": ("undistorting frames", "frame"),
 }
-_STEP = {"mapping": "sparse"}  # the step that a phase belongs to, where the names differ
+_STEP = {"mapping": "model"}  # the step that a phase belongs to, where the names differ
 
 
 class Monitor:

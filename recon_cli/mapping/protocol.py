@@ -10,10 +10,10 @@ import json
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from recon_cli.errors import FormatError, ReconError, SfmError, WorkspaceError
+from recon_cli.errors import ConfigError, FormatError, ReconError, SfmError, WorkspaceError
 
 _ERRORS: dict[str, type[ReconError]] = {
-    kind.__name__: kind for kind in (SfmError, FormatError, WorkspaceError)
+    kind.__name__: kind for kind in (SfmError, ConfigError, FormatError, WorkspaceError)
 }
 
 

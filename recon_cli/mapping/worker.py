@@ -20,14 +20,14 @@ from typing import BinaryIO
 import filelock
 
 from recon_cli.errors import ReconError, WorkspaceError
-from recon_cli.mapping import database, features, known, ladder, undistort
+from recon_cli.mapping import database, features, known, ladder, placing, undistort
 from recon_cli.mapping.job import LOCK, Job
 from recon_cli.mapping.ledger import Ledger, Result
 from recon_cli.mapping.protocol import Reporter
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
-_FOLDERS = ("sparse", "undistorted")  # steps that write a folder of their name
+_FOLDERS = ("model", "sparse", "undistorted")  # steps that write a folder of their name
 
 
 def work(job: Job, report: Reporter) -> None:
@@ -58,16 +58,17 @@ def _actions(job: Job, report: Reporter, deadline: float) -> dict[str, Callable[
     """Returns what is done in each step."""
     cameras: dict[str, Callable[[], Result]] = {
         "matches": lambda: ladder.match_first(job, report),
-        "sparse": lambda: ladder.climb(job, report, deadline=deadline),
+        "model": lambda: ladder.climb(job, report, deadline=deadline),
     }
     if job.known_poses:
         cameras = {
             "matches": lambda: known.match(job, report),
-            "sparse": lambda: known.build(job, report),
+            "model": lambda: known.build(job, report),
         }
     return {
         "features": lambda: features.extract(job, report),
         **cameras,
+        "sparse": lambda: placing.place_model(job),
         "undistorted": lambda: undistort.undistort(job, report),
     }
 

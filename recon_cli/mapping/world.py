@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap import Pinhole
 from recon_cli.mapping.measure import Measurement, ScaleBetween, measure
-from recon_cli.scene import Similarity
 from recon_cli.scene.axes import upright_axes
 from recon_cli.scene.gravity import Gravity, find_gravity
+from recon_cli.scene.similarity import Similarity
 
 ARBITRARY, DATA_SET, MEASURED = "arbitrary", "data set", "measured"  # where the scale comes from
 

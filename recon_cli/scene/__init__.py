@@ -1,8 +1,5 @@
-"""What a reconstruction is made of: cameras, views, Gaussians. Knows no files, no training."""
+"""What a reconstruction is made of: cameras, views, Gaussians. Knows no files, no training.
 
-from recon_cli.scene.camera import Camera
-from recon_cli.scene.scene import Scene, View
-from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.splats import Splats
-
-__all__ = ["Camera", "Scene", "Similarity", "Splats", "View"]
+Names are imported from the modules themselves: most of them do without torch, which takes a second
+to load.
+"""

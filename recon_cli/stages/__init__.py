@@ -51,7 +51,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 3, True, "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json", "verdict.json")),
+          ("database.db", "log.txt", "steps.json", "verdict.json", "model/*")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 2, False,
           "recon_cli.stages.train", ("log.jsonl",), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 2, False,

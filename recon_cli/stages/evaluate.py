@@ -39,7 +39,9 @@ from recon_cli.metrics import (
 )
 from recon_cli.progress import Bar
 from recon_cli.render import render
-from recon_cli.scene import Camera, Scene, Splats
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.scene import Scene
+from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.fitting import (
     LOG,

@@ -15,7 +15,8 @@ from recon_cli.errors import StageError, WorkspaceError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.mapping.measure import Measurement, ScaleBetween, measure
-from recon_cli.scene import Similarity, Splats
+from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.splats import Splats
 from recon_cli.scene.transformed import transformed
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 

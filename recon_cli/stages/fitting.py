@@ -20,7 +20,8 @@ from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_masked_image
 from recon_cli.machine import free_memory_bytes
 from recon_cli.metrics import MIN_PIXELS, leaves_enough
-from recon_cli.scene import Camera, Scene, View
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.train.fit import Report, Task, fit
 from recon_cli.train.memory import estimate, refuse_what_does_not_fit

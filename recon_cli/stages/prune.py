@@ -13,7 +13,7 @@ import torch
 
 from recon_cli.config import PruneConfig, TrainConfig
 from recon_cli.io.ply import write_ply
-from recon_cli.scene import Splats
+from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.fitting import (
     CHECKPOINT,

@@ -20,6 +20,7 @@ from recon_cli.mapping import process
 from recon_cli.mapping.doctor import listed
 from recon_cli.mapping.job import CameraGroup, Job
 from recon_cli.mapping.ledger import Ledger
+from recon_cli.mapping.measure import parse_place
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 
 
@@ -37,8 +38,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         frames were taken out of the model, by name), points, mean_track_length,
         reprojection_error_px, median_triangulation_angle_deg, models (number of frames in the model
         and in what is left of others), rungs (what was tried; see `mapping.ladder.Note`), verdict,
-        poses (of known poses: see `mapping.known`), cameras (width, height, focal_px undistorted
-        and frames of each), seconds (by step).
+        poses (of known poses: see `mapping.known`), world (see `mapping.world`), cameras (width,
+        height, focal_px undistorted and frames of each), seconds (by step).
 
     Raises:
         SfmError: there are too few cameras, the model cannot be trusted, the time is up, or the
@@ -61,6 +62,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         max_features=config.max_features,
         min_registered=config.min_registered,
         accept_weak=config.accept_weak,
+        gravity=config.gravity == "auto",
+        scale_between=config.scale_between,
         max_minutes=config.max_minutes,
         seed=config.seed,
         threads=ctx.threads,
@@ -70,6 +73,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
                if frame.time_seconds is not None},
     )
     _check_frames(job)
+    for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
+        parse_place(str(place), job.names)
     process.run_job(job, progress=ctx.progress, record=paced(ctx.record))
     summary = _summary(frames, job)
     _report(summary, ctx)
@@ -99,15 +104,16 @@ def _summary(frames: FrameList, job: Job) -> Summary:
         result = Ledger(job.out).result(step)
         assert result is not None, f"the mapping process ended without {step}"
         results[step] = result
-    sparse = results["sparse"]
-    unregistered = sorted({frame.name for frame in frames.frames} - set(sparse["registered"]))
+    model = results["model"]
+    unregistered = sorted({frame.name for frame in frames.frames} - set(model["registered"]))
     held_out = {frame.name for frame in frames.frames if frame.held_out}
     return {
         "frames": len(frames.frames),
-        **sparse,
-        "registered": len(sparse["registered"]),
+        **model,
+        "registered": len(model["registered"]),
         "unregistered": unregistered,
         "unregistered_held_out": [name for name in unregistered if name in held_out],
+        "world": results["sparse"],
         "cameras": results["undistorted"]["cameras"],
         "seconds": {step: result["seconds"] for step, result in results.items()},
     }
@@ -115,8 +121,9 @@ def _summary(frames: FrameList, job: Job) -> Summary:
 
 def _report(summary: Summary, ctx: StageContext) -> None:
     """Says what was tried, which frames have no camera and which models were left aside."""
-    for text in (*_tried(summary["rungs"]), *summary["lines"], *_moved(summary["poses"]),
-                 *_left_out(summary)):
+    told = (*_tried(summary["rungs"]), *summary["lines"], *_moved(summary["poses"]),
+            *_left_out(summary), *summary["world"]["sentences"])
+    for text in told:
         ctx.notice(text)
 
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from recon_cli.render import Statistics, render
-from recon_cli.scene import Camera, Splats
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 
 _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
 

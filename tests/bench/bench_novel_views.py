@@ -22,7 +22,7 @@ from recon_cli.io.images import fitted_camera, read_image
 from recon_cli.io.ply import read_ply
 from recon_cli.metrics import psnr, ssim
 from recon_cli.render import render
-from recon_cli.scene import Camera
+from recon_cli.scene.camera import Camera
 from recon_cli.stages.fitting import read_config
 
 FOCAL, WIDTH, HEIGHT = 300.0, 600, 340  # pixels, with the principal point at the centre

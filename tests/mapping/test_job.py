@@ -11,7 +11,9 @@ def job(count, pairs="auto"):
         frames=Path("/in/frames"), denoised=Path("/in/denoised"), out=Path("/out"),
         groups=(CameraGroup(tuple(f"{index:06d}.png" for index in range(count)), 600, 340),),
         masks=None, poses=None, pose_use="keep", given_points=False, pairs=pairs,
-        max_features=2048, min_registered=0.5, accept_weak=False, max_minutes=1.0,
+        max_features=2048, min_registered=0.5, accept_weak=False,
+        gravity=True, scale_between=None,
+        max_minutes=1.0,
         seed=0, threads=2, sharpness={"000000.png": 12.5}, times={"000000.png": 0.25})
 
 
@@ -30,7 +32,7 @@ def test_poses_and_points_that_are_kept_leave_nothing_to_be_found():
     group = replace(job(4).groups[0], lens=lens)
     given = replace(
         job(4), poses=Path("/in/poses.json"), given_points=True, groups=(group,))
-    assert given.steps == ("sparse", "undistorted")
+    assert given.steps == ("model", "sparse", "undistorted")
     assert replace(given, pose_use="refine").steps == STEPS
     assert replace(given, given_points=False).steps == STEPS
     assert replace(given, groups=(replace(group, lens=None),)).steps == STEPS

@@ -135,7 +135,7 @@ def test_a_good_capture_stops_at_the_first_rung(capture):
     assert result["registered"] == list(job.names)
     assert result["models"] == [20]
     assert not job.rungs.exists()
-    assert center_error(pycolmap.Reconstruction(job.out / "sparse"), truth) < 1e-3
+    assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
     assert json.loads((job.out / "verdict.json").read_text()) == json.loads(
         json.dumps(result["verdict"]))
     assert json.loads(json.dumps(result, allow_nan=False))
@@ -162,7 +162,7 @@ def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     with pytest.raises(SfmError, match="Only 0 of 20 frames have a camera") as caught:
         climb(job)
     assert "exhaustive found 0, relaxed found 0, global found 0" in caught.value.message
-    assert not (job.out / "sparse").exists()
+    assert not (job.model).exists()
 
 
 def test_a_rung_that_would_take_longer_than_there_is_time_is_passed_over(capture, monkeypatch):
@@ -201,10 +201,10 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
     monkeypatch.setattr(owner, name, full)
     with pytest.raises(OSError, match="No space left"):
         climb(job)
-    assert not (job.out / "sparse").exists()
+    assert not (job.model).exists()
     monkeypatch.undo()
     assert climb(job)["registered"] == list(job.names)
-    assert center_error(pycolmap.Reconstruction(job.out / "sparse"), truth) < 1e-3
+    assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
 
 
 def interrupt(*_, **__):

@@ -1,15 +1,15 @@
 import pytest
 
-from recon_cli.mapping.ledger import FILE, Ledger, fresh_folder, publish
+from recon_cli.mapping.ledger import FILE, STEPS, Ledger, fresh_folder, publish
 
 
 @pytest.fixture
 def finished(tmp_path):
-    """A folder in which all four steps are finished."""
+    """A folder in which all steps are finished."""
     ledger = Ledger(tmp_path)
     for step in ("features", "matches"):
         ledger.finish(step, {"rows": 3})
-    for step in ("sparse", "undistorted"):
+    for step in ("model", "sparse", "undistorted"):
         (tmp_path / step / "images").mkdir(parents=True)
         (tmp_path / step / "images" / "a.bin").write_bytes(b"12345")
         ledger.finish(step, {"points": 7}, tmp_path / step)
@@ -18,8 +18,7 @@ def finished(tmp_path):
 
 def done(folder):
     ledger = Ledger(folder)
-    return [step for step in ("features", "matches", "sparse", "undistorted")
-            if ledger.result(step) is not None]
+    return [step for step in STEPS if ledger.result(step) is not None]
 
 
 def test_results_are_read_back_by_the_next_process(finished):
@@ -33,12 +32,12 @@ def test_an_empty_folder_has_nothing_finished(tmp_path):
 
 def test_a_missing_file_takes_its_step_back(finished):
     (finished / "sparse" / "images" / "a.bin").unlink()
-    assert done(finished) == ["features", "matches", "undistorted"]
+    assert done(finished) == ["features", "matches", "model", "undistorted"]
 
 
 def test_a_file_cut_short_takes_its_step_back(finished):
     (finished / "undistorted" / "images" / "a.bin").write_bytes(b"123")
-    assert done(finished) == ["features", "matches", "sparse"]
+    assert done(finished) == ["features", "matches", "model", "sparse"]
 
 
 def test_files_without_a_note_prove_nothing(finished):

@@ -12,7 +12,7 @@ from rooms import degrees_between, make_room
 from recon_cli.errors import ConfigError
 from recon_cli.mapping.measure import ScaleBetween
 from recon_cli.mapping.world import World, world_transform
-from recon_cli.scene import Similarity
+from recon_cli.scene.similarity import Similarity
 
 
 def world_of(room, *, gravity=True, between=None, metric=False) -> World:

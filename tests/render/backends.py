@@ -11,7 +11,8 @@ from scenes import leaves
 from torch import Tensor
 
 from recon_cli.render import RenderOutput, available_backends, render
-from recon_cli.scene import Camera, Splats
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 
 BLACK = torch.zeros(3, dtype=torch.float64)
 GREENISH = torch.tensor([0.2, 0.5, 0.1], dtype=torch.float64)

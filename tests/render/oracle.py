@@ -15,7 +15,8 @@ from scipy.special import lpmv
 from torch import Tensor
 
 from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, DILATION, NEAR, TRANSMITTANCE_MIN
-from recon_cli.scene import Camera, Splats
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 
 
 class Composite(NamedTuple):

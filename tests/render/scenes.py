@@ -7,8 +7,8 @@ import math
 import numpy as np
 import torch
 
-from recon_cli.scene import Camera, Splats
-from recon_cli.scene.splats import SH_C0
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import SH_C0, Splats
 
 
 def camera_at(width: int = 50, height: int = 37, *, focal: float = 40.0) -> Camera:

@@ -10,7 +10,7 @@ from backends import CASES, GREENISH, Case
 from scenes import camera_at, random_splats
 
 from recon_cli.render import Statistics
-from recon_cli.scene import Splats
+from recon_cli.scene.splats import Splats
 
 EXACT = Case("torch", "cpu", torch.float64)
 OTHERS = [case for case in CASES if case.dtype == torch.float32]

@@ -20,7 +20,7 @@ from oracle import brute_force
 from scenes import camera_at, joined, one_splat, random_splats
 
 from recon_cli.render import render
-from recon_cli.scene import Splats
+from recon_cli.scene.splats import Splats
 
 pytestmark = every_backend
 

@@ -19,8 +19,7 @@ from oracle import composited
 from scenes import camera_at, joined, one_splat, random_splats
 
 from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from recon_cli.scene import Splats
-from recon_cli.scene.splats import SH_C0
+from recon_cli.scene.splats import SH_C0, Splats
 
 # T before the fragment that would leave less than 1e-4: alpha is at most .99
 STOPPED_BELOW = TRANSMITTANCE_MIN / (1 - ALPHA_MAX)

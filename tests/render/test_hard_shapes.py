@@ -18,7 +18,7 @@ from scenes import camera_at, joined, leaves, one_splat, random_splats
 
 from recon_cli.render.contract import ALPHA_MIN, NEAR
 from recon_cli.render.projection import project, rotation_matrices
-from recon_cli.scene import Camera
+from recon_cli.scene.camera import Camera
 
 pytestmark = every_backend
 

@@ -17,7 +17,8 @@ from scenes import leaves
 
 from recon_cli.render.contract import DILATION, NEAR, TRANSMITTANCE_MIN
 from recon_cli.render.projection import project
-from recon_cli.scene import Camera, Splats
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 
 pytestmark = every_backend
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from test_similarity import random_rotation
 
-from recon_cli.scene import Similarity
+from recon_cli.scene.similarity import Similarity
 
 NOISE = 0.015  # metres; points on the floor of the rendered rooms scatter by 1 to 2 cm
 

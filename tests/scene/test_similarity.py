@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from recon_cli.scene import Camera, Similarity
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.similarity import Similarity
 
 EXACT = 1e-12  # float64 on numbers of about ten, some dozen operations
 

@@ -15,6 +15,7 @@ from recon_cli.capture.frames import read_png
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images, read_scene
 from recon_cli.mapping import database
+from recon_cli.mapping.ledger import STEPS
 from recon_cli.stages.context import StageContext
 
 STEP, COUNT = 4, 12  # every 4th frame of the sample: few, and each still overlaps the next
@@ -82,7 +83,7 @@ def test_the_summary_is_json_and_has_plausible_figures(mapped):
     assert 0 < summary["reprojection_error_px"] < 1
     assert summary["median_triangulation_angle_deg"] > 5
     assert summary["models"][0] == COUNT
-    assert set(summary["seconds"]) == {"features", "matches", "sparse", "undistorted"}
+    assert set(summary["seconds"]) == {"features", "matches", "model", "sparse", "undistorted"}
     camera, = summary["cameras"]
     assert camera["frames"] == COUNT
     assert camera["focal_px"] == pytest.approx(300, rel=0.03)  # the room was rendered with 300
@@ -142,7 +143,8 @@ def test_undistortion_keeps_pixels_and_has_no_blank_border(mapped):
 def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
     out, _, _ = mapped
     assert sorted(path.name for path in out.iterdir()) == [
-        "database.db", "log.txt", "sparse", "steps.json", "undistorted", "verdict.json"]
+        "database.db", "log.txt", "model", "sparse", "steps.json", "undistorted", "verdict.json",
+        "world.json"]
     assert sorted(path.name for path in (out / "undistorted").iterdir()) == [
         "denoised", "images", "sparse"]
     for folder in (out / "sparse", out / "undistorted" / "sparse"):
@@ -152,7 +154,7 @@ def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
 def test_progress_is_recorded_in_order_up_to_the_last_step(mapped):
     _, _, seen = mapped
     assert seen == sorted(seen)
-    assert {total for _, total in seen} == {4 * (COUNT + 1)}
+    assert {total for _, total in seen} == {len(STEPS) * (COUNT + 1)}
     assert seen[-1][0] >= 2 * (COUNT + 1)  # features and matches, which a crash leaves
 
 

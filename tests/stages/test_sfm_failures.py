@@ -57,7 +57,7 @@ def told(caplog, **changes):
     summary = {
         "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
         "unregistered_held_out": [], "models": [49], "apart": [], "rejected": {}, "lines": [],
-        "poses": None,
+        "poses": None, "world": {"sentences": []},
         "rungs": [{"name": "exhaustive", "skipped": "", "registered": 40, "kept": False}]}
     sfm._report(summary | changes, StageContext())
     return caplog.text

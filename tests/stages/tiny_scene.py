@@ -14,7 +14,7 @@ from scenes import random_splats
 from recon_cli.atomic import write_json
 from recon_cli.io.images import write_png
 from recon_cli.render import render
-from recon_cli.scene import Camera
+from recon_cli.scene.camera import Camera
 from recon_cli.stages.context import StageInputs
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0

@@ -6,7 +6,7 @@ from scenes import joined, random_splats
 
 from recon_cli.config import TrainConfig
 from recon_cli.render.numba.crew import crew
-from recon_cli.scene import Splats
+from recon_cli.scene.splats import Splats
 from recon_cli.train.optimizer import SplatOptimizer
 
 # float32 in another order of operations, over 20 steps: a few units in the last place.

@@ -1,0 +1,187 @@
+"""Real captures through ingest, denoise and sfm: `python tests/bench/bench_captures.py DATA OUT`.
+
+DATA is the folder of test data. Each capture gets a workspace in OUT and a row of a table: what was
+chosen and registered, how far the cameras are from the reference where there is one, the verdict,
+seconds and peak memory of sfm. Name captures behind OUT to run only those.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pose_errors import Poses, compare, model_poses
+
+from recon_cli.io.layouts import read_posed
+
+HEADINGS = (
+    "capture", "chosen", "registered", "reprojection px", "centre RMSE", "centre median / max",
+    "rotation median / max", "weak link", "fold", "sfm s", "MB", "ended with")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One row.
+
+    Attributes:
+        source: makes or names what is ingested.
+        truth: the reference by frame name, None where there is none.
+        metric: the reference is in metres.
+        options: of each verb.
+    """
+
+    source: Callable[[Path, Path], Path]
+    truth: Callable[[Path, Path], Poses] | None = None
+    metric: bool = False
+    options: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def given(path: str) -> Callable[[Path, Path], Path]:
+    """A capture that lies in the data."""
+    return lambda data, _out: data / path
+
+
+def room(name: str) -> Callable[[Path, Path], Poses]:
+    """True poses of a rendered room; frame k of the video is line k."""
+    def read(data: Path, out: Path) -> dict[str, NDArray[np.float64]]:
+        lines = np.loadtxt(data / "rooms" / name / "traj.txt").reshape(-1, 4, 4)
+        places = np.arange(len(lines))
+        if (out / "places.txt").exists():  # a video that was cut together from the room
+            places = np.loadtxt(out / "places.txt").astype(int)
+        return {f"{index:06d}.png": lines[place] for index, place in enumerate(places)}
+    return read
+
+
+def fox(data: Path, _out: Path) -> dict[str, NDArray[np.float64]]:
+    """Poses of fox that others found."""
+    return {f"{Path(image.name).stem}.png": np.linalg.inv(image.viewmat)
+            for image in read_posed(data / "fox").images}
+
+
+def noisy_fox(data: Path, out: Path) -> Path:
+    """Fox with Gaussian noise of sigma 20."""
+    folder, draws = out / "photos", np.random.default_rng(0)
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in sorted((data / "fox" / "images").iterdir()):
+        image = cv2.imread(str(path)).astype(np.float64)
+        image += draws.normal(0, 20, image.shape)
+        cv2.imwrite(str(folder / f"{path.stem}.png"), np.clip(np.rint(image), 0, 255))
+    return folder
+
+
+def blurred_video(data: Path, out: Path) -> Path:
+    """880 frames of office, 269 of them blurred."""
+    called("bench_frame_choice.py", data / "rooms" / "office", out)
+    return out / "video.mp4"
+
+
+def dng(data: Path, out: Path) -> Path:
+    """Snowmiku as camera RAW, exposures a stop up and down."""
+    called("make_dng_set.py", data / "snowmiku_photos", out / "photos")
+    return out / "photos"
+
+
+def large_walk(_data: Path, out: Path) -> Path:
+    """200 views of 1280x720 of the trained demo."""
+    called("make_large_walk.py", out / "photos")
+    return out / "photos"
+
+
+def called(script: str, *arguments: Path) -> None:
+    """Runs a script that lies beside this one."""
+    subprocess.run(
+        [sys.executable, str(Path(__file__).with_name(script)), *map(str, arguments)], check=True)
+
+
+CAPTURES = {
+    "fox": Capture(given("fox/images"), fox, options={"sfm": ("--pairs", "exhaustive")}),
+    "fox, noise 20": Capture(noisy_fox, fox, options={
+        "denoise": ("--force", "--filter", "bilateral"), "sfm": ("--pairs", "sequential")}),
+    "living": Capture(given("rooms/living/video.mp4"), room("living"), metric=True),
+    "office": Capture(given("rooms/office/video.mp4"), room("office"), metric=True),
+    "living, noisy": Capture(
+        given("rooms/living/video_noisy.mp4"), room("living"), metric=True),
+    "office, noisy": Capture(
+        given("rooms/office/video_noisy.mp4"), room("office"), metric=True),
+    "office, blurred": Capture(
+        blurred_video, room("office"), metric=True, options={"ingest": ("--frames", "40")}),
+    "bedroom": Capture(given("video_bedroom/room.mp4")),
+    "house entry": Capture(given("video_house_entry/video.mp4")),
+    "desk": Capture(given("desk_monitors/images")),
+    "snowmiku": Capture(given("snowmiku_photos")),
+    "snowmiku, DNG": Capture(dng),
+    "large walk": Capture(large_walk),
+}
+
+
+def ran(workspace: Path, verb: str, *arguments: str) -> tuple[int, str]:
+    """Runs a verb as a user does; returns its exit code and its first error line."""
+    done = subprocess.run(
+        [sys.executable, "-m", "recon_cli", verb, *arguments, "-w", str(workspace)],
+        stderr=subprocess.PIPE, text=True)
+    click.echo(done.stderr, err=True, nl=False)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    return done.returncode, errors[0] if errors else ""
+
+
+def measured(name: str, data: Path, out: Path) -> list[str]:
+    """Returns the row of a capture."""
+    capture, workspace = CAPTURES[name], out / "ws"
+    out.mkdir(parents=True, exist_ok=True)
+    sources: dict[str, tuple[str, ...]] = {"ingest": (str(capture.source(data, out)),)}
+    for verb in ("ingest", "denoise", "sfm"):
+        code, error = ran(
+            workspace, verb, *sources.get(verb, ()), *capture.options.get(verb, ()))
+        if code:
+            return [name, *[""] * (len(HEADINGS) - 2), f"exit {code}: {error}"]
+    manifest = json.loads((workspace / "sfm" / "manifest.json").read_text(encoding="utf-8"))
+    cells = accuracy(capture, data, out)
+    summary = manifest["summary"]
+    verdict = json.loads((workspace / "sfm" / "verdict.json").read_text(encoding="utf-8"))
+    return [
+        name, str(summary["frames"]), str(summary["registered"]),
+        f"{summary['reprojection_error_px']:.2f}", *cells,
+        share(verdict["weak_link"]), share(verdict["fold"]), f"{manifest['seconds']:.0f}",
+        f"{manifest['peak_memory_bytes'] / 1e6:.0f}",
+        "trusted" if verdict["trusted"] else "; ".join(verdict["problems"])]
+
+
+def share(found: dict[str, Any]) -> str:
+    """The share of a test of the verdict."""
+    return "none" if found["share"] is None else f"{found['share']:.2f}"
+
+
+def accuracy(capture: Capture, data: Path, out: Path) -> tuple[str, str, str]:
+    """Cells on the errors of the cameras."""
+    if capture.truth is None:
+        return "", "", ""
+    errors = compare(model_poses(out / "ws" / "sfm" / "sparse"), capture.truth(data, out))
+    return (
+        f"{100 * errors.rmse:.2f} cm" if capture.metric else "",
+        f"{errors.median_share:.2%} / {errors.max_share:.2%}",
+        f"{errors.own_rotation_deg:.2f} / {errors.own_rotation_max_deg:.2f} deg")
+
+
+@click.command()
+@click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("out", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("names", nargs=-1, type=click.Choice(list(CAPTURES)))
+def main(data: Path, out: Path, names: tuple[str, ...]) -> None:
+    """Prints a Markdown table, a row as soon as it is known."""
+    click.echo(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}")
+    for name in names or CAPTURES:
+        folder = out.resolve() / name.replace(", ", "_").replace(" ", "_")
+        click.echo(f"| {' | '.join(measured(name, data.resolve(), folder))} |")
+
+
+if __name__ == "__main__":
+    main()
