@@ -25,8 +25,8 @@ from recon_cli.mapping.ledger import Result, fresh_folder, publish
 from recon_cli.mapping.protocol import Reporter
 
 NEAREST = 20  # cameras that each one is matched with, as many as look alike (see `retrieval`)
-# Views that differ by more share nothing to match: the wider side of a phone's picture spans 65 to
-# 80 degrees, and SIFT loses most matches from 50 degrees on.
+# Axes that differ by more leave little in common: the wider side of a phone's picture spans 65 to
+# 80 degrees.
 MAX_TURN_DEG = 75.0
 # COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
 MAX_ERROR, MIN_ANGLE = 4.0, 1.5

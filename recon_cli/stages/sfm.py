@@ -121,8 +121,8 @@ def _summary(frames: FrameList, job: Job) -> Summary:
 
 def _report(summary: Summary, ctx: StageContext) -> None:
     """Says what was tried, which frames have no camera and which models were left aside."""
-    told = (*_tried(summary["rungs"]), *summary["lines"], *_left_out(summary),
-            *summary["world"]["sentences"])
+    told = (*_tried(summary["rungs"]), *summary["lines"], *_moved(summary["poses"]),
+            *_left_out(summary), *summary["world"]["sentences"])
     for text in told:
         ctx.notice(text)
 
@@ -137,6 +137,15 @@ def _tried(rungs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         else:
             yield (f"{rung['name']} was tried, because {reason}: {rung['registered']} frames got a "
                    f"camera{', and this model is kept' if rung['kept'] else ''}.")
+
+
+def _moved(poses: Mapping[str, Any] | None) -> Iterator[str]:
+    """Yields a sentence on how far refining moved the given cameras."""
+    if poses and poses["use"] == "refine":
+        yield (f"Refining moved the cameras by {poses['moved_median']:.2%} of the size of their "
+               f"path (at most {poses['moved_max']:.2%}) and turned them by "
+               f"{poses['turned_median_deg']:.2f} degrees (at most "
+               f"{poses['turned_max_deg']:.2f}).")
 
 
 def _left_out(summary: Summary) -> Iterator[str]:

@@ -6,10 +6,13 @@ import pycolmap
 from recon_cli.mapping.job import CameraGroup, Job
 
 
-def make_capture(folder, *, frames=20, points=300, seed=0):
-    """Writes a database of exact features and matches; returns the job and the true model."""
+def make_capture(folder, *, frames=20, cameras=1, points=300, seed=0):
+    """Writes a database of exact features and matches; returns the job and the true model.
+
+    Each camera takes as many frames.
+    """
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs = options.num_cameras_per_rig = 1
+    options.num_rigs, options.num_cameras_per_rig = cameras, 1
     options.num_frames_per_rig = frames
     options.num_points3D = points
     options.camera_model_id = pycolmap.CameraModelId.OPENCV

@@ -57,6 +57,7 @@ def told(caplog, **changes):
     summary = {
         "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
         "unregistered_held_out": [], "models": [49], "apart": [], "rejected": {}, "lines": [],
+        "poses": None, "world": {"sentences": []},
         "rungs": [{"name": "exhaustive", "skipped": "", "registered": 40, "kept": False}]}
     sfm._report(summary | changes, StageContext())
     return caplog.text
@@ -83,6 +84,14 @@ def test_where_there_is_a_verdict_it_speaks_of_the_missing_frames(caplog):
 def test_frames_that_were_taken_out_of_the_model_are_told_with_the_reason(caplog):
     text = told(caplog, rejected={"9.png": "5% of its 200 matches agree"})
     assert "9.png was taken out of the model: 5% of its 200 matches agree." in text
+
+
+def test_how_far_given_poses_were_moved_is_told(caplog):
+    text = told(caplog, poses={
+        "use": "refine", "moved_median": 0.0021, "moved_max": 0.013, "turned_median_deg": 0.04,
+        "turned_max_deg": 0.31})
+    assert ("Refining moved the cameras by 0.21% of the size of their path (at most 1.30%) and "
+            "turned them by 0.04 degrees (at most 0.31).") in text
 
 
 def test_every_further_way_to_a_model_is_told_with_its_reason(caplog):
