@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sfm_inputs import run, texture, write_inputs
 
 from recon_cli.capture.frames import Frame, FrameList, Group, read_png, write_png
-from recon_cli.errors import SfmError
+from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images, read_scene
 from recon_cli.io.poses import KnownPoses
 from recon_cli.scene.lens import Lens
@@ -74,6 +74,33 @@ def test_poses_and_points_that_are_kept_are_written_as_they_were_given(
     assert summary["reprojection_error_px"] is None
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
     assert not (tmp_path / "out" / "database.db").exists()
+
+
+def test_a_known_distance_scales_cameras_points_and_what_is_undistorted(
+    room, truth, given, tmp_path
+):
+    given(truth, np.random.default_rng(0).normal(size=(50, 3)))
+    first, last = "000000.png", "000016.png"
+    summary = run(room, tmp_path / "out", scale_between=(first, "000016", 5.0))
+    for folder in ("sparse", "undistorted/sparse"):
+        centers = {name: np.linalg.inv(viewmat)[:3, 3] for name, _, viewmat in read_images(
+            tmp_path / "out" / folder / "images.bin")}
+        assert np.linalg.norm(centers[first] - centers[last]) == pytest.approx(5)
+    plain = np.linalg.inv(truth[first])[:3, 3] - np.linalg.inv(truth[last])[:3, 3]
+    similarity = summary["world"]["similarity"]
+    assert similarity["scale"] == pytest.approx(5 / np.linalg.norm(plain))
+    np.testing.assert_array_equal(similarity["rotation"], np.eye(3))  # others build on the axes
+    written = json.loads((tmp_path / "out" / "world.json").read_text())
+    assert summary["world"] == {**written, "seconds": summary["world"]["seconds"]}
+
+
+def test_a_place_that_does_not_exist_is_told_before_anything_is_mapped(
+    room, truth, given, tmp_path
+):
+    given(truth)
+    with pytest.raises(ConfigError, match=r"000017\.png"):
+        run(room, tmp_path / "out", scale_between=("000000.png", "000017.png", 5.0))
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_points_are_triangulated_from_poses_that_stay_where_they_are(room, truth, given, tmp_path):
