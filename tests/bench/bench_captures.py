@@ -18,10 +18,7 @@ from typing import Any
 import click
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from pose_errors import Poses, compare, model_poses
-
-from recon_cli.io.layouts import read_posed
+from pose_errors import Poses, compare, model_poses, reference_poses
 
 HEADINGS = (
     "capture", "chosen", "registered", "reprojection px", "centre RMSE", "centre median / max",
@@ -52,19 +49,20 @@ def given(path: str) -> Callable[[Path, Path], Path]:
 
 def room(name: str) -> Callable[[Path, Path], Poses]:
     """True poses of a rendered room; frame k of the video is line k."""
-    def read(data: Path, out: Path) -> dict[str, NDArray[np.float64]]:
-        lines = np.loadtxt(data / "rooms" / name / "traj.txt").reshape(-1, 4, 4)
-        places = np.arange(len(lines))
-        if (out / "places.txt").exists():  # a video that was cut together from the room
-            places = np.loadtxt(out / "places.txt").astype(int)
-        return {f"{index:06d}.png": lines[place] for index, place in enumerate(places)}
+    def read(data: Path, out: Path) -> Poses:
+        poses = reference_poses(data / "rooms" / name / "traj.txt")
+        if not (out / "places.txt").exists():
+            return poses
+        # a video that was cut together from the room
+        places = np.loadtxt(out / "places.txt").astype(int)
+        return {f"{index:06d}.png": poses[f"{place:06d}.png"]
+                for index, place in enumerate(places)}
     return read
 
 
-def fox(data: Path, _out: Path) -> dict[str, NDArray[np.float64]]:
+def fox(data: Path, _out: Path) -> Poses:
     """Poses of fox that others found."""
-    return {f"{Path(image.name).stem}.png": np.linalg.inv(image.viewmat)
-            for image in read_posed(data / "fox").images}
+    return reference_poses(data / "fox")
 
 
 def noisy_fox(data: Path, out: Path) -> Path:

@@ -14,8 +14,8 @@ from pathlib import Path
 import click
 import numpy as np
 import torch
-from bench_sfm import similarity
 from numpy.typing import NDArray
+from pose_errors import similarity
 
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_image

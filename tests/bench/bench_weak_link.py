@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from recon_cli.mapping.verdict import Verdict, examine
 
 sys.path += [str(Path(__file__).parents[1] / "mapping"), str(Path(__file__).parent)]
-from bench_sfm import similarity
 from made_model import MadeModel, along, wall
+from pose_errors import similarity
 
 NEAR = 0.05  # of the extent: a camera further off is displaced
 TRIALS = 2000  # samples of four cameras; with half of them right, one in 16 is good

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap import read_images
+from recon_cli.io.layouts import read_posed
 
 Poses = Mapping[str, NDArray[np.float64]]  # [4, 4] camera to world by name
 
@@ -43,14 +44,16 @@ class PoseErrors:
 
 def similarity(
     found: NDArray[np.float64], truth: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Scale s, rotation R and shift t with truth ~ s R found + t; both [F, 3] (Umeyama 1991)."""
+) -> tuple[float, NDArray[np.float64]]:
+    """Scale and [4, 4] motion with truth ~ motion (scale found); both [F, 3] (Umeyama 1991)."""
     a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a)
     flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     scale = float(np.trace(np.diag(s) @ flip) / (a**2).sum())
-    rotation = u @ flip @ vt
-    return scale, rotation, truth.mean(axis=0) - scale * rotation @ found.mean(axis=0)
+    motion = np.eye(4)
+    motion[:3, :3] = u @ flip @ vt
+    motion[:3, 3] = truth.mean(axis=0) - scale * motion[:3, :3] @ found.mean(axis=0)
+    return scale, motion
 
 
 def compare(found: Poses, truth: Poses) -> PoseErrors:
@@ -58,9 +61,10 @@ def compare(found: Poses, truth: Poses) -> PoseErrors:
     names = sorted(set(found) & set(truth))
     ours = np.stack([found[name] for name in names])
     true = np.stack([truth[name] for name in names])
-    scale, rotation, shift = similarity(ours[:, :3, 3], true[:, :3, 3])
+    scale, motion = similarity(ours[:, :3, 3], true[:, :3, 3])
+    rotation = motion[:3, :3]
     off = np.linalg.norm(
-        scale * ours[:, :3, 3] @ rotation.T + shift - true[:, :3, 3], axis=1)
+        scale * ours[:, :3, 3] @ rotation.T + motion[:3, 3] - true[:, :3, 3], axis=1)
     extent = float(np.linalg.norm(np.ptp(true[:, :3, 3], axis=0)))
     turns = Rotation.from_matrix(
         (rotation @ ours[:, :3, :3]).transpose(0, 2, 1) @ true[:, :3, :3])
@@ -75,3 +79,17 @@ def model_poses(sparse: Path) -> dict[str, NDArray[np.float64]]:
     """Returns the cameras of a COLMAP model."""
     return {name: np.linalg.inv(viewmat)
             for name, _, viewmat in read_images(sparse / "images.bin")}
+
+
+def reference_poses(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Returns the true cameras of the frames of a capture.
+
+    Args:
+        path: a traj.txt (one 4x4 camera-to-world pose a line, line k for frame k of a video), or a
+            data set that `recon ingest` takes (its images give the names).
+    """
+    if path.suffix == ".txt":
+        lines = np.loadtxt(path).reshape(-1, 4, 4)
+        return {f"{index:06d}.png": pose for index, pose in enumerate(lines)}
+    return {f"{Path(image.name).stem}.png": np.linalg.inv(image.viewmat)
+            for image in read_posed(path).images}
