@@ -21,8 +21,9 @@ from recon_cli.capture.tone import Transfer, gray_table, to_sdr
 UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
 # Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
 SD_WIDTH, SD_HEIGHT = 1280, 576
-# Without these, swscale takes ten bits or another width to RGB with errors of -2.3 to 0; with them
-# it rounds, at 1.6 times the cost. Eight bits of the same width take the short way: -1 to 0.
+# Without these, swscale cuts off where it should round, and repeats colours of half resolution
+# instead of interpolating them. Against the frames that a rendered video was made from: 1.0 of 255
+# too dark and 38.4 dB; with these 0.1 too bright and 39.0 dB, at 1.6 times the cost.
 ROUNDED = (
     Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT)
 # H.273, table 3: the transfer characteristics of HDR.
@@ -108,11 +109,9 @@ class Picture:
         return self._upright(gray)
 
     def _colours(self, pixels: str, matrix: Colorspace | None) -> NDArray[np.generic]:
-        width = self.square_size[0]
-        short = self.frame.format.components[0].bits == 8 and width == self.frame.width
         return self.frame.reformat(
-            width=width, format=pixels, src_colorspace=matrix,
-            interpolation=None if short else ROUNDED).to_ndarray()
+            width=self.square_size[0], format=pixels, src_colorspace=matrix,
+            interpolation=ROUNDED).to_ndarray()
 
     def _sdr_matrix(self) -> Colorspace | None:
         untagged = self.frame.colorspace == UNSPECIFIED

@@ -46,8 +46,9 @@ def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notice
         assert frame["held_out"] == (place % 8 == 0)
         rgb = store.read_png(tmp_path / "out" / "frames" / frame["name"])
         truth = walk(40)[index].astype(float)
-        # Half of the colour resolution is lost in the video; the wrong frame is off by 50.
-        assert np.abs(rgb - truth).mean() < 12
+        # Half of the colour resolution is lost in the video, and interpolated over the edges of the
+        # blocks; the wrong frame is off by 50.
+        assert np.abs(rgb - truth).mean() < 20
     assert notices() == []
 
 
