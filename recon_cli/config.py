@@ -99,7 +99,7 @@ class SfmConfig(StageConfig):
         "model is not good enough; a named way is the only one tried.",
         choices=("auto", "exhaustive", "retrieval", "sequential"))
     max_features: int = option(
-        2048, "Most SIFT keypoints of an image; the coarsest are kept.", unit="keypoints",
+        3000, "Most SIFT keypoints of an image; the coarsest are kept.", unit="keypoints",
         minimum=100)
     min_registered: float = option(
         0.5, "Fail when fewer images than this share get a camera.", unit="share",

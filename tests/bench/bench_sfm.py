@@ -64,7 +64,7 @@ def compared(rows: Mapping[int, Mapping[str, object]]) -> str:
     lines = [["keypoints", *names]]
     for count, row in rows.items():
         lines.append([str(count), *(
-            f"{row[name]:.3f}" if isinstance(row[name], float) else str(row[name])
+            f"{row[name]:.4g}" if isinstance(row[name], float) else str(row[name])
             for name in names)])
     return "\n".join("\t".join(line) for line in lines)
 
@@ -88,7 +88,7 @@ def table(rows: Mapping[str, object]) -> str:
     """Two columns of text."""
     width = max(map(len, rows))
     return "\n".join(
-        f"{name:<{width}}  {value:.3f}" if isinstance(value, float) else f"{name:<{width}}  {value}"
+        f"{name:<{width}}  {value:.4g}" if isinstance(value, float) else f"{name:<{width}}  {value}"
         for name, value in rows.items())
 
 
