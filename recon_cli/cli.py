@@ -154,10 +154,10 @@ _inputs = click.argument(
 @options.stage(IngestConfig)
 @pass_call
 def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
-    """Choose frames from INPUT: videos, folders of photos, or both.
+    """Choose frames from INPUT: videos, photos and folders of photos, or a data set with poses.
 
-    The frames of each INPUT get intrinsics of their own. Without INPUT, that of the last time is
-    read again.
+    Each video and folder gets intrinsics of its own. A COLMAP model, transforms.json, Replica or
+    ScanNet is told by its layout. Without INPUT, that of the last time is read again.
     """
     _perform(call, "ingest", ["ingest"], sources=inputs)
 
