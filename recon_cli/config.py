@@ -23,7 +23,8 @@ class IngestConfig(StageConfig):
     """Which frames of the capture are kept."""
 
     frames: int | None = option(
-        None, "How many frames to choose from videos and posed sequences.", unit="frames", minimum=3,
+        None, "How many frames to choose from videos and posed sequences.", unit="frames",
+        minimum=3,
         automatic="from the camera's motion, at most --max-frames",
     )
     max_frames: int = option(
