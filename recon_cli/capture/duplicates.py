@@ -95,15 +95,16 @@ def dropped_photos(candidates: Sequence[Candidate]) -> list[str]:
         f"{one.source} (like {candidates[one.like].source})" for one in candidates
         if one.reason is Reason.DUPLICATE and one.like is not None]
     if alike:
-        told.append(f"{len(alike)} photos are left out, for others show the same: {_list(alike)}.")
+        told.append(f"{len(alike)} photos are left out, for others show the same: {named(alike)}.")
     empty = [one.source for one in candidates if one.reason is Reason.CLIPPED]
     if empty:
         told.append(
-            f"{len(empty)} photos are left out, all black, blown out or flat: {_list(empty)}.")
+            f"{len(empty)} photos are left out, all black, blown out or flat: {named(empty)}.")
     return told
 
 
-def _list(names: Sequence[str]) -> str:
+def named(names: Sequence[str]) -> str:
+    """Returns names for a message: the first, and how many more there are."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
