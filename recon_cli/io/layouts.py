@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.colmap_set import is_colmap, read_colmap
+from recon_cli.io.colmap_set import is_colmap, lacks_cameras, read_colmap
 from recon_cli.io.posed import PosedSet
-from recon_cli.io.replica import is_replica, read_replica
+from recon_cli.io.replica import is_replica, lacks_trajectory, read_replica
 from recon_cli.io.scannet import is_scannet, read_scannet
 from recon_cli.io.transforms import is_transforms, read_transforms
 
@@ -54,6 +54,22 @@ def recognise(path: Path) -> str | None:
     """Returns the name of the layout that a path has, None where it has no known one."""
     layout = _find(path)
     return None if layout is None else layout.name
+
+
+def refuse_incomplete(path: Path) -> None:
+    """Raises FormatError for a data set that lacks its poses or cameras.
+
+    As photos alone it would lose its poses without a word, and its depth maps would be frames.
+    """
+    if lacks_cameras(path):
+        lacks, images = "a COLMAP model without cameras.bin or cameras.txt", path / "images"
+    elif lacks_trajectory(path):
+        lacks, images = "Replica frames without traj.txt", path / "results" / "frame*"
+    else:
+        return
+    raise FormatError(
+        f"{path} holds {lacks}.",
+        hint=f"Copy that file too, or give {images} to find the cameras anew.")
 
 
 def read_posed(path: Path) -> PosedSet:

@@ -16,7 +16,7 @@ from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.taken import Taken, joined
 from recon_cli.config import IngestConfig, parse_holdout
 from recon_cli.errors import InputError
-from recon_cli.io.layouts import recognise
+from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 
 MIN_TRAINED = 2  # one view holds no depth
@@ -106,6 +106,8 @@ def _take(
     layouts = {path: layout for path in sources if (layout := recognise(path))}
     if layouts:
         return [from_data_set.take(config, _alone(sources, layouts), out, ctx)]
+    for path in sources:
+        refuse_incomplete(path)
     parts = _parts(sources)
     prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
     videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)
