@@ -213,6 +213,7 @@ def _raise(error: BaseException) -> None:
 @pytest.mark.parametrize(("error", "code", "said"), [
     (KeyboardInterrupt(), 130, "interrupted; run the same command again to resume"),
     (OSError(errno.ENOSPC, "No space left"), 7, "MB free"),
+    (OSError(errno.EFBIG, "File too large"), 7, "larger than"),
     (PermissionError(errno.EACCES, "Permission denied"), 7, "not writable"),
     (ZeroDivisionError("by zero"), 1, "error: ZeroDivisionError: by zero"),
 ])
