@@ -85,6 +85,11 @@ def read_posed(path: Path) -> PosedSet:
         raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
     try:
         return layout.read(path)
+    except FormatError as error:
+        if error.hint:
+            raise
+        raise FormatError(
+            error.message, hint="Copy the data set again, or export it anew.") from error
     except OSError as error:  # a folder where a file belongs, or a file that may not be read
         raise FormatError(f"{path} cannot be read: {error}.") from error
 

@@ -50,8 +50,9 @@ def test_missing_images_are_described(tmp_path):
 def test_recognition_opens_nothing(tmp_path):
     (tmp_path / "transforms.json").write_text("{ broken")
     assert recognise(tmp_path) == "transforms"
-    with pytest.raises(FormatError, match="cannot be read as JSON"):
+    with pytest.raises(FormatError, match="cannot be read as JSON") as refused:
         read_posed(tmp_path)
+    assert "export it anew" in refused.value.hint
 
 
 @pytest.mark.parametrize(("make", "lost", "message"), [
