@@ -112,7 +112,8 @@ def named(names: Sequence[str]) -> str:
 def _check_left(folder: str, shown: int, alike: int) -> None:
     if alike and shown - alike < MIN_FRAMES:
         raise InputError(
-            f"{folder} holds {shown} photos but only {shown - alike} different views, and at least "
+            f"{folder} holds {shown} photos but only {shown - alike} different view"
+            f"{'s' * (shown - alike != 1)}, and at least "
             f"{MIN_FRAMES} are needed: the others are copies or were taken from the same place.",
             hint="Add photos from other places in the room, a step apart.")
 

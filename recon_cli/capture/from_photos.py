@@ -123,11 +123,11 @@ def take(
 
 
 def _listed(paths: Sequence[Path], ctx: Context) -> tuple[Path, Folder]:
-    """Returns the folder that stands for the photos in messages, and what they are."""
+    """Returns the path that stands for the photos in messages, and what they are."""
     path = paths[0]
     if not path.is_dir():
         _refuse_namesakes(paths)
-        return path.absolute().parent, list_photos(paths)
+        return (path if len(paths) == 1 else path.absolute().parent), list_photos(paths)
     home = photo_folder(path)
     if home != path:
         ctx.notice(f"{path} holds no photos itself: those in {home.name}/ are taken.")

@@ -91,6 +91,13 @@ def test_a_video_from_a_tripod_is_refused(tmp_path):
         take(video, tmp_path / "out")
 
 
+def test_a_video_that_is_dark_for_the_most_part_is_told(tmp_path, notices):
+    lit = walk(30)
+    take(write_video(tmp_path / "room.mp4", [*lit[:10], *(frame // 64 for frame in lit[10:])]),
+         tmp_path / "out")
+    assert "20 of 30 frames of room.mp4 are mostly black or blown out" in notices()[0]
+
+
 def test_adjacent_frames_are_warned_of(tmp_path, notices):
     wide = blocks(384, 560)  # a third of a percent of the width a frame, as at 60 a second
     take(write_video(tmp_path / "short.mp4", [wide[:, i:i + 384] for i in range(12)]),
@@ -103,7 +110,7 @@ def test_copies_of_one_photo_are_refused(tmp_path):
     folder.mkdir()
     for index in range(12):
         Image.fromarray(blocks(48, 64)).save(folder / f"{index}.jpg")
-    with pytest.raises(InputError, match="12 photos but only 1 different views"):
+    with pytest.raises(InputError, match="12 photos but only 1 different view,"):
         take(folder, tmp_path / "out")
 
 
@@ -137,7 +144,7 @@ def test_an_empty_file_is_refused(tmp_path):
 
 def test_one_photo_is_refused(tmp_path):
     folder = write_photos(tmp_path / "room", 1)
-    with pytest.raises(InputError, match="1 photo, but"):
+    with pytest.raises(InputError, match=r"IMG_0000\.jpg holds 1 photo, but"):
         take(folder / "IMG_0000.jpg", tmp_path / "out")
     with pytest.raises(InputError, match="1 photo, but"):
         take(folder, tmp_path / "out")
