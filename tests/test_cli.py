@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 from pathlib import Path
 
 import fake_stages
@@ -204,6 +205,12 @@ def test_a_broken_manifest_is_7(capsys: Said) -> None:
     assert "--again" in capsys.readouterr().err
     assert main(["ingest", "room.mp4", "--again"]) == 0
     assert main(["status"]) == 0
+
+
+def test_a_message_with_a_name_that_is_no_utf8_is_logged() -> None:
+    fake_stages.actions["ingest"] = lambda: logging.getLogger("recon").warning("b\udcff.jpg")
+    assert main(["ingest", "room.mp4"]) == 0
+    assert "b\\udcff.jpg" in Path("workspace/recon.log").read_text()
 
 
 def _raise(error: BaseException) -> None:

@@ -121,6 +121,14 @@ def test_a_photo_that_is_given_twice_is_taken_once(tmp_path):
     assert take((*files, files[0]), tmp_path / "out")["frames"] == 4
 
 
+def test_a_file_name_cannot_pass_for_a_message(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 4)
+    (folder / "a\nerror: \x1b[31mb.jpg").touch()
+    take(folder, tmp_path / "out")
+    assert notices() == [
+        r"A photo is left out: a\nerror: \x1b[31mb.jpg cannot be read: it is empty (0 bytes)."]
+
+
 def test_photos_in_an_inner_folder_are_taken_and_their_masks_beside_it(tmp_path, notices):
     (tmp_path / "room").mkdir()
     write_photos(tmp_path / "room" / "images", 3)
