@@ -98,7 +98,7 @@ def _advice(config: DenoiseConfig, noise: float, chosen: Score | None, gained: f
     if chosen is None:
         lines.append("That is no more than what 8 bits leave: there is nothing to remove.")
     elif chosen.filter == "none":
-        lines.append("Doing nothing is best at that level.")
+        lines.append("Doing nothing is best at that level; recon denoise --off does that.")
     else:
         lines.append(
             f"Best at {chosen.noise_255:g}/255: --filter {chosen.filter} --strength "

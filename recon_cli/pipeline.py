@@ -232,7 +232,8 @@ def _if_fresh(
 @contextmanager
 def _logged(path: Path) -> Iterator[None]:
     """Keeps everything that is logged, failures with their traceback, in a file as well."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    # File names need not be UTF-8, and a message that names one must not be lost for it.
+    handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logger.addHandler(handler)
     try:

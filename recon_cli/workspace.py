@@ -242,6 +242,10 @@ def _explained(error: OSError, root: Path, doing: str) -> ReconError | OSError:
         return WorkspaceError(
             f"The disk is full while {doing}: {free:.0f} MB free at {root}.",
             hint="Free some space and run the same command again; finished work is kept.")
+    if error.errno == errno.EFBIG:  # a limit of the process, or of a file system such as FAT32
+        return WorkspaceError(
+            f"A file is larger than {root} can hold, while {doing}.",
+            hint="Give a workspace on another disk with -w, or raise `ulimit -f`.")
     inside = error.filename is None or Path(os.fsdecode(error.filename)).is_relative_to(root)
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and inside:
         return WorkspaceError(

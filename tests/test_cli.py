@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 from pathlib import Path
 
 import fake_stages
@@ -206,6 +207,12 @@ def test_a_broken_manifest_is_7(capsys: Said) -> None:
     assert main(["status"]) == 0
 
 
+def test_a_message_with_a_name_that_is_no_utf8_is_logged() -> None:
+    fake_stages.actions["ingest"] = lambda: logging.getLogger("recon").warning("b\udcff.jpg")
+    assert main(["ingest", "room.mp4"]) == 0
+    assert "b\\udcff.jpg" in Path("workspace/recon.log").read_text()
+
+
 def _raise(error: BaseException) -> None:
     raise error
 
@@ -213,6 +220,7 @@ def _raise(error: BaseException) -> None:
 @pytest.mark.parametrize(("error", "code", "said"), [
     (KeyboardInterrupt(), 130, "interrupted; run the same command again to resume"),
     (OSError(errno.ENOSPC, "No space left"), 7, "MB free"),
+    (OSError(errno.EFBIG, "File too large"), 7, "larger than"),
     (PermissionError(errno.EACCES, "Permission denied"), 7, "not writable"),
     (ZeroDivisionError("by zero"), 1, "error: ZeroDivisionError: by zero"),
 ])

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from noisy_room import noisy, plain_room
 from PIL import Image
@@ -43,6 +44,17 @@ def test_comparing_filters_nothing_and_makes_nothing_stale(workspace, capsys):
     assert main(["status", "--json", "-w", str(workspace)]) == 0
     states = {one["name"]: one["state"] for one in json.loads(capsys.readouterr().out)["stages"]}
     assert (states["ingest"], states["denoise"]) == ("fresh", "fresh")
+
+
+def test_where_every_filter_costs_edges_the_way_to_do_nothing_is_named(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    for index in range(3):
+        grain = np.random.default_rng(index).integers(60, 196, (96, 128, 3), dtype=np.uint8)
+        Image.fromarray(grain).save(tmp_path / "photos" / f"{index}.png")
+    workspace = str(tmp_path / "ws")
+    assert main(["ingest", str(tmp_path / "photos"), "-w", workspace]) == 0
+    assert main(["denoise", "--compare", "-w", workspace]) == 0
+    assert "recon denoise --off does that" in capsys.readouterr().out
 
 
 def test_without_frames_there_is_nothing_to_compare(tmp_path, capsys):

@@ -42,6 +42,8 @@ COLOURS: dict[str, Colour] = {
     Reason.CLIPPED: (20, 20, 20), Reason.DUPLICATE: (204, 121, 167), Reason.CLOSE: (190, 190, 190),
     Reason.DAMAGED: (240, 228, 66)}
 
+MOST_OBLONG = 4  # width to height of a cell; a longer picture, a panorama say, leaves paper free
+
 
 @dataclass(frozen=True)
 class _Layout:
@@ -80,8 +82,7 @@ class ContactSheet:
     def add(self, index: int, rgb: NDArray[np.uint8]) -> None:
         """Takes the pixels [H, W, 3] of a candidate; those that are not shown are ignored."""
         if index in self.wanted:
-            small = cv2.resize(rgb, self._layout.thumb, interpolation=cv2.INTER_AREA)
-            self._thumbs[index] = Image.fromarray(small)
+            self._thumbs[index] = _thumbnail(rgb, self._layout.thumb)
 
     def write(self, path: Path, held_out: Collection[str]) -> None:
         """Draws the sheet as a PNG, whole or not at all.
@@ -168,7 +169,22 @@ def _encoded(canvas: Image.Image) -> bytes:
     return data
 
 
+def _thumbnail(
+    rgb: NDArray[np.uint8],  # [H, W, 3]
+    size: tuple[int, int],
+) -> Image.Image:
+    """Returns a picture reduced into `size`, in its own shape: photos may lie and stand."""
+    height, width = rgb.shape[:2]
+    scale = min(size[0] / width, size[1] / height)
+    fitted = max(1, round(width * scale)), max(1, round(height * scale))
+    thumb = Image.new("RGB", size, PAPER)
+    small = Image.fromarray(cv2.resize(rgb, fitted, interpolation=cv2.INTER_AREA))
+    thumb.paste(small, ((size[0] - fitted[0]) // 2, (size[1] - fitted[1]) // 2))
+    return thumb
+
+
 def _layout(width: int, height: int) -> _Layout:
+    width, height = max(width, height // MOST_OBLONG), max(height, width // MOST_OBLONG)
     scale = math.sqrt(THUMB_PIXELS / (width * height))
     thumb = max(8, round(width * scale)), max(8, round(height * scale))
     cell = (

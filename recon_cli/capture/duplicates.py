@@ -95,15 +95,16 @@ def dropped_photos(candidates: Sequence[Candidate]) -> list[str]:
         f"{one.source} (like {candidates[one.like].source})" for one in candidates
         if one.reason is Reason.DUPLICATE and one.like is not None]
     if alike:
-        told.append(f"{len(alike)} photos are left out, for others show the same: {_list(alike)}.")
+        told.append(f"{len(alike)} photos are left out, for others show the same: {named(alike)}.")
     empty = [one.source for one in candidates if one.reason is Reason.CLIPPED]
     if empty:
         told.append(
-            f"{len(empty)} photos are left out, all black, blown out or flat: {_list(empty)}.")
+            f"{len(empty)} photos are left out, all black, blown out or flat: {named(empty)}.")
     return told
 
 
-def _list(names: Sequence[str]) -> str:
+def named(names: Sequence[str]) -> str:
+    """Returns names for a message: the first, and how many more there are."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
@@ -111,7 +112,8 @@ def _list(names: Sequence[str]) -> str:
 def _check_left(folder: str, shown: int, alike: int) -> None:
     if alike and shown - alike < MIN_FRAMES:
         raise InputError(
-            f"{folder} holds {shown} photos but only {shown - alike} different views, and at least "
+            f"{folder} holds {shown} photos but only {shown - alike} different view"
+            f"{'s' * (shown - alike != 1)}, and at least "
             f"{MIN_FRAMES} are needed: the others are copies or were taken from the same place.",
             hint="Add photos from other places in the room, a step apart.")
 

@@ -42,7 +42,7 @@ def take(config: IngestConfig, path: Path, out: Path, ctx: Context) -> Taken:
     posed = read_posed(path)
     ctx.notice(f"{path.name} is taken for {describe(posed)}.")
     for notice in posed.notices:
-        ctx.notice(notice)
+        ctx.notice(f"{notice[0].upper()}{notice[1:]}.")
     images = _chosen(config, posed, ctx)
     names = names_in_order([Path(image.name).stem for image in images])
     broken = _write(images, names, posed.lenses, config.max_size, out, ctx)

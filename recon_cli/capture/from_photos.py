@@ -14,7 +14,14 @@ from recon_cli import atomic
 from recon_cli.capture import frames as store
 from recon_cli.capture.candidates import Candidate, Reason
 from recon_cli.capture.contact import ContactSheet
-from recon_cli.capture.duplicates import PhotoLook, choose_photos, dropped_photos, look_at_photo
+from recon_cli.capture.duplicates import (
+    NAMED,
+    PhotoLook,
+    choose_photos,
+    dropped_photos,
+    look_at_photo,
+    named,
+)
 from recon_cli.capture.frames import Frame, Group
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.groups import PhotoGroup, group_notices, group_photos
@@ -97,10 +104,9 @@ def take(
     writer = _Writer(out, config.max_size, masks.by_photo, plan)
     looks, unreadable = _write(photos, names, writer, ctx)
     broken = folder.broken | unreadable
-    for reason in broken.values():
-        ctx.notice(f"A photo is left out: {reason}")
     readable = sum(look is not None for look in looks)
     check_count(path, readable, broken)
+    _tell_broken(tuple(broken.values()), ctx)
     record = choose_photos(path.name, [photo.path.name for photo in photos], names, looks)
     for text in dropped_photos(record):
         ctx.notice(text)
@@ -117,15 +123,23 @@ def take(
 
 
 def _listed(paths: Sequence[Path], ctx: Context) -> tuple[Path, Folder]:
-    """Returns the folder that stands for the photos in messages, and what they are."""
+    """Returns the path that stands for the photos in messages, and what they are."""
     path = paths[0]
     if not path.is_dir():
         _refuse_namesakes(paths)
-        return path.absolute().parent, list_photos(paths)
+        return (path if len(paths) == 1 else path.absolute().parent), list_photos(paths)
     home = photo_folder(path)
     if home != path:
         ctx.notice(f"{path} holds no photos itself: those in {home.name}/ are taken.")
     return path, list_photos(home.iterdir())
+
+
+def _tell_broken(reasons: Sequence[str], ctx: Context) -> None:
+    """Says why photos are left out; of many, the record of the choice names the rest."""
+    for reason in reasons[:NAMED]:
+        ctx.notice(f"A photo is left out: {reason}")
+    if len(reasons) > NAMED:
+        ctx.notice(f"{len(reasons) - NAMED} more photos are left out for such reasons.")
 
 
 def _refuse_namesakes(paths: Sequence[Path]) -> None:
@@ -145,7 +159,11 @@ def _masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: Context) -> Foun
     if masks.outside:
         ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
     if masks.unused:
-        ctx.notice(f"Masks without a photo are left out: {', '.join(masks.unused)}.")
+        ctx.notice(f"Masks without a photo are left out: {named(masks.unused)}.")
+    if masks.unused and not masks.by_photo:
+        ctx.notice(
+            f"No mask is used: that of {photos[0].path.name} must be called "
+            f"{photos[0].path.stem}.png or {photos[0].path.name}.png.")
     return masks
 
 
@@ -207,7 +225,7 @@ def _write(
             try:
                 looks.append(look_at_photo(writer.write(photo, name)))
             except InputError as error:
-                broken[photo.path.name] = error.message
+                broken[photo.path.name] = f"{error.message} {error.hint}".rstrip()
                 looks.append(None)
             bar.advance()
             record(len(looks), len(photos))

@@ -22,7 +22,7 @@ from recon_cli.capture.choose import (
     travelled,
 )
 from recon_cli.capture.contact import ContactSheet
-from recon_cli.capture.exposure import check_exposure
+from recon_cli.capture.exposure import check_exposure, well_exposed
 from recon_cli.capture.frames import Frame, Group
 from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import MIN_FRAMES
@@ -72,6 +72,7 @@ def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> 
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
     check_exposure(path.name, scan.exposure[scan.whole], least=MIN_FRAMES)
+    _report_clipped(path, scan, ctx)
     warning = check_motion(path.name, scan.motion)
     if warning:
         ctx.notice(warning)
@@ -148,6 +149,19 @@ def _report_lost(path: Path, scan: Scan, ctx: Context) -> None:
             f"{whole} can be used.")
     elif 0 < scan.declared < decoded - inexact:
         ctx.notice(f"{path.name} declares {scan.declared} frames but holds {decoded}.")
+
+
+def _report_clipped(path: Path, scan: Scan, ctx: Context) -> None:
+    """Says where most of a video is lost to its exposure: what it shows, the rest cannot stand for.
+
+    The counts of the summary and the contact sheet tell of fewer ones.
+    """
+    whole = int(scan.whole.sum())
+    clipped = whole - int(well_exposed(scan.exposure[scan.whole]).sum())
+    if 2 * clipped > whole:
+        ctx.notice(
+            f"{clipped} of {whole} frames of {path.name} are mostly black or blown out and are "
+            "left out.")
 
 
 def _report_short(scan: Scan, chosen: int, asked: int | None, ctx: Context) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import pillow_heif
 import rawpy
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from recon_cli.capture.exif import Lens, read_lens
 from recon_cli.errors import InputError
@@ -177,12 +177,22 @@ def opened(path: Path) -> Image.Image:
 
 def refused(path: Path, error: Exception) -> InputError:
     """Returns what to raise for a picture that a library does not read."""
-    reason = error.args[0] if error.args else type(error).__name__
+    return InputError(f"{path.name} cannot be read: {_reason(path, error)}.")
+
+
+def _reason(path: Path, error: Exception) -> str:
+    """Returns a library's words, or plainer ones for what happens most."""
+    if path.is_file() and path.stat().st_size == 0:
+        return "it is empty (0 bytes)"
+    if isinstance(error, UnidentifiedImageError):
+        return "it is no picture of a known format"
     if isinstance(error, OSError) and error.strerror:
-        reason = error.strerror
-    if isinstance(reason, bytes):
-        reason = reason.decode(errors="replace")
-    return InputError(f"{path.name} cannot be read: {reason}.")
+        return error.strerror
+    words = error.args[0] if error.args else type(error).__name__
+    text = words.decode(errors="replace") if isinstance(words, bytes) else str(words)
+    if isinstance(error, Image.DecompressionBombError):
+        return text.split(", could be")[0]  # Pillow goes on about an attack
+    return text.split(" (")[0] if text.startswith("image file is truncated") else text.rstrip(".")
 
 
 @cache

@@ -1,9 +1,9 @@
 """What of a photo is to be ignored: from a folder of masks, or from the photo's own transparency.
 
 White counts, black is ignored. A mask lies in masks/ inside the folder that was given, or inside
-the one in it that holds the photos, and has its photo's name with .png or .jpg, or, as COLMAP wants
-it, behind the photo's whole name. Masks beside the folder that was given are not taken: they are no
-part of the input, and a change of theirs would go unnoticed.
+the one in it that holds the photos, and has its photo's name with .png or the ending of any other
+picture, or, as COLMAP wants it, behind the photo's whole name. Masks beside the folder that was
+given are not taken: they are no part of the input, and a change of theirs would go unnoticed.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli import atomic
-from recon_cli.capture.images import Photo, read_alpha, read_rgb
+from recon_cli.capture.images import PHOTO_SUFFIXES, RAW_SUFFIXES, Photo, read_alpha, read_rgb
 from recon_cli.errors import InputError
 
 FOLDER = "masks"
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = PHOTO_SUFFIXES - RAW_SUFFIXES
 HALF = 128  # from here on a pixel is white, or opaque
 
 
@@ -74,7 +74,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     Raises:
         InputError: it cannot be read, has another shape, or ignores every pixel.
     """
-    gray = read_rgb(path).max(axis=2)
+    gray = _gray(path)
     if not _same_shape(gray.shape[1], gray.shape[0], width, height):
         raise InputError(
             f"The mask {path.name} has {gray.shape[1]}x{gray.shape[0]} pixels, but {width}x{height}"
@@ -87,6 +87,15 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
             "255 is to stand for what counts.",
             hint="Write masks with 0 and 255, or remove the photo.")
     return mask
+
+
+def _gray(path: Path) -> NDArray[np.uint8]:
+    """Returns the brightest channel of a mask, [H, W]; a mask is often called like its photo."""
+    try:
+        return np.asarray(read_rgb(path).max(axis=2), np.uint8)
+    except InputError as error:
+        raise InputError(
+            f"The mask {error.message}", hint="Write it again, or remove it.") from error
 
 
 def alpha_mask(photo: Photo) -> NDArray[np.uint8] | None:

@@ -86,15 +86,28 @@ def _counting(stem: str) -> list[tuple[int, str]]:
 
 
 def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
-    """Raises InputError when too few photos are readable to reconstruct anything."""
+    """Raises InputError when too few photos can be used to reconstruct anything.
+
+    Args:
+        folder: that holds them, for the message.
+        readable: how many can be used.
+        broken: why each of the others cannot, by file name.
+    """
     if readable >= MIN_FRAMES:
         return
-    first = next(iter(broken.values()), "")
+    if not broken:
+        raise InputError(
+            f"{folder} holds {_photos(readable)}, but at least {MIN_FRAMES} are needed.",
+            hint="Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, "
+            "HEIC, camera RAW).")
     raise InputError(
-        f"{folder}: {readable} photos, {len(broken)} more that cannot be read, but at least "
-        f"{MIN_FRAMES} are needed. {first}".rstrip(),
-        hint="Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, "
-        "HEIC, camera RAW).")
+        f"{folder} holds {_photos(readable)} that can be used and {len(broken)} that cannot, but "
+        f"at least {MIN_FRAMES} are needed. The first: {next(iter(broken.values()))}",
+        hint="Mend what is named, or copy the photos from the camera again.")
+
+
+def _photos(count: int) -> str:
+    return f"{count or 'no'} photo{'s' * (count != 1)}"
 
 
 def frame_names(photos: Sequence[Photo]) -> list[str]:

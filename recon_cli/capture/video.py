@@ -84,8 +84,9 @@ def _video_stream(path: Path, container: InputContainer) -> VideoStream:
         raise _cut_off(path)
     kinds = {"video": "a still picture or text"}
     found = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
+    only = f", only {', '.join(found)}" if found else ": it is empty"
     raise InputError(
-        f"{path} holds no video that can be decoded, only {', '.join(found) or 'nothing'}.",
+        f"{path} holds no video that can be decoded{only}.",
         hint="Give a video or a folder of photos.")
 
 

@@ -18,6 +18,7 @@ from recon_cli.scene.lens import MODELS, Lens
 # Entries written with three decimals are off by up to 5e-4, so R R^T by up to
 # 2 * sqrt(3) * 5e-4 = 1.7e-3. A scale that is left in a pose is larger by far.
 ORTHONORMAL = 2e-3
+FARTHEST = 1e9  # UTM, the largest coordinates in use, reach 1e7 metres
 MAX_SIDE = 1 << 16  # pixels; no image format in use holds a longer side
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # y up and z backward, from y down and z forward
 _HINT = "Export the poses again, or take the image out of the list."
@@ -64,6 +65,9 @@ def _matrix(value: Any, where: str) -> NDArray[np.float64]:
     pose = pose.reshape(4, 4)
     if not np.isfinite(pose).all():
         raise FormatError(f"{where} holds a number that is not finite.", hint=_HINT)
+    if np.abs(pose[:3, 3]).max() > FARTHEST:
+        raise FormatError(
+            f"{where} puts the camera at {_numbers(pose[:3, 3])}, which is no place.", hint=_HINT)
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHONORMAL:
         raise FormatError(
             f"{where} is no rigid pose: its last row is {_numbers(pose[3])}, needed 0 0 0 1.",

@@ -29,6 +29,13 @@ def is_colmap(folder: Path) -> bool:
     return _find_model(folder) is not None
 
 
+def lacks_cameras(folder: Path) -> bool:
+    """Returns whether a folder holds images of a COLMAP model, but none of its cameras."""
+    return not is_colmap(folder) and any(
+        (folder / place / f"{part}{suffix}").is_file()
+        for place, _ in _PLACES for part in ("images", "frames") for suffix in (".bin", ".txt"))
+
+
 def read_colmap(folder: Path) -> PosedSet:
     """Returns a COLMAP model with its images.
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.colmap_set import is_colmap, read_colmap
+from recon_cli.io.colmap_set import is_colmap, lacks_cameras, read_colmap
 from recon_cli.io.posed import PosedSet
-from recon_cli.io.replica import is_replica, read_replica
+from recon_cli.io.replica import is_replica, lacks_trajectory, read_replica
 from recon_cli.io.scannet import is_scannet, read_scannet
 from recon_cli.io.transforms import is_transforms, read_transforms
 
@@ -56,6 +56,22 @@ def recognise(path: Path) -> str | None:
     return None if layout is None else layout.name
 
 
+def refuse_incomplete(path: Path) -> None:
+    """Raises FormatError for a data set that lacks its poses or cameras.
+
+    As photos alone it would lose its poses without a word, and its depth maps would be frames.
+    """
+    if lacks_cameras(path):
+        lacks, images = "a COLMAP model without cameras.bin or cameras.txt", path / "images"
+    elif lacks_trajectory(path):
+        lacks, images = "Replica frames without traj.txt", path / "results" / "frame*"
+    else:
+        return
+    raise FormatError(
+        f"{path} holds {lacks}.",
+        hint=f"Copy that file too, or give {images} to find the cameras anew.")
+
+
 def read_posed(path: Path) -> PosedSet:
     """Returns the data set with poses at a path.
 
@@ -69,6 +85,11 @@ def read_posed(path: Path) -> PosedSet:
         raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
     try:
         return layout.read(path)
+    except FormatError as error:
+        if error.hint:
+            raise
+        raise FormatError(
+            error.message, hint="Copy the data set again, or export it anew.") from error
     except OSError as error:  # a folder where a file belongs, or a file that may not be read
         raise FormatError(f"{path} cannot be read: {error}.") from error
 

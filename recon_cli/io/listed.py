@@ -122,8 +122,8 @@ def _check_sizes(there: Sequence[Listed], sizes: Sequence[tuple[int, int]]) -> f
         if off > slack:
             raise FormatError(
                 f"{item.path} is {width}x{height} pixels, but its camera "
-                f"{item.lens.width}x{item.lens.height}; the other images are {factor:.4g} times "
-                "as large as their cameras.",
+                f"{item.lens.width}x{item.lens.height}; most images are {factor:.4g} times as "
+                "wide as their cameras, which is no common factor.",
                 hint="Take the images that the poses were made for, all of them or all reduced "
                 "by one factor; pixels count as they lie in the file, before any EXIF turn.")
     return factor

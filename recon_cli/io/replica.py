@@ -34,6 +34,13 @@ def is_replica(folder: Path) -> bool:
     return (folder / _TRAJ).is_file() and (folder / "results").is_dir()
 
 
+def lacks_trajectory(folder: Path) -> bool:
+    """Returns whether a folder holds frames with depth as Replica does, but no poses."""
+    results = folder / "results"
+    return not (folder / _TRAJ).is_file() and all(
+        next(results.glob(f"{kind}[0-9]*"), None) for kind in ("frame", "depth"))
+
+
 def read_replica(folder: Path) -> PosedSet:
     """Returns a Replica sequence, its test/ folder held out.
 

@@ -53,5 +53,9 @@ class StageContext:
     record: Callable[[int, int], None] = _ignore
 
     def notice(self, text: str) -> None:
-        """Tells the user something that is no error but must not be missed."""
-        logger.warning("%s", text)
+        """Tells the user something that is no error but must not be missed, in one line.
+
+        It may hold file names, and those may hold whatever moves a terminal's cursor.
+        """
+        logger.warning("%s", "".join(
+            one if one.isprintable() else repr(one)[1:-1] for one in text))

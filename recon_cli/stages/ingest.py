@@ -16,8 +16,10 @@ from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.taken import Taken, joined
 from recon_cli.config import IngestConfig, parse_holdout
 from recon_cli.errors import InputError
-from recon_cli.io.layouts import recognise
+from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.stages.context import StageContext, StageInputs, Summary
+
+MIN_TRAINED = 2  # one view holds no depth
 
 
 def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
@@ -48,6 +50,7 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     parts = _take(config, inputs.sources, out, ctx)
     taken = joined(parts)
     held = _held_out(taken, config, ctx)
+    _check_split(taken, held, config, ctx)
     frames = tuple(replace(frame, held_out=frame.name in held) for frame in taken.frames)
     for part in parts:
         if part.choice is not None:
@@ -80,6 +83,22 @@ def _held_out(taken: Taken, config: IngestConfig, ctx: StageContext) -> frozense
     return held
 
 
+def _check_split(
+    taken: Taken, held: frozenset[str], config: IngestConfig, ctx: StageContext
+) -> None:
+    """Refuses a split that leaves too little to train on; says that options had no effect."""
+    left = len(taken.frames) - len(held)
+    if left < MIN_TRAINED:
+        raise InputError(
+            f"{len(held)} of {len(taken.frames)} frames are held out, which leaves {left} to train "
+            f"on, but at least {MIN_TRAINED} are needed.",
+            hint="Hold out fewer, for example with --holdout every:8.")
+    if not held and config.holdout != "none":
+        ctx.notice(f"--holdout {config.holdout} holds out none of {left} frames: no score.")
+    if config.frames is not None and taken.kind == "photos":
+        ctx.notice("--frames has no effect on photos: all are taken.")
+
+
 def _take(
     config: IngestConfig, sources: Sequence[Path], out: Path, ctx: StageContext
 ) -> list[Taken]:
@@ -87,6 +106,8 @@ def _take(
     layouts = {path: layout for path in sources if (layout := recognise(path))}
     if layouts:
         return [from_data_set.take(config, _alone(sources, layouts), out, ctx)]
+    for path in sources:
+        refuse_incomplete(path)
     parts = _parts(sources)
     prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
     videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)
@@ -109,7 +130,7 @@ def _take(
 
 def _parts(sources: Sequence[Path]) -> list[list[Path]]:
     """Returns the sources one by one, but files that are photos together in place of the first."""
-    files = [path for path in sources if not path.is_dir() and _of_photos(path)]
+    files = [path for path in dict.fromkeys(sources) if not path.is_dir() and _of_photos(path)]
     parts = [files if path in files else [path] for path in sources]
     return [part for index, part in enumerate(parts) if part not in parts[:index]]
 

@@ -41,6 +41,24 @@ def test_each_kind_has_its_border(tmp_path):
     assert swatches(picture) == {Reason.KEPT, HELD_OUT, Reason.BLURRED, Reason.DUPLICATE}
 
 
+def test_a_photo_of_another_shape_keeps_it(tmp_path):
+    sheet = ContactSheet("room", capture([Reason.KEPT] * 2), 160, 96)
+    sheet.add(0, np.full((96, 160, 3), (250, 30, 30), np.uint8))
+    sheet.add(1, np.full((160, 96, 3), (30, 30, 250), np.uint8))
+    sheet.write(tmp_path / "contact.png", ())
+    pixels = np.asarray(Image.open(tmp_path / "contact.png").convert("RGB")).astype(int)
+    for colour, ratio in (((250, 30, 30), 160 / 96), ((30, 30, 250), 96 / 160)):
+        rows, columns = np.nonzero(np.abs(pixels - colour).max(axis=2) < 12)
+        assert np.ptp(columns) / np.ptp(rows) == pytest.approx(ratio, rel=0.05)
+
+
+def test_a_sheet_of_strips_stays_within_its_width(tmp_path):
+    pixels = np.full((5, 1920, 3), 60, np.uint8)
+    picture = drawn(
+        capture([Reason.KEPT] * 4), tmp_path / "contact.png", width=1920, height=5, pixels=pixels)
+    assert picture.size[0] <= 4000
+
+
 def test_the_thumbnails_stand_in_order(tmp_path):
     colours = [(250, 30, 30), (30, 250, 30), (30, 30, 250)]
     sheet = ContactSheet("room.mp4", capture([Reason.KEPT] * 3), 160, 96)

@@ -252,6 +252,14 @@ def test_what_is_no_picture_is_refused(tmp_path, content):
         inspect_photo(tmp_path / "a.jpg")
 
 
+@pytest.mark.parametrize(("content", "reason"), [
+    (b"", "it is empty"), (b"no picture", "it is no picture of a known format")])
+def test_a_file_that_is_no_picture_is_refused_in_plain_words(tmp_path, content, reason):
+    (tmp_path / "a.jpg").write_bytes(content)
+    with pytest.raises(InputError, match=f"^a.jpg cannot be read: {reason}[^/]*$"):
+        inspect_photo(tmp_path / "a.jpg")
+
+
 def test_floating_point_colours_are_refused_too(tmp_path):
     cv2.imwrite(str(tmp_path / "a.tif"), np.ones((8, 8, 3), np.float32))
     with pytest.raises(InputError, match=r"a\.tif cannot be read"):
@@ -267,7 +275,7 @@ def test_floating_point_pixels_are_refused_because_their_range_is_unknown(tmp_pa
 def test_a_decompression_bomb_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
     Image.fromarray(picture()).save(tmp_path / "a.png")
-    with pytest.raises(InputError, match=r"3072 pixels.*2000 pixels.*bomb"):
+    with pytest.raises(InputError, match=r"3072 pixels.*2000 pixels\.$"):
         inspect_photo(tmp_path / "a.png")
 
 

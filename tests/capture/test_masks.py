@@ -41,6 +41,13 @@ def test_masks_inside_the_folder_are_found_by_stem_and_by_whole_name(tmp_path):
     assert found.unused == ("lost.png",)
 
 
+def test_masks_of_any_format_of_pictures_are_found(tmp_path):
+    masks = tmp_path / "masks"
+    touch(masks / "a.tif", masks / "b.webp", masks / "c.bmp", masks / "d.dng")
+    found = find_masks(tmp_path, tmp_path, photos(tmp_path, "a.jpg", "b.jpg", "c.jpg", "d.jpg"))
+    assert sorted(found.by_photo) == ["a.jpg", "b.jpg", "c.jpg"]
+
+
 def test_masks_beside_the_photos_count_where_the_folder_of_both_was_given(tmp_path):
     touch(tmp_path / "masks" / "a.png")
     images = tmp_path / "images"
@@ -100,7 +107,7 @@ def test_a_mask_that_ignores_everything_is_refused_with_its_brightest_value(tmp_
 
 def test_a_mask_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"a\.png cannot be read"):
+    with pytest.raises(InputError, match=r"^The mask a\.png cannot be read"):
         read_mask(tmp_path / "a.png", 8, 6)
 
 

@@ -59,9 +59,9 @@ def test_other_names_are_numbered(names):
 
 def test_too_few_photos_are_refused_with_the_reason():
     check_count(Path("room"), 3, {})
-    with pytest.raises(InputError, match="1 photos, 0 more"):
+    with pytest.raises(InputError, match="room holds 1 photo, but at least 3"):
         check_count(Path("room"), 1, {})
-    with pytest.raises(InputError, match=r"2 more.*a\.jpg cannot be read"):
+    with pytest.raises(InputError, match=r"no photos that can.* 2 that.*a\.jpg cannot be read"):
         check_count(Path("room"), 0, {"a.jpg": "a.jpg cannot be read.", "b.jpg": "?"})
 
 

@@ -95,6 +95,15 @@ def test_text_is_no_video_whatever_its_name(tmp_path, name):
         claimed_length(path)
 
 
+def test_a_video_without_frames_is_refused(tmp_path):
+    with av.open(str(tmp_path / "empty.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.height, stream.width, stream.pix_fmt = 64, 64, "yuv420p"
+        container.start_encoding()
+    with pytest.raises(InputError, match=r"holds no video that can be decoded: it is empty\."):
+        claimed_length(tmp_path / "empty.mp4")
+
+
 def test_sound_is_no_video(tmp_path):
     with pytest.raises(InputError, match="holds no video that can be decoded, only audio"):
         claimed_length(write_sound(tmp_path / "sound.mp4"))

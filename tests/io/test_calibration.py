@@ -13,6 +13,13 @@ def test_a_pose_is_inverted():
     np.testing.assert_allclose(viewmat_from_pose(POSE, "it") @ POSE, np.eye(4), atol=1e-15)
 
 
+def test_a_camera_beyond_all_coordinates_is_refused():
+    far = POSE.copy()
+    far[0, 3] = 1e30
+    with pytest.raises(FormatError, match=r"puts the camera at 1e\+30 3 4, which is no place"):
+        viewmat_from_pose(far, "it")
+
+
 def test_a_pose_may_be_a_row_of_numbers_or_lack_its_last_row():
     expected = viewmat_from_pose(POSE, "it")
     np.testing.assert_array_equal(viewmat_from_pose(POSE.ravel().tolist(), "it"), expected)

@@ -4,7 +4,7 @@ import posed_sets
 import pytest
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.layouts import LAYOUTS, describe, read_posed, recognise
+from recon_cli.io.layouts import LAYOUTS, describe, read_posed, recognise, refuse_incomplete
 
 
 def make_colmap(folder):
@@ -50,8 +50,21 @@ def test_missing_images_are_described(tmp_path):
 def test_recognition_opens_nothing(tmp_path):
     (tmp_path / "transforms.json").write_text("{ broken")
     assert recognise(tmp_path) == "transforms"
-    with pytest.raises(FormatError, match="cannot be read as JSON"):
+    with pytest.raises(FormatError, match="cannot be read as JSON") as refused:
         read_posed(tmp_path)
+    assert "export it anew" in refused.value.hint
+
+
+@pytest.mark.parametrize(("make", "lost", "message"), [
+    (make_colmap, "sparse/cameras.txt", "a COLMAP model without cameras.bin"),
+    (posed_sets.make_replica, "traj.txt", "Replica frames without traj.txt"),
+])
+def test_a_data_set_that_lost_its_poses_is_not_taken_for_photos(tmp_path, make, lost, message):
+    make(tmp_path)
+    refuse_incomplete(tmp_path)
+    (tmp_path / lost).unlink()
+    with pytest.raises(FormatError, match=message):
+        refuse_incomplete(tmp_path)
 
 
 def test_photos_and_videos_have_no_layout(tmp_path):

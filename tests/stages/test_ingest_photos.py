@@ -69,11 +69,64 @@ def test_a_photo_whose_mask_is_broken_is_left_out_and_named(tmp_path, notices):
     folder = write_photos(tmp_path / "room", 4)
     mask_of(folder / "masks", "IMG_0001.png", np.full((48, 48), 255, np.uint8))
     mask_of(folder / "masks", "IMG_0002.png", np.zeros((48, 64), np.uint8))
-    with pytest.raises(InputError, match=r"2 photos, 2 more.*IMG_0001\.png has 48x48"):
+    with pytest.raises(InputError, match=r"2 that cannot.*IMG_0001\.png has 48x48"):
         take(folder, tmp_path / "out")
     (folder / "masks" / "IMG_0002.png").unlink()
     assert take(folder, tmp_path / "out")["skipped"] == ["IMG_0001.jpg"]
     assert any("The mask IMG_0001.png has 48x48" in notice for notice in notices())
+
+
+def test_masks_that_are_all_broken_are_named_as_masks_with_what_helps(tmp_path):
+    folder = write_photos(tmp_path / "room", 4)
+    for index in range(4):
+        mask_of(folder / "masks", f"IMG_{index:04d}.png", np.ones((48, 64), np.uint8))
+    with pytest.raises(InputError, match=r"The mask IMG_0000\.png.*Write masks with 0 and 255"):
+        take(folder, tmp_path / "out")
+
+
+def test_where_no_mask_is_called_like_a_photo_the_right_name_is_told(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 4)
+    for index in range(12):
+        mask_of(folder / "masks", f"IMG_{index:04d}_mask.png", np.full((48, 64), 255, np.uint8))
+    take(folder, tmp_path / "out")
+    assert "and 4 more" in notices()[0]
+    assert "must be called IMG_0000.png or IMG_0000.jpg.png" in notices()[1]
+
+
+def test_of_many_broken_photos_the_first_are_told_one_by_one(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 4)
+    for index in range(12):
+        (folder / f"X{index:02d}.jpg").touch()
+    take(folder, tmp_path / "out")
+    assert sum("A photo is left out" in text for text in notices()) == 8
+    assert notices()[8].startswith("4 more photos are left out")
+
+
+def test_a_split_that_leaves_nothing_to_train_on_is_refused(tmp_path):
+    folder = write_photos(tmp_path / "room", 4)
+    with pytest.raises(InputError, match="4 of 4 frames are held out, which leaves 0"):
+        take(folder, tmp_path / "out", config=IngestConfig(holdout="segment:0:1"))
+
+
+def test_options_without_effect_on_photos_are_told(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 4)
+    take(folder, tmp_path / "out", config=IngestConfig(holdout="segment:0:0.01", frames=3))
+    assert notices() == [
+        "--holdout segment:0:0.01 holds out none of 4 frames: no score.",
+        "--frames has no effect on photos: all are taken."]
+
+
+def test_a_photo_that_is_given_twice_is_taken_once(tmp_path):
+    files = sorted(write_photos(tmp_path / "room", 4).iterdir())
+    assert take((*files, files[0]), tmp_path / "out")["frames"] == 4
+
+
+def test_a_file_name_cannot_pass_for_a_message(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 4)
+    (folder / "a\nerror: \x1b[31mb.jpg").touch()
+    take(folder, tmp_path / "out")
+    assert notices() == [
+        r"A photo is left out: a\nerror: \x1b[31mb.jpg cannot be read: it is empty (0 bytes)."]
 
 
 def test_photos_in_an_inner_folder_are_taken_and_their_masks_beside_it(tmp_path, notices):
