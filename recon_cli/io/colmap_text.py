@@ -6,6 +6,7 @@ that of COLMAP's src/colmap/scene/reconstruction_io_text.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from recon_cli.io.colmap_bytes import rigid
 from recon_cli.scene.lens import Lens
 
 _HINT = "Export the model again from COLMAP."
+_COUNT = re.compile(r"# Number of \w+: (\d+)")
+_HEAD = 5  # lines; COLMAP writes three or four comments
 Sensor = tuple[str, int]  # its type, such as CAMERA, and its id
 
 
@@ -32,6 +35,7 @@ def read_cameras_text(path: Path) -> dict[int, Lens]:
         camera_id, width, height = _integers([words[0], *words[2:4]], where, 3)
         params = _numbers(words[4:], where, len(words) - 4)
         cameras[camera_id] = checked_lens(words[1], width, height, params, where)
+    _check_complete(path, len(cameras))
     return cameras
 
 
@@ -54,6 +58,7 @@ def read_images_text(path: Path) -> list[tuple[str, int, NDArray[np.float64]]]:
         pose = _numbers(words[1:8], where, 7)
         images.append((words[9], camera_id, _pose(pose, where)))
         next(lines, None)  # its observations, which may be an empty line
+    _check_complete(path, len(images))
     return images
 
 
@@ -69,6 +74,7 @@ def read_points_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]
         if not np.isfinite(row).all() or not all(0 <= value <= 255 for value in row[4:]):
             raise _malformed(where, "no finite place with a colour of 0 to 255")
         rows.append(row)
+    _check_complete(path, len(rows))
     table = np.array(sorted(rows), np.float64).reshape(-1, 7)
     return np.ascontiguousarray(table[:, 1:4]), table[:, 4:].astype(np.uint8)
 
@@ -125,6 +131,16 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     except FileNotFoundError as error:
         raise FormatError(f"{path} is missing.", hint=_HINT) from error
     return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1)]
+
+
+def _check_complete(path: Path, found: int) -> None:
+    """Raises FormatError when a file holds less than COLMAP's comment at its head promises."""
+    for at, line in _lines(path)[:_HEAD]:
+        promised = _COUNT.match(line)
+        if promised and found < int(promised[1]):
+            raise _malformed(
+                f"{path}", f"it ends after {found} of the {promised[1]} entries that line {at} "
+                "promises")
 
 
 def _rows(path: Path, *, most: int = -1) -> Iterator[tuple[str, list[str]]]:
