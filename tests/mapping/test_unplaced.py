@@ -21,10 +21,11 @@ def test_the_sharpness_of_the_others_decides_what_is_blurred():
     assert "no overlap" in reasons(evidence, {"a": 50.0, "b": 60.0, "c": 40.0})["c"]
 
 
-def test_an_image_that_matches_another_room_is_not_called_blurred():
+def test_an_image_that_matches_another_room_is_not_called_blurred_alone():
     evidence = capture([900] * 4, [[0, 1], [2, 3]], [300, 300])
-    assert reasons(evidence, {"a": 50.0, "b": 60.0, "c": 20.0, "d": 19.0})["c"] == (
-        "no overlap: no verified match with an image that has a camera, only with 1 that have none")
+    assert reasons(evidence, {"a": 50.0, "b": 60.0, "c": 20.0, "d": 61.0})["c"] == (
+        "no overlap: no verified match with an image that has a camera, only with 1 that have "
+        "none; sharpness 20, 55 is usual")
 
 
 def test_an_image_of_a_bare_wall_has_too_few_features():
