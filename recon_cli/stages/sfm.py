@@ -137,7 +137,7 @@ def _report(summary: Summary, ctx: StageContext) -> None:
 def _tried(rungs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yields a sentence for each way to a model behind the first."""
     for rung in rungs[1:]:
-        reason = rung["reason"].rstrip(".")
+        reason = rung["reason"][:1].lower() + rung["reason"][1:].rstrip(".")  # may be a sentence
         if rung["skipped"]:
             yield (f"{rung['name']} was not tried although {reason}: {rung['skipped']}, more than "
                    "is left of --max-minutes.")
