@@ -28,6 +28,7 @@ from recon_cli.mapping.candidates import Candidate
 from recon_cli.mapping.job import VERDICT, Job
 from recon_cli.mapping.ledger import Ledger, Result, fresh_folder, publish
 from recon_cli.mapping.protocol import Reporter
+from recon_cli.mapping.weak_link import MIN_WEAK_LINK
 
 # Exhaustive matching grows with the square: 4950 pairs of 100 images are about a minute on two
 # cores at 600x340 and still the whole graph, so that a walk around a room closes.
@@ -193,11 +194,13 @@ def shortfall(found: Candidate, reach: Collection[str]) -> str:
 def best(notes: Sequence[Note]) -> Note | None:
     """Returns the note on the best model: the most frames that hang together best.
 
-    A frame counts as much as the weakest link of its model holds; in a tie of 1% the smaller
-    reprojection error decides, then the earlier rung.
+    A frame counts as much as the weakest link of its model holds, and as in a broken model where
+    something else speaks against it; in a tie of 1% the smaller reprojection error decides, then
+    the earlier rung.
     """
     def quality(note: Note) -> tuple[float, float]:
         link = note.weak_link if note.weak_link is not None else float(note.trusted)
+        link = link if note.trusted else min(link, MIN_WEAK_LINK)
         most = max(len(other.registered) for other in notes)
         return (round(len(note.registered) / most * (0.5 + 0.5 * link), 2),
                 -(note.reprojection_error_px or 0.0))

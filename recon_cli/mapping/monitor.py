@@ -83,14 +83,17 @@ class Monitor:
 
     def _counted(self) -> int:
         """Returns how many results of the current phase lie on the disk."""
-        name = "" if self._phase is None else self._phase.name
-        if name in ("features", "matches"):
-            return database.progress(self._job.database, name)
-        if name == "undistorted":
+        phase = self._phase
+        if phase is None:
+            return 0
+        if phase.name in ("features", "matches"):
+            return database.progress(self._job.database, phase.name)
+        if phase.name == "undistorted":
             # os.walk, not rglob: the process removes folders as it goes, and walk passes over them.
-            return sum(
+            files = sum(
                 name.endswith(".png")
                 for _, _, files in os.walk(self._job.undistorting) for name in files)
+            return min(files, phase.total)  # masks lie there twice for a moment
         return 0
 
     def _note_durable(self) -> None:

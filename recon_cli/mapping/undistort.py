@@ -27,11 +27,12 @@ def undistort(job: Job, report: Reporter) -> Result:
     """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
     model = pycolmap.Reconstruction(job.out / "sparse")
     names = sorted(model.image(i).name for i in model.reg_image_ids())
-    report.phase("undistorted", 2 * len(names))
+    masked = [name for name in names if job.masks and (job.masks / name).exists()]
+    report.phase("undistorted", 2 * len(names) + len(masked))
     work = fresh_folder(job.undistorting)
     _undistorted(job, job.frames, names, work)
     _write_twins(job, names, work)
-    _write_masks(job, names, work)
+    _write_masks(job, masked, work)
     cameras = _cameras(pycolmap.Reconstruction(work / SPARSE))
     publish(work, job.out / "undistorted")
     return {"cameras": cameras}
@@ -63,13 +64,12 @@ def _write_twins(job: Job, names: Sequence[str], work: Path) -> None:
         shutil.copyfile(work / IMAGES / name, twins / name)
 
 
-def _write_masks(job: Job, names: Sequence[str], work: Path) -> None:
+def _write_masks(job: Job, masked: Sequence[str], work: Path) -> None:
     """Writes the masks of masked frames through the same cameras: 255 where a pixel counts.
 
     A pixel that is made of one that counts and one that does not takes the side of the larger part.
     """
-    masked = [name for name in names if job.masks and (job.masks / name).exists()]
-    if job.masks is None or not masked:
+    if job.masks is None or not masked:  # an empty list would mean all
         return
     (work / MASKS).mkdir()
     _undistorted(job, job.masks, masked, work / "between")

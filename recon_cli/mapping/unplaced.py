@@ -34,17 +34,25 @@ def reasons(evidence: Evidence, sharpness: Mapping[str, float | None]) -> dict[s
 def _reason(
     evidence: Evidence, index: int, sharpness: Mapping[str, float | None], usual: float | None
 ) -> str:
-    own = sharpness.get(evidence.names[index])
-    if own is not None and usual is not None and own < BLURRED * usual:
-        return f"blurred: sharpness {own:.0f}, {usual:.0f} is usual"
-    if evidence.keypoints[index] < MIN_KEYPOINTS:
-        return f"too few features: {evidence.keypoints[index]} keypoints"
     of = (evidence.pairs == index).any(axis=1)
     others = evidence.pairs[of].sum(axis=1) - index
-    placed = evidence.registered[others]
+    placed, matches = evidence.registered[others], evidence.matches[of]
+    blur = _blur(sharpness.get(evidence.names[index]), usual)
+    # A blurred image matches little. One that matches others well may show another room.
+    if blur and matches[~placed].sum() <= matches[placed].sum():
+        return f"blurred: {blur}"
+    if evidence.keypoints[index] < MIN_KEYPOINTS:
+        return f"too few features: {evidence.keypoints[index]} keypoints"
     if not placed.any():
         where = f", only with {len(others)} that have none" if len(others) else ""
-        return f"no overlap: no verified match with an image that has a camera{where}"
-    count = np.count_nonzero(placed)
-    matches = evidence.matches[of][placed].sum()
-    return f"matched but not placed: {matches} matches to {count} images that have a camera"
+        also = f"; {blur}" if blur else ""
+        return f"no overlap: no verified match with an image that has a camera{where}{also}"
+    return (f"matched but not placed: {matches[placed].sum()} matches to "
+            f"{np.count_nonzero(placed)} images that have a camera")
+
+
+def _blur(own: float | None, usual: float | None) -> str:
+    """Returns how sharp an image is that is far less sharp than usual; empty for others."""
+    if own is None or usual is None or own >= BLURRED * usual:
+        return ""
+    return f"sharpness {own:.0f}, {usual:.0f} is usual"

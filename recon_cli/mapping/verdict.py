@@ -19,8 +19,8 @@ import numpy as np
 import pycolmap
 
 from recon_cli.errors import SfmError
+from recon_cli.mapping import drift, fold, graph, overlap, trajectory, unplaced, weak_link
 from recon_cli.mapping import evidence as facts
-from recon_cli.mapping import fold, graph, overlap, trajectory, unplaced, weak_link
 from recon_cli.mapping.doctor import listed
 from recon_cli.mapping.evidence import Evidence
 from recon_cli.mapping.fold import Fold
@@ -153,7 +153,7 @@ def examine(
         keypoints=Histogram.of(evidence.keypoints),
         points=Histogram.of(evidence.points[rows]),
         neighbours=Histogram.of(np.count_nonzero(evidence.shared[rows] >= MIN_MATCHES, axis=1)),
-        problems=tuple(_problems(parts, link, doubled, astray)),
+        problems=(*_problems(parts, link, doubled, astray), *drift.bent(model, database)),
     )
 
 

@@ -23,6 +23,8 @@ from recon_cli.mapping.ledger import Ledger
 from recon_cli.mapping.measure import parse_place
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 
+APART = 1e6  # seconds from clip to clip: the camera may have gone anywhere meanwhile
+
 
 def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Writes sparse/ and undistorted/{images,denoised,sparse} into `out`.
@@ -69,8 +71,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
-        times={frame.name: frame.time_seconds for frame in frames.frames
-               if frame.time_seconds is not None},
+        times=_times(frames),
     )
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
@@ -87,6 +88,12 @@ def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:
             tuple(frame.name for frame in frames.frames if frame.group == index),
             group.width, group.height, group.focal_px, group.lens)
         for index, group in enumerate(frames.groups))
+
+
+def _times(frames: FrameList) -> dict[str, float]:
+    """Returns the seconds of video frames; one clip follows another after a gap of any length."""
+    return {frame.name: frame.time_seconds + APART * frame.group for frame in frames.frames
+            if frame.time_seconds is not None}
 
 
 def _check_frames(job: Job) -> None:
@@ -130,7 +137,7 @@ def _report(summary: Summary, ctx: StageContext) -> None:
 def _tried(rungs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yields a sentence for each way to a model behind the first."""
     for rung in rungs[1:]:
-        reason = rung["reason"].rstrip(".")
+        reason = rung["reason"][:1].lower() + rung["reason"][1:].rstrip(".")  # may be a sentence
         if rung["skipped"]:
             yield (f"{rung['name']} was not tried although {reason}: {rung['skipped']}, more than "
                    "is left of --max-minutes.")

@@ -114,6 +114,13 @@ def test_a_broken_model_of_all_frames_is_worse_than_a_sound_one_of_most():
     assert best([broken, sound]) is sound
 
 
+def test_a_model_that_is_not_trusted_is_worse_though_its_matches_agree():
+    bent = replace(GOOD, name="relaxed", trusted=False, reprojection_error_px=0.1)
+    sound = replace(GOOD, name="global", registered=NAMES[:55])
+    assert best([bent, sound]) is sound
+    assert best([bent, replace(sound, registered=NAMES[:20])]) is bent
+
+
 def test_of_two_alike_the_smaller_error_decides_and_then_the_order():
     sharper = replace(GOOD, name="global", reprojection_error_px=0.3)
     assert best([GOOD, sharper]) is sharper

@@ -1,11 +1,16 @@
 """Captures that are hard to map: parts that do not meet, wrong images, no steps."""
 
+from types import SimpleNamespace
+
 import av
 import numpy as np
 import pytest
 from sfm_inputs import run, texture, write_inputs
 
+from recon_cli.capture.frames import Frame, FrameList, Group
 from recon_cli.errors import SfmError
+from recon_cli.mapping.trajectory import jumps
+from recon_cli.stages import sfm
 
 
 def frames(path, *, first=0, step=4, count=8, prefix=""):
@@ -82,3 +87,19 @@ def test_the_frames_of_every_way_of_pairing_meet(sample_video, tmp_path):
         assert summary["registered"] == 8
         rung, = summary["rungs"]
         assert (rung["name"], rung["reason"], rung["kept"]) == (pairs, "it was asked for", True)
+
+
+def test_from_clip_to_clip_the_camera_may_be_anywhere():
+    """Two clips begin at 0 s each; sorted by that alone, every step would lead to the other one."""
+    groups = tuple(Group(name, 600, 340) for name in ("long.mp4", "short.mp4"))
+    clips = {0: [*range(30)], 1: [100, 101, 102]}
+    listed = FrameList("video", groups, tuple(
+        Frame(f"{clip}_{index:03d}.png", float(index), groups[clip].name, None, False, clip)
+        for clip, places in clips.items() for index in range(len(places))))
+    names = tuple(frame.name for frame in listed.frames)
+    centers = np.zeros((len(names), 3))
+    centers[:, 0] = [*clips[0], *clips[1]]
+    evidence = SimpleNamespace(
+        names=names, registered=np.ones(len(names), bool), centers=centers)
+    assert jumps(evidence, sfm._times(listed)) == ()
+    assert jumps(evidence, {frame.name: frame.time_seconds for frame in listed.frames})

@@ -114,3 +114,10 @@ def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monke
     write_inputs(Path("in"), grey)
     with pytest.raises(SfmError, match="No features"):
         run(Path("in"), Path("out"))
+
+
+def test_a_problem_of_the_model_before_goes_on_within_the_sentence():
+    rung = {"name": "global", "reason": "The model is broken.", "skipped": "", "registered": 9,
+            "kept": False}
+    assert list(sfm._tried([{}, rung])) == [
+        "global was tried, because the model is broken: 9 frames got a camera."]
