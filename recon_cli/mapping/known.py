@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from recon_cli import atomic
 from recon_cli.errors import SfmError
 from recon_cli.io.poses import KnownPoses, read_poses
-from recon_cli.mapping import database, doctor, mapper, merge, pairs, verdict
+from recon_cli.mapping import database, doctor, mapper, merge, pairs, spot_check, verdict
 from recon_cli.mapping.job import VERDICT, Job
 from recon_cli.mapping.ledger import Result, fresh_folder, publish
 from recon_cli.mapping.protocol import Reporter
@@ -50,15 +50,26 @@ def near(viewmats: Mapping[str, NDArray[np.float64]]) -> set[pairs.Pair]:
     Args:
         viewmats: [4, 4] world to camera by name.
     """
+    return {
+        (min(one, two), max(one, two))
+        for one, others in neighbours(viewmats).items() for two in others[:NEAREST]}
+
+
+def neighbours(viewmats: Mapping[str, NDArray[np.float64]]) -> dict[str, list[str]]:
+    """Returns for each image those that look in about the same direction, nearest first.
+
+    Args:
+        viewmats: [4, 4] world to camera by name.
+    """
     names = sorted(viewmats)
     matrices = np.stack([viewmats[name] for name in names])
-    axes, found = matrices[:, 2, :3], set()
+    axes, found = matrices[:, 2, :3], {}
     tree = KDTree(_centers(matrices))
     for one, center in enumerate(tree.data):
         _, order = tree.query(center, k=len(names))
-        alike = [int(two) for two in np.atleast_1d(order)
-                 if two != one and axes[one] @ axes[two] >= np.cos(np.radians(MAX_TURN_DEG))]
-        found |= {(names[min(one, two)], names[max(one, two)]) for two in alike[:NEAREST]}
+        found[names[one]] = [
+            names[two] for two in np.atleast_1d(order).tolist()
+            if two != one and axes[one] @ axes[two] >= np.cos(np.radians(MAX_TURN_DEG))]
     return found
 
 
@@ -74,6 +85,10 @@ def build(job: Job, report: Reporter) -> Result:
     moved: dict[str, Any] = {}
     if "features" not in job.steps:
         model, found = _given(job, known), None
+        checked = spot_check.check(job, neighbours(known.viewmats), known.viewmats)
+        if not checked.fits:
+            raise _misfit(checked.share or 0.0, spot_check.MIN_AGREEING)
+        lines = checked.lines()
     else:
         model = _triangulated(job, known)
         if job.pose_use == "refine":
@@ -83,6 +98,7 @@ def build(job: Job, report: Reporter) -> Result:
             model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times)
         verdict.check_weak_link(found, job.accept_weak)
         atomic.write_json(job.out / VERDICT, found.to_json())
+        lines = found.lines()
     folder = fresh_folder(job.out / "model.partial")
     model.write(folder)
     publish(folder, job.model)
@@ -90,7 +106,7 @@ def build(job: Job, report: Reporter) -> Result:
     return {
         **mapper.described(model), "models": [model.num_reg_images()], "apart": [], "rejected": {},
         "rungs": [], "verdict": found.to_json() if found else None,
-        "lines": list(found.lines()) if found else [],
+        "lines": lines,
         "poses": {"use": job.pose_use, "metric": known.metric, **moved}}
 
 
@@ -137,11 +153,15 @@ def _check_fit(job: Job, model: pycolmap.Reconstruction) -> None:
     lengths = np.array([point.track.length() for point in model.points3D.values()])
     share = float((lengths * (lengths - 1) / 2).sum()) / max(1, matches)
     if share < MIN_AGREEING:
-        raise SfmError(
-            f"The given poses do not fit the images: {share:.0%} of the matches agree with them, "
-            f"at least {MIN_AGREEING:.0%} should.",
-            hint="Check which way the axes of the poses point, or find the cameras anew with "
-            "--poses ignore.")
+        raise _misfit(share, MIN_AGREEING)
+
+
+def _misfit(share: float, least: float) -> SfmError:
+    return SfmError(
+        f"The given poses do not fit the images: {share:.0%} of the matches agree with them, "
+        f"at least {least:.0%} should.",
+        hint="Check which way the axes of the poses point, or find the cameras anew with "
+        "--poses ignore.")
 
 
 def _refine(job: Job, model: pycolmap.Reconstruction, known: KnownPoses) -> dict[str, Any]:

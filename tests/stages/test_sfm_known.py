@@ -1,5 +1,6 @@
 import itertools
 import json
+import re
 
 import av
 import cv2
@@ -74,6 +75,28 @@ def test_poses_and_points_that_are_kept_are_written_as_they_were_given(
     assert summary["reprojection_error_px"] is None
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
     assert not (tmp_path / "out" / "database.db").exists()
+
+
+def test_kept_poses_are_held_against_some_of_the_images(room, truth, given, tmp_path):
+    given(truth, np.random.default_rng(0).normal(size=(50, 3)))
+    line, = run(room, tmp_path / "out")["lines"]
+    share, matches = re.match(r"(\d+)% of (\d+) matches between sampled images", line).groups()
+    assert int(share) > 80
+    assert int(matches) > 500
+
+
+@pytest.mark.parametrize("change", ["flipped axes", "shuffled"])
+def test_wrong_poses_are_refused_although_points_came_with_them(
+    room, truth, given, tmp_path, change
+):
+    wrong = {name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()}
+    if change == "shuffled":
+        names = sorted(truth)
+        wrong = dict(zip(names, [truth[name] for name in [*names[4:], *names[:4]]], strict=True))
+    given(wrong, np.random.default_rng(0).normal(size=(50, 3)))
+    with pytest.raises(SfmError, match="The given poses do not fit the images"):
+        run(room, tmp_path / "out")
+    assert not (tmp_path / "out" / "sparse").exists()
 
 
 def test_a_known_distance_scales_cameras_points_and_what_is_undistorted(
