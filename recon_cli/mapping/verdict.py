@@ -29,6 +29,9 @@ from recon_cli.mapping.overlap import MIN_OVERLAP
 from recon_cli.mapping.trajectory import Jump
 from recon_cli.mapping.weak_link import MIN_MATCHES, MIN_WEAK_LINK, Astray, WeakLink
 
+# Steps this much longer than the usual one are no cut in a video any more: displaced cameras gave 9
+# to 20, a walk that ends at rest 6.
+MAX_LEAP = 100.0
 MOST_LINES = 5  # for images without a camera; all of them are in the verdict
 
 Names = tuple[str, ...]
@@ -139,6 +142,7 @@ def examine(
     link, astray = weak_link.find(evidence, common)
     doubled = fold.find(evidence, common)
     parts = _model_parts(evidence)
+    jumps = trajectory.jumps(evidence, times or {})
     rows = evidence.registered
     return Verdict(
         images=len(names),
@@ -149,11 +153,12 @@ def examine(
         fold=doubled,
         astray=astray,
         unregistered=unplaced.reasons(evidence, sharpness or {}),
-        jumps=trajectory.jumps(evidence, times or {}),
+        jumps=jumps,
         keypoints=Histogram.of(evidence.keypoints),
         points=Histogram.of(evidence.points[rows]),
         neighbours=Histogram.of(np.count_nonzero(evidence.shared[rows] >= MIN_MATCHES, axis=1)),
-        problems=(*_problems(parts, link, doubled, astray), *drift.bent(model, database)),
+        problems=(*_problems(parts, link, doubled, astray), *_leaps(jumps),
+                  *drift.bent(model, database)),
     )
 
 
@@ -199,6 +204,12 @@ def _problems(
             f"Cameras that contradict the matches of their images: "
             f"{listed([item.name for item in astray])}.")
     return problems
+
+
+def _leaps(jumps: Sequence[Jump]) -> list[str]:
+    return [
+        f"The camera leaps from {jump.before} to {jump.after}: {jump.ratio:.0f} times as far as "
+        f"usual, at most {MAX_LEAP:.0f} times can be." for jump in jumps if jump.ratio > MAX_LEAP]
 
 
 def _broken(link: WeakLink) -> list[str]:

@@ -120,6 +120,14 @@ def test_a_camera_far_off_a_video_s_path_is_a_jump_there_and_back(tmp_path):
     assert [(jump.before, jump.after) for jump in verdict.jumps] == [
         (names[4], names[5]), (names[5], names[6])]
     assert verdict.jumps[0].ratio == pytest.approx(60, rel=0.1)
+    assert not any("leaps" in problem for problem in verdict.problems)
+
+
+def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
+    made = walk(motions={5: moved(0, 3000, 0)})
+    verdict = verdict_on(made, tmp_path)
+    assert not verdict.trusted
+    assert any(f"leaps from {made.names[4]}" in problem for problem in verdict.problems)
 
 
 def test_parts_that_share_no_point_are_a_problem(tmp_path):
