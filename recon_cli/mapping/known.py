@@ -28,8 +28,6 @@ NEAREST = 20  # cameras that each one is matched with, as many as look alike (se
 # Axes that differ by more leave little in common: the wider side of a phone's picture spans 65 to
 # 80 degrees.
 MAX_TURN_DEG = 75.0
-# COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
-MAX_ERROR, MIN_ANGLE = 4.0, 1.5
 # Share of the verified matches that the points must bear out. Nine rendered frames gave 0.76
 # with their true poses and at most 0.06 with axes of another convention or the names swapped.
 MIN_AGREEING = 0.2
@@ -175,7 +173,6 @@ def _refine(job: Job, model: pycolmap.Reconstruction, known: KnownPoses) -> dict
     fixed = set(model.cameras) - _unknown(job)
     for _ in range(2):  # points that the given poses had spoilt go before the second
         mapper.adjust(model, constant=fixed)
-        pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
     names = mapper.names(model)
     given = np.stack([known.viewmats[name] for name in names])
     model.transform(back(_viewmats(model, names), given))

@@ -24,6 +24,8 @@ GLOBAL_RATIO = 1.2
 # Images of a camera from which its principal point is free in the last adjustment: COLMAP calls
 # a model of fewer small (min_model_size), and a few images cannot tell it from a turn.
 MIN_IMAGES_PRINCIPAL = 10
+# COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
+MAX_ERROR, MIN_ANGLE = 4.0, 1.5
 # Where COLMAP writes models that are read from memory, and finds one that it shall go on with.
 FOUND, BEGUN = "found.partial", "begun.partial"
 
@@ -84,7 +86,7 @@ def globally(job: Job, report: Reporter) -> list[pycolmap.Reconstruction]:
 
 
 def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) -> None:
-    """Adjusts cameras and points together, now with the principal point free.
+    """Adjusts cameras and points together, the principal point free; drops points that got lost.
 
     The mapper keeps it in the middle, because a few images cannot tell it from a shift. All of them
     can: on the fox photos it comes out 2 px from the value that others found, 16 px off the middle.
@@ -102,6 +104,8 @@ def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) ->
         pycolmap.bundle_adjustment(model, options)
     else:
         _adjust_some(model, options, fixed)
+    # Nothing holds a point whose rays went parallel: one of 2,084 ended 1e153 away.
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
     model.update_point_3d_errors()
 
 

@@ -75,3 +75,12 @@ def test_a_model_is_extended_by_the_images_that_fit(tmp_path):
     whole = mapper.extended(job, part(truth, job.names[:15]))
     assert mapper.names(whole) == list(job.names)
     assert center_error(whole, truth) < 1e-3
+
+
+def test_a_point_that_nothing_holds_does_not_outlive_the_adjustment(tmp_path):
+    _, model = make_capture(tmp_path)
+    before, lost = model.num_points3D(), min(model.point3D_ids())
+    model.point3D(lost).xyz = np.array([1e12, 0, 0])
+    mapper.adjust(model)
+    assert model.num_points3D() == before - 1
+    assert model.compute_mean_reprojection_error() < 1
