@@ -77,10 +77,14 @@ def test_a_model_is_extended_by_the_images_that_fit(tmp_path):
     assert center_error(whole, truth) < 1e-3
 
 
-def test_a_point_that_nothing_holds_does_not_outlive_the_adjustment(tmp_path):
+def test_a_point_that_the_adjustment_lost_is_dropped(tmp_path, monkeypatch):
     _, model = make_capture(tmp_path)
     before, lost = model.num_points3D(), min(model.point3D_ids())
-    model.point3D(lost).xyz = np.array([1e12, 0, 0])
+
+    def lose(model, _):
+        model.point3D(lost).xyz = np.array([1e100, 0, 0])
+
+    monkeypatch.setattr(pycolmap, "bundle_adjustment", lose)
     mapper.adjust(model)
     assert model.num_points3D() == before - 1
     assert model.compute_mean_reprojection_error() < 1
