@@ -1,75 +1,22 @@
-import contextlib
 import shutil
 
 import numpy as np
 import posed_sets
-import pycolmap
 import pytest
+from colmap_sets import (
+    FORMS,
+    HEIGHT,
+    PARAMS,
+    WIDTH,
+    rig_model,
+    write,
+    write_old,
+)
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import read_model
 from recon_cli.io.colmap_set import is_colmap, read_colmap
 from recon_cli.scene.lens import MODELS
-
-WIDTH, HEIGHT = posed_sets.WIDTH, posed_sets.HEIGHT
-FORMS = ("bin", "txt")
-PARAMS = (30.0, 31.0, 16.5, 11.0, 0.1, 0.02, 0.003, 0.004, 0.05, 0.06, 0.07, 0.08)
-OLD_CAMERAS = "# Camera list\n3 PINHOLE 32 24 30 31 16.5 11\n"
-OLD_IMAGES = """# Image list with two lines of data per image:
-# Number of images: 2
-7 1 0 0 0 1 2 3 3 a b.png
-1.5 2.5 -1 3.5 4.5 9
-5 0.7071067811865476 0 0 0.7071067811865476 0 0 1 3 c.png
-
-"""
-OLD_POINTS = "# Points\n9 1 2 3 4 5 6 0.5 7 1 5 0\n2 -1 -2 -3 255 0 1 0.25\n"
-
-
-def moved(angle, place):
-    rotation = pycolmap.Rotation3d(np.array([0, np.sin(angle), 0, np.cos(angle)]))  # xyzw
-    return pycolmap.Rigid3d(rotation, np.array(place, float))
-
-
-def rig_model(frames=3, kind="PINHOLE", params=PARAMS[:4]):
-    """Frames of a rig of two cameras, the second beside the first and turned, and two points."""
-    made = pycolmap.Reconstruction()
-    rig = pycolmap.Rig(rig_id=1)
-    for camera_id in (1, 2):
-        made.add_camera(pycolmap.Camera(
-            camera_id=camera_id, model=kind, width=WIDTH, height=HEIGHT, params=list(params)))
-        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
-        if camera_id == 1:
-            rig.add_ref_sensor(sensor)
-        else:
-            rig.add_sensor(sensor, moved(0.3, [0.5, 0, 0]))
-    made.add_rig(rig)
-    for at in range(frames):
-        frame = pycolmap.Frame(frame_id=at + 1, rig_id=1)
-        frame.rig_from_world = moved(0.1 * at, [at, 0.25, 1])
-        images = []
-        for camera_id in (1, 2):
-            image = pycolmap.Image(
-                image_id=frames * (camera_id - 1) + at + 1, name=f"cam{camera_id}/{at}.png",
-                camera_id=camera_id,
-                points2D=[pycolmap.Point2D(np.array([1.5, 2.5]))])
-            frame.add_data_id(image.data_id)
-            image.frame_id = at + 1
-            images.append(image)
-        made.add_frame(frame)
-        for image in images:
-            made.add_image(image)
-        made.register_frame(at + 1)
-    for place, color in (([0, 2, 5], [255, 0, 7]), ([1, 2, 5], [1, 2, 3])):
-        made.add_point3D(np.array(place, float), pycolmap.Track(), np.array(color, np.uint8))
-    return made
-
-
-def write(folder, made, form, place="sparse/0"):
-    (folder / place).mkdir(parents=True, exist_ok=True)
-    (made.write_binary if form == "bin" else made.write_text)(folder / place)
-    for image in made.images.values():
-        posed_sets.write_image(folder / "images" / image.name)
-    return folder
 
 
 @pytest.fixture(params=FORMS)
@@ -94,17 +41,6 @@ def assert_same_poses(found, expected):
     assert found.keys() == expected.keys()
     for name, matrix in expected.items():
         np.testing.assert_allclose(found[name], matrix, atol=1e-14)
-
-
-def write_old(folder):
-    """Writes a model by hand, as COLMAP did before rigs and frames."""
-    (folder / "sparse").mkdir()
-    for name, text in (
-            ("cameras", OLD_CAMERAS), ("images", OLD_IMAGES), ("points3D", OLD_POINTS)):
-        (folder / "sparse" / f"{name}.txt").write_text(text)
-    for name in ("a b.png", "c.png"):
-        posed_sets.write_image(folder / "images" / name)
-    return folder
 
 
 def test_the_poses_of_a_rig_agree_with_pycolmap(folder):
@@ -239,91 +175,3 @@ def test_masks_named_as_colmap_does_are_kept(folder):
 def test_other_models_beside_the_first_are_said(folder):
     write(folder, rig_model(frames=2), "bin", "sparse/1")
     assert "only the first of 2 models in sparse was read" in read_colmap(folder).notices
-
-
-def test_an_image_outside_the_data_set_is_refused(tmp_path):
-    write_old(tmp_path)
-    path = tmp_path / "sparse" / "images.txt"
-    path.write_text(path.read_text().replace("c.png", "../../../secret.png"))
-    with pytest.raises(FormatError, match="lies outside"):
-        read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.99])
-def test_a_binary_file_cut_short_anywhere_is_damaged(tmp_path, name, share):
-    write(tmp_path, rig_model(), "bin")
-    cut(tmp_path / "sparse" / "0" / f"{name}.bin", share)
-    with pytest.raises(FormatError, match="not a whole COLMAP model"):
-        read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["rigs", "frames"])
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.99])
-def test_rigs_and_frames_cut_short_anywhere_are_damaged(tmp_path, name, share):
-    write(tmp_path, rig_model(), "bin")
-    (tmp_path / "sparse" / "0" / "images.bin").unlink()
-    cut(tmp_path / "sparse" / "0" / f"{name}.bin", share)
-    with pytest.raises(FormatError, match="not a whole COLMAP model"):
-        read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-@pytest.mark.parametrize("value", [0, 127, 255])
-def test_whatever_stands_in_a_byte_is_read_or_refused(tmp_path, name, value):
-    write(tmp_path, rig_model(frames=1), "bin")
-    path = tmp_path / "sparse" / "0" / f"{name}.bin"
-    data = path.read_bytes()
-    for at in range(len(data)):
-        path.write_bytes(data[:at] + bytes([value]) + data[at + 1:])
-        with contextlib.suppress(InputError):
-            read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize(("name", "old", "new", "line"), [
-    ("cameras", "30 31", "30 wide", 2), ("cameras", "30 31 16.5 11", "30 31 16.5", 2),
-    ("cameras", "32 24", "32", 2), ("cameras", "30 31", "nan 31", 2),
-    ("cameras", "32 24", "32 inf", 2),
-    ("images", "1 0 0 0 1 2 3", "1 0 0 zero 1 2 3", 3), ("images", "3 c.png", "", 5),
-    ("images", "1 0 0 0 1 2 3", "0 0 0 0 1 2 3", 3), ("images", "0 0 1 3 c", "0 0 inf 3 c", 5),
-    ("points3D", "4 5 6", "4 5 600", 2), ("points3D", "-1 -2 -3", "-1 nan -3", 3),
-    ("points3D", "255 0 1 0.25", "255", 3)])
-def test_a_malformed_line_of_text_is_named(tmp_path, name, old, new, line):
-    write_old(tmp_path)
-    path = tmp_path / "sparse" / f"{name}.txt"
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(FormatError, match=rf"{name}\.txt, line {line}[, :]"):
-        read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize(("name", "old", "new"), [
-    ("rigs", "CAMERA 2 1", "CAMERA 2"), ("frames", "CAMERA 2 4", "CAMERA"),
-    ("frames", "2 CAMERA", "two CAMERA")])
-def test_a_malformed_line_of_rigs_or_frames_is_named(tmp_path, name, old, new):
-    write(tmp_path, rig_model(), "txt")
-    (tmp_path / "sparse" / "0" / "images.txt").unlink()
-    path = tmp_path / "sparse" / "0" / f"{name}.txt"
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(FormatError, match=rf"{name}\.txt, line \d+, is malformed"):
-        read_colmap(tmp_path)
-
-
-def test_an_image_of_an_unknown_camera_is_refused(tmp_path):
-    write_old(tmp_path)
-    path = tmp_path / "sparse" / "cameras.txt"
-    path.write_text(path.read_text().replace("3 PINHOLE", "4 PINHOLE"))
-    with pytest.raises(FormatError, match="unknown camera 3"):
-        read_colmap(tmp_path)
-
-
-def test_an_empty_model_is_refused(tmp_path, form):
-    write(tmp_path, pycolmap.Reconstruction(), form)
-    with pytest.raises(FormatError, match="no image has a pose"):
-        read_colmap(tmp_path)
-
-
-def cut(path, share):
-    data = path.read_bytes()
-    path.write_bytes(data[:int(share * len(data))])
