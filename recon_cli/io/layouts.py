@@ -61,6 +61,10 @@ def refuse_incomplete(path: Path) -> None:
 
     As photos alone it would lose its poses without a word, and its depth maps would be frames.
     """
+    if path.name == "results" and is_replica(path.parent):
+        raise FormatError(
+            f"{path} holds frames and depth maps of a Replica sequence, but no poses.",
+            hint=f"Give {path.parent}; or give {path / 'frame*'} to find the cameras anew.")
     if lacks_cameras(path):
         lacks, images = "a COLMAP model without cameras.bin or cameras.txt", path / "images"
     elif lacks_trajectory(path):

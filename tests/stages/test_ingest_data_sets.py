@@ -161,3 +161,10 @@ def test_an_interrupted_run_ends_the_same(tmp_path):
     take(folder, tmp_path / "out")
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()
             if path.is_file()} == kept
+
+
+def test_the_inner_folder_of_a_replica_sequence_is_not_taken_for_photos(tmp_path):
+    folder = make_replica(tmp_path / "room")
+    with pytest.raises(FormatError, match="frames and depth maps of a Replica sequence") as caught:
+        take(folder / "results", tmp_path / "out")
+    assert f"Give {folder}" in caught.value.hint
