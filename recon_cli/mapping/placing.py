@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from recon_cli import atomic
 from recon_cli.io.colmap import Pinhole
@@ -51,7 +52,7 @@ def place(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
         similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 
-def _viewmat(image: pycolmap.Image) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def _viewmat(image: pycolmap.Image) -> NDArray[np.float64]:
     viewmat = np.eye(4)
     viewmat[:3] = image.cam_from_world().matrix()
     return viewmat

@@ -1,5 +1,6 @@
 """What sfm reads, made on the spot, and frames that defeat it."""
 
+import av
 import cv2
 import numpy as np
 
@@ -7,6 +8,15 @@ from recon_cli.capture.frames import Frame, FrameList, Group, write_png
 from recon_cli.config import SfmConfig
 from recon_cli.stages import sfm
 from recon_cli.stages.context import StageContext, StageInputs
+
+
+def every_nth(video, step, count):
+    """The first `count` frames of each `step` of a video, RGB by name."""
+    return {
+        f"{index:06d}.png": frame.to_ndarray(format="rgb24")
+        for index, frame in enumerate(av.open(str(video)).decode(video=0))
+        if index % step == 0 and index < step * count
+    }
 
 
 def write_inputs(base, images, *, filtered=(), held_out=()):

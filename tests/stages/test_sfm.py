@@ -5,11 +5,10 @@ import sys
 import threading
 import time
 
-import av
 import numpy as np
 import psutil
 import pytest
-from sfm_inputs import run, write_inputs
+from sfm_inputs import every_nth, run, write_inputs
 
 from recon_cli.capture.frames import read_png
 from recon_cli.errors import SfmError
@@ -49,11 +48,7 @@ def workers():
 @pytest.fixture(scope="module")
 def room(tmp_path_factory, sample_video):
     """Twelve frames of the sample room and a blank one."""
-    images = {
-        f"{index:06d}.png": frame.to_ndarray(format="rgb24")
-        for index, frame in enumerate(av.open(str(sample_video)).decode(video=0))
-        if index % STEP == 0 and index < STEP * COUNT
-    }
+    images = every_nth(sample_video, STEP, COUNT)
     images[BLANK] = np.full_like(images["000000.png"], 128)
     return write_inputs(
         tmp_path_factory.mktemp("room"), images, filtered=[FILTERED],

@@ -2,12 +2,11 @@ import itertools
 import json
 import re
 
-import av
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sfm_inputs import run, texture, write_inputs
+from sfm_inputs import every_nth, run, texture, write_inputs
 
 from recon_cli.capture.frames import Frame, FrameList, Group, read_png, write_png
 from recon_cli.errors import ConfigError, SfmError
@@ -23,11 +22,7 @@ POSELESS = "000032.png"
 @pytest.fixture(scope="module")
 def room(tmp_path_factory, sample_video):
     """Nine frames of the sample room with a known lens."""
-    images = {
-        f"{index:06d}.png": frame.to_ndarray(format="rgb24")
-        for index, frame in enumerate(av.open(str(sample_video)).decode(video=0))
-        if index % STEP == 0 and index < STEP * COUNT
-    }
+    images = every_nth(sample_video, STEP, COUNT)
     base = write_inputs(tmp_path_factory.mktemp("room"), images)
     FrameList("nerfstudio", (Group("room", 600, 340, lens=LENS),), tuple(
         Frame(name, None, name, None, held_out=False) for name in images)).write(base / "ingest")
