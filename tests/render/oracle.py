@@ -149,8 +149,11 @@ def _color(splats: Splats, i: int, camera: Camera, degree: int) -> Tensor:
     center = torch.from_numpy(camera.center)
     direction = splats.means[i] - center
     basis = sh_basis(direction / direction.norm(), degree)
-    coefficients = torch.cat([splats.sh_dc[i][None], splats.sh_rest[i]])[: len(basis)]
-    return (basis @ coefficients + 0.5).clamp_min(0)
+    coefficients = splats.sh_dc[i][None]
+    if i < len(splats.sh_rest):  # the others have no more
+        coefficients = torch.cat([coefficients, splats.sh_rest[i]])
+    used = min(len(basis), len(coefficients))
+    return (basis[:used] @ coefficients[:used] + 0.5).clamp_min(0)
 
 
 class _Harmonic(torch.autograd.Function):
