@@ -1,9 +1,9 @@
 """Which Gaussians need colours that depend on the direction, and which do with one colour.
 
-After Papantonakis et al. 2024, "Reducing the Memory Footprint of 3D Gaussian Splatting":
-what looks the same from all training views loses its higher spherical harmonics and takes the
-mean of what was seen. Left out is their second step, degrees between: here a Gaussian has the
-scene's degree or none.
+After Papantonakis et al. 2024, "Reducing the Memory Footprint of 3D Gaussian Splatting": what
+looks the same from all training views loses its higher spherical harmonics and takes the mean of
+what was seen. Left out is their second step, degrees between: here a Gaussian has the scene's
+degree or none.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from recon_cli.render.spherical_harmonics import colors_from_sh
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
 
-UNIFORM = 0.04  # deviation of a colour in [0, 1] under which it counts as one; of their code
+# Deviation of a colour in [0, 1] under which it counts as one: --std_threshold of the paper's runs
+# ("full_final" in the authors' full_eval.py), taken there at 15,000 of 30,000 iterations.
+UNIFORM = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +58,9 @@ def color_spread(
     Args:
         splats: N Gaussians.
         cameras: V training views.
-        weights: for each camera [N] how much it sees of each Gaussian, at least 0: a sum of
-            blend weights, a count of pixels, or `visibility`. A tensor [V, N] will do.
+        weights: for each camera [N] how much it sees of each Gaussian, at least 0: the mean
+            transmittance in front of it (the paper), a count of pixels, or `visibility`. A tensor
+            [V, N] will do.
     """
     total = torch.zeros(len(splats), dtype=torch.float64, device=splats.means.device)
     mean = (SH_C0 * splats.sh_dc + 0.5).clamp_min(0).double()
