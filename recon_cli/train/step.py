@@ -51,11 +51,13 @@ class GradientStep(Protocol):
     """
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
+        *, variance: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view; None where it sees no Gaussian.
 
-        The statistics are valid until the next call.
+        The statistics are valid until the next call. Their `variance` is computed where it is
+        asked for.
         """
 
 
@@ -79,12 +81,13 @@ class _FusedStep:
         self._background = torch.zeros(3)
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
+        *, variance: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
-            sh_degree, ssim_weight, mask=view.mask)
+            sh_degree, ssim_weight, mask=view.mask, details=variance)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -95,12 +98,14 @@ class _AutogradStep:
         self._backend = backend
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
+        *, variance: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
         output = render(
-            splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend)
+            splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
+            scores=variance)
         device = splats.means.device
         loss = photometric_loss(
             output.rgb, view.pixels(device), ssim_weight, mask=view.counting(device))

@@ -44,7 +44,7 @@ class PhotometricStep:
     def __call__(
         self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
         background: Tensor, sh_degree: int, ssim_weight: float, *,
-        mask: NDArray[np.bool_] | None = None,
+        mask: NDArray[np.bool_] | None = None, details: bool = False,
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
@@ -59,6 +59,7 @@ class PhotometricStep:
             sh_degree: highest in use, as in `recon_cli.render.registry.render`.
             ssim_weight: w in [0, 1].
             mask: [H, W], True where a pixel counts; None where all do.
+            details: the statistics absolute_grad and variance are wanted too.
         """
         height, width, n = camera.height, camera.width, len(splats)
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
@@ -88,7 +89,7 @@ class PhotometricStep:
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters.of(gradients.parameters().values()), grad_rgb=grad_rgb,
-            grad_alpha=nothing, grad_depth=nothing, details=False, scores=False,
+            grad_alpha=nothing, grad_depth=nothing, details=details, scores=False,
             means2d_grad=flat(statistics.means2d_grad),
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))
