@@ -47,18 +47,20 @@ def rotated(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
     """Returns the coefficients of the same colours in turned axes.
 
     Args:
-        sh_rest: [N, 15, 3] coefficients of degrees 1 to 3.
+        sh_rest: [M, T, 3] coefficients of degrees 1 and up, T one of 0, 3, 8, 15.
         rotation: [3, 3] from old to new axes.
 
     Returns:
-        [N, 15, 3] of the same dtype and device; computed in float64.
+        [M, T, 3] of the same dtype and device; computed in float64.
     """
-    parts, start = [], 0
+    turned, start = torch.empty_like(sh_rest), 0
     for block in rotation_blocks(rotation):
-        terms = sh_rest[:, start:start + len(block)].double()
-        parts.append(block.to(sh_rest.device) @ terms)
-        start += len(block)
-    return torch.cat(parts, dim=1).to(sh_rest.dtype)
+        end = start + len(block)
+        if end <= sh_rest.shape[1]:
+            terms = sh_rest[:, start:end].double()
+            turned[:, start:end] = (block.to(sh_rest.device) @ terms).to(sh_rest.dtype)
+        start = end
+    return turned
 
 
 def _lattice(count: int) -> Tensor:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render.contract import Statistics
-from recon_cli.render.numba.backend import flat
-from recon_cli.render.numba.frame import Frame, Parameters
+from recon_cli.render.numba.frame import Frame, Parameters, flat
 from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -57,7 +56,7 @@ class PhotometricStep:
             camera: of the view.
             truth: [H, W, 3], contiguous.
             background: [3].
-            sh_degree: in use.
+            sh_degree: highest in use, as in `recon_cli.render.registry.render`.
             ssim_weight: w in [0, 1].
             mask: [H, W], True where a pixel counts; None where all do.
             details: the statistics absolute_grad and variance are wanted too.
@@ -70,7 +69,7 @@ class PhotometricStep:
         statistics, frame, pixels = self.statistics, self._frame, height * width
         statistics.radii.zero_()
         rgb = frame.take("rgb", CHANNELS * pixels)
-        ours = Parameters(*map(flat, splats.parameters().values()))
+        ours = Parameters.of(splats.parameters().values())
         frame.forward(
             ours, camera, flat(background), sh_degree, rgb=rgb, alpha=frame.take("alpha", pixels),
             depth=frame.take("depth", pixels), radii=flat(statistics.radii))
@@ -89,7 +88,7 @@ class PhotometricStep:
             grad_rgb[ignored] = 0
         nothing = frame.take("nothing", 0)
         frame.backward(
-            ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,
+            ours, Parameters.of(gradients.parameters().values()), grad_rgb=grad_rgb,
             grad_alpha=nothing, grad_depth=nothing, details=details, scores=False,
             means2d_grad=flat(statistics.means2d_grad),
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
