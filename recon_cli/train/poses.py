@@ -1,0 +1,152 @@
+"""Refinement of the training cameras during training: a twist on top of each one that SfM gave.
+
+Held-out views are not refined. Scores on them take their cameras as they were found: they rise by
+what the scene gains in sharpness, and not by what their own cameras would gain. A scene that moved
+as a whole would look worse through them, which is why the mean twist is held at 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.harmonics import basis_rest
+from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.train.rows import Rows
+
+_TURN_RATE, _MOVE_RATE = 1e-3, 1e-3  # rad, and x extent
+_FINAL = 0.01  # of the initial rates, at the end of the run
+_PREFIX = "poses"
+
+
+class Poses:
+    """The twists of all training cameras, and their optimizer.
+
+    A twist is a turn about the camera's own centre, as a rotation vector, and a move of that
+    centre, both in world axes: C' = exp(w) C for the camera-to-world rotation, c' = c + v.
+    The scene can turn and move with its cameras, so that only twists of mean 0 are told apart: the
+    mean over the training images is held there. A camera that is never seen keeps its place.
+
+    Args:
+        images: F, how many there are.
+        extent: of the scene in world units; scales the rate of the moves.
+    """
+
+    def __init__(self, images: int, extent: float) -> None:
+        self._rows = Rows(torch.zeros(images, 6))
+        self._extent = extent
+
+    @property
+    def twists(self) -> NDArray[np.float64]:
+        """Turns in rad and moves in units of the scene extent, [F, 6]; a copy."""
+        return self._rows.value.numpy().copy()
+
+    def camera(self, image: int, camera: Camera) -> Camera:
+        """Returns an image's camera as it is refined so far.
+
+        Args:
+            image: its index.
+            camera: as it was found, at any size.
+        """
+        twist = self._rows.value[image].numpy()
+        if not twist.any():
+            return camera
+        return moved(camera, twist[:3], self._extent * twist[3:])
+
+    def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
+        """Moves one camera, and all that were ever moved back to a mean of 0.
+
+        Args:
+            image: its index.
+            gradient: [6] as `camera_gradient` gives it.
+            done: share of the run, 0 to 1; the rate falls geometrically with it.
+        """
+        self._rows.step(image, gradient, _TURN_RATE * _FINAL**done)
+        self._rows.center()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Returns twists, moments and counts by name, for a checkpoint."""
+        return self._rows.tensors(_PREFIX)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Takes back what `tensors` returned."""
+        self._rows.restore(_PREFIX, tensors)
+
+
+def moved(
+    camera: Camera,
+    turn: NDArray[np.float64],  # [3] rotation vector in world axes, rad
+    move: NDArray[np.float64],  # [3] world units
+) -> Camera:
+    """Returns a camera that is turned about its centre and then moved."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = camera.viewmat[:3, :3] @ Rotation.from_rotvec(turn).as_matrix().T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (camera.center + move)
+    return replace(camera, viewmat=viewmat)
+
+
+def camera_gradient(
+    splats: Splats, gradients: Splats, camera: Camera, sh_degree: int
+) -> NDArray[np.float64]:
+    """Returns the gradient [6] of a loss for a further turn (rad) and move (world units).
+
+    What the step left for the Gaussians is enough, because a picture stays the same when camera
+    and scene move together:
+
+        move   dL/dv = - sum dL/dmean
+        turn   dL/dw = - sum [(mean - c) x dL/dmean + torque(quat) + torque(sh)]
+
+    A scene that turns takes its orientations along, q' = (1, w/2) q, so that with q = (s, u) and
+    its gradient (a, b) torque(quat) = (s b - a u + u x b) / 2; and its colours: what was seen along
+    d is seen along exp(w) d. Turning the harmonics undoes just what the turn of the direction d to
+    the mean does to the colour, and dL/dmean holds the latter, so that
+    torque(sh) = - d x d/dd sum_k p_k Y_k(d), with p_k = sum over channels of sh_rest_k dL/dcolour,
+    and dL/dcolour = dL/dsh_dc / SH_C0.
+
+    Sums over Gaussians are taken in float64 and in a fixed order, whatever the number of threads.
+
+    Args:
+        splats: as they were rendered.
+        gradients: of them, of the same shapes; sh_rest is not looked at.
+        camera: that they were rendered with.
+        sh_degree: in use.
+    """
+    seen = torch.nonzero(gradients.sh_dc.any(dim=1) | gradients.means.any(dim=1))[:, 0]
+    offsets = splats.means.detach()[seen].double() - torch.from_numpy(camera.center).to(
+        splats.means.device)
+    pull = gradients.means[seen].double()
+    torque = torch.linalg.cross(offsets, pull) + _quat_torque(
+        splats.quats.detach()[seen].double(), gradients.quats[seen].double())
+    if sh_degree > 0:
+        torque -= _color_torque(
+            offsets, splats.sh_rest.detach()[seen], gradients.sh_dc[seen] / SH_C0, sh_degree)
+    sums = torch.cat([torque, pull], dim=1).cpu().numpy().sum(axis=0)
+    return np.asarray(-sums)
+
+
+def _quat_torque(quats: Tensor, pull: Tensor) -> Tensor:
+    """Returns the gradients [N, 3] of turning quaternions [N, 4] with gradients [N, 4]."""
+    s, u, a, b = quats[:, :1], quats[:, 1:], pull[:, :1], pull[:, 1:]
+    return (s * b - a * u + torch.linalg.cross(u, b)) / 2
+
+
+def _color_torque(offsets: Tensor, sh_rest: Tensor, pull: Tensor, degree: int) -> Tensor:
+    """Returns the gradients [N, 3] of turning the directions that colours are seen along.
+
+    Args:
+        offsets: [N, 3] from the camera to the Gaussians.
+        sh_rest: [N, 15, 3].
+        pull: [N, 3] gradient of the colours.
+        degree: in use, at least 1.
+    """
+    directions = torch.nn.functional.normalize(offsets, dim=1).requires_grad_()
+    basis = basis_rest(directions, degree)
+    weights = (sh_rest[:, : basis.shape[1]] * pull[:, None]).sum(dim=2).double()
+    (along,) = torch.autograd.grad(basis, directions, weights)
+    return torch.linalg.cross(directions.detach(), along)
