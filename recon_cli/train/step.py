@@ -14,6 +14,7 @@ from recon_cli.render import Statistics, render
 from recon_cli.scene.camera import Camera
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.poses import camera_gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,15 @@ class GradientStep(Protocol):
     def log_gain_gradient(self) -> NDArray[np.float64]:
         """Gradient [3] of the logarithm of the gain, of the last view that was given one."""
 
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera of the last view.
+
+        As `poses.camera_gradient`; to be asked before the optimizer uses the gradients up, and only
+        where the view saw a Gaussian.
+        """
+
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
         gain: NDArray[np.float32] | None = None,
@@ -89,6 +99,14 @@ class _FusedStep:
         """Gradient [3] of the logarithm of the gain."""
         return self._compute.log_gain_gradient
 
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        from recon_cli.render.numba.camera_gradient import pull_of_scene
+
+        return -pull_of_scene(optimizer.splats, optimizer.gradients, camera, sh_degree)
+
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
         gain: NDArray[np.float32] | None = None,
@@ -106,6 +124,14 @@ class _AutogradStep:
     def __init__(self, backend: str) -> None:
         self._backend = backend
         self.log_gain_gradient = np.zeros(3)
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        gradients = optimizer.splats.map(
+            lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
+        return camera_gradient(optimizer.splats, gradients, camera, sh_degree)
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,

@@ -5,11 +5,18 @@ import pytest
 import torch
 from scenes import camera_at, leaves, one_splat, random_splats
 
+from recon_cli.config import TrainConfig
 from recon_cli.render import render
 from recon_cli.render.numba.crew import crew
 from recon_cli.scene.camera import Camera
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.poses import Poses, camera_gradient, moved
+from recon_cli.train.state import new_state
+from recon_cli.train.step import TrainView, fuses, gradient_step
+
+BLACK = torch.zeros(3, dtype=torch.float64)
+CONFIG = TrainConfig(iterations=10, max_gaussians=6000)
+every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 
 # Central differences against a float64 gradient. Their reach must be so small that no Gaussian
 # reaches or leaves a pixel, where its alpha jumps by 1/255; the loss is then good to 1e-8 of them.
@@ -21,20 +28,30 @@ SINGLE = 1e-4  # float32 gradients; measured 7e-6
 
 
 def photograph(seed=0):
-    return torch.from_numpy(np.random.default_rng(seed).uniform(size=(37, 50, 3)))
+    return np.random.default_rng(seed).integers(0, 256, (37, 50, 3), np.uint8)
 
 
-def loss_of(splats, camera, degree, backend="torch"):
-    dtype = splats.means.dtype
-    rgb = render(splats, camera, torch.zeros(3, dtype=dtype), degree, backend=backend).rgb
-    return photometric_loss(rgb, photograph().to(dtype), 0.2)
+def loss_of(splats, camera, degree):
+    rgb = render(splats, camera, BLACK, degree, backend="torch").rgb
+    return photometric_loss(rgb, torch.from_numpy(photograph()).double() / 255, 0.2)
 
 
-def gradients_of(splats, camera, degree, backend="torch"):
+def gradients_of(splats, camera, degree):
     held = leaves(splats)
-    loss_of(held, camera, degree, backend).backward()
-    return held.map(
-        lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
+    loss_of(held, camera, degree).backward()
+    return collected(held)
+
+
+def collected(held):
+    """The gradients that autograd left; zeros where there are none."""
+    return held.map(lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
+
+
+def after_a_step(splats, camera, degree, backend):
+    state = new_state(splats, CONFIG, 1.0, fused=fuses(backend))
+    compute = gradient_step(backend)
+    compute(state.optimizer, TrainView(camera, photograph()), degree, 0.2)
+    return state, compute
 
 
 def slopes(splats, camera, degree, reach=REACH):
@@ -57,11 +74,10 @@ def test_a_picture_shifts_as_the_camera_turns_and_moves():
     focal, z = 60.0, 3.0
     camera = Camera(41, 41, focal, focal, 20.5, 20.5, np.eye(4))
     splats = leaves(one_splat((0.0, 0.0, z), scale=0.05, opacity=0.9, color=(0.5, 0.5, 0.5)))
-    rgb = render(splats, camera, torch.zeros(3, dtype=torch.float64), 0, backend="torch").rgb
+    rgb = render(splats, camera, BLACK, 0, backend="torch").rgb
     columns = torch.arange(41.0, dtype=torch.float64)[None, :, None]
     (rgb * columns).sum().backward()
-    gradient = camera_gradient(splats, splats.map(
-        lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad), camera, 0)
+    gradient = camera_gradient(splats, collected(splats), camera, 0)
     brightness = rgb.detach().sum().item()
     assert gradient[1] == pytest.approx(-focal * brightness, rel=CUT_OFF)
     assert gradient[3] == pytest.approx(-focal / z * brightness, rel=CUT_OFF)
@@ -86,23 +102,27 @@ def test_without_the_part_of_the_colours_a_turn_would_be_wrong():
     assert np.array_equal(right[3:], wrong[3:])
 
 
-def test_gradients_of_the_numba_backend_move_cameras_alike():
-    splats, camera = random_splats(150, seed=5), camera_at()
-    exact = camera_gradient(splats, gradients_of(splats, camera, 3), camera, 3)
-    single = splats.map(torch.Tensor.float)
-    found = camera_gradient(single, gradients_of(single, camera, 3, "numba"), camera, 3)
-    assert np.linalg.norm(found - exact) <= SINGLE * np.linalg.norm(exact)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@every_cpu_backend
+def test_a_step_leaves_the_gradient_of_its_camera(backend, degree):
+    splats, camera = random_splats(5000, seed=5), camera_at()
+    exact = camera_gradient(splats, gradients_of(splats, camera, degree), camera, degree)
+    state, compute = after_a_step(splats.map(torch.Tensor.float), camera, degree, backend)
+    found = compute.camera_gradient(state.optimizer, camera, degree)
+    for part in (slice(0, 3), slice(3, 6)):
+        assert np.linalg.norm(found[part] - exact[part]) <= SINGLE * np.linalg.norm(exact[part])
 
 
-def test_any_number_of_threads_gives_the_same_gradient(monkeypatch):
-    splats = random_splats(3000, seed=5, dtype=torch.float32)
+@every_cpu_backend
+def test_any_number_of_threads_gives_the_same_gradient(backend, monkeypatch):
+    splats = random_splats(5000, seed=5, dtype=torch.float32)
+    state, compute = after_a_step(splats, camera_at(), 3, backend)
     found, before = [], torch.get_num_threads()
     try:
         for threads in (1, 2, 3):
             monkeypatch.setattr(crew, "threads", threads)
             torch.set_num_threads(threads)
-            gradients = gradients_of(splats, camera_at(), 3, "numba")
-            found.append(camera_gradient(splats, gradients, camera_at(), 3))
+            found.append(compute.camera_gradient(state.optimizer, camera_at(), 3))
     finally:
         torch.set_num_threads(before)
     assert np.array_equal(found[0], found[1])
