@@ -57,7 +57,7 @@ def generators() -> Tensor:
     basis = basis_rest(directions, _DEGREE)
     for axis in torch.eye(3, dtype=torch.float64):
         turn = torch.linalg.cross(axis.expand_as(directions), directions)
-        _, slope = torch.func.jvp(lambda d: basis_rest(d, _DEGREE), (directions,), (turn,))
+        slope = torch.func.jvp(lambda d: basis_rest(d, _DEGREE), (directions,), (turn,))[1]
         solved = torch.linalg.lstsq(basis, -slope).solution
         solved[solved.abs() < _ROUNDING] = 0
         matrices.append((solved - solved.T) / 2)

@@ -18,7 +18,7 @@ from recon_cli.train.step import TrainView
 
 _SIDE = 100  # pixels of the longer side; a small view is denoised and does not mind blur
 _POINTS = 4000  # enough for medians of hundreds of points in two views that share a tenth
-_LEAST = 40  # points that two views must share; the median of 40 is known to a fifth of their spread
+_LEAST = 40  # points that two views must share; their median is known to a fifth of their spread
 _DARK, _BRIGHT = 12 / 255, 243 / 255  # means over a block; beyond, pixels of it may be clipped
 _FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known better
 

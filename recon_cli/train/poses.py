@@ -20,7 +20,7 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.rows import Rows
 
-_TURN_RATE, _MOVE_RATE = 1e-3, 1e-3  # rad, and x extent
+_RATE = 1e-3  # rad a step, and share of the extent
 _FINAL = 0.01  # of the initial rates, at the end of the run
 _PREFIX = "poses"
 
@@ -67,7 +67,7 @@ class Poses:
             gradient: [6] as `camera_gradient` gives it.
             done: share of the run, 0 to 1; the rate falls geometrically with it.
         """
-        self._rows.step(image, gradient, _TURN_RATE * _FINAL**done)
+        self._rows.step(image, gradient, _RATE * _FINAL**done)
         self._rows.center()
 
     def tensors(self) -> dict[str, Tensor]:
@@ -133,7 +133,8 @@ def camera_gradient(
 def _quat_torque(quats: Tensor, pull: Tensor) -> Tensor:
     """Returns the gradients [N, 3] of turning quaternions [N, 4] with gradients [N, 4]."""
     s, u, a, b = quats[:, :1], quats[:, 1:], pull[:, :1], pull[:, 1:]
-    return (s * b - a * u + torch.linalg.cross(u, b)) / 2
+    torque: Tensor = (s * b - a * u + torch.linalg.cross(u, b)) / 2
+    return torque
 
 
 def _color_torque(offsets: Tensor, sh_rest: Tensor, pull: Tensor, degree: int) -> Tensor:
@@ -149,4 +150,5 @@ def _color_torque(offsets: Tensor, sh_rest: Tensor, pull: Tensor, degree: int) -
     basis = basis_rest(directions, degree)
     weights = (sh_rest[:, : basis.shape[1]] * pull[:, None]).sum(dim=2).double()
     (along,) = torch.autograd.grad(basis, directions, weights)
-    return torch.linalg.cross(directions.detach(), along)
+    torque: Tensor = torch.linalg.cross(directions.detach(), along)
+    return torque

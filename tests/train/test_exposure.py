@@ -138,7 +138,7 @@ def stepped(exposure, steps=300, images=4, seed=0):
 
 def test_gains_are_found_up_to_their_mean():
     exposure = Exposure(4)
-    truth = stepped(exposure, 1200)
+    truth = stepped(exposure, 3000)
     assert exposure.log_gains == pytest.approx(truth - truth.mean(axis=0), abs=0.02)
 
 

@@ -134,7 +134,7 @@ def test_a_camera_turns_about_its_own_centre():
     turned = moved(camera, np.array([0.1, -0.2, 0.3]), np.zeros(3))
     assert turned.center == pytest.approx(camera.center, abs=1e-12)
     shifted = moved(camera, np.zeros(3), np.array([1.0, 2.0, 3.0]))
-    assert shifted.center == pytest.approx(camera.center + [1, 2, 3], abs=1e-12)
+    assert shifted.center == pytest.approx(camera.center + np.arange(1, 4), abs=1e-12)
     assert shifted.viewmat[:3, :3] == pytest.approx(camera.viewmat[:3, :3], abs=1e-12)
 
 

@@ -1,8 +1,8 @@
 """What the gradients of the Gaussians say about the camera, in one sweep over them.
 
-The derivation stands in recon_cli.train.poses, with a reference in torch. Here the colours
-are turned by their coefficients: torque_i(sh) = sum (G_i sh_rest) . dL/dsh_rest with the generators G_i, which
-needs no direction and no derivative of the basis.
+The derivation stands in recon_cli.train.poses, with a reference in torch. Here the colours are
+turned by their coefficients: torque_i(sh) = sum (G_i sh_rest) . dL/dsh_rest with the generators
+G_i, which needs no direction and no derivative of the basis.
 """
 
 from __future__ import annotations
