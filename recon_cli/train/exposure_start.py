@@ -20,6 +20,10 @@ _SIDE = 100  # pixels of the longer side; a small view is denoised and does not 
 _POINTS = 4000  # enough for medians of hundreds of points in two views that share a tenth
 _LEAST = 40  # points that two views must share; their median is known to a fifth of their spread
 _DARK, _BRIGHT = 12 / 255, 243 / 255  # means over a block; beyond, pixels of it may be clipped
+# Spread from which a capture drifts. Measured: .003 to .0194 in clean room videos (the larger ones
+# from gloss), .0326 to .0519 in rooms whose gain drifts by .82 to
+# 1.42, .06 in photos from a phone video, .14 and more in a walk from a window and in loose photos.
+_DRIFTS = 0.025
 _FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known better
 
 
@@ -37,6 +41,11 @@ class Estimate:
     log_gains: NDArray[np.float64]
     spread: float
     compared: int
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the views differ by more than gloss and occlusion make them differ."""
+        return self.spread > _DRIFTS
 
 
 def estimated(

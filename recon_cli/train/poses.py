@@ -20,8 +20,9 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.rows import Rows
 
-_RATE = 1e-3  # rad a step, and share of the extent
-_FINAL = 0.01  # of the initial rates, at the end of the run
+_RATE = 5e-3
+_FINAL = 0.1
+_MOVE = 0.3
 _PREFIX = "poses"
 
 
@@ -36,11 +37,13 @@ class Poses:
     Args:
         images: F, how many there are.
         extent: of the scene in world units; scales the rate of the moves.
+        visits: steps that the run takes for each image.
     """
 
-    def __init__(self, images: int, extent: float) -> None:
+    def __init__(self, images: int, extent: float, *, visits: float) -> None:
         self._rows = Rows(torch.zeros(images, 6))
-        self._extent = extent
+        self._unit = _MOVE * extent
+        self._rate = _RATE
 
     @property
     def twists(self) -> NDArray[np.float64]:
@@ -57,7 +60,7 @@ class Poses:
         twist = self._rows.value[image].numpy()
         if not twist.any():
             return camera
-        return moved(camera, twist[:3], self._extent * twist[3:])
+        return moved(camera, twist[:3], self._unit * twist[3:])
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
         """Moves one camera, and all that were ever moved back to a mean of 0.
@@ -67,7 +70,7 @@ class Poses:
             gradient: [6] as `camera_gradient` gives it.
             done: share of the run, 0 to 1; the rate falls geometrically with it.
         """
-        self._rows.step(image, gradient, _RATE * _FINAL**done)
+        self._rows.step(image, gradient, self._rate * _FINAL**done)
         self._rows.center()
 
     def tensors(self) -> dict[str, Tensor]:
