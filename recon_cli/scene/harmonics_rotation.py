@@ -46,6 +46,7 @@ def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
 
 
 @cache
+@torch.enable_grad()
 def generators() -> Tensor:
     """Returns the matrices [3, 15, 15] of small turns about x, y and z, float64.
 
@@ -53,12 +54,14 @@ def generators() -> Tensor:
     sum_i w_i (G_i c): with Y the row of basis functions, Y(R d) (c + w_i G_i c) = Y(d) c demands
     Y(d) G_i = -dY(R d)/dw_i, solved as in `rotation_blocks`. Antisymmetric; 48 entries are not 0.
     """
-    directions, matrices = _lattice(_DIRECTIONS), []
+    directions, matrices = _lattice(_DIRECTIONS).requires_grad_(), []
     basis = basis_rest(directions, _DEGREE)
+    slopes = torch.stack([
+        torch.autograd.grad(function.sum(), directions, retain_graph=True)[0]
+        for function in basis.T])  # [15, directions, 3]
     for axis in torch.eye(3, dtype=torch.float64):
-        turn = torch.linalg.cross(axis.expand_as(directions), directions)
-        slope = torch.func.jvp(lambda d: basis_rest(d, _DEGREE), (directions,), (turn,))[1]
-        solved = torch.linalg.lstsq(basis, -slope).solution
+        turn = torch.linalg.cross(axis.expand_as(directions), directions.detach())
+        solved = torch.linalg.lstsq(basis.detach(), -(slopes * turn).sum(dim=2).T).solution
         solved[solved.abs() < _ROUNDING] = 0
         matrices.append((solved - solved.T) / 2)
     return torch.stack(matrices)

@@ -20,8 +20,15 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.rows import Rows
 
-_RATE = 5e-3
-_FINAL = 0.1
+# Measured on a room of 100 views with each camera off by 1 degree and 1 cm, at 300 pixels: in 1,200
+# steps, 12 for a camera, .99 degrees came down to .21; with a tenth of the final rate to .31, with
+# .001 to .81. In 2,400 steps .005 left .19 and .0025 .20 degrees, and .2 dB less at novel views.
+# In a longer run a camera may go twice as far, but not farther: right cameras lost .1 degrees to
+# .005.
+_RATE, _REACH = 5e-3, 0.12  # rad: the most that a step starts with, and first step x steps
+_FINAL = 0.1  # of the first rate, at the end of the run
+# Share of the scene's extent that a camera moves while it turns by a rad. A turn and a move across
+# the view look alike, and 1 left a centimetre as 1.5 centimetres.
 _MOVE = 0.3
 _PREFIX = "poses"
 
@@ -43,12 +50,13 @@ class Poses:
     def __init__(self, images: int, extent: float, *, visits: float) -> None:
         self._rows = Rows(torch.zeros(images, 6))
         self._unit = _MOVE * extent
-        self._rate = _RATE
+        self._rate = min(_RATE, _REACH / visits)
 
     @property
     def twists(self) -> NDArray[np.float64]:
-        """Turns in rad and moves in units of the scene extent, [F, 6]; a copy."""
-        return self._rows.value.numpy().copy()
+        """Turns in rad and moves in world units, [F, 6]; a copy."""
+        scales = np.repeat((1.0, self._unit), 3)
+        return np.asarray(self._rows.value.numpy() * scales)
 
     def camera(self, image: int, camera: Camera) -> Camera:
         """Returns an image's camera as it is refined so far.
@@ -57,10 +65,8 @@ class Poses:
             image: its index.
             camera: as it was found, at any size.
         """
-        twist = self._rows.value[image].numpy()
-        if not twist.any():
-            return camera
-        return moved(camera, twist[:3], self._unit * twist[3:])
+        twist = self.twists[image]
+        return moved(camera, twist[:3], twist[3:]) if twist.any() else camera
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
         """Moves one camera, and all that were ever moved back to a mean of 0.

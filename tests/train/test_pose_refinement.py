@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from scenes import random_splats
+from scipy.spatial.transform import Rotation
 
 from recon_cli.config import TrainConfig
 from recon_cli.render import render
@@ -21,7 +20,7 @@ EXTENT = 1.0
 
 
 def scene():
-    """Gaussians in a block of 3 x 2.4 units before the cameras, all of them opaque enough to see."""
+    """Gaussians in a block of 3 x 2.4 units before the cameras, all opaque enough to be seen."""
     splats = random_splats(300, seed=3, dtype=torch.float32)
     splats.means[:, 2] = 2 + splats.means[:, 2].abs() / 2
     splats.log_scales = splats.log_scales.clamp(-3.5, -2.0)
@@ -92,7 +91,7 @@ def errors(found, truth):
 
 def test_cameras_before_a_known_scene_come_back():
     truth = photographs(scene())
-    views, poses = disturbed(truth), Poses(VIEWS, EXTENT, visits=120)
+    views, poses = disturbed(truth), Poses(VIEWS, EXTENT, visits=24)  # the rate of a short run
     train(scene(), views, 120, poses=poses, scene_moves=False)
     found = [poses.camera(i, view.camera) for i, view in enumerate(views)]
     turn, move = errors(found, [view.camera for view in truth])
@@ -110,10 +109,8 @@ def test_cameras_come_back_while_the_scene_is_learnt():
     refined = train(start, views, 100, poses=poses, scene_moves=True)
     found = [poses.camera(i, view.camera) for i, view in enumerate(views)]
     after = errors(found, [view.camera for view in truth])
-    print(before, after)
     assert after[0] < 0.5 * before[0]
     left = train(start, views, 100, poses=None, scene_moves=True)
-    print(seen_db(refined, found, truth), seen_db(left, [v.camera for v in views], truth))
     assert seen_db(refined, found, truth) > seen_db(left, [v.camera for v in views], truth) + 2
 
 

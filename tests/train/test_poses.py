@@ -139,7 +139,7 @@ def test_a_camera_turns_about_its_own_centre():
 
 
 def test_a_camera_that_was_never_stepped_is_the_one_that_was_found():
-    poses, camera = Poses(3, 2.0), camera_at()
+    poses, camera = Poses(3, 2.0, visits=3), camera_at()
     poses.step(0, np.ones(6), 0.0)
     poses.step(1, -np.ones(6), 0.0)
     assert poses.camera(2, camera) is camera
@@ -147,7 +147,7 @@ def test_a_camera_that_was_never_stepped_is_the_one_that_was_found():
 
 
 def test_the_mean_twist_stays_zero():
-    poses, rng = Poses(4, 2.0), np.random.default_rng(0)
+    poses, rng = Poses(4, 2.0, visits=3), np.random.default_rng(0)
     for i in range(9):
         poses.step(i % 4, rng.normal(size=6), i / 9)
         assert poses.twists.mean(axis=0) == pytest.approx(0, abs=1e-15)
@@ -155,7 +155,7 @@ def test_the_mean_twist_stays_zero():
 
 
 def test_a_camera_is_refined_at_any_size():
-    poses, camera = Poses(2, 2.0), camera_at()
+    poses, camera = Poses(2, 2.0, visits=3), camera_at()
     poses.step(0, np.ones(6), 0.0)
     poses.step(1, -np.ones(6), 0.0)
     small = poses.camera(0, camera.resized(25, 18))
@@ -166,7 +166,7 @@ def test_a_camera_is_refined_at_any_size():
 def test_poses_that_go_on_from_a_checkpoint_are_the_same_to_the_bit():
     rng = np.random.default_rng(0)
     pulls = rng.normal(size=(24, 6))
-    whole, resumed = Poses(4, 2.0), Poses(4, 2.0)
+    whole, resumed = Poses(4, 2.0, visits=3), Poses(4, 2.0, visits=3)
     for i in range(12):
         whole.step(i % 4, pulls[i], i / 24)
     resumed.restore({name: value.clone() for name, value in whole.tensors().items()})
