@@ -6,6 +6,7 @@ A rotation mixes the coefficients of one degree among themselves and leaves degr
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ _DEGREE = 3
 # The 2l+1 functions of degree l are determined by their values in 2l+1 general directions. 64 of a
 # Fibonacci lattice keep the least squares at a condition number under 1.03 for every degree.
 _DIRECTIONS = 64
+_ROUNDING = 1e-9  # entries of a generator are 0 or at least 1
 
 
 def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
@@ -41,6 +43,28 @@ def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
         rows = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
         blocks.append(torch.linalg.lstsq(after[:, rows], before[:, rows]).solution)
     return tuple(blocks)
+
+
+@cache
+@torch.enable_grad()
+def generators() -> Tensor:
+    """Returns the matrices [3, 15, 15] of small turns about x, y and z, float64.
+
+    A turn by the small rotation vector w changes coefficients c of degrees 1 to 3 by
+    sum_i w_i (G_i c): with Y the row of basis functions, Y(R d) (c + w_i G_i c) = Y(d) c demands
+    Y(d) G_i = -dY(R d)/dw_i, solved as in `rotation_blocks`. Antisymmetric; 48 entries are not 0.
+    """
+    directions, matrices = _lattice(_DIRECTIONS).requires_grad_(), []
+    basis = basis_rest(directions, _DEGREE)
+    slopes = torch.stack([
+        torch.autograd.grad(function.sum(), directions, retain_graph=True)[0]
+        for function in basis.T])  # [15, directions, 3]
+    for axis in torch.eye(3, dtype=torch.float64):
+        turn = torch.linalg.cross(axis.expand_as(directions), directions.detach())
+        solved = torch.linalg.lstsq(basis.detach(), -(slopes * turn).sum(dim=2).T).solution
+        solved[solved.abs() < _ROUNDING] = 0
+        matrices.append((solved - solved.T) / 2)
+    return torch.stack(matrices)
 
 
 def rotated(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
