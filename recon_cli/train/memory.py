@@ -72,6 +72,19 @@ def estimate(
         gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM)
 
 
+def room(needed: MemoryEstimate, free: int, *, fused: bool) -> int:
+    """Returns the most Gaussians that fit into `free` bytes; 0 where not even the rest does.
+
+    Args:
+        needed: estimate without any Gaussian.
+        free: bytes.
+        fused: as in `estimate`.
+    """
+    factor = 1 if fused else _TORCH_FACTOR
+    each = _PER_GAUSSIAN + factor * _BUFFERS_PER_GAUSSIAN
+    return max(0, (free - needed.total) // each)
+
+
 def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
     """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes."""
     if needed.total <= free:
