@@ -60,6 +60,11 @@ def disturbed(views):
             for view, turn, move in zip(views, *twists, strict=True)]
 
 
+def poses_for(views, visits):
+    centers = np.stack([view.camera.center for view in views])
+    return Poses(centers, EXTENT, visits=visits, error=TURN)
+
+
 def train(splats, views, epochs, *, poses, scene_moves):
     config = TrainConfig(iterations=epochs * VIEWS, max_gaussians=300)
     state = new_state(splats, config, EXTENT, fused=True)
@@ -91,7 +96,8 @@ def errors(found, truth):
 
 def test_cameras_before_a_known_scene_come_back():
     truth = photographs(scene())
-    views, poses = disturbed(truth), Poses(VIEWS, EXTENT, visits=24)  # the rate of a short run
+    views = disturbed(truth)
+    poses = poses_for(views, visits=14)  # at the rate of a short run
     train(scene(), views, 120, poses=poses, scene_moves=False)
     found = [poses.camera(i, view.camera) for i, view in enumerate(views)]
     turn, move = errors(found, [view.camera for view in truth])
@@ -104,7 +110,8 @@ def test_cameras_come_back_while_the_scene_is_learnt():
     start = scene()
     start.sh_dc, start.sh_rest = torch.zeros(300, 3), torch.zeros(300, 15, 3)
     start.means += 0.01 * torch.randn(300, 3, generator=torch.Generator().manual_seed(1))
-    views, poses = disturbed(truth), Poses(VIEWS, EXTENT, visits=100)
+    views = disturbed(truth)
+    poses = poses_for(views, visits=100)
     before = errors([view.camera for view in views], [view.camera for view in truth])
     refined = train(start, views, 100, poses=poses, scene_moves=True)
     found = [poses.camera(i, view.camera) for i, view in enumerate(views)]
