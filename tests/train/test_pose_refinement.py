@@ -50,14 +50,21 @@ def photographs(splats):
 
 
 def disturbed(views):
-    """The views with cameras off by a degree and a centimetre; the mean of all that is zero."""
-    rng, twists = np.random.default_rng(0), []
-    for size in (TURN, MOVE):
-        part = rng.normal(size=(VIEWS, 3))
-        part -= part.mean(axis=0)
-        twists.append(size * part / np.linalg.norm(part, axis=1).mean())
+    """The views with cameras off by a degree and a centimetre.
+
+    The mean of all that is zero and the path keeps its size: what the scene could follow, and
+    refinement therefore never takes back, is left out.
+    """
+    rng = np.random.default_rng(0)
+    turns, moves = rng.normal(size=(2, VIEWS, 3))
+    arms = np.stack([view.camera.center for view in views])
+    arms -= arms.mean(axis=0)
+    turns, moves = turns - turns.mean(axis=0), moves - moves.mean(axis=0)
+    moves -= (moves * arms).sum() / (arms * arms).sum() * arms
+    turns *= TURN / np.linalg.norm(turns, axis=1).mean()
+    moves *= MOVE / np.linalg.norm(moves, axis=1).mean()
     return [replace(view, camera=moved(view.camera, turn, move))
-            for view, turn, move in zip(views, *twists, strict=True)]
+            for view, turn, move in zip(views, turns, moves, strict=True)]
 
 
 def poses_for(views, visits):
