@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# A gain under this is not worth a part that can go wrong: two runs that differ by their seed alone
-# differ by about as much.
+# A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
+# alone were .07 +- .06 dB apart (17 views, 500 steps at 200 pixels): the errors decide as well.
 THRESHOLD_DB = 0.05
 _ERRORS = 2.0  # standard errors, a chance of about one in forty
 LEAST_VIEWS = 8  # whose mean has a standard error that can be told; fewer, and the split is own
