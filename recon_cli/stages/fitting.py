@@ -14,7 +14,7 @@ import torch
 
 from recon_cli.atomic import read_json, write_bytes
 from recon_cli.capture.frames import read_frame_list
-from recon_cli.config import RunConfig
+from recon_cli.config import MIN_GAUSSIANS, RunConfig
 from recon_cli.errors import TrainingError
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_masked_image
@@ -109,7 +109,7 @@ def sizes_of(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
 
 def gaussians_that_fit(scene: Scene, config: RunConfig, ctx: StageContext) -> int:
     """Returns how many Gaussians memory has room for, before the images are loaded."""
-    needed = _memory(scene, dataclasses.replace(config, max_gaussians=1), ctx)
+    needed = _memory(scene, dataclasses.replace(config, max_gaussians=MIN_GAUSSIANS), ctx)
     return room(needed, _free_bytes(ctx), fused=fuses(ctx.backend))
 
 

@@ -112,7 +112,8 @@ def _state(task: Task, scene: Scene, checkpoint: Path) -> TrainState:
     if checkpoint.exists():
         return load_state(checkpoint, config, task.extent, task.device, fused=fused)
     first = splats_from_points(
-        scene.points, scene.colors, most=config.max_gaussians, seed=config.seed)
+        scene.points, scene.colors, most=plan.first_count(config, len(scene.points)),
+        seed=config.seed)
     return new_state(
         first.map(lambda tensor: tensor.to(task.device)), config, task.extent, fused=fused)
 

@@ -93,17 +93,14 @@ class CostModel:
 def counts(schedule: Schedule, first: int) -> list[tuple[int, int, int]]:
     """Returns the run cut into (begin, end, Gaussians), the count as the schedule lets it grow."""
     config = schedule.config
-    stride = max(1, math.ceil(config.iterations / _SEGMENTS))
-    if config.densify_every < stride:
-        stride = config.densify_every * math.ceil(stride / config.densify_every)
+    stride = math.ceil(config.iterations / _SEGMENTS)
     result, count, begin = [], min(first, config.max_gaussians), 0
     while begin < config.iterations:
         end = min(begin + stride, config.iterations)
         result.append((begin, end, count))
-        grows = any(schedule.densifies(i) for i in range(begin + 1, end + 1))
-        if grows:
-            most = count + int(_GROWTH * count) * max(1, (end - begin) // config.densify_every)
-            count = max(count, min(schedule.target(end, first), most))
+        for iteration in filter(schedule.densifies, range(begin + 1, end + 1)):
+            most = count + int(_GROWTH * count)
+            count = max(count, min(schedule.target(iteration, first), most))
         begin = end
     return result
 

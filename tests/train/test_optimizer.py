@@ -4,7 +4,7 @@ import pytest
 import torch
 from scenes import joined, random_splats
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.render.numba.crew import crew
 from recon_cli.scene.splats import Splats
 from recon_cli.train.optimizer import SplatOptimizer
@@ -16,7 +16,7 @@ BYTES = 1500  # a Gaussian may take in training: what is promised for a million 
 
 
 def stepped(splats, times=3):
-    optimizer = SplatOptimizer(splats.map(lambda t: t.float()), TrainConfig(), extent=2.0)
+    optimizer = SplatOptimizer(splats.map(lambda t: t.float()), RunConfig(), extent=2.0)
     for _ in range(times):
         loss = sum(p.square().sum() for p in optimizer.splats.parameters().values())
         loss.backward()
@@ -69,7 +69,7 @@ def test_forgetting_touches_one_parameter_only():
 
 # ---- fused: gradients in buffers, one kernel for all parameters ----
 
-CONFIG = TrainConfig(max_gaussians=50)
+CONFIG = RunConfig(max_gaussians=50)
 both_kinds = pytest.mark.parametrize("fused", [False, True])
 
 
