@@ -69,8 +69,8 @@ def main(
     registry.use_threads("numba", threads)
     registry.prepare("numba", lambda: None)
     ctx = StageContext(backend="numba", threads=threads)
-    click.echo("| scene | asked | steps | Gaussians | calibration s | estimate s | took s | error |\n"
-               "|---|---|---:|---:|---:|---:|---:|---:|")
+    click.echo("| scene | asked | steps | Gaussians | calibration s | estimate s | took s "
+               "| error |\n|---|---|---:|---:|---:|---:|---:|---:|")
     configs = [TrainConfig(minutes=one, early_stop=False) for one in minutes]
     configs += [TrainConfig(quality=one, early_stop=False) for one in quality]
     for config in configs:
