@@ -191,9 +191,10 @@ def _resolved(
     asked: TrainConfig, iterations: int, max_gaussians: int, max_size: int
 ) -> RunConfig:
     values = {item.name: getattr(asked, item.name) for item in dataclasses.fields(asked)}
+    degree = 3 if asked.sh_degree is None else asked.sh_degree
     return RunConfig(**{
-        **values, "minutes": None, "iterations": iterations, "max_gaussians": max_gaussians,
-        "max_size": max_size})
+        **values, "minutes": None, "sh_degree": degree, "iterations": iterations,
+        "max_gaussians": max_gaussians, "max_size": max_size})
 
 
 def _most(fits: Callable[[int], bool], low: int, high: int) -> int:

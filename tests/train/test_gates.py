@@ -116,6 +116,12 @@ def test_good_cameras_are_left_alone_untried(error):
     assert next(one for one in needs.decisions if one.name == "poses").mean_db is None
 
 
+def test_matt_colours_get_no_harmonics():
+    needs = examine(replace(scene(), harmonics=True))
+    assert needs.config.sh_degree == 0
+    assert [one.name for one in needs.decisions][-1] == "harmonics above degree 0"
+
+
 def test_the_same_scene_gets_the_same_answer():
     first, second = (examine(scene(window=True)) for _ in range(2))
     assert first.config == second.config
