@@ -29,6 +29,7 @@ from recon_cli.pipeline import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress
 from recon_cli.settings import Settings
 from recon_cli.stages import STAGES
+from recon_cli.study.command import study
 from recon_cli.workspace import SETTINGS, Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
@@ -317,3 +318,4 @@ def show_doctor(call: Call, as_json: bool) -> None:
 
 
 cli.add_command(bench)
+cli.add_command(study)

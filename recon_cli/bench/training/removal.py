@@ -1,0 +1,23 @@
+"""The prune of an arm, as the stage does it in mid-training."""
+
+from __future__ import annotations
+
+import torch
+
+from recon_cli.bench.training.arms import Prune
+from recon_cli.train.fit import Task
+from recon_cli.train.gathered import Gathered
+from recon_cli.train.importance import kept_rows, significance
+from recon_cli.train.state import TrainState
+
+
+def remove(state: TrainState, task: Task, prune: Prune) -> None:
+    """Removes the Gaussians of `state` that matter least to the training views."""
+    config = prune.config
+    score = significance(
+        config.score, state.splats, [view.camera for view in task.train], beta=config.beta,
+        sh_degree=task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend,
+        generator=state.generator)
+    rows = kept_rows(score, config.ratio)
+    state.optimizer.replace(state.splats.select(rows), rows)
+    state.gathered = Gathered.zeros(len(rows), torch.device(task.device))
