@@ -117,7 +117,8 @@ def _check_memory(scene: Scene, config: TrainConfig, ctx: StageContext) -> None:
     width, height = sizes_of([fitted_camera(view.camera, config.max_size) for view in views])[0]
     needed = estimate(
         views=len(views), width=width, height=height, gaussians=config.max_gaussians,
-        fused=fuses(ctx.backend), masks=sum(view.mask is not None for view in views))
+        fused=fuses(ctx.backend), sh_degree=config.sh_degree,
+        masks=sum(view.mask is not None for view in views))
     free = free_memory_bytes()
     if ctx.device == "cuda":
         free = torch.cuda.mem_get_info()[0]

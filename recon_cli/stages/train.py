@@ -38,7 +38,8 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
             checkpoint, config, task.extent, task.device, fused=fuses(task.backend))
     else:
         first = splats_from_points(
-            scene.points, scene.colors, most=config.max_gaussians, seed=config.seed)
+            scene.points, scene.colors, most=config.max_gaussians, seed=config.seed,
+            sh_degree=config.sh_degree)
         state = new_state(
             first.map(lambda tensor: tensor.to(task.device)), config, task.extent,
             fused=fuses(task.backend))
