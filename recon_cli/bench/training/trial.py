@@ -149,7 +149,8 @@ def _cut(run: Run) -> int | None:
 def _first_state(scene: Scene, config: TrainConfig, task: Task) -> TrainState:
     """Returns what the train stage starts from."""
     first = splats_from_points(
-        scene.points, scene.colors, most=config.max_gaussians, seed=config.seed)
+        scene.points, scene.colors, most=config.max_gaussians, seed=config.seed,
+        sh_degree=config.sh_degree)
     return new_state(
         first.map(lambda tensor: tensor.to(task.device)), config, task.extent,
         fused=fuses(task.backend))
