@@ -305,9 +305,7 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
 
 
 @cli.command("doctor")
-@click.option(
-    "--json", "as_json", is_flag=True,
-    help="Print the same as JSON.  [default: off]")
+@click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.  [default: off]")
 @options.common()
 @pass_call
 def show_doctor(call: Call, as_json: bool) -> None:
