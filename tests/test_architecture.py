@@ -52,8 +52,8 @@ ALLOWED: dict[str, set[str]] = {
         "settings", "options", "machine", "progress", "metrics", "scene", "render", "train", "io",
         "stages", "digests", "workspace", "execute", "pipeline"},
     "study": BOTTOM | OPTIONS | {
-        "settings", "options", "progress", "metrics", "lock", "digests", "stages", "execute",
-        "bench"},
+        "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
+        "execute", "bench"},
     "cli": OPTIONS | {
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study"},

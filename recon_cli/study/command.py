@@ -39,7 +39,7 @@ _scene = click.Path(path_type=Path)
     "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("study"),
     help="Folder of finished runs, study.json, study.md and study.svg; what lies there is not run "
          "again.  [default: study]")
-@options.assignments()
+@options.assignments("ingest.frames=200")
 @options.of(ComputeConfig)
 @options.verbosity()
 @pass_call

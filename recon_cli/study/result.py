@@ -8,6 +8,7 @@ from typing import Any
 
 from recon_cli.bench.host import Host
 from recon_cli.bench.training.arms import Arm
+from recon_cli.bench.training.request import shared
 from recon_cli.bench.training.trial import Point
 from recon_cli.config import TrainConfig
 from recon_cli.study.intervals import Difference, Spread, difference, spread
@@ -102,7 +103,7 @@ class Result:
         """Returns what the JSON file holds."""
         return {
             "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
-            "run_on": list(self.machines), "seeds": self.seeds, "base": self.base.hashed(),
+            "run_on": list(self.machines), "seeds": self.seeds, "base": shared(self.base),
             "clock": self.clock, "arms": [arm.record() | {"label": arm.label} for arm in ARMS],
             "scenes": {name: {key: value for key, value in vars(scene).items() if key != "runs"}
                        for name, scene in self.scenes.items()},

@@ -19,6 +19,7 @@ from recon_cli.study.records import Records
 from recon_cli.study.request import Request
 from recon_cli.study.result import Result
 from recon_cli.study.work import Ground, Work
+from recon_cli.workspace import disk_errors
 
 logger = logging.getLogger("recon")
 
@@ -31,7 +32,8 @@ def run(request: Request, progress: Progress) -> str:
     """
     paths = checked(request.scenes)
     _make_folder(request.out)
-    with lock.held(request.out, "study"):
+    with (disk_errors(request.out, "running study"),
+          lock.held(request.out, "study", other="another folder with --out")):
         ctx = rendering(request.compute, progress)
         host = examine(ctx.threads, ctx.device)
         records = Records(request.out)

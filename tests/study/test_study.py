@@ -239,7 +239,7 @@ def test_an_interrupted_study_says_so(studied, tmp_path, capsys, monkeypatch):
     (["--scenes", "room", "--set", "compute.threads=2"], 2, "has no effect here"),
     (["--scenes", "room", "--out", "file"], 2, "--out"),
     (["--scenes", "room", "--out", "file/below"], 7, "cannot be made"),
-    (["--scenes", "room", "--set", "ingest.holdout=none"], 3, "No held-out view"),
+    (["--scenes", "room", "--set", "ingest.holdout=none"], 5, "No held-out view"),
 ])
 def test_what_cannot_be_done_is_refused_before_training(
     words, code, said, tmp_path, capsys, monkeypatch

@@ -52,7 +52,7 @@ _scene = click.Path(path_type=Path)
     "--markdown", type=_file,
     help="Write the tables between the lines `<!-- recon bench: begin -->` and "
          "`<!-- recon bench: end -->` of FILE.  [default: nowhere]")
-@options.assignments()
+@options.assignments("ingest.frames=200")
 @options.of(ComputeConfig)
 @options.verbosity()
 @pass_call

@@ -99,3 +99,9 @@ def base_config(
         values["validation"] = validation
     return TrainConfig(
         **values, iterations=STEPS, max_size=max_size, max_gaussians=max_gaussians)
+
+
+def shared(base: TrainConfig) -> dict[str, Any]:
+    """Returns the options that all arms share, without those that each run has of its own."""
+    return {name: value for name, value in base.hashed().items()
+            if name not in ("iterations", "seed", "densify", "mid")}

@@ -9,6 +9,7 @@ from typing import Any
 from recon_cli.bench.host import Host
 from recon_cli.bench.training.arms import Arm
 from recon_cli.bench.training.curve import common_target, seconds_to
+from recon_cli.bench.training.request import shared
 from recon_cli.bench.training.trial import Point
 from recon_cli.config import TrainConfig
 
@@ -100,7 +101,7 @@ class Result:
         """Returns what the JSON file holds."""
         return {
             "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
-            "seeds": self.seeds, "base": self.base.hashed(),
+            "seeds": self.seeds, "base": shared(self.base),
             "scenes": {name: self._scene(scene) for name, scene in self.scenes.items()},
         }
 

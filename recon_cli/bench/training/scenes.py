@@ -10,7 +10,7 @@ from pathlib import Path
 from recon_cli import pipeline
 from recon_cli.config import ComputeConfig, IngestConfig, SfmConfig, TrainConfig
 from recon_cli.digests import digest_file, sha256_json
-from recon_cli.errors import ConfigError, FormatError, InputError, StageError
+from recon_cli.errors import ConfigError, InputError, ReconstructionError, StageError
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.pipeline import Job, Target
 from recon_cli.progress import Progress
@@ -136,7 +136,7 @@ def opened(
 
 
 def refuse_unscored(place: Place, scene: Scene, *, test: bool) -> None:
-    """Raises FormatError unless a scene has views that can be scored.
+    """Raises ReconstructionError or ConfigError unless a scene has views that can be scored.
 
     Args:
         place: for the message.
@@ -144,10 +144,10 @@ def refuse_unscored(place: Place, scene: Scene, *, test: bool) -> None:
         test: the held-out views are scored; otherwise the validation views.
     """
     if test and not scene.test:
-        raise FormatError(
+        raise ReconstructionError(
             f"No held-out view of {place.name} has a camera.",
             hint="Run `recon ingest` with a --holdout such as every:8.")
     if not test and not scene.validation:
-        raise FormatError(
+        raise ConfigError(
             f"{place.name} has no validation views.",
             hint="Use --set train.validation=0.1, or give a scene with more views.")
