@@ -7,17 +7,19 @@ unpruned model stays in train/, so that evaluation can set them side by side.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from recon_cli.config import PruneConfig, TrainConfig
+from recon_cli.config import PruneConfig, RunConfig
 from recon_cli.io.ply import write_ply
 from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.fitting import (
     CHECKPOINT,
     LOG,
+    jump_in,
     load_scene,
     load_task,
     read_config,
@@ -27,6 +29,7 @@ from recon_cli.stages.fitting import (
 from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.gathered import Gathered
 from recon_cli.train.importance import kept_rows, significance
+from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, load_state
 from recon_cli.train.step import fuses
 
@@ -38,12 +41,12 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     train = inputs.folders["train"]
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
-    task = load_task(scene, train_config, ctx)
+    task = _following(load_task(scene, train_config, ctx), train)
     source = train / ("mid.safetensors" if config.at == "mid" else "final.safetensors")
     fused = fuses(task.backend)
     start = load_state(source, train_config, task.extent, task.device, fused=fused)
     until = _until(config, train_config, start.iteration)
-    before, first = len(start.splats), start.iteration
+    before, first, steps = len(start.splats), start.iteration, start.steps
     psnr_before = validation_psnr(start, task)
     if (out / CHECKPOINT).exists():
         state = load_state(
@@ -59,14 +62,20 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     return {
         "at": config.at, "score": config.score, "ratio": config.ratio,
         "gaussians_before": before, "gaussians": len(state.splats),
-        "recovery_steps": until - first, "iterations": state.iteration,
+        "recovery_steps": state.steps - steps, "iterations": state.steps,
         "validation_psnr_db_before": psnr_before, "validation_psnr_db_pruned": psnr_pruned,
         "validation_psnr_db": validation_psnr(state, task),
         "train_seconds": seconds_at(out / LOG, until),
     }
 
 
-def _until(config: PruneConfig, train: TrainConfig, first: int) -> int:
+def _following(task: Task, train: Path) -> Task:
+    """Returns a task that stops early exactly where the training did, and nowhere else."""
+    config = replace(task.schedule.config, early_stop=False)
+    return replace(task, schedule=Schedule(config), jump=jump_in(train / LOG))
+
+
+def _until(config: PruneConfig, train: RunConfig, first: int) -> int:
     """Returns the total number of steps at which recovery ends."""
     if config.recovery is not None:
         return first + config.recovery

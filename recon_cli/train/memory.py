@@ -79,6 +79,17 @@ def estimate(
         gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM)
 
 
+def room(one: MemoryEstimate, free: int) -> int:
+    """Returns the most Gaussians that fit into `free` bytes; 0 where not even the rest does.
+
+    Args:
+        one: estimate with a single Gaussian.
+        free: bytes.
+    """
+    each = one.gaussians + one.gaussian_buffers
+    return max(0, (free - one.total + each) // each)
+
+
 def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
     """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes."""
     if needed.total <= free:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.scene.splats import Splats, with_terms
 
 _BETAS = 0.9, 0.999
@@ -38,7 +38,7 @@ class SplatOptimizer:
     """
 
     def __init__(
-        self, splats: Splats, config: TrainConfig, extent: float, *, fused: bool = False
+        self, splats: Splats, config: RunConfig, extent: float, *, fused: bool = False
     ) -> None:
         self._extent, self._fused = extent, fused
         self._rates = {

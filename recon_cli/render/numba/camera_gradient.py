@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.render.numba.backend import flat
 from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba.frame import flat
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.lane_memory import fetch_add
 from recon_cli.scene.camera import Camera
