@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from recon_cli.bench.training.arms import BUDGET, BUDGET_PRUNED, PAPER, REFERENCE, Arm
-from recon_cli.config import ComputeConfig, TrainConfig
+from recon_cli.config import ComputeConfig, RunConfig
 from recon_cli.settings import Settings
 
 # The paper compares the first two; the others are what `recon train` does without and with --prune.
@@ -34,7 +34,7 @@ class Request:
     scenes: tuple[Path, ...]
     seeds: int
     iterations: int
-    base: TrainConfig
+    base: RunConfig
     out: Path
     settings: Settings = field(default_factory=dict)
     compute: ComputeConfig = field(default_factory=ComputeConfig)

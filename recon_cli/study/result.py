@@ -10,7 +10,7 @@ from recon_cli.bench.host import Host
 from recon_cli.bench.training.arms import Arm
 from recon_cli.bench.training.request import shared
 from recon_cli.bench.training.trial import Point
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.study.intervals import Difference, Spread, difference, spread
 from recon_cli.study.records import Record
 from recon_cli.study.request import ARMS, BASELINE, DEFAULT
@@ -66,7 +66,7 @@ class Result:
 
     host: Host
     seeds: int
-    base: TrainConfig
+    base: RunConfig
     clock: str
     scenes: Mapping[str, SceneResult]
 

@@ -23,12 +23,12 @@ from recon_cli.bench.training.result import ArmResult, Result, SceneResult, Seed
 from recon_cli.bench.training.scenes import Place, checked
 from recon_cli.bench.training.trial import Point, Run, run_trial, stand
 from recon_cli.cli import main
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.stages.context import StageContext
 
 Said = pytest.CaptureFixture[str]
-BASE = TrainConfig(iterations=1, max_size=48, max_gaussians=90, densify_every=10, validation=0.2)
+BASE = RunConfig(iterations=1, max_size=48, max_gaussians=90, densify_every=10, validation=0.2)
 
 
 def nothing() -> None:

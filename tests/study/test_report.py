@@ -6,7 +6,7 @@ import pytest
 
 from recon_cli.bench.host import Host
 from recon_cli.bench.training.trial import Point
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.study import picture, report
 from recon_cli.study.published import TABLE_I, published
 from recon_cli.study.records import Record
@@ -35,7 +35,7 @@ def scene(base_db, gains, machine="A CPU"):
 
 
 def result(**scenes):
-    return Result(HOST, 3, TrainConfig(), "wall", scenes or {
+    return Result(HOST, 3, RunConfig(), "wall", scenes or {
         "office0": scene(30.0, (0.0, 0.5, 1.0, 0.1)), "home": scene(20.0, (0.0, -0.1, 1.0, 0.1))})
 
 
@@ -76,7 +76,7 @@ def test_the_words_say_whether_an_interval_contains_zero():
             "[-2.14, +0.34] contains 0: no difference shown.") in text
     assert "3 seeds are few" in text
     assert "several machines" not in text
-    one = Result(HOST, 1, TrainConfig(), "wall", {"home": SceneResult(1, 9, 9, "", {
+    one = Result(HOST, 1, RunConfig(), "wall", {"home": SceneResult(1, 9, 9, "", {
         name: {arm: records[:1] for arm, records in arms.items()}
         for name, arms in scene(20.0, (0.0, 1.0, 1.0, 1.0)).runs.items()})})
     assert "one seed shows no interval" in report.text(one)

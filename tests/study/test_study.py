@@ -12,7 +12,7 @@ from recon_cli.bench.training import trial
 from recon_cli.bench.training.scenes import Place
 from recon_cli.bench.training.trial import Run, stand
 from recon_cli.cli import main
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.errors import FormatError
 from recon_cli.progress import NullProgress
 from recon_cli.stages.context import StageContext
@@ -23,7 +23,7 @@ from recon_cli.study.request import ARMS, EQUAL_SECONDS, EQUAL_STEPS, Request
 from recon_cli.study.work import Ground, Work, equal_seconds
 
 STEPS = 20
-BASE = TrainConfig(
+BASE = RunConfig(
     iterations=1, max_size=48, max_gaussians=80, densify_every=5, validation=0.0)
 COSTS = {"reference": 0.5, "paper": 0.4, "budget": 0.25, "budget-pruned": 0.2}  # seconds a step
 

@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from recon_cli.config import PruneConfig, TrainConfig
+from recon_cli.config import PruneConfig, RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.settings import parse_assignment
 
-_MID = TrainConfig().mid  # where `recon train --prune` branches off
+_MID = RunConfig().mid  # where `recon train --prune` branches off
+# options that all recipes of a benchmark have in common, or that have no effect here
+_SHARED = {"iterations", "seed", "max_size", "quality", "minutes", "early_stop", "mid"}
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Arm:
     Attributes:
         name: for the files and the command line.
         label: for the tables.
-        options: fields of TrainConfig that differ from the base.
+        options: fields of the training options that differ from the base.
         prune: None where nothing is removed.
     """
 
@@ -43,7 +45,7 @@ class Arm:
     options: Mapping[str, Any] = field(default_factory=dict)
     prune: Prune | None = None
 
-    def config(self, base: TrainConfig, *, iterations: int, seed: int) -> TrainConfig:
+    def config(self, base: RunConfig, *, iterations: int, seed: int) -> RunConfig:
         """Returns the options of one run.
 
         Raises:
@@ -87,13 +89,13 @@ def parse(text: str) -> Arm:
     known, options = KNOWN[name], {}
     for change in changes:
         options.update(parse_assignment(f"train.{change}")["train"])
-    if fixed := {"iterations", "seed", "max_size"} & options.keys():
+    if fixed := _SHARED & options.keys():
         raise ConfigError(
             f"The recipe {text!r} sets {', '.join(sorted(fixed))}, which all recipes share.",
             hint="Use --iterations, --seeds and --max-size.")
     label = known.name if not changes else text
     arm = Arm(text, label, {**known.options, **options}, known.prune)
-    arm.config(TrainConfig(), iterations=1, seed=0)  # refuses values out of range
+    arm.config(RunConfig(), iterations=1, seed=0)  # refuses values out of range
     return arm
 
 

@@ -10,7 +10,7 @@ from recon_cli.bench import page
 from recon_cli.bench.picture import check_picture
 from recon_cli.bench.request import refuse_missing_folders
 from recon_cli.bench.training.arms import Arm
-from recon_cli.config import ComputeConfig, TrainConfig
+from recon_cli.config import ComputeConfig, RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.settings import Settings
 
@@ -18,7 +18,8 @@ from recon_cli.settings import Settings
 SIZE, STEPS, CAP = 600, 3000, 60_000
 SECTIONS = ("ingest", "denoise", "sfm", "train")  # that --set may reach
 # of training, that have options of their own here, or no effect
-_OWN = {"iterations", "max_size", "max_gaussians", "seed", "densify", "mid", "checkpoint_every"}
+_OWN = {"iterations", "max_size", "max_gaussians", "seed", "densify", "mid", "checkpoint_every",
+        "quality", "minutes", "early_stop"}
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Request:
     seconds: float | None
     seeds: int
     targets_db: tuple[float, ...]
-    base: TrainConfig
+    base: RunConfig
     settings: Settings = field(default_factory=dict)
     compute: ComputeConfig = field(default_factory=ComputeConfig)
     json_file: Path | None = None
@@ -72,7 +73,7 @@ class Request:
 
 def base_config(
     settings: Settings, *, max_size: int, max_gaussians: int, validation: float | None = None
-) -> TrainConfig:
+) -> RunConfig:
     """Returns the options that all arms share.
 
     Args:
@@ -97,11 +98,12 @@ def base_config(
             hint="See --help for sizes, steps and seeds; recipes say how to densify.")
     if validation is not None:
         values["validation"] = validation
-    return TrainConfig(
-        **values, iterations=STEPS, max_size=max_size, max_gaussians=max_gaussians)
+    return RunConfig(
+        **values, iterations=STEPS, max_size=max_size, max_gaussians=max_gaussians,
+        early_stop=False)  # every run takes the steps that it is said to take
 
 
-def shared(base: TrainConfig) -> dict[str, Any]:
+def shared(base: RunConfig) -> dict[str, Any]:
     """Returns the options that all arms share, without those that each run has of its own."""
     return {name: value for name, value in base.hashed().items()
-            if name not in ("iterations", "seed", "densify", "mid")}
+            if name not in _OWN - {"max_size", "max_gaussians"}}

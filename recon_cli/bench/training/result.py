@@ -11,7 +11,7 @@ from recon_cli.bench.training.arms import Arm
 from recon_cli.bench.training.curve import common_target, seconds_to
 from recon_cli.bench.training.request import shared
 from recon_cli.bench.training.trial import Point
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 
 SCHEMA, VERSION = "recon-bench-train", 1
 
@@ -88,7 +88,7 @@ class Result:
 
     host: Host
     seeds: int
-    base: TrainConfig
+    base: RunConfig
     targets_db: tuple[float, ...]
     scenes: Mapping[str, SceneResult]
 

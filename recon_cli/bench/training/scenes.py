@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from recon_cli import pipeline
-from recon_cli.config import ComputeConfig, IngestConfig, SfmConfig, TrainConfig
+from recon_cli.config import ComputeConfig, IngestConfig, RunConfig, SfmConfig
 from recon_cli.digests import digest_file, sha256_json
 from recon_cli.errors import ConfigError, InputError, ReconstructionError, StageError
 from recon_cli.io.layouts import recognise, refuse_incomplete
@@ -35,7 +35,7 @@ class Place:
     name: str
     inputs: StageInputs
 
-    def load(self, config: TrainConfig) -> Scene:
+    def load(self, config: RunConfig) -> Scene:
         """Returns the views, split as for a run with these options, and the points."""
         return load_scene(self.inputs, validation=config.validation)
 

@@ -10,7 +10,7 @@ from recon_cli.bench.training.arms import Arm
 from recon_cli.bench.training.clock import TrainingClock
 from recon_cli.bench.training.removal import remove
 from recon_cli.bench.training.scoring import load_scored, score
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext
@@ -60,12 +60,12 @@ class Run:
     """
 
     arm: Arm
-    base: TrainConfig
+    base: RunConfig
     iterations: int
     seed: int
 
     @property
-    def config(self) -> TrainConfig:
+    def config(self) -> RunConfig:
         """The options of this run."""
         return self.arm.config(self.base, iterations=self.iterations, seed=self.seed)
 
@@ -87,7 +87,7 @@ class Stand:
     ctx: StageContext
     _tasks: dict[str, Task] = field(default_factory=dict)
 
-    def task(self, config: TrainConfig) -> Task:
+    def task(self, config: RunConfig) -> Task:
         """Returns the task of a run; training itself looks at no view that it does not fit."""
         if config.images not in self._tasks:
             self._tasks[config.images] = load_task(self.scene, config, self.ctx)
@@ -96,7 +96,7 @@ class Stand:
 
 
 def stand(
-    name: str, scene: Scene, scored: Sequence[View], base: TrainConfig, ctx: StageContext
+    name: str, scene: Scene, scored: Sequence[View], base: RunConfig, ctx: StageContext
 ) -> Stand:
     """Returns a scene with the views in memory that scores come from.
 
@@ -146,7 +146,7 @@ def _cut(run: Run) -> int | None:
     return min(run.iterations, max(1, round(run.arm.prune.at * run.iterations)))
 
 
-def _first_state(scene: Scene, config: TrainConfig, task: Task) -> TrainState:
+def _first_state(scene: Scene, config: RunConfig, task: Task) -> TrainState:
     """Returns what the train stage starts from."""
     first = splats_from_points(
         scene.points, scene.colors, most=config.max_gaussians, seed=config.seed,
@@ -165,7 +165,7 @@ def _look(where: Stand, state: TrainState, task: Task, clock: TrainingClock) -> 
         found.bytes, found.psnr_db, found.ssim)
 
 
-def pilot(where: Stand, arm: Arm, base: TrainConfig, *, on_step: Callable[[], None]) -> Point:
+def pilot(where: Stand, arm: Arm, base: RunConfig, *, on_step: Callable[[], None]) -> Point:
     """Returns the end of a short run, whose seconds say what a step of the arm costs here.
 
     It goes through the whole plan of the recipe. A few steps ahead warm the caches.
