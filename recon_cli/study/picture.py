@@ -27,7 +27,8 @@ def draw(result: Result, path: Path) -> None:
         for axes, comparison in zip(line, COMPARISONS, strict=True):
             _panel(axes, result, comparison, name)
             axes.set(xlabel=label, title=comparison)
-    panels[0][0].legend(fontsize=8)
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
     figure.suptitle(f"{result.seeds} seeds, 95% intervals", fontsize=10)
     with atomic.replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)

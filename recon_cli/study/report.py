@@ -141,7 +141,7 @@ def notes(result: Result) -> list[str]:
         "steps are then fixed. Seconds are of training, pruning included, without scoring.",
         "Intervals: 95% by Student's t over the differences seed by seed. They speak of other "
         f"seeds on these scenes, not of other scenes. Of {_count(result)} intervals about "
-        f"{max(1, round(0.05 * _count(result)))} would leave out 0 by chance.",
+        f"{max(1, round(0.05 * _count(result)))} would leave out 0 by chance if no arm differed.",
         f"PSNR: {PSNR_CONVENTION}. SSIM: {SSIM_CONVENTION}. Scored on held-out test views, which "
         "nothing was tuned on."]
     if result.seeds < 5:

@@ -42,7 +42,8 @@ def draw(result: Result, path: Path) -> None:
             axes.set(xlabel=across[0], ylabel=up[0])
             axes.grid(color="0.92")
         line[0].set_title(name, fontsize=10)
-    panels[0][0].legend(fontsize=8)
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
     figure.suptitle(f"{result.host.cpu}, threads: {result.host.threads}", fontsize=9)
     with atomic.replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)
