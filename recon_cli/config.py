@@ -168,8 +168,17 @@ class TrainConfig(StageConfig):
     early_stop: bool = option(
         True, "Go on to the final phase once the validation views gain nothing more.")
     images: str = option(
-        "denoised", "Pixels to train on; scores always use the originals.",
-        choices=("denoised", "original"))
+        "auto", "Pixels to train on; scores always use the originals. auto: denoised where a trial "
+        "shows that it pays.", choices=("auto", "denoised", "original"))
+    far: str = option(
+        "auto", "Gaussians far outside, for what is seen through windows. auto: where several "
+        "views see nothing near and a trial shows that it pays.", choices=("auto", "on", "off"))
+    exposure: str = option(
+        "auto", "A gain for each image and channel, for cameras that set their exposure. auto: "
+        "where the images drift and a trial shows that it pays.", choices=("auto", "on", "off"))
+    poses: str = option(
+        "auto", "Refine the training cameras. auto: where their error is large and a trial shows "
+        "that it pays.", choices=("auto", "on", "off"))
     validation: float = option(
         0.05, "Share of the training views kept out to watch progress.", unit="share",
         minimum=0.0, maximum=0.5)
