@@ -48,17 +48,17 @@ def planned_task(
     first = plan.first_config(config)
     fit_memory = gaussians_that_fit(scene, first, ctx)
     task = load_task(scene, first, ctx)
-    needs = _needs(task, scene, inputs, ctx)
-    if needs.config.images == "denoised" and first.images != "denoised":
+    found = needs(task, scene, inputs, ctx)
+    if found.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
-    parts = {name: getattr(needs.config, name) for name in ("far", "exposure", "poses", "images")}
+    parts = {name: getattr(found.config, name) for name in ("far", "exposure", "poses", "images")}
     asked = dataclasses.replace(config, **parts)
     facts = Facts(plan.detail(task.train), len(task.train), len(scene.points), fit_memory)
-    made = _plan(asked, facts, task, scene, out, needs.seconds)
+    made = _plan(asked, facts, task, scene, out, found.seconds)
     _tell(made, asked, facts, ctx)
     run_config = made.config(asked)
     write_config(out, run_config)
-    write_json(out / PLAN, {**dataclasses.asdict(made), "needs": described(needs.decisions)})
+    write_json(out / PLAN, {**dataclasses.asdict(made), "needs": described(found.decisions)})
     return _with(task, run_config)
 
 
@@ -68,7 +68,7 @@ def recorded_plan(out: Path) -> Summary:
     return record
 
 
-def _needs(task: Task, scene: Scene, inputs: StageInputs, ctx: StageContext) -> Needs:
+def needs(task: Task, scene: Scene, inputs: StageInputs, ctx: StageContext) -> Needs:
     """Returns which parts of the model the scene needs, and says so."""
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
     config = task.schedule.config
@@ -82,11 +82,11 @@ def _needs(task: Task, scene: Scene, inputs: StageInputs, ctx: StageContext) -> 
 
     changed = config.images == "auto" and any(
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
-    needs = examine(Candidate(
+    found = examine(Candidate(
         task, scene.points, scene.colors, twins if changed else None, error))
-    for decision in needs.decisions:
+    for decision in found.decisions:
         logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
-    return needs
+    return found
 
 
 def _plan(

@@ -30,10 +30,12 @@ class Record:
     Attributes:
         point: how it ended.
         machine: that it ran on; seconds of two machines do not compare.
+        parts: optional parts of the model that were on, and the pixels trained on.
     """
 
     point: Point
     machine: str
+    parts: str = ""
 
 
 def key_of(where: Stand, digest: str, run: Run) -> str:
@@ -84,7 +86,8 @@ class Records:
     def run(self, key: str) -> Record | None:
         """Returns a finished run, None where there is none."""
         value = self._values.get(key)
-        return None if value is None else Record(Point(**value["point"]), value["machine"])
+        return None if value is None else Record(
+            Point(**value["point"]), value["machine"], value["parts"])
 
     def steps(self, key: str) -> Mapping[str, int] | None:
         """Returns steps that were fixed by arm, None where they were not."""

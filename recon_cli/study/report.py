@@ -139,6 +139,9 @@ def notes(result: Result) -> list[str]:
         f"Equal seconds: each arm takes as many steps as fit into the seconds {clock} that the "
         "slowest arm's take at equal steps, by the medians over the seeds measured first; the "
         "steps are then fixed. Seconds are of training, pruning included, without scoring.",
+        "Each arm is trained on " + "; ".join(
+            f"{scene}: {_parts(result, scene)}" for scene in result.scenes)
+        + ". The trials that decide so are not timed.",
         "Intervals: 95% by Student's t over the differences seed by seed. They speak of other "
         f"seeds on these scenes, not of other scenes. Of {_count(result)} intervals about "
         f"{max(1, round(0.05 * _count(result)))} would leave out 0 by chance if no arm differed.",
@@ -149,6 +152,14 @@ def notes(result: Result) -> list[str]:
     if len(result.machines) > 1:
         found.append("The runs are of several machines: their seconds do not compare.")
     return found
+
+
+def _parts(result: Result, scene: str) -> str:
+    """Returns which parts the models of a scene have, arms of the same parts together."""
+    found = result.parts(scene)
+    return ", ".join(
+        f"{parts} ({' and '.join(arm.label for arm in ARMS if found[arm.name] == parts)})"
+        for parts in dict.fromkeys(found.values()))
 
 
 def _count(result: Result) -> int:

@@ -75,6 +75,11 @@ class Result:
         """The scenes, and their mean where there are several."""
         return (*self.scenes, *((MEAN,) if len(self.scenes) > 1 else ()))
 
+    def parts(self, scene: str) -> dict[str, str]:
+        """Returns what the model of each arm was made of, by arm."""
+        runs = next(iter(self.scenes[scene].runs.values()))
+        return {name: records[0].parts for name, records in runs.items()}
+
     @property
     def machines(self) -> tuple[str, ...]:
         """The machines that the runs were made on."""
@@ -105,8 +110,10 @@ class Result:
             "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
             "run_on": list(self.machines), "seeds": self.seeds, "base": shared(self.base),
             "clock": self.clock, "arms": [arm.record() | {"label": arm.label} for arm in ARMS],
-            "scenes": {name: {key: value for key, value in vars(scene).items() if key != "runs"}
-                       for name, scene in self.scenes.items()},
+            "scenes": {name: {
+                "views": scene.views, "width": scene.width, "height": scene.height,
+                "digest": scene.digest, "parts": self.parts(name),
+            } for name, scene in self.scenes.items()},
             "comparisons": {
                 name: {row: self._compared(row, name) for row in self.rows}
                 for name in next(iter(self.scenes.values())).runs},

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from recon_cli import atomic, lock
 from recon_cli.bench.host import Host, examine
-from recon_cli.bench.training.scenes import checked, opened, refuse_unscored
+from recon_cli.bench.training.scenes import checked, opened
 from recon_cli.bench.training.trial import stand
 from recon_cli.errors import WorkspaceError
 from recon_cli.execute import rendering
@@ -62,9 +62,7 @@ def _machine(host: Host) -> str:
 def _ground(name: str, path: Path, request: Request, ctx: StageContext) -> Ground:
     place = opened(
         name, path, request.out / "scenes", request.settings, request.compute, ctx.progress)
-    scene = place.load(request.base)
-    refuse_unscored(place, scene, test=True)
-    return Ground(stand(name, scene, scene.test, request.base, ctx), place.digest)
+    return Ground(stand(place, "test", request.base, ctx), place.digest)
 
 
 def _write(out: Path, result: Result) -> None:

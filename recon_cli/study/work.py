@@ -137,7 +137,9 @@ class Work:
     def _made(self, ground: Ground, run: Run, on_step: Callable[[], None]) -> Record:
         """Makes a run and keeps it."""
         points = run_trial(ground.stand, run, (), on_step=on_step)
-        record = Record(points[-1], self._machine)
+        config = ground.stand.task(run.config).schedule.config
+        on = [name for name in ("far", "exposure", "poses") if getattr(config, name) == "on"]
+        record = Record(points[-1], self._machine, ", ".join([f"{config.images} images", *on]))
         self._records.add_run(
             key_of(ground.stand, ground.digest, run), record, run, ground.stand.name)
         return record

@@ -46,8 +46,7 @@ def wall(one: Point) -> float:
 @pytest.fixture
 def tiny(tmp_path: Path) -> trial.Stand:
     place = Place("tiny", make_inputs(tmp_path))
-    scene = place.load(BASE)
-    return stand("tiny", scene, scene.validation, BASE, StageContext(backend="numba"))
+    return stand(place, "validation", BASE, StageContext(backend="numba"))
 
 
 # ---- curves ----
@@ -79,15 +78,14 @@ def test_a_median_says_how_many_runs_it_is_of() -> None:
     assert report.middle([1.0, None]) == "-"
 
 
-def test_the_clock_stands_still_outside_its_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_clock_stands_still_in_its_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     walls, cpus = iter([1.0, 3.0, 10.0, 11.0]), iter([5.0, 9.0, 20.0, 20.5])
     monkeypatch.setattr(clock.time, "perf_counter", lambda: next(walls))
     monkeypatch.setattr(clock.time, "process_time", lambda: next(cpus))
     found = TrainingClock("cpu")
-    for _ in range(2):
-        with found.running():
-            pass
-    assert (found.seconds, found.cpu_seconds) == (3.0, 4.5)
+    with found.paused():  # from 3 to 10, and from 9 to 20
+        pass
+    assert found.seconds() == (3.0, 4.5)
 
 
 # ---- recipes ----
@@ -136,12 +134,12 @@ def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: trial.Stand)
     assert PAPER.prune
     assert (PAPER.prune.config.ratio, PAPER.prune.config.score) == (0.6, "paper")
     points = {one.iteration: one for one in run_trial(
-        tiny, Run(PAPER, BASE, 60, 0), (39, 40, 60), on_step=nothing)}
-    before, after = points[39].gaussians, points[40].gaussians
+        tiny, Run(PAPER, BASE, 60, 0), (40, 41, 60), on_step=nothing)}
+    before, after = points[40].gaussians, points[41].gaussians
     assert after == before - int(0.6 * before)
     assert points[60].gaussians == after  # nothing grows back
-    other = run_trial(tiny, Run(REFERENCE, BASE, 60, 0), (39,), on_step=nothing)
-    assert other[0].psnr_db == points[39].psnr_db  # the same run up to there
+    other = run_trial(tiny, Run(REFERENCE, BASE, 60, 0), (40,), on_step=nothing)
+    assert other[0].psnr_db == points[40].psnr_db  # the same run up to there
 
 
 def test_a_run_trains_on_no_view_that_is_scored(tiny: trial.Stand) -> None:

@@ -29,7 +29,8 @@ def scene(base_db, gains, machine="A CPU"):
             own = (0.5, -0.5, 0.0) if arm is ARMS[-1] else (0.0, 0.0, 0.0)
             runs[comparison][arm.name] = tuple(
                 Record(Point(100, 10.0, 20.0, 5000, 1_240_000, base_db + gain + noise + extra,
-                             (base_db + gain + noise + extra) / 50), machine)
+                             (base_db + gain + noise + extra) / 50), machine,
+                       "original images" + (", far" if arm in ARMS[2:] else ""))
                 for noise, extra in zip(NOISE, own, strict=True))
     return SceneResult(4, 600, 340, "digest", runs)
 
@@ -76,6 +77,8 @@ def test_the_words_say_whether_an_interval_contains_zero():
             "[-2.14, +0.34] contains 0: no difference shown.") in text
     assert "3 seeds are few" in text
     assert "several machines" not in text
+    assert ("home: original images (3DGS and paper), original images, far (ours and ours pruned)."
+            in text)
     one = Result(HOST, 1, RunConfig(), "wall", {"home": SceneResult(1, 9, 9, "", {
         name: {arm: records[:1] for arm, records in arms.items()}
         for name, arms in scene(20.0, (0.0, 1.0, 1.0, 1.0)).runs.items()})})
@@ -108,7 +111,9 @@ def test_the_record_holds_every_seed_and_is_json():
     assert home["differences"]["paper - reference"]["psnr_db"]["shown"] == "lower"
     assert record["arms"][1]["prune"]["ratio"] == 0.6
     assert record["scenes"]["home"] == {
-        "views": 4, "width": 600, "height": 340, "digest": "digest"}
+        "views": 4, "width": 600, "height": 340, "digest": "digest",
+        "parts": {"reference": "original images", "paper": "original images",
+                  "budget": "original images, far", "budget-pruned": "original images, far"}}
 
 
 def test_the_picture_is_drawn(tmp_path):

@@ -31,9 +31,7 @@ COSTS = {"reference": 0.5, "paper": 0.4, "budget": 0.25, "budget-pruned": 0.2}  
 @pytest.fixture
 def ground(tmp_path):
     place = Place("tiny", make_inputs(tmp_path / "tiny"))
-    scene = place.load(BASE)
-    return Ground(
-        stand("tiny", scene, scene.test, BASE, StageContext(backend="numba")), place.digest)
+    return Ground(stand(place, "test", BASE, StageContext(backend="numba")), place.digest)
 
 
 @pytest.fixture
@@ -162,7 +160,8 @@ def test_a_key_tells_everything_apart_that_decides(ground, monkeypatch):
 
 
 def test_a_record_comes_back_as_it_was(tmp_path):
-    record = Record(trial.Point(1, 2.0, 3.0, 4, 5, 6.789, 0.123), "a machine")
+    point = trial.Point(1, 2.0, 3.0, 4, 5, 6.789, 0.123)
+    record = Record(point, "a machine", "original images, far")
     Records(tmp_path).add_run("key", record, Run(ARMS[0], BASE, 1, 0), "tiny")
     assert Records(tmp_path).run("key") == record
     assert Records(tmp_path).run("other") is None

@@ -64,8 +64,10 @@ class Arm:
 PAPER_PRUNE = Prune(2 / 3, PruneConfig(ratio=0.6, score="paper", at="mid"))
 DEFAULT_PRUNE = Prune(_MID, PruneConfig(at="mid"))
 
-REFERENCE = Arm("reference", "3DGS", {"densify": "reference"})
-PAPER = Arm("paper", "paper", {"densify": "reference"}, PAPER_PRUNE)
+# 3DGS has Gaussians alone; which pixels are trained on is decided for all arms alike
+_PLAIN = {"densify": "reference", "far": "off", "exposure": "off", "poses": "off"}
+REFERENCE = Arm("reference", "3DGS", _PLAIN)
+PAPER = Arm("paper", "paper", _PLAIN, PAPER_PRUNE)
 BUDGET = Arm("budget", "ours", {"densify": "budget"})
 BUDGET_PRUNED = Arm("budget-pruned", "ours pruned", {"densify": "budget"}, DEFAULT_PRUNE)
 KNOWN: dict[str, Arm] = {arm.name: arm for arm in (

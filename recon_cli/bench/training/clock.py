@@ -10,30 +10,30 @@ import torch
 
 
 class TrainingClock:
-    """Sums up wall and CPU seconds of the blocks that it is told to time.
+    """Counts wall and CPU seconds from its making on, but for its pauses.
 
     Args:
         device: "cpu" or "cuda", whose queue is waited for.
-
-    Attributes:
-        seconds: on the wall.
-        cpu_seconds: of all threads of this process.
     """
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self.seconds = self.cpu_seconds = 0.0
+        self._zero = self._now()
+
+    def seconds(self) -> tuple[float, float]:
+        """Returns the seconds on the wall, and those of all threads of this process."""
+        wall, cpu = self._now()
+        return wall - self._zero[0], cpu - self._zero[1]
 
     @contextmanager
-    def running(self) -> Iterator[None]:
-        """Counts the time of the block."""
-        wall, cpu = self._now()
+    def paused(self) -> Iterator[None]:
+        """Leaves out the time of the block."""
+        began = self._now()
         try:
             yield
         finally:
-            now_wall, now_cpu = self._now()
-            self.seconds += now_wall - wall
-            self.cpu_seconds += now_cpu - cpu
+            ended = self._now()
+            self._zero = (self._zero[0] + ended[0] - began[0], self._zero[1] + ended[1] - began[1])
 
     def _now(self) -> tuple[float, float]:
         if self._device == "cuda":

@@ -14,7 +14,7 @@ from recon_cli.bench.training.arms import Arm
 from recon_cli.bench.training.curve import looks
 from recon_cli.bench.training.request import STEPS, Request
 from recon_cli.bench.training.result import ArmResult, Result, SceneResult, SeedRun
-from recon_cli.bench.training.scenes import checked, opened, refuse_unscored
+from recon_cli.bench.training.scenes import checked, opened
 from recon_cli.bench.training.trial import PILOT_STEPS, Run, Stand, pilot, run_trial, stand
 from recon_cli.execute import rendering
 from recon_cli.progress import Progress
@@ -43,9 +43,7 @@ def _stand(
     name: str, path: Path, scratch: Path, request: Request, ctx: StageContext
 ) -> Stand:
     place = opened(name, path, scratch, request.settings, request.compute, ctx.progress)
-    scene = place.load(request.base)
-    refuse_unscored(place, scene, test=False)
-    return stand(name, scene, scene.validation, request.base, ctx)
+    return stand(place, "validation", request.base, ctx)
 
 
 def _measured(where: Stand, request: Request, progress: Progress) -> SceneResult:

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
-from recon_cli.bench.training.arms import Arm
+from recon_cli.bench.training.arms import Arm, Prune
 from recon_cli.bench.training.clock import TrainingClock
 from recon_cli.bench.training.removal import remove
-from recon_cli.bench.training.scoring import load_scored, score
+from recon_cli.bench.training.scenes import Place, refuse_unscored
+from recon_cli.bench.training.scoring import Score, load_scored, score
 from recon_cli.config import RunConfig
 from recon_cli.errors import ConfigError
-from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.scene import Scene
 from recon_cli.stages.context import StageContext
 from recon_cli.stages.fitting import MASK_HINT, load_task
+from recon_cli.stages.planning import needs
 from recon_cli.train.fit import Task, fit
-from recon_cli.train.initialize import splats_from_points
+from recon_cli.train.gates import PARTS
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import TrainState, new_state
-from recon_cli.train.step import TrainView, fuses
+from recon_cli.train.start import first_state
+from recon_cli.train.state import TrainState
+from recon_cli.train.step import TrainView
 
 PILOT_STEPS = 200  # the count changes twice in them at the usual hundred steps
 _WARM_STEPS = 10  # caches and threads; the kernels are compiled before
@@ -75,38 +80,70 @@ class Stand:
     """A scene in memory, ready to be trained on by any arm.
 
     Attributes:
-        name: of the scene.
+        place: its folders.
         scene: its views and points.
         scored: the views that scores come from, with their original pixels.
+        base: options that all arms share.
         ctx: where to compute.
     """
 
-    name: str
+    place: Place
     scene: Scene
     scored: Sequence[TrainView]
+    base: RunConfig
     ctx: StageContext
-    _tasks: dict[str, Task] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of the scene."""
+        return self.place.name
+
+    @cached_property
+    def parts(self) -> dict[str, str]:
+        """The optional parts of the model that the scene needs, as `recon train` finds them."""
+        config = needs(self._loaded(self.base), self.scene, self.place.inputs, self.ctx).config
+        return {name: getattr(config, name) for name in PARTS}
 
     def task(self, config: RunConfig) -> Task:
         """Returns the task of a run; training itself looks at no view that it does not fit."""
-        if config.images not in self._tasks:
-            self._tasks[config.images] = load_task(self.scene, config, self.ctx)
+        open_parts = [name for name in PARTS if getattr(config, name) == "auto"]
+        if open_parts:  # not before it is asked for: it may take trials
+            changes: dict[str, Any] = {name: self.parts[name] for name in open_parts}
+            config = dataclasses.replace(config, **changes)
         return dataclasses.replace(
-            self._tasks[config.images], validation=[], schedule=Schedule(config))
+            self._loaded(config), validation=[], schedule=Schedule(config))
+
+    def _loaded(self, config: RunConfig) -> Task:
+        images = "denoised" if config.images == "denoised" else "original"
+        if images not in self._tasks:
+            self._tasks[images] = load_task(self.scene, config, self.ctx)
+        return dataclasses.replace(self._tasks[images], schedule=Schedule(config))
+
+    @cached_property
+    def _tasks(self) -> dict[str, Task]:
+        return {}
 
 
-def stand(
-    name: str, scene: Scene, scored: Sequence[View], base: RunConfig, ctx: StageContext
-) -> Stand:
+def stand(place: Place, scored: str, base: RunConfig, ctx: StageContext) -> Stand:
     """Returns a scene with the views in memory that scores come from.
 
+    Args:
+        place: its folders.
+        scored: "test" or "validation": which views are scored.
+        base: options that all arms share.
+        ctx: where to compute.
+
     Raises:
-        ConfigError: the views are too small, or their masks leave none.
+        ReconstructionError: no held-out view has a camera.
+        ConfigError: there are no validation views, the views are too small, or masks leave none.
     """
-    views = load_scored(scored, base.max_size, ctx)
+    scene = place.load(base)
+    refuse_unscored(place, scene, test=scored == "test")
+    views = load_scored(
+        scene.test if scored == "test" else scene.validation, base.max_size, ctx)
     if not views:
-        raise ConfigError(f"The masks of {name} leave no view to score.", hint=MASK_HINT)
-    return Stand(name, scene, views, ctx)
+        raise ConfigError(f"The masks of {place.name} leave no view to score.", hint=MASK_HINT)
+    return Stand(place, scene, views, base, ctx)
 
 
 def run_trial(
@@ -123,46 +160,46 @@ def run_trial(
     Raises:
         TrainingError: memory is short, or training diverged.
     """
-    config = run.config
-    task = where.task(config)
-    state = _first_state(where.scene, config, task)
-    cut = _cut(run)
+    task = where.task(run.config)
+    state = first_state(
+        task, where.scene.points, where.scene.colors, most=task.schedule.config.max_gaussians)
+    stops = sorted({*looks, run.iterations})
+    points: list[Point] = []
     clock = TrainingClock(where.ctx.device)
-    points = []
-    for stop in sorted({*looks, run.iterations} | ({cut} if cut else set())):
-        with clock.running():
+
+    def look() -> None:
+        seconds, cpu_seconds = clock.seconds()
+        with clock.paused():
+            found = _score(where, state, task)
+        points.append(Point(
+            state.iteration, round(seconds, 3), round(cpu_seconds, 3), found.gaussians,
+            found.bytes, found.psnr_db, found.ssim))
+
+    def advance(until: int) -> None:
+        while state.iteration < until:
+            stop = min(until, *(stop for stop in stops if stop > state.iteration))
             fit(state, task, stop, on_step=lambda _state: on_step(), on_report=lambda _report: None)
-            if stop == cut and run.arm.prune:
-                remove(state, task, run.arm.prune)
-        if stop in looks or stop == run.iterations:
-            points.append(_look(where, state, task, clock))
+            if stop in stops:
+                look()
+
+    if 0 in stops:
+        look()
+    if run.arm.prune is not None:
+        advance(_cut(run.arm.prune, run.iterations))
+        remove(state, task, run.arm.prune)
+    advance(run.iterations)
     return tuple(points)
 
 
-def _cut(run: Run) -> int | None:
-    """Returns the step after which the arm prunes."""
-    if run.arm.prune is None:
-        return None
-    return min(run.iterations, max(1, round(run.arm.prune.at * run.iterations)))
+def _cut(prune: Prune, iterations: int) -> int:
+    """Returns the step after which an arm prunes; at least one is left to recover."""
+    return min(iterations - 1, round(prune.at * iterations))
 
 
-def _first_state(scene: Scene, config: RunConfig, task: Task) -> TrainState:
-    """Returns what the train stage starts from."""
-    first = splats_from_points(
-        scene.points, scene.colors, most=config.max_gaussians, seed=config.seed,
-        sh_degree=config.sh_degree)
-    return new_state(
-        first.map(lambda tensor: tensor.to(task.device)), config, task.extent,
-        fused=fuses(task.backend))
-
-
-def _look(where: Stand, state: TrainState, task: Task, clock: TrainingClock) -> Point:
-    found = score(
+def _score(where: Stand, state: TrainState, task: Task) -> Score:
+    return score(
         state.splats.map(lambda tensor: tensor.detach()), where.scored,
         task.schedule.sh_degree(max(1, state.iteration)), where.ctx)
-    return Point(
-        state.iteration, round(clock.seconds, 3), round(clock.cpu_seconds, 3), found.gaussians,
-        found.bytes, found.psnr_db, found.ssim)
 
 
 def pilot(where: Stand, arm: Arm, base: RunConfig, *, on_step: Callable[[], None]) -> Point:
