@@ -30,8 +30,8 @@ from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.gathered import Gathered
 from recon_cli.train.importance import kept_rows, significance
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import TrainState, load_state
-from recon_cli.train.step import fuses
+from recon_cli.train.start import saved_state
+from recon_cli.train.state import TrainState
 
 _END_RECOVERY = 6  # the reference recovers for 5,000 steps after 30,000
 
@@ -43,14 +43,12 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     scene = load_scene(inputs, validation=train_config.validation)
     task = _following(load_task(scene, train_config, ctx), train)
     source = train / ("mid.safetensors" if config.at == "mid" else "final.safetensors")
-    fused = fuses(task.backend)
-    start = load_state(source, train_config, task.extent, task.device, fused=fused)
+    start = saved_state(source, task)
     until = _until(config, train_config, start.iteration)
     before, first, steps = len(start.splats), start.iteration, start.steps
     psnr_before = validation_psnr(start, task)
     if (out / CHECKPOINT).exists():
-        state = load_state(
-            out / CHECKPOINT, train_config, task.extent, task.device, fused=fused)
+        state = saved_state(out / CHECKPOINT, task)
     else:
         state = _pruned(start, task, config)
     psnr_pruned = None if state.iteration > first else validation_psnr(state, task)

@@ -18,7 +18,7 @@ from recon_cli.errors import ConfigError
 from recon_cli.scene.scene import Scene
 from recon_cli.stages.context import StageContext
 from recon_cli.stages.fitting import MASK_HINT, load_task
-from recon_cli.stages.planning import needs
+from recon_cli.stages.planning import parts_needed
 from recon_cli.train.fit import Task, fit
 from recon_cli.train.gates import PARTS
 from recon_cli.train.schedule import Schedule
@@ -101,7 +101,7 @@ class Stand:
     @cached_property
     def parts(self) -> dict[str, str]:
         """The optional parts of the model that the scene needs, as `recon train` finds them."""
-        config = needs(self._loaded(self.base), self.scene, self.place.inputs, self.ctx).config
+        config = parts_needed(self._loaded(self.base), self.scene, self.ctx).config
         return {name: getattr(config, name) for name in PARTS}
 
     def task(self, config: RunConfig) -> Task:
