@@ -10,7 +10,7 @@ from typing import Any
 
 from recon_cli.bench.training.arms import Arm, Prune
 from recon_cli.bench.training.clock import TrainingClock
-from recon_cli.bench.training.removal import remove
+from recon_cli.bench.training.removal import prune_rest
 from recon_cli.bench.training.scenes import Place, refuse_unscored
 from recon_cli.bench.training.scoring import Score, load_scored, score
 from recon_cli.config import RunConfig
@@ -175,7 +175,7 @@ def run_trial(
             state.iteration, round(seconds, 3), round(cpu_seconds, 3), found.gaussians,
             found.bytes, found.psnr_db, found.ssim))
 
-    def advance(until: int) -> None:
+    def advance(task: Task, until: int) -> None:
         while state.iteration < until:
             stop = min(until, *(stop for stop in stops if stop > state.iteration))
             fit(state, task, stop, on_step=lambda _state: on_step(), on_report=lambda _report: None)
@@ -185,9 +185,10 @@ def run_trial(
     if 0 in stops:
         look()
     if run.arm.prune is not None:
-        advance(_cut(run.arm.prune, run.iterations))
-        remove(state, task, run.arm.prune)
-    advance(run.iterations)
+        advance(task, _cut(run.arm.prune, run.iterations))
+        prune_rest(state, task, run.arm.prune, run.iterations, advance)
+    else:
+        advance(task, run.iterations)
     return tuple(points)
 
 
