@@ -1,0 +1,95 @@
+"""Far content: found where views see past the points, and only there."""
+
+import numpy as np
+import pytest
+import torch
+
+from recon_cli.render import render
+from recon_cli.scene.camera import Camera
+from recon_cli.train.far import faces, far_content, fibonacci_sphere, splats_of
+from recon_cli.train.step import TrainView
+
+SKY = (40, 90, 200)
+EXTENT = 1.0
+
+
+def looking(x, image):
+    """A view from (x, 0, 0) along z."""
+    viewmat = np.eye(4)
+    viewmat[0, 3] = -x
+    return TrainView(Camera(160, 120, 100.0, 100.0, 80.0, 60.0, viewmat), image)
+
+
+def room(window=True):
+    """Five views of a wall at z = 3 whose right half is open, and the wall's points."""
+    x, y = np.meshgrid(np.linspace(-4, 4, 161), np.linspace(-3, 3, 121))
+    wall = np.stack([x, y, np.full_like(x, 3.0)], -1).reshape(-1, 3)
+    if window:
+        wall = wall[wall[:, 0] < 0]
+    views = []
+    for at in np.linspace(-0.4, 0.4, 5):
+        image = np.full((120, 160, 3), 128, np.uint8)
+        edge = int(80 + 100 * (0 - at) / 3)
+        if window:
+            image[:, edge:] = SKY
+        views.append(looking(at, image))
+    return views, wall
+
+
+def test_directions_are_even_on_the_sphere():
+    sphere = fibonacci_sphere(2000)
+    assert np.allclose(np.linalg.norm(sphere, axis=1), 1)
+    assert np.abs(sphere.mean(axis=0)).max() < 2e-3
+    nearest = np.sort(sphere @ sphere[1000])[-2]
+    assert np.arccos(nearest) == pytest.approx(np.sqrt(4 * np.pi / 2000), rel=0.25)
+
+
+def test_what_is_seen_through_a_window_lies_far_outside_in_its_colour():
+    views, wall = room()
+    content = far_content(views, wall, EXTENT)
+    assert len(content.positions) > 20
+    distance = np.linalg.norm(content.positions, axis=1)
+    assert distance.min() > 90 * EXTENT
+    ahead = content.positions[content.positions[:, 2] > 90 * EXTENT * np.cos(np.radians(20))]
+    assert (ahead[:, 0] > -25).all()  # none behind the wall but for the margin
+    assert np.abs(content.colors - np.array(SKY) / 255).max() < 0.1
+
+
+def test_a_closed_room_has_no_far_content():
+    views, wall = room(window=False)
+    content = far_content(views, wall, EXTENT)
+    assert (len(content.positions), content.share) == (0, 0.0)
+    assert not faces(views[0], content, wall)
+
+
+def test_only_views_that_look_out_face_it():
+    views, wall = room()
+    content = far_content(views, wall, EXTENT)
+    assert faces(views[0], content, wall)
+    away = views[0].camera.viewmat.copy()
+    away[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ away[:3, :3]
+    camera = Camera(160, 120, 100.0, 100.0, 80.0, 60.0, away)
+    assert not faces(TrainView(camera, views[0].image), content, wall)
+
+
+def test_one_view_alone_cannot_tell():
+    views, wall = room()
+    assert len(far_content(views[:1], wall, EXTENT).positions) == 0
+
+
+def test_a_mask_hides_what_lies_far_outside():
+    views, wall = room()
+    hidden = [TrainView(view.camera, view.image, np.zeros((120, 160), bool)) for view in views]
+    assert len(far_content(hidden, wall, EXTENT).positions) == 0
+
+
+def test_its_gaussians_close_the_window_and_have_no_parallax():
+    views, wall = room()
+    splats = splats_of(far_content(views, wall, EXTENT), 0)
+    pictures = []
+    for view in (views[0], views[-1]):
+        with torch.no_grad():
+            pictures.append(render(splats, view.camera, torch.zeros(3), 0, backend="torch"))
+    middle = slice(50, 70), slice(110, 150)
+    assert pictures[0].alpha[middle].min() > 0.5
+    assert (pictures[0].rgb - pictures[1].rgb)[middle].abs().max() < 0.1
