@@ -135,6 +135,9 @@ def check_scale_between(value: tuple[str, str, float] | None) -> None:
             f"scale_between says {metres:g} metres, but it must be more than 0.", hint=_MEASURE)
 
 
+MIN_GAUSSIANS = 4  # the first ones are as large as the mean distance to 3 neighbours
+
+
 @dataclass(frozen=True)
 class TrainConfig(StageConfig):
     """How Gaussians are fitted: a recipe, scaled to the number of iterations.
@@ -144,11 +147,11 @@ class TrainConfig(StageConfig):
 
     quality: str = option(
         "normal", "Sets what is not given: iterations, longest side and cap of the count. On two "
-        "cores draft takes about 10 seconds, normal 40, high 4 minutes.",
+        "cores draft takes about 10 seconds, normal 40, high 2 to 4 minutes.",
         choices=("draft", "normal", "high"))
     minutes: float | None = option(
         None, "Time for the training: the steps and the cap of the count that fill it here, by a "
-        "few that are timed first. Excludes --iterations.", unit="minutes", minimum=0.0,
+        "few that are timed first. Excludes --iterations.", unit="minutes", minimum=0.01,
         automatic="as long as the iterations take")
     densify: str = option(
         "budget", "How Gaussians are added: budget (where the error is, the count on a line), "
@@ -156,14 +159,14 @@ class TrainConfig(StageConfig):
         choices=("budget", "reference", "mcmc"))
     iterations: int | None = option(
         None, "Optimization steps, one view each.", unit="steps", minimum=1,
-        automatic="by --quality: 1,500, 3,000 or 10,000")
+        automatic="by --quality: 1,500, 3,000 or 8,000")
     max_size: int | None = option(
         None, "Longest side of a training image; larger ones are reduced by area.",
-        unit="pixels", minimum=16, automatic="by --quality: 400, 600 or 960")
+        unit="pixels", minimum=16, automatic="by --quality: 400, 600 or 800")
     sh_degree: int = option(
         3, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3)
     max_gaussians: int | None = option(
-        None, "Densification stops at this count.", unit="Gaussians", minimum=1,
+        None, "Densification stops at this count.", unit="Gaussians", minimum=MIN_GAUSSIANS,
         automatic="by the detail of the images, the length of the run and the memory")
     early_stop: bool = option(
         True, "Go on to the final phase once the validation views gain nothing more.")
@@ -234,7 +237,7 @@ class RunConfig(TrainConfig):
     iterations: int = option(3000, "Optimization steps.", unit="steps", minimum=1)
     max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)
     max_gaussians: int = option(
-        60_000, "Densification stops at this count.", unit="Gaussians", minimum=1)
+        60_000, "Densification stops at this count.", unit="Gaussians", minimum=MIN_GAUSSIANS)
 
 
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians

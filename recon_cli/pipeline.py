@@ -164,7 +164,7 @@ def command(look: Inspection, check: Check) -> str:
     had, plain = look.config(check.row, latest.basis), look.config(check.row, None)
     for item in dataclasses.fields(check.row.config):
         value = getattr(had, item.name)
-        if value != getattr(plain, item.name) and option_info(item).hashed:
+        if value not in (None, getattr(plain, item.name)) and option_info(item).hashed:
             flag = item.name.replace("_", "-")
             if isinstance(value, bool):
                 words.append(f"--{flag}" if value else f"--no-{flag}")

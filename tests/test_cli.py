@@ -139,7 +139,7 @@ def test_status_shows_state_reason_and_summary(capsys: Said) -> None:
     assert len(lines) == 1 + len(NAMES)
     assert "fresh" in lines[1]
     assert "steps 6, length 1.5" in lines[1]
-    assert "train.iterations changed: 2000 -> 7" in lines[4]
+    assert "train.iterations changed: automatic -> 7" in lines[4]
 
 
 def test_status_as_json_has_stable_keys(capsys: Said) -> None:

@@ -32,7 +32,7 @@ def test_toml_round_trips_every_section(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("text", "message", "hint"), [
     ("[trian]\niterations = 3", "section trian", "Did you mean train?"),
     ("[train]\niteration = 3", "train.iteration,", "Did you mean iterations?"),
-    ("[train]\nxyz = 3", "train.xyz", "[train] knows iterations"),
+    ("[train]\nxyz = 3", "train.xyz", "[train] knows quality"),
     ("train = 3", "it is a section", "[train]"),
     ("[train\n", "not valid TOML", "Mend"),
 ])
@@ -71,7 +71,7 @@ def test_an_assignment_is_typed_as_its_field_is(text: str, expected: object) -> 
     ("train.iterations", "section.field=value"),
     ("iterations=3", "section.field=value"),
     ("train.iterations=many", "type int"),
-    ("train.iterations=automatic", "type int"),
+    ("train.seed=automatic", "type int"),
     ("sfm.scale_between=a.png 2", "3 values (str, str, float)"),
     ("sfm.scale_between=a.png b.png far", "3 values (str, str, float)"),
     ("sfm.scale_between=a.png 'b.png 2", "3 values (str, str, float)"),

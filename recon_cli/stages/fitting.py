@@ -54,11 +54,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     Raises:
         TrainingError: fewer than two views are left to train on, or memory is short.
     """
-    if len(scene.train) < 2:
-        raise TrainingError(
-            f"{len(scene.train)} views are left to train on; at least 2 are needed.",
-            hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
-
+    _refuse_too_few_views(scene)
     _check_memory(scene, config, ctx)
     train = load_views(scene.train, config, ctx)
     if len(train) < 2:
@@ -69,6 +65,13 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     return Task(
         train, load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), camera_error=error)
+
+
+def _refuse_too_few_views(scene: Scene) -> None:
+    if len(scene.train) < 2:
+        raise TrainingError(
+            f"{len(scene.train)} views are left to train on; at least 2 are needed.",
+            hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
 
 
 def load_views(
@@ -109,7 +112,12 @@ def sizes_of(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
 
 
 def gaussians_that_fit(scene: Scene, config: RunConfig, ctx: StageContext) -> int:
-    """Returns how many Gaussians memory has room for, before the images are loaded."""
+    """Returns how many Gaussians memory has room for, before the images are loaded.
+
+    Raises:
+        TrainingError: fewer than two views are left to train on.
+    """
+    _refuse_too_few_views(scene)
     one = _memory(scene, dataclasses.replace(config, max_gaussians=1), ctx)
     return room(one, _free_bytes(ctx))
 

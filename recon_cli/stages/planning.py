@@ -116,5 +116,5 @@ def first_or_saved(task: Task, scene: Scene, checkpoint: Path) -> TrainState:
     """Returns the state that a checkpoint holds, or the first one."""
     if checkpoint.exists():
         return saved_state(checkpoint, task)
-    return first_state(
-        task, scene.points, scene.colors, most=task.schedule.config.max_gaussians)
+    most = plan.first_count(task.schedule.config, len(scene.points))
+    return first_state(task, scene.points, scene.colors, most=most)

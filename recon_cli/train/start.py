@@ -32,7 +32,7 @@ def first_state(
         task: views and plan.
         points: sparse points in world units.
         colors: of them.
-        most: Gaussians, those that lie far outside included unless they were more than half.
+        most: Gaussians that begin at points; fewer where the cap must hold what lies far outside.
     """
     config = task.schedule.config
     far = far_content(task.train, points, task.extent) if config.far == "on" else None
@@ -80,8 +80,8 @@ def first_splats(
     """Returns the Gaussians before the first step: of the points, and of what lies far outside."""
     outside = 0 if far is None else len(far.positions)
     near = splats_from_points(
-        points, colors, most=max(most // 2, most - outside), seed=config.seed,
-        sh_degree=config.sh_degree)
+        points, colors, most=max(most // 2, min(most, config.max_gaussians - outside)),
+        seed=config.seed, sh_degree=config.sh_degree)
     if far is None or len(far.positions) == 0:
         return near
     return joined([near, splats_of(far, near.sh_rest.shape[1])])[0]

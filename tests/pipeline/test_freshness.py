@@ -54,7 +54,7 @@ def test_a_changed_field_makes_exactly_its_stage_and_those_behind_it_stale(
 
 def test_the_reason_names_the_field_and_both_values(job: Job) -> None:
     changed = stale(job_at(job.workspace.root, {"train": {"iterations": 100}}))
-    assert changed["train"] == ("train.iterations changed: 2000 -> 100",)
+    assert changed["train"] == ("train.iterations changed: automatic -> 100",)
     assert changed["export"][0] == "train is stale"
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from tiny_scene import VIEWS, make_inputs
 
-from recon_cli.config import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
+from recon_cli.config import EvaluateConfig, ExportConfig, PruneConfig, RunConfig
 from recon_cli.errors import (
     ConfigError,
     FormatError,
@@ -28,7 +28,7 @@ from recon_cli.stages import evaluate, export, fitting, prune, train
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train.state import save_state
 
-CONFIG = TrainConfig(
+CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
     checkpoint_every=7)
 PRUNE = PruneConfig(ratio=0.5, at="mid")
@@ -74,7 +74,8 @@ def stopping_after(steps, monkeypatch):
 def test_training_leaves_a_scene_its_states_and_a_log(inputs):
     folder = inputs.folders["train"]
     assert sorted(p.name for p in folder.iterdir()) == [
-        "config.json", "final.safetensors", "log.jsonl", "mid.safetensors", "splats.ply"]
+        "config.json", "final.safetensors", "log.jsonl", "mid.safetensors",
+        "plan.json", "splats.ply"]
     rows = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     assert rows[-1]["iteration"] == 160
     assert rows[-1]["gaussians"] == len(read_ply(folder / "splats.ply"))

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from tiny_scene import TWO, make_inputs, write_masks
 
-from recon_cli.config import EvaluateConfig, PruneConfig, TrainConfig
+from recon_cli.config import EvaluateConfig, PruneConfig, RunConfig
 from recon_cli.io.images import read_image
 from recon_cli.metrics import psnr
 from recon_cli.stages import evaluate, fitting, prune, train
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train.memory import estimate
 
-CONFIG = TrainConfig(
+CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05)
 SIZES = {"000000.png": (48, 36), "000004.png": (30, 44), "000008.png": (48, 36)}  # held out
 

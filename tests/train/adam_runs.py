@@ -4,13 +4,13 @@ import pytest
 import torch
 from scenes import random_splats
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.train.optimizer import SplatOptimizer
 
 # float32 in another order of operations, over 20 steps: a few units in the last place.
 STEPS_TOLERANCE = 1e-6
 ROLES = "exp_avg", "exp_avg_sq"
-CONFIG = TrainConfig(max_gaussians=50)
+CONFIG = RunConfig(max_gaussians=50)
 both_kinds = pytest.mark.parametrize("fused", [False, True])
 
 

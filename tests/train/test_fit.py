@@ -5,26 +5,24 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from scenes import camera_at, random_splats, with_harmonics
+from tiny_task import (
+    CONFIG,
+    EXTENT,
+    STRATEGIES,
+    first_state,
+    same,
+    saved_and_loaded,
+    tiny_task,
+)
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.io.images import painted
 from recon_cli.render import available_backends, render
 from recon_cli.render.numba.crew import crew
-from recon_cli.train.fit import Task, fit, validation_psnr
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import load_state, new_state, save_state
-from recon_cli.train.step import TrainView, fuses, gradient_step
-
-CONFIG = TrainConfig(
-    iterations=60, densify="reference", densify_every=10, densify_gradient=1e-5, max_gaussians=90,
-    sh_rate=0.05)
-STRATEGIES = {
-    name: TrainConfig(iterations=60, densify=name, densify_every=10, max_gaussians=90, sh_rate=0.05)
-    for name in ("budget", "mcmc")} | {"reference": CONFIG}
-EXTENT = 1.0
-
+from recon_cli.train.fit import fit, validation_psnr
+from recon_cli.train.state import load_state, save_state
+from recon_cli.train.step import TrainView, gradient_step
 
 RUNS = [(status.name, device) for status in available_backends() if not status.missing
         for device in status.devices]
@@ -32,17 +30,6 @@ every_run = pytest.mark.parametrize(("backend", "device"), RUNS)
 every_strategy = pytest.mark.parametrize("config", STRATEGIES.values(), ids=STRATEGIES)
 every_cpu_backend = pytest.mark.parametrize(
     "backend", [backend for backend, device in RUNS if device == "cpu"])
-
-
-def tiny_task(config=CONFIG, device="cpu", backend="torch"):
-    truth = random_splats(40, seed=0, dtype=torch.float32)
-    views = []
-    for i in range(5):
-        camera = camera_at(40, 30, focal=30.0 + 2 * i)
-        with torch.no_grad():
-            rgb = render(truth, camera, torch.zeros(3), 0).rgb
-        views.append(TrainView(camera, (rgb.clamp(0, 1) * 255).to(torch.uint8).numpy()))
-    return Task(views[1:], views[:1], Schedule(config), EXTENT, backend, torch.device(device))
 
 
 def masked_task(backend, device="cpu"):
@@ -56,29 +43,9 @@ def masked_task(backend, device="cpu"):
     return task
 
 
-def first_state(config=CONFIG, device="cpu", backend="torch", *, colored=40):
-    splats = with_harmonics(
-        random_splats(40, seed=0, dtype=torch.float32), config.sh_degree, colored)
-    splats.sh_dc = torch.zeros(40, 3)
-    return new_state(splats.map(lambda tensor: tensor.to(device)), config, EXTENT,
-                     fused=fuses(backend))
-
-
-def saved_and_loaded(state, folder, device="cpu", backend="torch", config=CONFIG):
-    """The state after a process that ended and another that began, maybe on another backend."""
-    save_state(folder / "state.safetensors", state)
-    return load_state(folder / "state.safetensors", config, EXTENT, torch.device(device),
-                      fused=fuses(backend))
-
-
 def run(state, task, until, **hooks):
     fit(state, task, until, on_step=hooks.get("on_step", lambda _: None),
         on_report=hooks.get("on_report", lambda _: None))
-
-
-def same(a, b):
-    return all(torch.equal(value, getattr(b.splats, name))
-               for name, value in a.splats.parameters().items())
 
 
 @every_run
@@ -160,7 +127,7 @@ def test_validation_scores_the_pixels_that_count():
 
 
 def test_another_seed_gives_another_result():
-    first, second = first_state(), first_state(TrainConfig(**{**vars(CONFIG), "seed": 1}))
+    first, second = first_state(), first_state(RunConfig(**{**vars(CONFIG), "seed": 1}))
     run(first, tiny_task(), 10)
     run(second, tiny_task(), 10)
     assert not same(first, second)
@@ -192,7 +159,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(
 def test_a_run_in_which_only_some_have_harmonics_resumes_to_the_same_bits(
     tmp_path, degree, colored, backend, device
 ):
-    config = TrainConfig(**{**vars(CONFIG), "sh_degree": degree})
+    config = RunConfig(**{**vars(CONFIG), "sh_degree": degree})
     task = tiny_task(config, device, backend)
     whole, part = (first_state(config, device, backend, colored=colored) for _ in range(2))
     run(whole, task, 45)
@@ -316,6 +283,6 @@ def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monke
 @every_cpu_backend
 @pytest.mark.parametrize("strategy", ["reference", "budget", "mcmc"])
 def test_deleting_every_gaussian_is_an_error(backend, strategy):
-    config = TrainConfig(iterations=40, densify_every=10, min_opacity=1.0, densify=strategy)
+    config = RunConfig(iterations=40, densify_every=10, min_opacity=1.0, densify=strategy)
     with pytest.raises(TrainingError, match="No Gaussian is left"):
         run(first_state(config, backend=backend), tiny_task(config, backend=backend), 40)

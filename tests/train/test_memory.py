@@ -3,7 +3,7 @@
 import pytest
 
 from recon_cli.errors import TrainingError
-from recon_cli.train.memory import estimate, refuse_what_does_not_fit
+from recon_cli.train.memory import estimate, refuse_what_does_not_fit, room
 
 
 def needed(**changes):
@@ -42,3 +42,13 @@ def test_the_error_says_what_to_lower(changes, option):
     with pytest.raises(TrainingError, match="MB are free") as caught:
         refuse_what_does_not_fit(needed(**changes), 8_000_000_000)
     assert option in caught.value.hint
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_as_many_gaussians_fit_as_there_is_room_for_and_no_more(fused):
+    bare, free = needed(gaussians=0, fused=fused), 1_500_000_000
+    most = room(bare, free, fused=fused)
+    refuse_what_does_not_fit(needed(gaussians=most, fused=fused), free)
+    with pytest.raises(TrainingError):
+        refuse_what_does_not_fit(needed(gaussians=most + 1, fused=fused), free)
+    assert room(bare, 1000, fused=fused) == 0

@@ -5,7 +5,7 @@ import torch
 from adam_runs import CONFIG, ROLES, assert_close, both_kinds, held, optimizer_of, walk
 from scenes import joined, random_splats
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.render.numba.crew import crew
 from recon_cli.scene.splats import Splats
 from recon_cli.train.optimizer import SplatOptimizer
@@ -14,7 +14,7 @@ BYTES = 1500  # a Gaussian may take in training: what is promised for a million 
 
 
 def stepped(splats, times=3):
-    optimizer = SplatOptimizer(splats.map(lambda t: t.float()), TrainConfig(), extent=2.0)
+    optimizer = SplatOptimizer(splats.map(lambda t: t.float()), RunConfig(), extent=2.0)
     for _ in range(times):
         loss = sum(p.square().sum() for p in optimizer.splats.parameters().values())
         loss.backward()

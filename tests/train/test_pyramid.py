@@ -47,9 +47,9 @@ def test_sizes_that_do_not_divide_keep_the_field_of_view():
 
 
 def test_a_reduced_pixel_counts_only_where_all_that_it_covers_counts():
-    mask = np.ones((48, 64), bool)
+    mask = np.ones((96, 128), bool)
     mask[10, 10] = False
-    small = reduced(view(mask=mask), 4)
+    small = reduced(view(128, 96, mask), 4)
     assert small.mask is not None
     assert not small.mask[2, 2]
     assert small.mask.sum() == small.mask.size - 1

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scenes import camera_at, joined, one_splat, random_splats
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.io.images import painted
 from recon_cli.render import render
 from recon_cli.train.losses import photometric_loss
@@ -14,7 +14,7 @@ from recon_cli.train.step import TrainView, fuses, gradient_step
 
 # Gradients of float32 against float64, relative in the 2-norm. Measured 3e-6 (torch), 8e-7 (numba).
 TOLERANCE = 1e-5
-CONFIG = TrainConfig(iterations=10, max_gaussians=300)
+CONFIG = RunConfig(iterations=10, max_gaussians=300)
 CAMERA = camera_at(60, 41)
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 

@@ -21,6 +21,7 @@ from recon_cli.stages.fitting import MASK_HINT, load_task
 from recon_cli.stages.planning import parts_needed
 from recon_cli.train.fit import Task, fit
 from recon_cli.train.gates import PARTS
+from recon_cli.train.plan import first_count
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.start import first_state
 from recon_cli.train.state import TrainState
@@ -162,7 +163,8 @@ def run_trial(
     """
     task = where.task(run.config)
     state = first_state(
-        task, where.scene.points, where.scene.colors, most=task.schedule.config.max_gaussians)
+        task, where.scene.points, where.scene.colors,
+        most=first_count(task.schedule.config, len(where.scene.points)))
     stops = sorted({*looks, run.iterations})
     points: list[Point] = []
     clock = TrainingClock(where.ctx.device)

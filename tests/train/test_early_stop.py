@@ -1,0 +1,113 @@
+"""When a run that has flattened goes on to its final phase, and that a resumed one does too."""
+
+from dataclasses import replace
+
+import pytest
+from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, tiny_task
+
+from recon_cli.config import RunConfig
+from recon_cli.train import fit as fitting
+from recon_cli.train.early_stop import next_iteration
+from recon_cli.train.fit import fit
+from recon_cli.train.schedule import Schedule
+
+PLAN = Schedule(RunConfig(iterations=1000))
+
+
+def looks(*values, every=50):
+    return [(every * (i + 1), value) for i, value in enumerate(values)]
+
+
+FLAT = looks(*[20.0] * 20)
+RISING = looks(*[20 + 0.02 * i for i in range(20)])
+
+
+@pytest.mark.parametrize(("iteration", "expected"), [
+    (300, None), (600, None), (650, 800), (750, 800), (800, None), (1000, None)])
+def test_a_flat_run_jumps_after_densification_and_before_the_final_phase(iteration, expected):
+    assert next_iteration(PLAN, iteration, FLAT[: iteration // 50]) == expected
+
+
+def test_a_run_that_gains_two_hundredths_in_a_tenth_goes_on():
+    assert next_iteration(PLAN, 700, RISING[:14]) is None
+
+
+def test_a_run_whose_middle_is_not_kept_yet_goes_on():
+    late = Schedule(RunConfig(iterations=1000, mid=0.7))
+    assert next_iteration(late, 700, FLAT[:14]) is None
+    assert next_iteration(late, 750, FLAT[:15]) == 800
+
+
+def test_a_recipe_without_a_final_phase_jumps_to_its_last_fifth():
+    plan = Schedule(RunConfig(iterations=1000, densify="reference"))
+    assert next_iteration(plan, 700, FLAT[:14]) == 800
+
+
+def test_without_looks_there_is_nothing_to_judge():
+    assert next_iteration(PLAN, 700, []) is None
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_the_smallest_runs_never_jump(iterations):
+    plan = Schedule(RunConfig(iterations=iterations))
+    for iteration in range(1, iterations + 1):
+        assert next_iteration(plan, iteration, [(1, 20.0), (2, 20.0)]) is None
+
+
+@pytest.fixture
+def flat(monkeypatch):
+    """Reports every two steps of validation views that never change."""
+    monkeypatch.setattr(fitting, "report_every", lambda _: 2)
+    monkeypatch.setattr(fitting, "validation_psnr", lambda *_: 20.0)
+
+
+def run(state, task, until=60):
+    reports = []
+    fit(state, task, until, on_step=lambda _: None, on_report=reports.append)
+    return reports
+
+
+@pytest.mark.usefixtures("flat")
+@pytest.mark.parametrize("config", [CONFIG, *STRATEGIES.values()])
+def test_the_steps_between_are_not_taken_and_the_final_phase_is(config):
+    state = first_state(config)
+    reports = run(state, tiny_task(config))
+    assert state.jump == (38, 48)
+    assert (state.iteration, state.steps) == (60, 50)
+    assert [(r.iteration, r.goes_on_at) for r in reports if r.goes_on_at] == [(38, 48)]
+    assert state.optimizer.count == 50
+
+
+@pytest.mark.usefixtures("flat")
+@pytest.mark.parametrize("stop", [17, 37, 38, 50])
+def test_a_resumed_run_jumps_at_the_same_step_to_the_same_bits(tmp_path, stop):
+    whole, part = first_state(), first_state()
+    run(whole, tiny_task())
+    run(part, tiny_task(), stop)
+    resumed = saved_and_loaded(part, tmp_path)
+    run(resumed, tiny_task())
+    assert same(whole, resumed)
+    assert (resumed.jump, resumed.looks) == (whole.jump, whole.looks)
+
+
+@pytest.mark.usefixtures("flat")
+def test_it_can_be_switched_off():
+    config = replace(CONFIG, early_stop=False)
+    state = first_state(config)
+    run(state, tiny_task(config))
+    assert (state.jump, state.steps) == (None, 60)
+
+
+def test_without_validation_views_a_run_takes_all_its_steps(monkeypatch):
+    monkeypatch.setattr(fitting, "report_every", lambda _: 2)
+    state, task = first_state(), replace(tiny_task(), validation=[])
+    run(state, task)
+    assert (state.jump, state.steps) == (None, 60)
+
+
+@pytest.mark.usefixtures("flat")
+def test_a_branch_jumps_where_the_other_run_did():
+    state = first_state()
+    run(state, replace(tiny_task(), jump=(44, 52)))
+    assert state.jump == (44, 52)
+    assert state.steps == 52

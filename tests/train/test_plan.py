@@ -1,0 +1,111 @@
+"""What is decided where the user left it open: in closed form, on a model of known cost."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import camera_at
+
+from recon_cli.config import RunConfig, TrainConfig
+from recon_cli.errors import ConfigError
+from recon_cli.train import plan
+from recon_cli.train.cost import CostModel, LevelCost
+from recon_cli.train.plan import QUALITIES, Facts, make_plan
+from recon_cli.train.step import TrainView
+
+FACTS = Facts(detail=60_000, views=40, points=9000, room=10**9)
+FREE = LevelCost(1, 0.0, 0.0)
+# ten milliseconds a step, whatever the count
+COST = CostModel(tuple(LevelCost(level, 10.0, 0.0) for level in (1, 2, 4)), FREE, 0.0, 0.5)
+
+
+def test_iterations_and_minutes_exclude_each_other():
+    with pytest.raises(ConfigError, match="iterations is 100 and minutes is 2") as caught:
+        TrainConfig(iterations=100, minutes=2)
+    assert "--minutes" in caught.value.hint
+
+
+@pytest.mark.parametrize("quality", ["draft", "normal", "high"])
+def test_the_quality_sets_what_is_not_given(quality):
+    made = make_plan(TrainConfig(quality=quality), FACTS, COST)
+    assert made.iterations == QUALITIES[quality].iterations
+    assert made.max_size == QUALITIES[quality].max_size
+    given = make_plan(
+        TrainConfig(quality=quality, iterations=7, max_size=99, max_gaussians=50), FACTS, COST)
+    assert (given.iterations, given.max_size, given.max_gaussians) == (7, 99, 50)
+
+
+def test_the_defaults_of_a_run_are_those_of_the_normal_quality():
+    assert (RunConfig().iterations, RunConfig().max_size) == (
+        QUALITIES["normal"].iterations, QUALITIES["normal"].max_size)
+
+
+@pytest.mark.parametrize("minutes", [0.1, 1.0, 10.0])
+def test_minutes_are_filled_calibration_included(minutes):
+    made = make_plan(TrainConfig(minutes=minutes), FACTS, COST)
+    assert made.iterations == pytest.approx((60 * minutes - 0.5) / 0.01, abs=1)
+    assert made.seconds + COST.seconds <= 60 * minutes
+
+
+def test_a_hundredth_of_a_minute_gives_the_smallest_run():
+    made = make_plan(TrainConfig(minutes=0.01), FACTS, COST)
+    assert made.iterations == 100
+    assert made.max_gaussians >= 5000
+
+
+def test_no_time_makes_a_run_endless():
+    assert make_plan(TrainConfig(minutes=1e6), FACTS, COST).iterations == 100_000
+
+
+def test_the_same_numbers_given_make_the_same_config():
+    asked = TrainConfig(minutes=0.3, seed=4)
+    made = make_plan(asked, FACTS, COST)
+    again = TrainConfig(iterations=made.iterations, max_gaussians=made.max_gaussians,
+                        max_size=made.max_size, seed=4)
+    assert made.config(asked) == make_plan(again, FACTS, COST).config(again)
+
+
+def test_the_cap_grows_with_the_root_of_the_steps_and_with_the_detail():
+    asked = TrainConfig()
+    assert plan.cap(asked, FACTS, 6000) == 60_000
+    assert plan.cap(asked, FACTS, 1500) == 30_000
+    assert plan.cap(asked, replace(FACTS, detail=30_000), 6000) == 30_000
+    assert plan.cap(asked, replace(FACTS, views=2), 6000) == 15_000
+    assert plan.cap(asked, replace(FACTS, detail=0), 6000) == 5000
+    assert plan.cap(TrainConfig(max_gaussians=77), FACTS, 6000) == 77
+
+
+def test_memory_lowers_the_cap():
+    made = make_plan(TrainConfig(), replace(FACTS, room=12_345), COST)
+    assert made.max_gaussians == 12_345
+    assert make_plan(TrainConfig(), replace(FACTS, room=0), COST).max_gaussians == 4
+
+
+def test_a_count_that_grows_begins_with_a_quarter_of_its_cap_and_never_with_more_than_points():
+    config = RunConfig(max_gaussians=80_000)
+    assert plan.first_count(config, 100_000) == 20_000
+    assert plan.first_count(config, 9000) == 9000
+    assert plan.first_count(replace(config, max_gaussians=50), 100_000) == 50
+    assert plan.first_count(replace(config, densify="reference"), 100_000) == 80_000
+
+
+def view(image, mask=None):
+    height, width = image.shape[:2]
+    return TrainView(camera_at(width, height, focal=30.0), image, mask)
+
+
+def test_detail_counts_the_pixels_at_edges():
+    flat = np.full((20, 30, 3), 90, np.uint8)
+    edge = flat.copy()
+    edge[:, 15:] = 190
+    assert plan.detail([view(flat)]) == 0
+    assert plan.detail([view(edge)]) == 2 * 20  # a column on either side
+    assert plan.detail([view(flat), view(edge)]) == 20
+    hidden = np.ones((20, 30), bool)
+    hidden[:10] = False
+    assert plan.detail([view(edge, hidden)]) == 20
+
+
+def test_faint_noise_is_no_detail():
+    noise = np.random.default_rng(0).normal(100, 2, (40, 60, 1)).repeat(3, 2)
+    assert plan.detail([view(noise.round().astype(np.uint8))]) < 0.01 * 2400

@@ -1,0 +1,50 @@
+"""A training on a tiny scene of known truth, for the tests of the loop."""
+
+import torch
+from scenes import camera_at, random_splats, with_harmonics
+
+from recon_cli.config import RunConfig
+from recon_cli.render import render
+from recon_cli.train.fit import Task
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.state import load_state, new_state, save_state
+from recon_cli.train.step import TrainView, fuses
+
+CONFIG = RunConfig(
+    iterations=60, densify="reference", densify_every=10, densify_gradient=1e-5, max_gaussians=90,
+    sh_rate=0.05)
+STRATEGIES = {
+    name: RunConfig(iterations=60, densify=name, densify_every=10, max_gaussians=90, sh_rate=0.05)
+    for name in ("budget", "mcmc")} | {"reference": CONFIG}
+EXTENT = 1.0
+
+
+def tiny_task(config=CONFIG, device="cpu", backend="torch"):
+    truth = random_splats(40, seed=0, dtype=torch.float32)
+    views = []
+    for i in range(5):
+        camera = camera_at(40, 30, focal=30.0 + 2 * i)
+        with torch.no_grad():
+            rgb = render(truth, camera, torch.zeros(3), 0).rgb
+        views.append(TrainView(camera, (rgb.clamp(0, 1) * 255).to(torch.uint8).numpy()))
+    return Task(views[1:], views[:1], Schedule(config), EXTENT, backend, torch.device(device))
+
+
+def first_state(config=CONFIG, device="cpu", backend="torch", *, colored=40):
+    splats = with_harmonics(
+        random_splats(40, seed=0, dtype=torch.float32), config.sh_degree, colored)
+    splats.sh_dc = torch.zeros(40, 3)
+    return new_state(splats.map(lambda tensor: tensor.to(device)), config, EXTENT,
+                     fused=fuses(backend))
+
+
+def saved_and_loaded(state, folder, device="cpu", backend="torch", config=CONFIG):
+    """The state after a process that ended and another that began, maybe on another backend."""
+    save_state(folder / "state.safetensors", state)
+    return load_state(folder / "state.safetensors", config, EXTENT, torch.device(device),
+                      fused=fuses(backend))
+
+
+def same(a, b):
+    return all(torch.equal(value, getattr(b.splats, name))
+               for name, value in a.splats.parameters().items())
