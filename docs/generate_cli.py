@@ -24,7 +24,11 @@ Shell completion: `eval "$(_RECON_COMPLETE=bash_source recon)"`, with `zsh_sourc
 def reference() -> str:
     """Returns the whole page."""
     sections = [INTRODUCTION, _section("recon", cli)]
-    sections += [_section(f"recon {name}", verb) for name, verb in cli.commands.items()]
+    for name, verb in cli.commands.items():
+        sections.append(_section(f"recon {name}", verb))
+        if isinstance(verb, click.Group):
+            sections += [_section(f"recon {name} {under}", command)
+                         for under, command in verb.commands.items()]
     return "\n".join(sections)
 
 

@@ -29,6 +29,7 @@ from recon_cli.pipeline import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress
 from recon_cli.settings import Settings
 from recon_cli.stages import STAGES
+from recon_cli.study.command import study
 from recon_cli.workspace import SETTINGS, Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
@@ -304,9 +305,7 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
 
 
 @cli.command("doctor")
-@click.option(
-    "--json", "as_json", is_flag=True,
-    help="Print the same as JSON.  [default: off]")
+@click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.  [default: off]")
 @options.common()
 @pass_call
 def show_doctor(call: Call, as_json: bool) -> None:
@@ -317,3 +316,4 @@ def show_doctor(call: Call, as_json: bool) -> None:
 
 
 cli.add_command(bench)
+cli.add_command(study)

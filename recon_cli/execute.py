@@ -180,19 +180,29 @@ def _recorder(
 
 
 def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:
+    if row.renders:
+        return dataclasses.replace(rendering(job.compute, job.progress), record=record)
     threads = job.compute.threads or machine.usable_threads()
-    if not row.renders:
-        return StageContext(progress=job.progress, threads=threads, record=record)
+    return StageContext(progress=job.progress, threads=threads, record=record)
+
+
+def rendering(compute: ComputeConfig, progress: Progress) -> StageContext:
+    """Returns where to train and render, once the rasterizer is ready.
+
+    Raises:
+        BackendError: what was asked for is not there.
+    """
     # Importing torch takes seconds, which status and --help must not pay.
     from recon_cli.render import registry  # noqa: PLC0415
 
-    backend, device = registry.resolve(job.compute.backend, job.compute.device)
+    threads = compute.threads or machine.usable_threads()
+    backend, device = registry.resolve(compute.backend, compute.device)
     registry.use_threads(backend, threads)
-    _prepare_kernels(job, backend)
-    return StageContext(job.progress, device, backend, threads, record)
+    _prepare_kernels(progress, backend)
+    return StageContext(progress, device, backend, threads)
 
 
-def _prepare_kernels(job: Job, backend: str) -> None:
+def _prepare_kernels(progress: Progress, backend: str) -> None:
     """Loads the kernels of a backend, or compiles them with something to look at."""
     from recon_cli.render import registry  # noqa: PLC0415 (imports torch)
 
@@ -200,7 +210,7 @@ def _prepare_kernels(job: Job, backend: str) -> None:
     if not count:  # kernels that turn out to be damaged are compiled here too
         registry.prepare(backend, lambda: None)
         return
-    with job.progress.bar("compile for this CPU, once", count, unit="kernel") as bar:
+    with progress.bar("compile for this CPU, once", count, unit="kernel") as bar:
         seconds = registry.prepare(backend, bar.advance)
     logger.info("kernels compiled in %.1f s", seconds)
 

@@ -20,12 +20,13 @@ HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read e
 
 
 @contextmanager
-def held(root: Path, verb: str) -> Iterator[None]:
+def held(root: Path, verb: str, *, other: str = "another workspace with -w") -> Iterator[None]:
     """Holds the lock of the workspace at `root` for as long as the block runs.
 
     Args:
         root: an existing folder.
         verb: what the user typed, for whoever comes second.
+        other: what to give instead, for the hint.
 
     Raises:
         WorkspaceError: another process holds the lock; the message says which.
@@ -36,7 +37,7 @@ def held(root: Path, verb: str) -> Iterator[None]:
     except Timeout as error:
         raise WorkspaceError(
             f"{root} is in use by {_holder(root)}.",
-            hint="Wait until it is done, or give another workspace with -w.") from error
+            hint=f"Wait until it is done, or give {other}.") from error
     try:
         write_json(root / HOLDER, {
             "pid": os.getpid(), "host": socket.gethostname(), "verb": verb,

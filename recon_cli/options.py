@@ -108,16 +108,19 @@ def compare() -> Decorator:
              "the workspace, and stop.  [default: off]")
 
 
-def assignments() -> Decorator:
-    """Returns a decorator that adds --set, for the verbs that run many stages."""
+def assignments(example: str = "train.iterations=1000") -> Decorator:
+    """Returns a decorator that adds --set, for the verbs that run many stages.
+
+    Args:
+        example: that the help shows.
+    """
     def keep(ctx: click.Context, _parameter: click.Parameter, values: tuple[str, ...]) -> None:
         ctx.ensure_object(Call).assigned = merged(parse_assignment(text) for text in values)
 
     return click.option(
         "--set", "assigned", multiple=True, metavar="SECTION.FIELD=VALUE", expose_value=False,
         callback=keep,
-        help="Set an option of any stage, such as train.iterations=1000; may be repeated.  "
-             "[default: none]")
+        help=f"Set an option of any stage, such as {example}; may be repeated.  [default: none]")
 
 
 def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:

@@ -49,15 +49,19 @@ ALLOWED: dict[str, set[str]] = {
     "report": {"doctor", "pipeline"},
     "options": OPTIONS | {"settings"},
     "bench": BOTTOM | OPTIONS | {
-        "settings", "options", "machine", "progress", "scene", "render", "train"},
+        "settings", "options", "machine", "progress", "metrics", "scene", "render", "train", "io",
+        "stages", "digests", "workspace", "execute", "pipeline"},
+    "study": BOTTOM | OPTIONS | {
+        "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
+        "execute", "bench"},
     "cli": OPTIONS | {
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
-        "progress", "stages", "workspace", "bench"},
+        "progress", "stages", "workspace", "bench", "study"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "options", "bench"},
-    "matplotlib": {"bench"},
+    "click": {"cli", "options", "bench", "study"},
+    "matplotlib": {"bench", "study"},
     "numba": {"render"},
     "llvmlite": {"render"},
     "tqdm": {"progress"},

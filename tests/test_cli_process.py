@@ -34,7 +34,7 @@ def test_completion_gives_a_script_and_the_verbs() -> None:
     script = _recon(_RECON_COMPLETE="zsh_source")
     assert script.returncode == 0
     assert "_RECON_COMPLETE=zsh_complete" in script.stdout
-    words = _recon(_RECON_COMPLETE="bash_complete", COMP_WORDS="recon st", COMP_CWORD="1")
+    words = _recon(_RECON_COMPLETE="bash_complete", COMP_WORDS="recon sta", COMP_CWORD="1")
     assert words.stdout == "plain,status\n"
 
 

@@ -14,7 +14,7 @@ from recon_cli.settings import SECTIONS
 
 EVERY_OPTION = [
     pytest.param(parameter, id=f"{verb} {parameter.opts[0]}")
-    for verb, command in cli.commands.items()
+    for verb, command in [*cli.commands.items(), *cli.commands["bench"].commands.items()]
     for parameter in command.params if isinstance(parameter, click.Option)
 ]
 EVERY_FIELD = [

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
 from recon_cli import options, settings
 from recon_cli.bench.request import Request
+from recon_cli.bench.training.command import train
 from recon_cli.config import ComputeConfig
 from recon_cli.options import Call, pass_call
 from recon_cli.progress import TqdmProgress
@@ -15,7 +17,7 @@ from recon_cli.progress import TqdmProgress
 _file = click.Path(dir_okay=False, path_type=Path)
 
 
-@click.command("bench")
+@click.group("bench", invoke_without_command=True, subcommand_metavar="[train ...]")
 @click.option(
     "--scene", type=click.Choice(["room", "small"]), default="room",
     help="room is 100,000 Gaussians at 640x360, small 10,000 at 320x180.  [default: room]")
@@ -53,16 +55,21 @@ _file = click.Path(dir_okay=False, path_type=Path)
          "[default: none]")
 @options.verbosity()
 @pass_call
+@click.pass_context
 def bench(
-    call: Call, scene: str, gaussians: int | None, size: str | None, sh_degree: int,
-    backends: tuple[str, ...], rounds: int | None, quick: bool, json_file: Path | None,
-    plot: Path | None, markdown: Path | None, compare: Path | None,
+    ctx: click.Context, call: Call, scene: str, gaussians: int | None, size: str | None,
+    sh_degree: int, backends: tuple[str, ...], rounds: int | None, quick: bool,
+    json_file: Path | None, plot: Path | None, markdown: Path | None, compare: Path | None,
 ) -> None:
     """Measure the rasterizers: speed against error.
 
     Times every stage on a synthetic room and compares images and gradients with a rasterizer in
-    float64, for every backend and for approximations of it.
+    float64, for every backend and for approximations of it. `recon bench train` measures recipes
+    of training instead.
     """
+    if ctx.invoked_subcommand is not None:
+        _refuse_own_options(ctx)
+        return
     from recon_cli.bench.run import run
 
     compute = settings.build(ComputeConfig, call.settings)
@@ -70,3 +77,14 @@ def bench(
         scene, gaussians, size, sh_degree, backends, compute.device, compute.threads, rounds,
         quick, json_file, plot, markdown, compare)
     click.echo(run(request, TqdmProgress()))
+
+
+def _refuse_own_options(ctx: click.Context) -> None:
+    """Raises UsageError where an option of `recon bench` stands before a subcommand."""
+    for parameter in ctx.command.params:
+        if ctx.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE:
+            raise click.UsageError(
+                f"{parameter.opts[0]} has no effect on {ctx.invoked_subcommand}.", ctx)
+
+
+bench.add_command(train)

@@ -52,15 +52,20 @@ class Request:
     def __post_init__(self) -> None:
         if self.size is not None:
             pixels(self.size)
-        for path in (self.json_file, self.plot):
-            if path is not None and not path.absolute().parent.is_dir():
-                raise InputError(
-                    f"The folder of {path} does not exist.", hint=f"mkdir -p {path.parent}")
+        refuse_missing_folders(self.json_file, self.plot)
 
     @property
     def count(self) -> int:
         """Rounds behind each median."""
         return self.rounds or (_QUICK_ROUNDS if self.quick else _ROUNDS)
+
+
+def refuse_missing_folders(*files: Path | None) -> None:
+    """Raises InputError where the folder of a file to write does not exist."""
+    for path in files:
+        if path is not None and not path.absolute().parent.is_dir():
+            raise InputError(
+                f"The folder of {path} does not exist.", hint=f"mkdir -p {path.parent}")
 
 
 def pixels(size: str) -> tuple[int, int]:

@@ -46,7 +46,7 @@ def planned_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext
     first = plan.first_config(config)
     fit_memory = gaussians_that_fit(scene, first, ctx)
     task = load_task(scene, first, ctx)
-    needs = _needs(task, scene, ctx, harmonics=config.sh_degree is None)
+    needs = parts_needed(task, scene, ctx, harmonics=config.sh_degree is None)
     if needs.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
@@ -70,7 +70,9 @@ def recorded_plan(out: Path) -> Summary:
     return record
 
 
-def _needs(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool) -> Needs:
+def parts_needed(
+    task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False
+) -> Needs:
     """Returns which parts of the model the scene needs, and says so."""
     config = task.schedule.config
 

@@ -1,0 +1,215 @@
+"""One run of one arm on one scene: trained, stopped here and there, scored off the clock."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from recon_cli.bench.training.arms import Arm, Prune
+from recon_cli.bench.training.clock import TrainingClock
+from recon_cli.bench.training.removal import prune_rest
+from recon_cli.bench.training.scenes import Place, refuse_unscored
+from recon_cli.bench.training.scoring import Score, load_scored, score
+from recon_cli.config import RunConfig
+from recon_cli.errors import ConfigError
+from recon_cli.scene.scene import Scene
+from recon_cli.stages.context import StageContext
+from recon_cli.stages.fitting import MASK_HINT, load_task
+from recon_cli.stages.planning import parts_needed
+from recon_cli.train.fit import Task, fit
+from recon_cli.train.gates import PARTS
+from recon_cli.train.plan import first_count
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.start import first_state
+from recon_cli.train.state import TrainState
+from recon_cli.train.step import TrainView
+
+PILOT_STEPS = 200  # the count changes twice in them at the usual hundred steps
+_WARM_STEPS = 10  # caches and threads; the kernels are compiled before
+
+
+@dataclass(frozen=True)
+class Point:
+    """How a run stands at one step.
+
+    Attributes:
+        iteration: steps done.
+        seconds: of training alone, on the wall.
+        cpu_seconds: of training alone, of all threads.
+        gaussians: count.
+        bytes: of the .ply that would be written.
+        psnr_db: mean over the scored views.
+        ssim: mean over the scored views.
+    """
+
+    iteration: int
+    seconds: float
+    cpu_seconds: float
+    gaussians: int
+    bytes: int
+    psnr_db: float
+    ssim: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is run: one arm from one seed for so many steps.
+
+    Attributes:
+        arm: how it is trained.
+        base: options that all arms share.
+        iterations: steps.
+        seed: of every random choice.
+    """
+
+    arm: Arm
+    base: RunConfig
+    iterations: int
+    seed: int
+
+    @property
+    def config(self) -> RunConfig:
+        """The options of this run."""
+        return self.arm.config(self.base, iterations=self.iterations, seed=self.seed)
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """A scene in memory, ready to be trained on by any arm.
+
+    Attributes:
+        place: its folders.
+        scene: its views and points.
+        scored: the views that scores come from, with their original pixels.
+        base: options that all arms share.
+        ctx: where to compute.
+    """
+
+    place: Place
+    scene: Scene
+    scored: Sequence[TrainView]
+    base: RunConfig
+    ctx: StageContext
+
+    @property
+    def name(self) -> str:
+        """Of the scene."""
+        return self.place.name
+
+    @cached_property
+    def parts(self) -> dict[str, str]:
+        """The optional parts of the model that the scene needs, as `recon train` finds them."""
+        config = parts_needed(self._loaded(self.base), self.scene, self.ctx).config
+        return {name: getattr(config, name) for name in PARTS}
+
+    def task(self, config: RunConfig) -> Task:
+        """Returns the task of a run; training itself looks at no view that it does not fit."""
+        open_parts = [name for name in PARTS if getattr(config, name) == "auto"]
+        if open_parts:  # not before it is asked for: it may take trials
+            changes: dict[str, Any] = {name: self.parts[name] for name in open_parts}
+            config = dataclasses.replace(config, **changes)
+        return dataclasses.replace(
+            self._loaded(config), validation=[], schedule=Schedule(config))
+
+    def _loaded(self, config: RunConfig) -> Task:
+        images = "denoised" if config.images == "denoised" else "original"
+        if images not in self._tasks:
+            self._tasks[images] = load_task(self.scene, config, self.ctx)
+        return dataclasses.replace(self._tasks[images], schedule=Schedule(config))
+
+    @cached_property
+    def _tasks(self) -> dict[str, Task]:
+        return {}
+
+
+def stand(place: Place, scored: str, base: RunConfig, ctx: StageContext) -> Stand:
+    """Returns a scene with the views in memory that scores come from.
+
+    Args:
+        place: its folders.
+        scored: "test" or "validation": which views are scored.
+        base: options that all arms share.
+        ctx: where to compute.
+
+    Raises:
+        ReconstructionError: no held-out view has a camera.
+        ConfigError: there are no validation views, the views are too small, or masks leave none.
+    """
+    scene = place.load(base)
+    refuse_unscored(place, scene, test=scored == "test")
+    views = load_scored(
+        scene.test if scored == "test" else scene.validation, base.max_size, ctx)
+    if not views:
+        raise ConfigError(f"The masks of {place.name} leave no view to score.", hint=MASK_HINT)
+    return Stand(place, scene, views, base, ctx)
+
+
+def run_trial(
+    where: Stand, run: Run, looks: Sequence[int], *, on_step: Callable[[], None]
+) -> tuple[Point, ...]:
+    """Trains and returns how the run stood after the steps in `looks`, and at its end.
+
+    Args:
+        where: the scene.
+        run: what is trained.
+        looks: steps after which the model is scored; 0 is before the first.
+        on_step: called after each step.
+
+    Raises:
+        TrainingError: memory is short, or training diverged.
+    """
+    task = where.task(run.config)
+    state = first_state(
+        task, where.scene.points, where.scene.colors,
+        most=first_count(task.schedule.config, len(where.scene.points)))
+    stops = sorted({*looks, run.iterations})
+    points: list[Point] = []
+    clock = TrainingClock(where.ctx.device)
+
+    def look() -> None:
+        seconds, cpu_seconds = clock.seconds()
+        with clock.paused():
+            found = _score(where, state, task)
+        points.append(Point(
+            state.iteration, round(seconds, 3), round(cpu_seconds, 3), found.gaussians,
+            found.bytes, found.psnr_db, found.ssim))
+
+    def advance(task: Task, until: int) -> None:
+        while state.iteration < until:
+            stop = min(until, *(stop for stop in stops if stop > state.iteration))
+            fit(state, task, stop, on_step=lambda _state: on_step(), on_report=lambda _report: None)
+            if stop in stops:
+                look()
+
+    if 0 in stops:
+        look()
+    if run.arm.prune is not None:
+        advance(task, _cut(run.arm.prune, run.iterations))
+        prune_rest(state, task, run.arm.prune, run.iterations, advance)
+    else:
+        advance(task, run.iterations)
+    return tuple(points)
+
+
+def _cut(prune: Prune, iterations: int) -> int:
+    """Returns the step after which an arm prunes; at least one is left to recover."""
+    return min(iterations - 1, round(prune.at * iterations))
+
+
+def _score(where: Stand, state: TrainState, task: Task) -> Score:
+    return score(
+        state.splats.map(lambda tensor: tensor.detach()), where.scored,
+        task.schedule.sh_degree(max(1, state.iteration)), where.ctx)
+
+
+def pilot(where: Stand, arm: Arm, base: RunConfig, *, on_step: Callable[[], None]) -> Point:
+    """Returns the end of a short run, whose seconds say what a step of the arm costs here.
+
+    It goes through the whole plan of the recipe. A few steps ahead warm the caches.
+    """
+    for iterations in (_WARM_STEPS, PILOT_STEPS):
+        found = run_trial(where, Run(arm, base, iterations, 0), (), on_step=on_step)
+    return found[-1]

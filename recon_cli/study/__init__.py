@@ -1,0 +1,1 @@
+"""`recon study`: the paper's experiment, repeated over seeds, with intervals."""

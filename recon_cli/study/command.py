@@ -1,0 +1,64 @@
+"""The verb `recon study`: what can be asked of it. Torch is imported only when it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from recon_cli import options, settings
+from recon_cli.config import ComputeConfig
+from recon_cli.options import Call, pass_call
+from recon_cli.progress import TqdmProgress
+
+_scene = click.Path(path_type=Path)
+
+
+@click.command("study")
+@click.argument("more", metavar="[SCENE]...", nargs=-1, type=_scene)
+@click.option(
+    "--scenes", multiple=True, type=_scene, metavar="SCENE...",
+    help="Workspaces with cameras, or data sets with poses; the words after it are scenes too.  "
+         "[default: none]")
+@click.option(
+    "--seeds", type=click.IntRange(min=1), default=5, metavar="N",
+    help="Runs of each arm, with seeds 0 to N - 1.  [default: 5]")
+@click.option(
+    "--iterations", type=click.IntRange(min=1), default=3000, metavar="N",
+    help="Steps of every arm where steps are equal.  [default: 3000]")
+@click.option(
+    "--max-size", type=click.IntRange(min=16), default=600, metavar="N",
+    help="Longest side of the images.  [pixels; default: 600]")
+@click.option(
+    "--max-gaussians", type=click.IntRange(min=1), default=60_000, metavar="N",
+    help="Cap of the count.  [default: 60000]")
+@click.option(
+    "--clock", type=click.Choice(["wall", "cpu"]), default="wall",
+    help="Which seconds are made equal; cpu on a machine that others use too.  [default: wall]")
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("study"),
+    help="Folder of finished runs, study.json, study.md and study.svg; what lies there is not run "
+         "again.  [default: study]")
+@options.assignments("ingest.frames=200")
+@options.of(ComputeConfig)
+@options.verbosity()
+@pass_call
+def study(
+    call: Call, more: tuple[Path, ...], scenes: tuple[Path, ...], seeds: int, iterations: int,
+    max_size: int, max_gaussians: int, clock: str, out: Path,
+) -> None:
+    """Repeat the paper's experiment: 3DGS against ours.
+
+    Trains 3DGS, 3DGS with the paper's prune, ours and ours pruned on every SCENE, at equal steps
+    and at equal seconds, and scores them on held-out views, with intervals over the seeds.
+    """
+    from recon_cli.bench.training.request import base_config
+    from recon_cli.study.request import Request
+    from recon_cli.study.run import run
+
+    # nothing looks at validation views here, so all but the test views are trained on
+    base = base_config(
+        call.assigned, max_size=max_size, max_gaussians=max_gaussians, validation=0.0)
+    click.echo(run(Request(
+        (*scenes, *more), seeds, iterations, base, out, call.assigned,
+        settings.build(ComputeConfig, call.settings), clock), TqdmProgress()))

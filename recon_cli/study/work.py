@@ -1,0 +1,164 @@
+"""The runs of a study: those that are kept from before, and those that are still to be made."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from recon_cli.bench.training.arms import Arm
+from recon_cli.bench.training.trial import PILOT_STEPS, Point, Run, Stand, pilot, run_trial
+from recon_cli.digests import sha256_json
+from recon_cli.progress import Progress
+from recon_cli.study.records import Record, Records, key_of
+from recon_cli.study.request import ARMS, EQUAL_SECONDS, EQUAL_STEPS, Request
+from recon_cli.study.result import SceneResult
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A scene of the study.
+
+    Attributes:
+        stand: the scene in memory.
+        digest: of what it holds.
+    """
+
+    stand: Stand
+    digest: str
+
+
+def equal_seconds(
+    iterations: int, seconds: Mapping[str, float]
+) -> dict[str, int]:
+    """Returns the steps of each arm that take as long as the slowest arm's `iterations`.
+
+    A recipe scales with its run, so that a step of it costs on average the same in a longer one.
+
+    Args:
+        iterations: steps that every arm took.
+        seconds: that they took, by arm.
+    """
+    slowest = max(seconds.values())
+    return {name: max(iterations, round(iterations * slowest / own)) if own > 0 else iterations
+            for name, own in seconds.items()}
+
+
+class Work:
+    """Makes the runs that are missing and hands out all of them.
+
+    Args:
+        request: what is asked.
+        records: what is kept.
+        machine: that runs are made on, in words.
+    """
+
+    def __init__(self, request: Request, records: Records, machine: str) -> None:
+        self._request, self._records, self._machine = request, records, machine
+
+    def announced(self, grounds: Sequence[Ground], progress: Progress) -> str:
+        """Returns in words what is to be done and about how long it will take."""
+        seconds, missing, kept = 0.0, 0, 0
+        for ground in grounds:
+            left = {arm.name: self._missing(ground, arm) for arm in ARMS}
+            missing += sum(left.values())
+            kept += 2 * len(ARMS) * self._request.seeds - sum(left.values())
+            if any(left.values()):
+                costs = self._costs(ground, progress)
+                seconds += sum(
+                    costs[name] * min(count, self._request.seeds)
+                    + max(costs.values()) * max(0, count - self._request.seeds)
+                    for name, count in left.items())
+        text = f"{missing} runs are to be made, {kept} are kept from before"
+        return f"{text}; about {max(1, round(seconds / 60))} minutes" if missing else text
+
+    def _costs(self, ground: Ground, progress: Progress) -> dict[str, float]:
+        """Returns the seconds of a run by arm, from pilots, which warm the caches too."""
+        costs = {}
+        label = f"{ground.stand.name}: pilots"
+        with progress.bar(label, len(ARMS), unit="arm") as bar:
+            for arm in ARMS:
+                point = pilot(ground.stand, arm, self._request.base, on_step=_nothing)
+                costs[arm.name] = point.seconds * self._request.iterations / PILOT_STEPS
+                bar.advance()
+        return costs
+
+    def _missing(self, ground: Ground, arm: Arm) -> int:
+        """Returns how many runs of an arm are not kept; unfixed steps count as not kept."""
+        steps = [{arm.name: self._request.iterations}, self._records.steps(self._steps_key(ground))]
+        return sum(
+            found is None or self._kept(ground, self._run(arm, found[arm.name], seed)) is None
+            for found in steps for seed in range(self._request.seeds))
+
+    def done(self, ground: Ground, progress: Progress) -> SceneResult:
+        """Returns all runs on a scene, those that are missing made now."""
+        steps = dict.fromkeys((arm.name for arm in ARMS), self._request.iterations)
+        equal = self._all(ground, EQUAL_STEPS, steps, progress)
+        steps = dict(self._fixed(ground, equal))
+        longer = self._all(ground, EQUAL_SECONDS, steps, progress)
+        runs = {EQUAL_STEPS: equal, EQUAL_SECONDS: longer}
+        size = ground.stand.scored[0].camera
+        return SceneResult(
+            len(ground.stand.scored), size.width, size.height, ground.digest, runs)
+
+    def _fixed(
+        self, ground: Ground, equal: Mapping[str, tuple[Record, ...]]
+    ) -> Mapping[str, int]:
+        """Returns the steps at equal seconds; once computed they are kept, whatever comes."""
+        key = self._steps_key(ground)
+        steps = self._records.steps(key)
+        if steps is None:
+            steps = equal_seconds(self._request.iterations, {
+                name: statistics.median(self._seconds(record.point) for record in records)
+                for name, records in equal.items()})
+            self._records.add_steps(key, steps)
+        return steps
+
+    def _all(
+        self, ground: Ground, comparison: str, steps: Mapping[str, int], progress: Progress
+    ) -> dict[str, tuple[Record, ...]]:
+        """Returns the records by arm; seeds are the outer loop: a slow minute falls on all arms."""
+        found: dict[str, list[Record]] = {arm.name: [] for arm in ARMS}
+        total = self._request.seeds * sum(steps.values())
+        label = f"{ground.stand.name}, {comparison}"
+        with progress.bar(label, total, unit="step") as bar:
+            for seed in range(self._request.seeds):
+                for arm in ARMS:
+                    bar.note(f"{arm.label}, seed {seed}")
+                    run = self._run(arm, steps[arm.name], seed)
+                    record = self._kept(ground, run)
+                    if record is None:
+                        record = self._made(ground, run, bar.advance)
+                    else:
+                        bar.advance(run.iterations)
+                    found[arm.name].append(record)
+        return {name: tuple(records) for name, records in found.items()}
+
+    def _made(self, ground: Ground, run: Run, on_step: Callable[[], None]) -> Record:
+        """Makes a run and keeps it."""
+        points = run_trial(ground.stand, run, (), on_step=on_step)
+        config = ground.stand.task(run.config).schedule.config
+        on = [name for name in ("far", "exposure", "poses") if getattr(config, name) == "on"]
+        record = Record(points[-1], self._machine, ", ".join([f"{config.images} images", *on]))
+        self._records.add_run(
+            key_of(ground.stand, ground.digest, run), record, run, ground.stand.name)
+        return record
+
+    def _seconds(self, point: Point) -> float:
+        return point.cpu_seconds if self._request.clock == "cpu" else point.seconds
+
+    def _kept(self, ground: Ground, run: Run) -> Record | None:
+        return self._records.run(key_of(ground.stand, ground.digest, run))
+
+    def _run(self, arm: Arm, iterations: int, seed: int) -> Run:
+        return Run(arm, self._request.base, iterations, seed)
+
+    def _steps_key(self, ground: Ground) -> str:
+        """Returns what the steps at equal seconds are known by, whatever the number of seeds."""
+        first = [key_of(ground.stand, ground.digest, self._run(arm, self._request.iterations, 0))
+                 for arm in ARMS]
+        return sha256_json({"steps of": first, "clock": self._request.clock})
+
+
+def _nothing() -> None:
+    """Reports to nobody."""
