@@ -45,7 +45,7 @@ class PhotometricStep:
     def __call__(
         self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
         background: Tensor, sh_degree: int, ssim_weight: float, *,
-        mask: NDArray[np.bool_] | None = None,
+        mask: NDArray[np.bool_] | None = None, scores: bool = False,
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
@@ -60,6 +60,8 @@ class PhotometricStep:
             sh_degree: in use.
             ssim_weight: w in [0, 1].
             mask: [H, W], True where a pixel counts; None where all do.
+            scores: also gather hits, blend weights and loo of the pixels that count; without
+                it they mean nothing.
         """
         height, width, n = camera.height, camera.width, len(splats)
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
@@ -72,8 +74,11 @@ class PhotometricStep:
         ours = Parameters(*map(flat, splats.parameters().values()))
         frame.forward(
             ours, camera, flat(background), sh_degree, rgb=rgb, alpha=frame.take("alpha", pixels),
-            depth=frame.take("depth", pixels), radii=flat(statistics.radii))
+            depth=frame.take("depth", pixels), radii=flat(statistics.radii), scores=scores,
+            counting=mask if scores else None)
         statistics.broken = frame.broken
+        if scores:
+            frame.tally(statistics)
         grad_rgb = frame.take("grad_rgb", CHANNELS * pixels)
         if not truth.flags.writeable:  # would be another type, and kernels compiled once more
             truth = truth.copy()
@@ -89,7 +94,7 @@ class PhotometricStep:
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,
-            grad_alpha=nothing, grad_depth=nothing, details=False, scores=False,
+            grad_alpha=nothing, grad_depth=nothing, details=False, scores=scores,
             means2d_grad=flat(statistics.means2d_grad),
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))
