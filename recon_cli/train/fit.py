@@ -17,6 +17,7 @@ from recon_cli.train.densify import (
     densify,
     lowered_opacities,
 )
+from recon_cli.train.importance import Importance
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.step import GradientStep, TrainView, gradient_step
@@ -72,6 +73,7 @@ def fit(
     *,
     on_step: Callable[[TrainState], None],
     on_report: Callable[[Report], None],
+    importance: Importance | None = None,
 ) -> None:
     """Runs `state` on until it has done `until` steps.
 
@@ -81,6 +83,7 @@ def fit(
         until: total number of steps, those already done included.
         on_step: called after each step; may save the state.
         on_report: called every hundred steps and at the end.
+        importance: gets the scores of every step's view, from the very passes that train.
 
     Raises:
         TrainingError: the loss is not finite, or no Gaussian is left.
@@ -88,7 +91,7 @@ def fit(
     start = time.perf_counter()
     compute = gradient_step(task.backend)
     while state.iteration < until:
-        loss = _step(state, task, compute)
+        loss = _step(state, task, compute, importance)
         if state.iteration % _REPORT_EVERY == 0 or state.iteration == until:
             on_report(Report(
                 state.iteration, loss, validation_psnr(state, task), len(state.splats),
@@ -96,7 +99,9 @@ def fit(
         on_step(state)
 
 
-def _step(state: TrainState, task: Task, compute: GradientStep) -> float:
+def _step(
+    state: TrainState, task: Task, compute: GradientStep, importance: Importance | None
+) -> float:
     """Takes one optimization step and returns its loss."""
     if not state.queue:
         state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
@@ -104,12 +109,15 @@ def _step(state: TrainState, task: Task, compute: GradientStep) -> float:
     iteration = state.iteration + 1
     degree = task.schedule.sh_degree(iteration)
     loss, statistics = compute(
-        state.optimizer, view, degree, task.schedule.config.ssim_weight)
+        state.optimizer, view, degree, task.schedule.config.ssim_weight,
+        scores=importance is not None)
     if not np.isfinite(loss):
         raise TrainingError(
             f"The loss is not finite at step {iteration}.",
             hint="Lower the learning rates, or run `recon train --again` with another --seed.")
     if statistics is not None:
+        if importance is not None:
+            importance.add(statistics)
         if task.schedule.gathers(iteration):
             state.pull.add(statistics, view.camera.width, view.camera.height)
         state.optimizer.step(task.schedule.means_rate(iteration), sh_rest=degree > 0)

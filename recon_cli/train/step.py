@@ -51,11 +51,13 @@ class GradientStep(Protocol):
     """
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        scores: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view; None where it sees no Gaussian.
 
-        The statistics are valid until the next call.
+        The statistics are valid until the next call; hits, blend weights and loo among them only
+        with `scores`, over the pixels that the view's mask counts.
         """
 
 
@@ -79,12 +81,13 @@ class _FusedStep:
         self._background = torch.zeros(3)
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        scores: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
-            sh_degree, ssim_weight, mask=view.mask)
+            sh_degree, ssim_weight, mask=view.mask, scores=scores)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -95,15 +98,16 @@ class _AutogradStep:
         self._backend = backend
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        scores: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
+        device, counting = splats.means.device, view.counting(splats.means.device)
         output = render(
-            splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend)
-        device = splats.means.device
-        loss = photometric_loss(
-            output.rgb, view.pixels(device), ssim_weight, mask=view.counting(device))
+            splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
+            scores=scores, mask=counting if scores else None)
+        loss = photometric_loss(output.rgb, view.pixels(device), ssim_weight, mask=counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None
