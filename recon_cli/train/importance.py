@@ -122,12 +122,14 @@ def _log_volumes(splats: Splats) -> Tensor:
     return splats.log_scales.detach().double().sum(-1)
 
 
-def importance_of(
-    splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str, loo: bool = True
-) -> Importance:
-    """Returns what a pass over views finds, with each view's mask.
+def add_views(
+    found: Importance, splats: Splats, views: Iterable[TrainView], *, sh_degree: int,
+    backend: str, loo: bool = True,
+) -> None:
+    """Adds what a pass over views finds, each with its mask.
 
     Args:
+        found: changed in place.
         splats: N Gaussians.
         views: training views; never validation or test views.
         sh_degree: degree in use.
@@ -137,11 +139,18 @@ def importance_of(
     device = splats.means.device
     background = torch.zeros(3, dtype=splats.means.dtype, device=device)
     leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(loo))
-    found = Importance.zeros(len(splats), device)
     for view in views:
         output = render(leaves, view.camera, background, sh_degree, backend=backend, scores=True,
                         mask=view.counting(device))
         if loo and output.rgb.requires_grad:
             output.rgb.sum().backward()  # type: ignore[no-untyped-call]
         found.add(output.statistics)
+
+
+def importance_of(
+    splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str, loo: bool = True
+) -> Importance:
+    """Returns what a pass over views finds; the arguments are those of `add_views`."""
+    found = Importance.zeros(len(splats), splats.means.device)
+    add_views(found, splats, views, sh_degree=sh_degree, backend=backend, loo=loo)
     return found
