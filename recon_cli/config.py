@@ -137,8 +137,12 @@ def check_scale_between(value: tuple[str, str, float] | None) -> None:
 
 @dataclass(frozen=True)
 class TrainConfig(StageConfig):
-    """The reference recipe of 3D Gaussian Splatting, scaled to the number of iterations."""
+    """How Gaussians are fitted: a recipe, scaled to the number of iterations."""
 
+    densify: str = option(
+        "budget", "How Gaussians are added: budget (where the error is, the count on a line), "
+        "reference (clone, split and reset as in 3DGS) or mcmc (relocation and noise).",
+        choices=("budget", "reference", "mcmc"))
     iterations: int = option(2000, "Optimization steps, one view each.", unit="steps", minimum=1)
     max_size: int = option(
         400, "Longest side of a training image; larger ones are reduced by area.",
@@ -164,12 +168,14 @@ class TrainConfig(StageConfig):
     sh_rate: float = option(
         2.5e-3, "Learning rate of the base colours; higher degrees get a twentieth.", minimum=0.0)
     densify_every: int = option(
-        100, "Clone, split and delete this often.", unit="steps", minimum=1)
+        100, "Add and delete Gaussians this often.", unit="steps", minimum=1)
     densify_gradient: float = option(
-        2e-4, "Mean gradient of the projected mean from which a Gaussian is cloned or split.",
+        2e-4, "With reference: mean gradient of the projected mean from which a Gaussian is cloned "
+        "or split.",
         unit="NDC", minimum=0.0)
     densify_scale: float = option(
-        0.01, "Clone up to this largest scale, split above it.", unit="x extent", minimum=0.0)
+        0.01, "With reference: clone up to this largest scale, split above it.",
+        unit="x extent", minimum=0.0)
     min_opacity: float = option(
         0.005, "Gaussians below this opacity are deleted.", minimum=0.0, maximum=1.0)
     mid: float = option(
@@ -188,7 +194,7 @@ class TrainConfig(StageConfig):
                 hint=f"Use --mid {DENSIFY_UNTIL:g} or more.")
 
 
-DENSIFY_UNTIL = 0.5  # share of the run: 15,000 of 30,000 iterations in the reference
+DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 
 @dataclass(frozen=True)

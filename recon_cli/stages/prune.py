@@ -24,8 +24,8 @@ from recon_cli.stages.fitting import (
     run_fit,
     seconds_at,
 )
-from recon_cli.train.densify import Pull
 from recon_cli.train.fit import Task, validation_psnr
+from recon_cli.train.gathered import Gathered
 from recon_cli.train.importance import kept_rows, significance
 from recon_cli.train.state import TrainState, load_state
 from recon_cli.train.step import fuses
@@ -82,5 +82,5 @@ def _pruned(state: TrainState, task: Task, config: PruneConfig) -> TrainState:
     rows = kept_rows(score, config.ratio)
     kept: Splats = state.splats.select(rows)
     state.optimizer.replace(kept, rows)
-    state.pull = Pull.zeros(len(kept), torch.device(task.device))
+    state.gathered = Gathered.zeros(len(kept), torch.device(task.device))
     return state

@@ -5,25 +5,24 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
-from recon_cli.train.densify import (
-    DensifyRule,
-    Pull,
-    densify,
-    lowered_opacities,
-)
 from recon_cli.train.importance import Importance
+from recon_cli.train.pyramid import Pyramid
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.step import GradientStep, TrainView, gradient_step
+from recon_cli.train.strategies import STRATEGIES
 
-_LARGE_SCALE = 0.1  # x extent; larger Gaussians are deleted once opacities were reset
-_REPORT_EVERY = 100  # steps between looks at the validation views
+_REPORT_EVERY = 100  # steps between looks at the validation views, at least
+_REPORTS = 40  # of a long run; each costs a picture of every validation view
+_SKIPPED = 0.02  # share of the run's steps that may come to nothing
+_SKIPPED_FLOOR = 5
 
 
 @dataclass(frozen=True)
@@ -65,6 +64,11 @@ class Task:
     backend: str
     device: torch.device
 
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """The training views at every size."""
+        return Pyramid(self.train)
+
 
 def fit(
     state: TrainState,
@@ -90,13 +94,19 @@ def fit(
     """
     start = time.perf_counter()
     compute = gradient_step(task.backend)
+    every = report_every(task.schedule)
     while state.iteration < until:
         loss = _step(state, task, compute, importance)
-        if state.iteration % _REPORT_EVERY == 0 or state.iteration == until:
+        if state.iteration % every == 0 or state.iteration == until:
             on_report(Report(
                 state.iteration, loss, validation_psnr(state, task), len(state.splats),
                 time.perf_counter() - start))
         on_step(state)
+
+
+def report_every(schedule: Schedule) -> int:
+    """Returns the steps between two reports, a multiple of a hundred."""
+    return _REPORT_EVERY * max(1, schedule.config.iterations // (_REPORTS * _REPORT_EVERY))
 
 
 def _step(
@@ -105,46 +115,43 @@ def _step(
     """Takes one optimization step and returns its loss."""
     if not state.queue:
         state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
-    view = task.train[state.queue.pop()]
     iteration = state.iteration + 1
-    degree = task.schedule.sh_degree(iteration)
+    schedule, strategy = task.schedule, STRATEGIES[task.schedule.config.densify]
+    view = task.pyramid.view(state.queue.pop(), schedule.level(iteration))
+    degree, gathers = schedule.sh_degree(iteration), schedule.gathers(iteration)
     loss, statistics = compute(
-        state.optimizer, view, degree, task.schedule.config.ssim_weight,
-        scores=importance is not None)
+        state.optimizer, view, degree, schedule.config.ssim_weight,
+        variance=gathers and strategy.variance, scores=importance is not None)
+    state.iteration = iteration
     if not np.isfinite(loss):
-        raise TrainingError(
-            f"The loss is not finite at step {iteration}.",
-            hint="Lower the learning rates, or run `recon train --again` with another --seed.")
+        _skip(state, task)
+        return loss
     if statistics is not None:
         if importance is not None:
             importance.add(statistics)
-        if task.schedule.gathers(iteration):
-            state.pull.add(statistics, view.camera.width, view.camera.height)
-        state.optimizer.step(task.schedule.means_rate(iteration), sh_rest=degree > 0)
-    state.iteration = iteration
-    _control_density(state, task)
+        if gathers:
+            state.gathered.add(statistics, view.camera.width, view.camera.height)
+        state.optimizer.regularize(schedule.recipe.regularize)
+        state.optimizer.step(
+            schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
+            factor=schedule.rate_factor(iteration))
+    strategy.control(state, task)
     return loss
 
 
-def _control_density(state: TrainState, task: Task) -> None:
-    """Clones, splits, deletes and resets where the schedule says so."""
-    schedule, config = task.schedule, task.schedule.config
-    if schedule.densifies(state.iteration):
-        large = _LARGE_SCALE * task.extent if schedule.deletes_large(state.iteration) else None
-        rule = DensifyRule(
-            config.densify_gradient, config.densify_scale * task.extent, config.min_opacity,
-            large, config.max_gaussians)
-        splats, source = densify(state.splats, state.pull, rule, state.generator)
-        if len(splats) == 0:
-            raise TrainingError(
-                f"No Gaussian is left at step {state.iteration}.",
-                hint="Lower --min-opacity, or check the cameras with another viewer.")
-        state.optimizer.replace(splats, source)
-        state.pull = Pull.zeros(len(splats), task.device)
-    if schedule.resets(state.iteration):
-        kept = torch.arange(len(state.splats), device=task.device)
-        state.optimizer.replace(lowered_opacities(state.splats), kept)
-        state.optimizer.forget("logit_opacities")
+def _skip(state: TrainState, task: Task) -> None:
+    """Counts a step whose loss is not finite; the parameters stay as they are.
+
+    Raises:
+        TrainingError: there were too many.
+    """
+    state.skipped += 1
+    most = max(_SKIPPED_FLOOR, int(_SKIPPED * task.schedule.config.iterations))
+    if state.skipped > most:
+        raise TrainingError(
+            f"The loss is not finite at step {state.iteration}, as at {state.skipped - 1} steps "
+            f"before it; {most} are borne with.",
+            hint="Lower the learning rates, or run `recon train --again` with another --seed.")
 
 
 def validation_psnr(state: TrainState, task: Task) -> float | None:

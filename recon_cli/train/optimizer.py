@@ -45,6 +45,7 @@ class SplatOptimizer:
             "sh_dc": config.sh_rate, "sh_rest": config.sh_rate * _REST_FACTOR,
         }
         self.count = 0
+        self._factor = 1.0
         self._buffers: dict[str, dict[str, Tensor]] = {}
         self._reserve(splats, max(len(splats), config.max_gaussians))
         self._show(len(splats))
@@ -82,14 +83,37 @@ class SplatOptimizer:
                    for roles in self._buffers.values() for buffer in roles.values())
         return held if self._fused else held // 3 * 4  # autograd holds the gradients
 
-    def step(self, means_rate: float, *, sh_rest: bool = True) -> None:
+    @torch.no_grad()
+    def regularize(self, weight: float) -> None:
+        """Adds the gradient of weight x (mean opacity + mean scale) (Kheradmand et al. 2024)."""
+        if weight <= 0:
+            return
+        opacities, scales = self.splats.opacities, self.splats.scales
+        for name, slope in (("logit_opacities", opacities * (1 - opacities)),
+                            ("log_scales", scales)):
+            self.gradient(name).add_(slope, alpha=weight / slope.numel())
+
+    def gradient(self, name: str) -> Tensor:
+        """Returns the gradient of a parameter that the last backward pass left, to be changed."""
+        if self._fused:
+            return self._view(name, "gradient")
+        gradient: Tensor | None = getattr(self.splats, name).grad
+        if gradient is None:
+            raise ValueError(f"{name} has no gradient")
+        return gradient
+
+    def step(
+        self, means_rate: float, *, sh_rest: bool = True, factor: float = 1.0
+    ) -> None:
         """Moves the parameters against their gradients, which are then used up.
 
         Args:
             means_rate: learning rate of the means in units of the scene extent.
-            sh_rest: the higher SH degrees are in use; otherwise they stay as they are.
+            sh_rest: the higher SH degrees are moved; otherwise they stay as they are.
+            factor: of all learning rates but that of the means.
         """
-        self._rates["means"] = means_rate * self._extent
+        self._factor = factor
+        self._rates["means"] = means_rate * self._extent / factor
         self.count += 1
         names = [name for name in self._buffers if sh_rest or name != "sh_rest"]
         if self._fused:
@@ -103,21 +127,23 @@ class SplatOptimizer:
         def flat(role: str) -> list[Tensor]:
             return [self._view(name, role).reshape(-1) for name in self._buffers]
 
-        rates = [self._rates[name] if name in names else None for name in self._buffers]
+        rates = [self._factor * self._rates[name] if name in names else None
+                 for name in self._buffers]
         step(flat("value"), flat("gradient"), flat("exp_avg"), flat("exp_avg_sq"), rates,
              count=self.count, betas=_BETAS, epsilon=_EPSILON)
 
     @torch.no_grad()
     def _step_torch(self, names: list[str]) -> None:
-        for name in names:
+        for name in self._buffers:
             value = getattr(self.splats, name)
-            if value.grad is None:
+            if value.grad is None or name not in names:
+                value.grad = None  # autograd would add the next one to it
                 continue
             count = torch.full((), self.count - 1.0, device=value.device)
             adam([value], [value.grad], [self._view(name, "exp_avg")],
                  [self._view(name, "exp_avg_sq")], [], [count], fused=True, amsgrad=False,
-                 beta1=_BETAS[0], beta2=_BETAS[1], lr=self._rates[name], weight_decay=0.0,
-                 eps=_EPSILON, maximize=False)
+                 beta1=_BETAS[0], beta2=_BETAS[1], lr=self._factor * self._rates[name],
+                 weight_decay=0.0, eps=_EPSILON, maximize=False)
             value.grad = None
 
     @torch.no_grad()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon_cli.train.densify import Pull
+from recon_cli.train.gathered import Gathered
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 
@@ -34,11 +34,11 @@ class Removal:
     count: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recovery(Schedule):
-    """A run that starts anew at `first`: its means move as far as in a run of their own.
+    """A run of its own, but for its coarse beginning: all learning rates start anew.
 
-    The rate at which training ended lets no Gaussian move into the gap that its neighbour left.
+    The rates at which training ended let no Gaussian move into the gap that its neighbour left.
 
     Attributes:
         first: step at which the recovery begins.
@@ -48,10 +48,21 @@ class Recovery(Schedule):
     first: int
     until: int
 
-    def means_rate(self, iteration: int) -> float:
-        """Returns the learning rate of the means in units of the scene extent."""
-        done = (iteration - self.first) / max(1, self.until - self.first)
-        return super().means_rate(round(done * self.config.iterations))
+    def share(self, iteration: int) -> float:
+        """Returns how much of the recovery is done after a step, 0 to 1."""
+        return min(1.0, (iteration - self.first) / max(1, self.until - self.first))
+
+    def level(self, iteration: int) -> int:  # noqa: ARG002
+        """Returns 1: images are never reduced."""
+        return 1
+
+    def sh_degree(self, iteration: int) -> int:  # noqa: ARG002
+        """Returns the degree in use, which is the highest."""
+        return self.config.sh_degree
+
+    def gathers(self, iteration: int) -> bool:  # noqa: ARG002
+        """Returns False: nothing grows back."""
+        return False
 
 
 def remaining(n: int, ratio: float) -> int:
@@ -93,4 +104,4 @@ def remove(state: TrainState, rows: Tensor) -> None:
     """Goes on with the Gaussians at `rows` alone; they keep their moments."""
     kept = state.splats.select(rows)
     state.optimizer.replace(kept, rows)
-    state.pull = Pull.zeros(len(kept), kept.means.device)
+    state.gathered = Gathered.zeros(len(kept), kept.means.device)

@@ -1,4 +1,4 @@
-"""When things happen in a run: the reference's 30,000 iterations scaled to any number.
+"""When things happen in a run: a recipe's shares turned into steps.
 
 Intervals that give the optimizer time to settle (densification, the recovery from an opacity
 reset) are counted in steps and have a floor; everything else scales with the run.
@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from recon_cli.config import DENSIFY_UNTIL, TrainConfig
+from recon_cli.config import TrainConfig
+from recon_cli.train.recipe import RECIPES, Recipe
 
 _REFERENCE = 30_000  # iterations of INRIA's default run
-_DENSIFY_FROM = 500
 _RESET_EVERY = 3000
-_SH_EVERY = 1000
 _RESET_FLOOR = 1000  # steps; after a reset at a rate of .05 a picture needs some hundred to return
-_FINAL_MEANS_RATE = 0.01  # of the initial one: 1.6e-4 to 1.6e-6
+_SH_EVERY = 1000  # steps of the reference between two degrees, in a run of any length
 
 
 @dataclass(frozen=True)
@@ -24,51 +23,83 @@ class Schedule:
 
     Attributes:
         config: the run's options.
+        recipe: of the strategy that the options name.
     """
 
     config: TrainConfig
+    recipe: Recipe = None  # type: ignore[assignment]  # filled in below
 
-    @property
-    def scale(self) -> float:
-        """Length of the run in reference runs."""
-        return self.config.iterations / _REFERENCE
+    def __post_init__(self) -> None:
+        if self.recipe is None:
+            object.__setattr__(self, "recipe", RECIPES[self.config.densify])
+
+    def share(self, iteration: int) -> float:
+        """Returns how much of the run is done after a step, 0 to 1."""
+        return min(1.0, iteration / self.config.iterations)
 
     @property
     def reset_every(self) -> int:
         """Steps from one opacity reset to the next."""
-        return max(_RESET_FLOOR, round(_RESET_EVERY * self.scale))
+        return max(_RESET_FLOOR, round(_RESET_EVERY * self.config.iterations / _REFERENCE))
 
     @property
     def mid(self) -> int:
         """The iteration whose state is kept for pruning."""
         return max(1, round(self.config.mid * self.config.iterations))
 
+    def level(self, iteration: int) -> int:
+        """Returns the factor by which images are reduced in this step."""
+        before = self.share(iteration - 1)
+        return next((factor for share, factor in self.recipe.levels if before < share), 1)
+
     def sh_degree(self, iteration: int) -> int:
-        """Returns the degree in use: one more every 1,000 steps or every tenth of the run."""
-        every = max(1, min(_SH_EVERY, self.config.iterations // 10))
-        return min(self.config.sh_degree, (iteration - 1) // every)
+        """Returns the degree in use; the reference raises it every 1,000 steps or sooner."""
+        before = iteration - 1
+        if self.recipe.resets:
+            every = max(1, min(_SH_EVERY, self.config.iterations // 10))
+            return min(self.config.sh_degree, before // every)
+        return min(self.config.sh_degree,
+                   sum(before >= share * self.config.iterations for share in self.recipe.sh_at))
 
     def means_rate(self, iteration: int) -> float:
         """Returns the learning rate of the means in units of the scene extent."""
-        done = min(1.0, iteration / self.config.iterations)
-        return float(self.config.means_rate * _FINAL_MEANS_RATE**done)
+        return float(self.config.means_rate * self.recipe.means_final**self.share(iteration))
+
+    def rate_factor(self, iteration: int) -> float:
+        """Returns the factor of all other learning rates."""
+        start = self.recipe.final_from
+        if start >= 1:
+            return 1.0
+        done = max(0.0, (self.share(iteration) - start) / (1 - start))
+        return float(self.recipe.final_rate**done)
+
+    def moves_sh(self, iteration: int) -> bool:
+        """Tells whether the higher degrees are moved in this step."""
+        return self.sh_degree(iteration) > 0 and iteration % self.recipe.sh_every == 0
 
     def densifies(self, iteration: int) -> bool:
-        """Tells whether Gaussians are cloned, split and deleted after this step."""
-        start = max(self.config.densify_every, round(_DENSIFY_FROM * self.scale))
-        return (
-            start <= iteration < DENSIFY_UNTIL * self.config.iterations
-            and iteration % self.config.densify_every == 0
-        )
+        """Tells whether Gaussians are added and deleted after this step."""
+        start = max(self.config.densify_every,
+                    round(self.recipe.densify_from * self.config.iterations))
+        return (self.gathers(iteration) and iteration >= start
+                and iteration % self.config.densify_every == 0)
 
     def gathers(self, iteration: int) -> bool:
         """Tells whether densification still needs this step's gradients."""
-        return iteration < DENSIFY_UNTIL * self.config.iterations
+        return iteration < self.recipe.densify_until * self.config.iterations
+
+    def target(self, iteration: int, first: int) -> int:
+        """Returns the count that a budget allows after this step, from `first` up to the cap."""
+        start, full = self.recipe.densify_from, self.recipe.full_at
+        done = min(1.0, max(0.0, (self.share(iteration) - start) / (full - start)))
+        most = self.config.max_gaussians
+        return min(most, first + int((most - first) * done))
 
     def resets(self, iteration: int) -> bool:
         """Tells whether opacities are lowered after this step."""
-        return self.gathers(iteration) and iteration % self.reset_every == 0
+        return (self.recipe.resets and self.gathers(iteration)
+                and iteration % self.reset_every == 0)
 
     def deletes_large(self, iteration: int) -> bool:
         """Tells whether Gaussians that cover too much are deleted as well."""
-        return iteration > self.reset_every
+        return self.recipe.resets and iteration > self.reset_every

@@ -19,10 +19,10 @@ from recon_cli.atomic import replacing
 from recon_cli.config import TrainConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import Splats
-from recon_cli.train.densify import Pull
+from recon_cli.train.gathered import Gathered
 from recon_cli.train.optimizer import SplatOptimizer
 
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass(eq=False)
@@ -31,17 +31,21 @@ class TrainState:
 
     Attributes:
         optimizer: holds the splats and their moments.
-        pull: what densification has gathered so far.
+        gathered: what steps left behind for densification.
         generator: source of every random choice; on the CPU whatever the device.
         iteration: steps done.
         queue: indices of the views still to come in this epoch, last first.
+        first_count: Gaussians before the first step; budgets grow from there.
+        skipped: steps whose loss was not finite, and that changed nothing.
     """
 
     optimizer: SplatOptimizer
-    pull: Pull
+    gathered: Gathered
     generator: torch.Generator
     iteration: int = 0
     queue: list[int] = field(default_factory=list)
+    first_count: int = 0
+    skipped: int = 0
 
     @property
     def splats(self) -> Splats:
@@ -54,8 +58,9 @@ def new_state(
 ) -> TrainState:
     """Returns the state before the first step; `fused` as in `SplatOptimizer`."""
     generator = torch.Generator().manual_seed(config.seed)
-    pull = Pull.zeros(len(splats), splats.means.device)
-    return TrainState(SplatOptimizer(splats, config, extent, fused=fused), pull, generator)
+    gathered = Gathered.zeros(len(splats), splats.means.device)
+    return TrainState(SplatOptimizer(splats, config, extent, fused=fused), gathered, generator,
+        first_count=len(splats))
 
 
 def save_state(path: Path, state: TrainState) -> None:
@@ -65,11 +70,12 @@ def save_state(path: Path, state: TrainState) -> None:
         TrainingError: a parameter is not finite; the checkpoint before it stays.
     """
     tensors = state.optimizer.tensors()
-    for name, value in vars(state.pull).items():
-        tensors[f"pull.{name}"] = value
+    for name, value in vars(state.gathered).items():
+        tensors[f"gathered.{name}"] = value
     tensors["generator"] = state.generator.get_state()
     check_finite(tensors, "Training diverged")
-    scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue}
+    scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue,
+               "first_count": state.first_count, "skipped": state.skipped}
     with replacing(path) as temporary:
         save_file({name: value.contiguous().cpu() for name, value in tensors.items()},
                   temporary, metadata={"state": json.dumps(scalars)})
@@ -96,8 +102,9 @@ def load_state(
         splats = Splats(**_under("splats.", tensors))
         state = TrainState(
             SplatOptimizer(splats, config, extent, fused=fused),
-            Pull(**_under("pull.", tensors)), generator, int(scalars["iteration"]),
-            [int(i) for i in scalars["queue"]])
+            Gathered(**_under("gathered.", tensors)), generator, int(scalars["iteration"]),
+            [int(i) for i in scalars["queue"]], int(scalars["first_count"]),
+            int(scalars["skipped"]))
         state.optimizer.restore(tensors)
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise FormatError(

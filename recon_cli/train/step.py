@@ -51,13 +51,14 @@ class GradientStep(Protocol):
     """
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        scores: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
+        *, variance: bool = False, scores: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view; None where it sees no Gaussian.
 
-        The statistics are valid until the next call; hits, blend weights and loo among them only
-        with `scores`, over the pixels that the view's mask counts.
+        The statistics are valid until the next call. Their `variance` is computed where it is
+        asked for, and so are the scores (hits, blend weights and loo), over the pixels that the
+        view's mask counts.
         """
 
 
@@ -81,13 +82,14 @@ class _FusedStep:
         self._background = torch.zeros(3)
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        scores: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
+        *, variance: bool = False, scores: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
-            sh_degree, ssim_weight, mask=view.mask, scores=scores)
+            sh_degree, ssim_weight, mask=view.mask, details=variance,
+            scores=scores)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -98,15 +100,15 @@ class _AutogradStep:
         self._backend = backend
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        scores: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
+        *, variance: bool = False, scores: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
         device, counting = splats.means.device, view.counting(splats.means.device)
         output = render(
             splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
-            scores=scores, mask=counting if scores else None)
+            scores=variance or scores, mask=counting)
         loss = photometric_loss(output.rgb, view.pixels(device), ssim_weight, mask=counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):

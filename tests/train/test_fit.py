@@ -15,16 +15,21 @@ from recon_cli.render.numba.crew import crew
 from recon_cli.train.fit import Task, fit, validation_psnr
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
-from recon_cli.train.step import TrainView, fuses
+from recon_cli.train.step import TrainView, fuses, gradient_step
 
 CONFIG = TrainConfig(
-    iterations=60, densify_every=10, densify_gradient=1e-5, max_gaussians=90, sh_rate=0.05)
+    iterations=60, densify="reference", densify_every=10, densify_gradient=1e-5, max_gaussians=90,
+    sh_rate=0.05)
+STRATEGIES = {
+    name: TrainConfig(iterations=60, densify=name, densify_every=10, max_gaussians=90, sh_rate=0.05)
+    for name in ("budget", "mcmc")} | {"reference": CONFIG}
 EXTENT = 1.0
 
 
 RUNS = [(status.name, device) for status in available_backends() if not status.missing
         for device in status.devices]
 every_run = pytest.mark.parametrize(("backend", "device"), RUNS)
+every_strategy = pytest.mark.parametrize("config", STRATEGIES.values(), ids=STRATEGIES)
 every_cpu_backend = pytest.mark.parametrize(
     "backend", [backend for backend, device in RUNS if device == "cpu"])
 
@@ -58,10 +63,10 @@ def first_state(config=CONFIG, device="cpu", backend="torch"):
                      fused=fuses(backend))
 
 
-def saved_and_loaded(state, folder, device="cpu", backend="torch"):
+def saved_and_loaded(state, folder, device="cpu", backend="torch", config=CONFIG):
     """The state after a process that ended and another that began, maybe on another backend."""
     save_state(folder / "state.safetensors", state)
-    return load_state(folder / "state.safetensors", CONFIG, EXTENT, torch.device(device),
+    return load_state(folder / "state.safetensors", config, EXTENT, torch.device(device),
                       fused=fuses(backend))
 
 
@@ -76,8 +81,9 @@ def same(a, b):
 
 
 @every_run
-def test_training_raises_the_psnr_of_a_view_that_it_never_sees(backend, device):
-    state, task = first_state(CONFIG, device, backend), tiny_task(CONFIG, device, backend)
+@every_strategy
+def test_training_raises_the_psnr_of_a_view_that_it_never_sees(backend, device, config):
+    state, task = first_state(config, device, backend), tiny_task(config, device, backend)
     before = validation_psnr(state, task)
     reports = []
     run(state, task, 60, on_report=reports.append)
@@ -94,12 +100,13 @@ def test_two_runs_with_one_seed_give_the_same_bits(backend, device):
     assert same(first, second)
 
 
-def test_any_number_of_threads_trains_to_the_same_bits(monkeypatch):
+@every_strategy
+def test_any_number_of_threads_trains_to_the_same_bits(monkeypatch, config):
     states = []
     for threads in (1, 2, 3):
         monkeypatch.setattr(crew, "threads", threads)
-        states.append(first_state(backend="numba"))
-        run(states[-1], tiny_task(backend="numba"), 30)
+        states.append(first_state(config, backend="numba"))
+        run(states[-1], tiny_task(config, backend="numba"), 30)
     assert same(states[0], states[1])
     assert same(states[0], states[2])
 
@@ -159,13 +166,16 @@ def test_another_seed_gives_another_result():
 
 
 @every_run
+@every_strategy
 @pytest.mark.parametrize("stop", [1, 17, 30])
-def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(tmp_path, stop, backend, device):
-    whole, task = first_state(CONFIG, device, backend), tiny_task(CONFIG, device, backend)
+def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(
+    tmp_path, stop, backend, device, config
+):
+    whole, task = first_state(config, device, backend), tiny_task(config, device, backend)
     run(whole, task, 45)
-    part = first_state(CONFIG, device, backend)
+    part = first_state(config, device, backend)
     run(part, task, stop)
-    resumed = saved_and_loaded(part, tmp_path, device, backend)
+    resumed = saved_and_loaded(part, tmp_path, device, backend, config)
     run(resumed, task, 45)
     assert same(whole, resumed)
     assert resumed.iteration == 45
@@ -253,16 +263,36 @@ def test_a_view_that_sees_nothing_does_not_stop_the_run(backend):
 
 
 @every_cpu_backend
-def test_a_loss_that_is_not_finite_stops_the_run(backend):
+def test_a_loss_that_stays_not_finite_stops_the_run(backend):
     state = first_state(backend=backend)
     with torch.no_grad():
         state.splats.sh_dc.fill_(3e38)  # colours overflow in the sum over fragments
-    with pytest.raises(TrainingError, match="not finite at step 1"):
-        run(state, tiny_task(backend=backend), 3)
+    with pytest.raises(TrainingError, match="not finite at step 6, as at 5 steps before it"):
+        run(state, tiny_task(backend=backend), 30)
 
 
 @every_cpu_backend
-def test_deleting_every_gaussian_is_an_error(backend):
-    config = TrainConfig(iterations=40, densify_every=10, min_opacity=1.0)
+def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monkeypatch, tmp_path):
+    state, task = first_state(backend=backend), tiny_task(backend=backend)
+    before = state.splats.map(lambda tensor: tensor.detach().clone())
+    compute = gradient_step(backend)
+    monkeypatch.setattr(
+        "recon_cli.train.fit.gradient_step",
+        lambda _: lambda *given, **named: (float("nan"), compute(*given, **named)[1]))
+    run(state, task, 2)
+    assert (state.iteration, state.skipped, state.optimizer.count) == (2, 2, 0)
+    assert all(torch.equal(value, getattr(before, name))
+               for name, value in state.splats.parameters().items())
+    assert saved_and_loaded(state, tmp_path, backend=backend).skipped == 2
+    monkeypatch.undo()
+    run(state, task, 20)
+    assert state.skipped == 2
+    assert all(torch.isfinite(value).all() for value in state.splats.parameters().values())
+
+
+@every_cpu_backend
+@pytest.mark.parametrize("strategy", ["reference", "budget", "mcmc"])
+def test_deleting_every_gaussian_is_an_error(backend, strategy):
+    config = TrainConfig(iterations=40, densify_every=10, min_opacity=1.0, densify=strategy)
     with pytest.raises(TrainingError, match="No Gaussian is left"):
         run(first_state(config, backend=backend), tiny_task(config, backend=backend), 40)

@@ -8,7 +8,7 @@ from recon_cli.train.schedule import Schedule
 
 
 def test_a_run_of_30000_follows_the_reference():
-    plan = Schedule(TrainConfig(iterations=30_000))
+    plan = Schedule(TrainConfig(densify="reference", iterations=30_000))
     assert [i for i in range(1, 30_001) if plan.resets(i)] == [3000, 6000, 9000, 12000]
     densified = [i for i in range(1, 30_001) if plan.densifies(i)]
     assert (densified[0], densified[-1], len(densified)) == (500, 14_900, 145)
@@ -20,19 +20,20 @@ def test_a_run_of_30000_follows_the_reference():
 
 
 def test_a_short_run_reaches_the_full_degree_and_still_recovers_from_its_last_reset():
-    plan = Schedule(TrainConfig(iterations=3000))
+    plan = Schedule(TrainConfig(densify="reference", iterations=3000))
     assert plan.sh_degree(3000) == 3
     assert [i for i in range(1, 3001) if plan.resets(i)] == [1000]
-    shorter = Schedule(TrainConfig(iterations=1500))
+    shorter = Schedule(TrainConfig(densify="reference", iterations=1500))
     assert not any(shorter.resets(i) for i in range(1, 1501))
 
 
 def test_the_degree_is_capped_by_the_option():
-    assert Schedule(TrainConfig(iterations=100, sh_degree=1)).sh_degree(100) == 1
+    plan = Schedule(TrainConfig(densify="reference", iterations=100, sh_degree=1))
+    assert plan.sh_degree(100) == 1
 
 
 def test_a_run_of_one_step_has_a_plan():
-    plan = Schedule(TrainConfig(iterations=1))
+    plan = Schedule(TrainConfig(densify="reference", iterations=1))
     assert plan.mid == 1
     assert plan.sh_degree(1) == 0
 
@@ -40,3 +41,22 @@ def test_a_run_of_one_step_has_a_plan():
 def test_a_middle_before_the_end_of_densification_is_refused():
     with pytest.raises(ConfigError, match="densification"):
         TrainConfig(mid=0.3)
+
+
+def test_a_budget_starts_small_and_coarse_and_ends_calm():
+    plan = Schedule(TrainConfig(iterations=1000, max_gaussians=5000))
+    factors = [plan.level(i) for i in range(1, 1001)]
+    assert sorted(set(factors), reverse=True) == [4, 2, 1]
+    assert factors == sorted(factors, reverse=True)
+    counts = [plan.target(i, 1000) for i in range(1, 1001)]
+    assert counts == sorted(counts)
+    assert (counts[0], counts[599], counts[-1]) == (1000, 5000, 5000)
+    assert plan.rate_factor(700) == 1
+    assert plan.rate_factor(1000) == pytest.approx(0.1)
+    assert [plan.sh_degree(i) for i in (1, 151, 301, 451, 1000)] == [0, 1, 2, 3, 3]
+    assert not any(plan.resets(i) or plan.deletes_large(i) for i in range(1, 1001))
+
+
+def test_the_target_never_falls_below_what_the_run_began_with():
+    plan = Schedule(TrainConfig(iterations=1000, max_gaussians=5000))
+    assert plan.target(900, 5000) == 5000

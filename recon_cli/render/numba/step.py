@@ -45,7 +45,7 @@ class PhotometricStep:
     def __call__(
         self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
         background: Tensor, sh_degree: int, ssim_weight: float, *,
-        mask: NDArray[np.bool_] | None = None, scores: bool = False,
+        mask: NDArray[np.bool_] | None = None, details: bool = False, scores: bool = False,
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
@@ -60,8 +60,9 @@ class PhotometricStep:
             sh_degree: in use.
             ssim_weight: w in [0, 1].
             mask: [H, W], True where a pixel counts; None where all do.
-            scores: also gather hits, blend weights and loo of the pixels that count; without
-                it they mean nothing.
+            details: the statistics absolute_grad and variance are wanted too.
+            scores: hits, blend weights and loo too, over the pixels that count; without it they
+                mean nothing.
         """
         height, width, n = camera.height, camera.width, len(splats)
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
@@ -94,7 +95,7 @@ class PhotometricStep:
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,
-            grad_alpha=nothing, grad_depth=nothing, details=False, scores=scores,
+            grad_alpha=nothing, grad_depth=nothing, details=details, scores=scores,
             means2d_grad=flat(statistics.means2d_grad),
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))

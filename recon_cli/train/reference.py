@@ -12,48 +12,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon_cli.render import Statistics
 from recon_cli.render.projection import rotation_matrices
 from recon_cli.scene.splats import Splats
+from recon_cli.train.gathered import Gathered
 
 _SPLIT = 2  # Gaussians that replace one that is split
 _SHRINK = 1.6  # their scales are divided by this
 _MAX_RADIUS = 20.0  # pixels on the screen
 _MAX_SCALE = 0.1  # x extent
 RESET_OPACITY = 0.01
-
-
-@dataclass(eq=False)
-class Pull:
-    """How hard the loss pulled at each projected mean since the last densification.
-
-    Attributes:
-        total: [N] sum over steps of the gradient's length, in normalised device coordinates.
-        count: [N] steps in which the Gaussian was seen.
-        radius: [N] largest radius on the screen, pixels.
-    """
-
-    total: Tensor
-    count: Tensor
-    radius: Tensor
-
-    @staticmethod
-    def zeros(n: int, device: torch.device) -> Pull:
-        """Returns a record of nothing for n Gaussians."""
-        return Pull(*(torch.zeros(n, device=device) for _ in range(3)))
-
-    def add(self, statistics: Statistics, width: int, height: int) -> None:
-        """Adds what one backward pass over an image of width x height found."""
-        seen = statistics.radii > 0
-        scale = statistics.means2d_grad.new_tensor([width / 2, height / 2])
-        self.total += (statistics.means2d_grad * scale).norm(dim=-1)
-        self.count += seen
-        self.radius = torch.maximum(self.radius, statistics.radii)
-
-    @property
-    def mean(self) -> Tensor:
-        """Mean length per step in which the Gaussian was seen, [N]; 0 where it never was."""
-        return self.total / self.count.clamp_min(1)
 
 
 @dataclass(frozen=True)
@@ -76,12 +43,12 @@ class DensifyRule:
 
 
 def densify(
-    splats: Splats, pull: Pull, rule: DensifyRule, generator: torch.Generator
+    splats: Splats, gathered: Gathered, rule: DensifyRule, generator: torch.Generator
 ) -> tuple[Splats, Tensor]:
     """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones."""
     opaque = splats.opacities.detach() >= rule.min_opacity
-    kept = opaque & _not_oversized(splats, pull, rule)
-    selected = opaque & _hardest_pulled(pull.mean, rule, len(splats))
+    kept = opaque & _not_oversized(splats, gathered, rule)
+    selected = opaque & _hardest_pulled(gathered.mean_pull, rule, len(splats))
     small = splats.scales.detach().amax(1) <= rule.clone_scale
     clones = torch.nonzero(selected & small & kept)[:, 0]
     splits = torch.nonzero(selected & ~small)[:, 0]
@@ -118,12 +85,12 @@ def _halves(splats: Splats, rows: Tensor, generator: torch.Generator) -> Splats:
     return parent
 
 
-def _not_oversized(splats: Splats, pull: Pull, rule: DensifyRule) -> Tensor:
+def _not_oversized(splats: Splats, gathered: Gathered, rule: DensifyRule) -> Tensor:
     """Returns a mask of the Gaussians that are not too large on the screen or in the world."""
     if rule.large_scale is None:
-        return torch.ones_like(pull.radius, dtype=torch.bool)
+        return torch.ones_like(gathered.radius, dtype=torch.bool)
     largest = splats.scales.detach().amax(1)
-    fits: Tensor = (pull.radius <= _MAX_RADIUS) & (largest <= rule.large_scale)
+    fits: Tensor = (gathered.radius <= _MAX_RADIUS) & (largest <= rule.large_scale)
     return fits
 
 

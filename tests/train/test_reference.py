@@ -7,7 +7,8 @@ import torch
 from scenes import joined, one_splat
 
 from recon_cli.render import Statistics
-from recon_cli.train.densify import DensifyRule, Pull, densify, lowered_opacities
+from recon_cli.train.gathered import Gathered
+from recon_cli.train.reference import DensifyRule, densify, lowered_opacities
 
 RULE = DensifyRule(gradient=1.0, clone_scale=0.1, min_opacity=0.005, large_scale=1.0, most=100)
 
@@ -18,10 +19,10 @@ def splat(scale=0.05, opacity=0.5):
 
 
 def pulled(*means):
-    pull = Pull.zeros(len(means), torch.device("cpu"))
-    pull.total[:] = torch.tensor(means)
-    pull.count[:] = 1
-    return pull
+    gathered = Gathered.zeros(len(means), torch.device("cpu"))
+    gathered.pull[:] = torch.tensor(means)
+    gathered.count[:] = 1
+    return gathered
 
 
 def test_a_small_gaussian_that_is_pulled_hard_is_cloned():
@@ -51,11 +52,11 @@ def test_transparent_and_oversized_ones_are_deleted():
 
 
 def test_one_that_covers_too_much_of_the_screen_is_deleted_only_when_asked():
-    pull = pulled(0.0)
-    pull.radius[:] = 21.0
+    gathered = pulled(0.0)
+    gathered.radius[:] = 21.0
     kept = DensifyRule(1.0, 0.1, 0.005, None, 100)
-    assert len(densify(splat(), pull, RULE, torch.Generator())[0]) == 0
-    assert len(densify(splat(), pull, kept, torch.Generator())[0]) == 1
+    assert len(densify(splat(), gathered, RULE, torch.Generator())[0]) == 0
+    assert len(densify(splat(), gathered, kept, torch.Generator())[0]) == 1
 
 
 def test_the_count_never_exceeds_its_cap_and_the_hardest_pulled_come_first():
@@ -70,11 +71,11 @@ def test_the_pull_is_measured_in_normalised_device_coordinates_over_seen_steps()
     statistics = Statistics.zeros(torch.zeros(2, 3))
     statistics.means2d_grad[0] = torch.tensor([0.3, 0.4])
     statistics.radii[0] = 5.0
-    pull = Pull.zeros(2, torch.device("cpu"))
-    pull.add(statistics, 20, 20)
-    pull.add(statistics, 20, 20)
-    assert pull.mean.tolist() == pytest.approx([0.5 * 10, 0.0])
-    assert pull.radius.tolist() == [5.0, 0.0]
+    gathered = Gathered.zeros(2, torch.device("cpu"))
+    gathered.add(statistics, 20, 20)
+    gathered.add(statistics, 20, 20)
+    assert gathered.mean_pull.tolist() == pytest.approx([0.5 * 10, 0.0])
+    assert gathered.radius.tolist() == [5.0, 0.0]
 
 
 def test_a_reset_lowers_high_opacities_and_leaves_low_ones():
