@@ -189,7 +189,7 @@ def sfm(call: Call) -> None:
     "--prune", "with_prune", is_flag=True,
     help="Then branch off in mid-training, prune there and train the rest of the run again.  "
          "[default: off]")
-@options.of(PruneConfig, without=("at",), lead="With --prune: ")
+@options.of(PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"), lead="With --prune: ")
 @options.stage(TrainConfig, renders=True)
 @pass_call
 def train(call: Call, with_prune: bool) -> None:

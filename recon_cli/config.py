@@ -197,24 +197,56 @@ class TrainConfig(StageConfig):
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 
+PRUNE_SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
+LIMITS = ("ratio", "max_gaussians", "max_mb", "max_psnr_drop")  # of which one may be given
+
+
 @dataclass(frozen=True)
 class PruneConfig(StageConfig):
     """Which Gaussians go, and how the rest recovers."""
 
-    ratio: float = option(
-        0.5, "Share of the Gaussians that is removed.", unit="share", minimum=0.0, maximum=1.0)
-    beta: float = option(
-        0.1, "Exponent of the normalised volume in the significance score (equation 4).",
-        minimum=0.0)
+    ratio: float | None = option(
+        None, "Share of the Gaussians that is removed; at least one stays.", unit="share",
+        minimum=0.0, maximum=1.0, automatic="0.5 where no other limit is given")
+    max_gaussians: int | None = option(
+        None, "Most Gaussians that stay.", unit="Gaussians", minimum=1, automatic="no limit")
+    max_mb: float | None = option(
+        None, "Largest .ply that is written.", unit="MB", minimum=0.0, automatic="no limit")
+    max_psnr_drop: float | None = option(
+        None, "Remove as many as cost no more than this, on the validation views and after "
+        "recovery.", unit="dB", minimum=0.0, automatic="no limit")
+    rounds: int = option(
+        3, "Rounds of removal, with recovery and new scores in between; 1 removes all at once.",
+        unit="rounds", minimum=1)
     score: str = option(
-        "paper", "Significance: the paper's score (equations 3 to 5), or a control.",
-        choices=("paper", "blend_max", "loo", "opacity", "random"))
+        "loo", "What ranks a Gaussian: loo (the squared error of leaving it out), paper (the "
+        "significance of equations 3 to 5), lightgaussian (the same, volume not clamped), "
+        "blend_sum and blend_max (of its weights in the pixels), opacity, or random.",
+        choices=PRUNE_SCORES)
+    beta: float = option(
+        0.1, "With paper: exponent of the normalised volume (equation 4).", minimum=0.0)
     at: str = option(
         "end", "Prune the finished model, or branch off in mid-training and train the rest of "
         "the run (what train --prune does).", choices=("end", "mid"))
     recovery: int | None = option(
-        None, "Training steps after pruning.", unit="steps", minimum=0,
+        None, "Training steps from the first removal on; with --max-psnr-drop each round takes "
+        "its share of them.", unit="steps", minimum=0,
         automatic="the rest of the run at mid, a sixth of it at end")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given = [name for name in LIMITS if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ConfigError(
+                f"{' and '.join(given)} are given, but only one of them can say how much goes.",
+                hint="Leave out all but one of --ratio, --max-gaussians, --max-mb and "
+                "--max-psnr-drop, in recon.toml too.")
+        if self.max_psnr_drop is not None and self.at == "mid":
+            raise ConfigError(
+                "max_psnr_drop is given for pruning in mid-training, where there is no finished "
+                "model to hold the pruned one against.",
+                hint="Run `recon train`, then `recon prune --max-psnr-drop "
+                f"{self.max_psnr_drop:g}`.")
 
 
 @dataclass(frozen=True)

@@ -45,12 +45,25 @@ def write_ply(path: Path, splats: Splats) -> None:
         "logit_opacities": raw["logit_opacities"][:, None],
     }
     table = torch.cat([columns[name] for name in _GROUPS], dim=1).numpy()
-    names = [name for group in _GROUPS.values() for name in group]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}",
-              *(f"property float {name}" for name in names), "end_header", ""]
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
+        file.write(_header(n))
         file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
+
+
+def _header(n: int) -> bytes:
+    names = [name for group in _GROUPS.values() for name in group]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}",
+             *(f"property float {name}" for name in names), "end_header", ""]
+    return "\n".join(lines).encode("ascii")
+
+
+def most_gaussians(size: int) -> int:
+    """Returns how many Gaussians fit into a .ply of `size` bytes; 0 where not even one does."""
+    each = 4 * sum(len(names) for names in _GROUPS.values())
+    count = max(0, (size - len(_header(0))) // each)
+    while count and len(_header(count)) + each * count > size:  # the count has digits
+        count -= 1
+    return count
 
 
 def read_ply(path: Path) -> Splats:

@@ -24,6 +24,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.train.fit import Report, Task, fit
+from recon_cli.train.importance import Importance
 from recon_cli.train.memory import estimate, refuse_what_does_not_fit
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
@@ -147,7 +148,7 @@ def seconds_at(log: Path, iteration: int) -> float:
     return seconds
 
 
-class _Log:
+class Log:
     """One JSON line a report; what a crash left behind the checkpoint is cut off."""
 
     def __init__(self, path: Path, iteration: int, earlier_seconds: float) -> None:
@@ -164,7 +165,14 @@ class _Log:
     def add(self, report: Report) -> None:
         """Appends a report; its seconds count from the very start of training."""
         row = dataclasses.asdict(report)
-        row["seconds"] = round(self._earlier + report.seconds, 3)
+        self.write({**row, "seconds": round(self._earlier + report.seconds, 3)})
+
+    def spend(self, iteration: int, seconds: float) -> None:
+        """Counts seconds in which no step was taken."""
+        self.write({"iteration": iteration, "seconds": round(self._earlier + seconds, 3)})
+
+    def write(self, row: dict[str, object]) -> None:
+        """Appends a line."""
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
@@ -204,6 +212,9 @@ def run_fit(
     first: int = 0,
     earlier_seconds: float = 0.0,
     keep: dict[int, str] | None = None,
+    end: int | None = None,
+    checkpoint: str = CHECKPOINT,
+    importance: Importance | None = None,
 ) -> None:
     """Fits until `until` steps, saving the state in `out` as it goes.
 
@@ -217,22 +228,26 @@ def run_fit(
         first: step at which this stage's own work begins.
         earlier_seconds: training seconds before that.
         keep: file names under which the state after certain steps is kept.
+        end: step at which this stage's own work ends; `until` where it is None.
+        checkpoint: file name of the state that a later run goes on from.
+        importance: gets the scores of these steps. They are in no checkpoint, so none is written
+            while they are gathered.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
     """
-    log = _Log(out / LOG, state.iteration, earlier_seconds)
+    log = Log(out / LOG, state.iteration, earlier_seconds)
     every = task.schedule.config.checkpoint_every
     with _deferred_interrupt() as pressed, ctx.progress.bar(
-        label, until - first, unit="step", done=state.iteration - first
+        label, (end or until) - first, unit="step", done=state.iteration - first
     ) as bar:
         def on_step(now: TrainState) -> None:
             bar.advance()
             if keep and now.iteration in keep:
                 save_state(out / keep[now.iteration], now)
-            if now.iteration % every == 0 or pressed:
-                save_state(out / CHECKPOINT, now)
-                ctx.record(now.iteration - first, until - first)
+            if importance is None and (now.iteration % every == 0 or pressed):
+                save_state(out / checkpoint, now)
+                ctx.record(now.iteration - first, (end or until) - first)
             if pressed:
                 raise KeyboardInterrupt
 
@@ -242,4 +257,4 @@ def run_fit(
             shown = "" if value is None else f", validation {value:.2f} dB"
             bar.note(f"loss {report.loss:.4f}{shown}, {report.gaussians:,} Gaussians")
 
-        fit(state, task, until, on_step=on_step, on_report=on_report)
+        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance)

@@ -18,8 +18,6 @@ from recon_cli.render import Statistics, render
 from recon_cli.scene.splats import Splats
 from recon_cli.train.step import TrainView
 
-SCORES = ("paper", "lightgaussian", "blend_sum", "blend_max", "loo", "opacity", "random")
-
 _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
 _BETA_SHIPPED = 0.1  # LightGaussian's --v_pow
 
@@ -45,8 +43,9 @@ class Importance:
     @staticmethod
     def zeros(n: int, device: torch.device) -> Importance:
         """Returns the record of no view."""
-        sums = (torch.zeros(n, dtype=torch.float64, device=device) for _ in range(3))
-        return Importance(torch.zeros(n, dtype=torch.int64, device=device), *sums)
+        zeros = torch.zeros(n, dtype=torch.float64, device=device)
+        return Importance(
+            torch.zeros(n, dtype=torch.int64, device=device), zeros, zeros.clone(), zeros.clone())
 
     def add(self, statistics: Statistics) -> None:
         """Adds one view: a pass with `scores=True`, its backward pass included where loo counts."""
@@ -62,7 +61,7 @@ class Importance:
         """Returns the score [N] float64 by which Gaussians are ranked; the lowest go first.
 
         Args:
-            name: one of SCORES.
+            name: one of PRUNE_SCORES.
             splats: the N Gaussians as they are now.
             beta: exponent of the volume in the paper's score.
             generator: draws the random score, and nothing else.

@@ -8,17 +8,23 @@ between.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from recon_cli.train.fit import Task
 from recon_cli.train.gathered import Gathered
+from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 
 # Share of the recovery by which the last round is over; what is left mends it. docs/pruning.md
 LAST_ROUND = 0.5
+
+# Trains a state up to a step; the scores of those steps go where the third argument says.
+Advance = Callable[[TrainState, int, Importance | None], None]
 
 
 @dataclass(frozen=True)
@@ -105,3 +111,35 @@ def remove(state: TrainState, rows: Tensor) -> None:
     kept = state.splats.select(rows)
     state.optimizer.replace(kept, rows)
     state.gathered = Gathered.zeros(len(kept), kept.means.device)
+
+
+def scored(
+    state: TrainState, task: Task, until: int, *, name: str, beta: float, advance: Advance
+) -> Tensor:
+    """Trains up to `until` and returns the score [N] that the last epoch's own passes give.
+
+    Every training view counts once: those that the steps at hand do not reach are rendered.
+
+    Args:
+        state: changed in place.
+        task: views and plan.
+        until: total number of steps.
+        name: of the score.
+        beta: exponent of the volume in the paper's score.
+        advance: trains; it must not save the state while scores are gathered.
+    """
+    found = Importance.zeros(len(state.splats), state.splats.means.device)
+    if name in ("opacity", "random"):
+        advance(state, until, None)
+    else:
+        advance(state, max(state.iteration, until - len(task.train)), None)
+        left = list(range(len(task.train)))
+        if state.iteration < until:
+            state.queue = []  # a new epoch, in which no view comes twice
+            advance(state, until, found)
+            left = state.queue
+        add_views(
+            found, state.splats, [task.train[i] for i in sorted(left)],
+            sh_degree=task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend,
+            loo=name == "loo")
+    return found.score(name, state.splats, beta=beta, generator=state.generator)

@@ -5,10 +5,9 @@ import pytest
 import torch
 from scenes import camera_at, joined, one_splat, random_splats
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import PRUNE_SCORES, TrainConfig
 from recon_cli.render import render
 from recon_cli.train.importance import (
-    SCORES,
     Importance,
     importance_of,
     lightgaussian_score,
@@ -104,7 +103,7 @@ def test_one_gaussian_alone_has_the_score_that_its_picture_gives():
     assert found.loo.item() == pytest.approx(2 * squares * alpha.square().sum().item())
 
 
-@pytest.mark.parametrize("name", [name for name in SCORES if name != "random"])
+@pytest.mark.parametrize("name", [name for name in PRUNE_SCORES if name != "random"])
 def test_a_view_whose_mask_ignores_all_adds_nothing(name):
     splats, camera = random_splats(30), camera_at(30, 20)
     views = [blank(camera), blank(camera, np.zeros((20, 30), bool))]
