@@ -215,9 +215,10 @@ class PruneConfig(StageConfig):
     max_psnr_drop: float | None = option(
         None, "Remove as many as cost no more than this, on the validation views and after "
         "recovery.", unit="dB", minimum=0.0, automatic="no limit")
-    rounds: int = option(
-        3, "Rounds of removal, with recovery and new scores in between; 1 removes all at once.",
-        unit="rounds", minimum=1)
+    rounds: int | None = option(
+        None, "Rounds of removal, with recovery and new scores in between; 1 removes all at once.",
+        unit="rounds", minimum=1, automatic="one an epoch in the first half of the recovery, 3 "
+        "to 8")
     score: str = option(
         "loo", "What ranks a Gaussian: loo (the squared error of leaving it out), paper (the "
         "significance of equations 3 to 5), lightgaussian (the same, volume not clamped), "

@@ -43,7 +43,8 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     write_ply(out / "splats.ply", state.splats)
     course.clear()
     return {
-        **_summary(config, state, rounds, n), "recovery_steps": state.iteration - course.first,
+        **_summary(config, state, rounds, n), "iterations": state.iteration,
+        "recovery_steps": state.iteration - course.first,
         "validation_psnr_db_before": psnr_before,
         "validation_psnr_db": validation_psnr(state, course.task),
         "train_seconds": seconds_at(out / LOG, state.iteration),

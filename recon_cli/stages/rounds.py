@@ -23,7 +23,15 @@ from recon_cli.stages.context import StageContext
 from recon_cli.stages.fitting import LOG, Log, run_fit
 from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.importance import Importance
-from recon_cli.train.pruning import Recovery, remaining, removals, remove, scored, survivors
+from recon_cli.train.pruning import (
+    Recovery,
+    remaining,
+    removals,
+    remove,
+    rounds_within,
+    scored,
+    survivors,
+)
 from recon_cli.train.state import TrainState, save_state
 
 logger = logging.getLogger("recon")
@@ -86,6 +94,11 @@ class Course:
     first: int
     until: int
     earlier_seconds: float
+
+    @property
+    def rounds(self) -> int:
+        """How many rounds there are."""
+        return self.config.rounds or rounds_within(self.until - self.first, len(self.task.train))
 
     def recovering(self, first: int, until: int) -> Task:
         """Returns the task with learning rates for a recovery between two steps."""
@@ -170,7 +183,7 @@ def prune_to(course: Course, target: int) -> tuple[TrainState, list[Round]]:
     number, task = len(done), course.recovering(first, until)
     state = course.state(number)
     n = done[0].gaussians_before if done else len(state.splats)
-    plan = removals(n, min(n, target), course.config.rounds, until - first)
+    plan = removals(n, min(n, target), course.rounds, until - first)
     for removal in plan[number:]:
         score = course.scored(task, number, state, first + removal.after)
         _settle(done, state, course.task)
@@ -189,7 +202,7 @@ def prune_while_good(
 
     A round that costs too much is taken back, and a smaller one is tried from the state before.
     """
-    steps = (course.until - course.first) // course.config.rounds
+    steps = (course.until - course.first) // course.rounds
     done, good = course.read(), course.out / GOOD
     while True:
         number = len(done)

@@ -121,7 +121,9 @@ def _step(
     degree, gathers = schedule.sh_degree(iteration), schedule.gathers(iteration)
     loss, statistics = compute(
         state.optimizer, view, degree, schedule.config.ssim_weight,
-        variance=gathers and strategy.variance, scores=importance is not None)
+        variance=gathers and strategy.variance,
+        scores=importance is not None and importance.weighs,
+        loo=importance is not None and importance.leaves_out)
     state.iteration = iteration
     if not np.isfinite(loss):
         _skip(state, task)

@@ -32,6 +32,8 @@ class Importance:
         blend_max: [N] float64, greatest alpha T.
         loo: [N] float64, squared error that removing it alone causes.
         views: how many were added.
+        weighs: hits and blend weights are gathered.
+        leaves_out: loo is gathered.
     """
 
     hits: Tensor
@@ -39,21 +41,38 @@ class Importance:
     blend_max: Tensor
     loo: Tensor
     views: int = 0
+    weighs: bool = True
+    leaves_out: bool = True
 
     @staticmethod
     def zeros(n: int, device: torch.device) -> Importance:
-        """Returns the record of no view."""
+        """Returns the record of no view, for every score."""
         zeros = torch.zeros(n, dtype=torch.float64, device=device)
         return Importance(
             torch.zeros(n, dtype=torch.int64, device=device), zeros, zeros.clone(), zeros.clone())
 
+    @staticmethod
+    def of_score(name: str, n: int, device: torch.device) -> Importance:
+        """Returns the record of no view that gathers no more than one score needs."""
+        found = Importance.zeros(n, device)
+        found.leaves_out = name == "loo"
+        found.weighs = name in ("paper", "lightgaussian", "blend_sum", "blend_max")
+        return found
+
+    @property
+    def needs_views(self) -> bool:
+        """Whether the score is about what views show at all."""
+        return self.weighs or self.leaves_out
+
     def add(self, statistics: Statistics) -> None:
-        """Adds one view: a pass with `scores=True`, its backward pass included where loo counts."""
-        self.hits += statistics.hits
-        self.blend_sum += statistics.blend_sum
-        self.blend_max = torch.maximum(self.blend_max, statistics.blend_max.double())
-        self.loo += statistics.loo
+        """Adds what one view's passes found, as far as it is gathered."""
         self.views += 1
+        if self.weighs:
+            self.hits += statistics.hits
+            self.blend_sum += statistics.blend_sum
+            self.blend_max = torch.maximum(self.blend_max, statistics.blend_max.double())
+        if self.leaves_out:
+            self.loo += statistics.loo
 
     def score(
         self, name: str, splats: Splats, *, beta: float, generator: torch.Generator
@@ -122,8 +141,7 @@ def _log_volumes(splats: Splats) -> Tensor:
 
 
 def add_views(
-    found: Importance, splats: Splats, views: Iterable[TrainView], *, sh_degree: int,
-    backend: str, loo: bool = True,
+    found: Importance, splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str
 ) -> None:
     """Adds what a pass over views finds, each with its mask.
 
@@ -133,23 +151,22 @@ def add_views(
         views: training views; never validation or test views.
         sh_degree: degree in use.
         backend: rasterizer.
-        loo: also take the backward pass that loo needs.
     """
     device = splats.means.device
     background = torch.zeros(3, dtype=splats.means.dtype, device=device)
-    leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(loo))
+    leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(found.leaves_out))
     for view in views:
         output = render(leaves, view.camera, background, sh_degree, backend=backend, scores=True,
                         mask=view.counting(device))
-        if loo and output.rgb.requires_grad:
+        if output.rgb.requires_grad:
             output.rgb.sum().backward()  # type: ignore[no-untyped-call]
         found.add(output.statistics)
 
 
 def importance_of(
-    splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str, loo: bool = True
+    splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str
 ) -> Importance:
-    """Returns what a pass over views finds; the arguments are those of `add_views`."""
+    """Returns all that a pass over views finds; the arguments are those of `add_views`."""
     found = Importance.zeros(len(splats), splats.means.device)
-    add_views(found, splats, views, sh_degree=sh_degree, backend=backend, loo=loo)
+    add_views(found, splats, views, sh_degree=sh_degree, backend=backend)
     return found

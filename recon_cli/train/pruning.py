@@ -22,6 +22,7 @@ from recon_cli.train.state import TrainState
 
 # Share of the recovery by which the last round is over; what is left mends it. docs/pruning.md
 LAST_ROUND = 0.5
+_LEAST_ROUNDS, _MOST_ROUNDS = 3, 8  # more gained nothing. docs/pruning.md
 
 # Trains a state up to a step; the scores of those steps go where the third argument says.
 Advance = Callable[[TrainState, int, Importance | None], None]
@@ -76,11 +77,20 @@ def remaining(n: int, ratio: float) -> int:
     return max(1, n - int(ratio * n))
 
 
+def rounds_within(recovery: int, views: int) -> int:
+    """Returns how many rounds a recovery has room for: one an epoch, 3 to 8.
+
+    An epoch between two removals scores every view by its training steps alone.
+    """
+    return min(_MOST_ROUNDS, max(_LEAST_ROUNDS, int(LAST_ROUND * recovery) // max(1, views)))
+
+
 def removals(n: int, target: int, rounds: int, recovery: int) -> tuple[Removal, ...]:
     """Returns the plan that leads from n Gaussians to `target`.
 
-    Each round removes the same share of what is there. The first one comes at once, the last one
-    at LAST_ROUND of the recovery. Rounds that would remove nothing are left out.
+    Each round removes the same share of what is there. They are evenly spread up to LAST_ROUND of
+    the recovery, so that training steps come before the first one and score it; a single round
+    comes at once. Rounds that would remove nothing are left out.
 
     Args:
         n: Gaussians now.
@@ -90,7 +100,7 @@ def removals(n: int, target: int, rounds: int, recovery: int) -> tuple[Removal, 
     """
     plan: list[Removal] = []
     for k in range(rounds):
-        after = round(LAST_ROUND * recovery * k / max(1, rounds - 1))
+        after = round(LAST_ROUND * recovery * (k + 1) / rounds) if rounds > 1 else 0
         count = target if k == rounds - 1 else round(n * (target / n) ** ((k + 1) / rounds))
         if count < (plan[-1].count if plan else n):
             plan.append(Removal(after, count))
@@ -128,8 +138,8 @@ def scored(
         beta: exponent of the volume in the paper's score.
         advance: trains; it must not save the state while scores are gathered.
     """
-    found = Importance.zeros(len(state.splats), state.splats.means.device)
-    if name in ("opacity", "random"):
+    found = Importance.of_score(name, len(state.splats), state.splats.means.device)
+    if not found.needs_views:
         advance(state, until, None)
     else:
         advance(state, max(state.iteration, until - len(task.train)), None)
@@ -140,6 +150,5 @@ def scored(
             left = state.queue
         add_views(
             found, state.splats, [task.train[i] for i in sorted(left)],
-            sh_degree=task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend,
-            loo=name == "loo")
+            sh_degree=task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend)
     return found.score(name, state.splats, beta=beta, generator=state.generator)

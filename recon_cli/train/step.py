@@ -52,13 +52,13 @@ class GradientStep(Protocol):
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
-        *, variance: bool = False, scores: bool = False,
+        *, variance: bool = False, scores: bool = False, loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view; None where it sees no Gaussian.
 
         The statistics are valid until the next call. Their `variance` is computed where it is
-        asked for, and so are the scores (hits, blend weights and loo), over the pixels that the
-        view's mask counts.
+        asked for, and so are the scores (hits and blend weights) and loo, over the pixels that
+        the view's mask counts.
         """
 
 
@@ -83,13 +83,13 @@ class _FusedStep:
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
-        *, variance: bool = False, scores: bool = False,
+        *, variance: bool = False, scores: bool = False, loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
             sh_degree, ssim_weight, mask=view.mask, details=variance,
-            scores=scores)
+            scores=scores, loo=loo)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -101,14 +101,14 @@ class _AutogradStep:
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
-        *, variance: bool = False, scores: bool = False,
+        *, variance: bool = False, scores: bool = False, loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
         device, counting = splats.means.device, view.counting(splats.means.device)
         output = render(
             splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
-            scores=variance or scores, mask=counting)
+            scores=variance or scores or loo, mask=counting)
         loss = photometric_loss(output.rgb, view.pixels(device), ssim_weight, mask=counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):

@@ -82,7 +82,7 @@ def test_the_fused_step_gives_the_scores_of_the_renderer():
     step = PhotometricStep()
     for counting in (None, mask, None):  # one after the other: nothing adds up
         step(splats, splats.map(torch.empty_like), camera, truth, BLACK, 3, 0.2, mask=counting,
-             scores=True)
+             scores=True, loo=True)
         output = render(splats, camera, BLACK, 3, backend="numba", scores=True,
                         mask=None if counting is None else torch.from_numpy(counting))
         output.rgb.sum().backward()
@@ -98,6 +98,7 @@ def test_asking_for_scores_changes_no_gradient():
     found = []
     for scores in (False, True):
         gradients = splats.map(torch.empty_like)
-        PhotometricStep()(splats, gradients, camera, truth, BLACK, 3, 0.2, scores=scores)
+        PhotometricStep()(
+            splats, gradients, camera, truth, BLACK, 3, 0.2, scores=scores, loo=scores)
         found.append(gradients.parameters().values())
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))

@@ -117,12 +117,12 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
 
     original = fitting.fit
 
-    def fit_and_press(state, task, until, *, on_step, on_report):
+    def fit_and_press(state, task, until, *, on_step, **others):
         def step(now):
             if now.iteration == 10:
                 os.kill(os.getpid(), signal.SIGINT)
             on_step(now)
-        original(state, task, until, on_step=step, on_report=on_report)
+        original(state, task, until, on_step=step, **others)
 
     with monkeypatch.context() as patch:
         patch.setattr(fitting, "fit", fit_and_press)

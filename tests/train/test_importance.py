@@ -133,7 +133,7 @@ def test_a_training_step_leaves_the_scores_of_its_view(backend):
     mask = np.random.default_rng(0).random((20, 30)) < 0.5
     view = blank(camera_at(30, 20), mask)
     optimizer = SplatOptimizer(splats, TrainConfig(), 1.0, fused=fuses(backend))
-    _, statistics = gradient_step(backend)(optimizer, view, 0, 0.2, scores=True)
+    _, statistics = gradient_step(backend)(optimizer, view, 0, 0.2, scores=True, loo=True)
     trained = Importance.zeros(60, CPU)
     trained.add(statistics)
     expected = importance_of(splats, [view], sh_degree=0, backend=backend)

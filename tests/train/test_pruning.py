@@ -17,6 +17,7 @@ from recon_cli.train.pruning import (
     remaining,
     removals,
     remove,
+    rounds_within,
     scored,
     survivors,
 )
@@ -70,12 +71,18 @@ def test_a_ratio_is_the_share_that_goes_and_one_always_stays():
 
 def test_rounds_remove_the_same_share_each_and_leave_the_rest_of_the_recovery_in_peace():
     plan = removals(1000, 125, 3, 300)
-    assert plan == (Removal(0, 500), Removal(75, 250), Removal(150, 125))
+    assert plan == (Removal(50, 500), Removal(100, 250), Removal(150, 125))
     assert plan[-1].after == LAST_ROUND * 300
 
 
 def test_one_round_removes_all_at_once():
     assert removals(1000, 200, 1, 300) == (Removal(0, 200),)
+
+
+def test_there_is_a_round_an_epoch_within_bounds():
+    assert rounds_within(800, 95) == 4
+    assert rounds_within(0, 95) == 3
+    assert rounds_within(10**6, 95) == 8
 
 
 def test_rounds_that_would_remove_nothing_are_left_out():

@@ -46,6 +46,7 @@ class PhotometricStep:
         self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
         background: Tensor, sh_degree: int, ssim_weight: float, *,
         mask: NDArray[np.bool_] | None = None, details: bool = False, scores: bool = False,
+        loo: bool = False,
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
@@ -61,8 +62,9 @@ class PhotometricStep:
             ssim_weight: w in [0, 1].
             mask: [H, W], True where a pixel counts; None where all do.
             details: the statistics absolute_grad and variance are wanted too.
-            scores: hits, blend weights and loo too, over the pixels that count; without it they
-                mean nothing.
+            scores: hits and blend weights too, over the pixels that count; without it they mean
+                nothing.
+            loo: loo too, likewise.
         """
         height, width, n = camera.height, camera.width, len(splats)
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
@@ -76,7 +78,7 @@ class PhotometricStep:
         frame.forward(
             ours, camera, flat(background), sh_degree, rgb=rgb, alpha=frame.take("alpha", pixels),
             depth=frame.take("depth", pixels), radii=flat(statistics.radii), scores=scores,
-            counting=mask if scores else None)
+            counting=mask if scores or loo else None)
         statistics.broken = frame.broken
         if scores:
             frame.tally(statistics)
@@ -95,7 +97,7 @@ class PhotometricStep:
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters(*map(flat, gradients.parameters().values())), grad_rgb=grad_rgb,
-            grad_alpha=nothing, grad_depth=nothing, details=details, scores=scores,
+            grad_alpha=nothing, grad_depth=nothing, details=details, scores=loo,
             means2d_grad=flat(statistics.means2d_grad),
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))
