@@ -232,7 +232,7 @@ class PruneConfig(StageConfig):
     recovery: int | None = option(
         None, "Training steps from the first removal on; with --max-psnr-drop each round takes "
         "its share of them.", unit="steps", minimum=0,
-        automatic="the rest of the run at mid, a sixth of it at end")
+        automatic="the rest of the run at mid; a sixth of it, at least six epochs, at end")
 
     def __post_init__(self) -> None:
         super().__post_init__()

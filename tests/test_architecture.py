@@ -45,6 +45,9 @@ ALLOWED: dict[str, set[str]] = {
     "pipeline": OPTIONS | RECORDS | {"settings", "stages", "freshness", "execute"},
     "cleaning": RECORDS | {"errors", "execute"},
     "comparing": OPTIONS | BOTTOM | {"capture", "execute", "pipeline", "workspace"},
+    "sweep": OPTIONS | BOTTOM | {
+        "metrics", "scene", "render", "train", "stages", "execute", "pipeline", "workspace",
+        "progress"},
     "doctor": {"errors", "machine", "render"},
     "report": {"doctor", "pipeline"},
     "options": OPTIONS | {"settings"},
@@ -52,12 +55,12 @@ ALLOWED: dict[str, set[str]] = {
         "settings", "options", "machine", "progress", "scene", "render", "train"},
     "cli": OPTIONS | {
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
-        "progress", "stages", "workspace", "bench"},
+        "progress", "stages", "workspace", "bench", "sweep"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "options", "bench"},
-    "matplotlib": {"bench"},
+    "click": {"cli", "options", "bench", "console"},
+    "matplotlib": {"bench", "sweep"},
     "numba": {"render"},
     "llvmlite": {"render"},
     "tqdm": {"progress"},

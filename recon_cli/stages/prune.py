@@ -9,19 +9,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recon_cli.config import PruneConfig, TrainConfig
+from recon_cli.config import PruneConfig
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import most_gaussians, write_ply
 from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.stages.fitting import LOG, load_scene, load_task, read_config, seconds_at
-from recon_cli.stages.rounds import Course, Round, prune_to, prune_while_good
+from recon_cli.stages.course import Round, course_of
+from recon_cli.stages.fitting import LOG, seconds_at
+from recon_cli.stages.rounds import prune_to, prune_while_good
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.pruning import remaining
-from recon_cli.train.state import TrainState, load_state
-from recon_cli.train.step import fuses
+from recon_cli.train.state import TrainState
 
 _RATIO = 0.5  # where no limit is given
-_END_RECOVERY = 6  # the reference recovers for 5,000 steps after 30,000
 
 
 def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
@@ -49,31 +48,6 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
         "validation_psnr_db": validation_psnr(state, course.task),
         "train_seconds": seconds_at(out / LOG, state.iteration),
     }
-
-
-def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Course:
-    """Returns what the rounds need: the state to be pruned, the views, and the steps there are."""
-    train = inputs.folders["train"]
-    train_config = read_config(train)
-    scene = load_scene(inputs, validation=train_config.validation)
-    task = load_task(scene, train_config, ctx)
-    source = train / ("mid.safetensors" if config.at == "mid" else "final.safetensors")
-
-    def load(path: Path) -> TrainState:
-        return load_state(
-            path, train_config, task.extent, task.device, fused=fuses(task.backend))
-
-    first = load(source).iteration
-    return Course(
-        config, task, lambda: load(source), load, out, ctx, first,
-        _until(config, train_config, first), seconds_at(train / LOG, first))
-
-
-def _until(config: PruneConfig, train: TrainConfig, first: int) -> int:
-    """Returns the total number of steps at which recovery ends."""
-    if config.recovery is not None:
-        return first + config.recovery
-    return train.iterations if config.at == "mid" else first + train.iterations // _END_RECOVERY
 
 
 def _target(config: PruneConfig, n: int) -> int:

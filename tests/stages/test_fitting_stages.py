@@ -24,7 +24,7 @@ from recon_cli.errors import (
 from recon_cli.io.images import read_image
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.metrics import psnr, ssim
-from recon_cli.stages import evaluate, export, fitting, prune, train
+from recon_cli.stages import course, evaluate, export, fitting, prune, train
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train.state import save_state
 
@@ -148,7 +148,7 @@ def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(input
 def test_a_killed_recovery_ends_with_the_same_bytes(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         stopping_after(119, patch)
-        patch.setattr(prune, "read_config", lambda _: CONFIG)  # checkpoints every 7 steps
+        patch.setattr(course, "read_config", lambda _: CONFIG)  # checkpoints every 7 steps
         with pytest.raises(Killed):
             run(prune, PRUNE, inputs, tmp_path / "out")
     run(prune, PRUNE, inputs, tmp_path / "out")

@@ -13,7 +13,7 @@ from recon_cli.config import PRUNE_SCORES, PruneConfig, TrainConfig
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import use_threads
-from recon_cli.stages import fitting, prune, rounds, train
+from recon_cli.stages import course, fitting, prune, rounds, train
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train.state import save_state
 
@@ -77,7 +77,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     config, inputs, whole, tmp_path, monkeypatch
 ):
     """Each time one write of a state or of the list succeeds more than the time before."""
-    monkeypatch.setattr(prune, "read_config", lambda _: CONFIG)  # a checkpoint every 3 steps
+    monkeypatch.setattr(course, "read_config", lambda _: CONFIG)  # a checkpoint every 3 steps
     expected, summary = whole[config]
     kills = 0
     while True:
@@ -91,9 +91,9 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
                 raise Killed
 
         with monkeypatch.context() as patch:
-            patch.setattr(rounds, "save_state", lambda *a: count_and_die(save_state, *a))
-            patch.setattr(fitting, "save_state", lambda *a: count_and_die(save_state, *a))
-            patch.setattr(rounds, "write_bytes", lambda *a: count_and_die(fitting.write_bytes, *a))
+            for module in (course, fitting, rounds):
+                patch.setattr(module, "save_state", lambda *a: count_and_die(save_state, *a))
+            patch.setattr(course, "write_bytes", lambda *a: count_and_die(fitting.write_bytes, *a))
             try:
                 resumed = run(config, inputs, tmp_path / "out")
                 break
@@ -193,7 +193,7 @@ def test_where_every_removal_costs_too_much_nothing_goes(inputs, tmp_path, caplo
 
 
 def test_a_loss_of_psnr_without_validation_views_is_refused(inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(prune, "read_config", lambda _: replace(CONFIG, validation=0.0))
+    monkeypatch.setattr(course, "read_config", lambda _: replace(CONFIG, validation=0.0))
     with pytest.raises(TrainingError, match="validation views") as caught:
         run(SEARCH, inputs, tmp_path / "out")
     assert "--validation" in caught.value.hint
