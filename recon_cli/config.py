@@ -137,20 +137,36 @@ def check_scale_between(value: tuple[str, str, float] | None) -> None:
 
 @dataclass(frozen=True)
 class TrainConfig(StageConfig):
-    """How Gaussians are fitted: a recipe, scaled to the number of iterations."""
+    """How Gaussians are fitted: a recipe, scaled to the number of iterations.
 
+    What is left automatic is decided by `train.plan`, once the scene is known.
+    """
+
+    quality: str = option(
+        "normal", "Sets what is not given: iterations, longest side and cap of the count. On two "
+        "cores draft takes about 10 seconds, normal 40, high 4 minutes.",
+        choices=("draft", "normal", "high"))
+    minutes: float | None = option(
+        None, "Time for the training: the steps and the cap of the count that fill it here, by a "
+        "few that are timed first. Excludes --iterations.", unit="minutes", minimum=0.0,
+        automatic="as long as the iterations take")
     densify: str = option(
         "budget", "How Gaussians are added: budget (where the error is, the count on a line), "
         "reference (clone, split and reset as in 3DGS) or mcmc (relocation and noise).",
         choices=("budget", "reference", "mcmc"))
-    iterations: int = option(2000, "Optimization steps, one view each.", unit="steps", minimum=1)
-    max_size: int = option(
-        400, "Longest side of a training image; larger ones are reduced by area.",
-        unit="pixels", minimum=16)
+    iterations: int | None = option(
+        None, "Optimization steps, one view each.", unit="steps", minimum=1,
+        automatic="by --quality: 1,500, 3,000 or 10,000")
+    max_size: int | None = option(
+        None, "Longest side of a training image; larger ones are reduced by area.",
+        unit="pixels", minimum=16, automatic="by --quality: 400, 600 or 960")
     sh_degree: int = option(
         3, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3)
-    max_gaussians: int = option(
-        60_000, "Densification stops at this count.", unit="Gaussians", minimum=1)
+    max_gaussians: int | None = option(
+        None, "Densification stops at this count.", unit="Gaussians", minimum=1,
+        automatic="by the detail of the images, the length of the run and the memory")
+    early_stop: bool = option(
+        True, "Go on to the final phase once the validation views gain nothing more.")
     images: str = option(
         "denoised", "Pixels to train on; scores always use the originals.",
         choices=("denoised", "original"))
@@ -192,6 +208,24 @@ class TrainConfig(StageConfig):
                 f"mid is {self.mid:g}, but densification runs until {DENSIFY_UNTIL:g} of the run "
                 "and would grow back what was pruned.",
                 hint=f"Use --mid {DENSIFY_UNTIL:g} or more.")
+        if self.iterations is not None and self.minutes is not None:
+            raise ConfigError(
+                f"iterations is {self.iterations} and minutes is {self.minutes:g}, but each "
+                "decides how long the training is.",
+                hint="Leave out --iterations or --minutes, here and in recon.toml.")
+
+
+@dataclass(frozen=True)
+class RunConfig(TrainConfig):
+    """The same with numbers in place of what was automatic; a run and what builds on it read this.
+
+    `train.plan` makes it. The defaults are those of a run on which nobody decided.
+    """
+
+    iterations: int = option(3000, "Optimization steps.", unit="steps", minimum=1)
+    max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)
+    max_gaussians: int = option(
+        60_000, "Densification stops at this count.", unit="Gaussians", minimum=1)
 
 
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians

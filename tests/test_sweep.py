@@ -71,7 +71,8 @@ def test_a_sweep_touches_no_result_and_makes_nothing_stale(workspace, swept, cap
     assert (states["train"], states["prune"]) == ("fresh", "fresh")
 
 
-def test_the_picture_is_an_svg_that_names_every_score(workspace, swept):
+@pytest.mark.usefixtures("swept")
+def test_the_picture_is_an_svg_that_names_every_score(workspace):
     pytest.importorskip("matplotlib")
     picture = (workspace / "sweep.svg").read_text()
     assert "<svg" in picture

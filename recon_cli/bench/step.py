@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.bench.scenes import BenchScene
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.render.numba.loss import C1, C2, MAPS, RADIUS, photometric, taps
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
@@ -31,7 +31,7 @@ def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
     does the same arithmetic.
     """
     still = replace(
-        TrainConfig(), means_rate=0.0, quats_rate=0.0, scales_rate=0.0, opacities_rate=0.0,
+        RunConfig(), means_rate=0.0, quats_rate=0.0, scales_rate=0.0, opacities_rate=0.0,
         sh_rate=0.0)
     optimizer = SplatOptimizer(scene.splats, still, 1.0, fused=fuses(backend))
     compute, view = gradient_step(backend), TrainView(scene.camera, noise(scene))
@@ -50,7 +50,7 @@ def loss_passes(scene: BenchScene, device: str) -> dict[str, Callable[[], object
 
     "torch" is what the others are compared with.
     """
-    weight, truth = TrainConfig().ssim_weight, noise(scene)
+    weight, truth = RunConfig().ssim_weight, noise(scene)
     target = torch.from_numpy(truth).to(device).float() / 255
     image = target.flip(0).contiguous()
     leaf = image.clone().requires_grad_()

@@ -1,8 +1,11 @@
 """The .ply of INRIA's 3D Gaussian Splatting, which viewers agree on.
 
-Binary little endian, float32: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3.
-f_rest is channel-major, opacity a logit, scale a natural logarithm, rot wxyz. Reading takes the
-properties in any order, other degrees of f_rest, and ignores properties that it does not know.
+Binary little endian, float32: x y z nx ny nz f_dc_0..2 f_rest opacity scale_0..2 rot_0..3. f_rest
+is channel-major, opacity a logit, scale a natural logarithm, rot wxyz. Of f_rest there is what the
+scene's degree needs, as INRIA's trainer writes it: f_rest_0..44 at degree 3, up to 23 at degree 2,
+up to 8 at degree 1, none at degree 0. Gaussians of degree 0 in a scene of another have zeros there.
+
+Reading takes the properties in any order and ignores those that it does not know.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.atomic import replacing
 from recon_cli.errors import FormatError
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import TERMS, Splats, with_rows
 
 _HEADER_LIMIT = 1 << 16  # bytes; a header that does not end by then is none
 _TYPES = {
@@ -23,12 +26,12 @@ _TYPES = {
     "float": "<f4", "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2",
     "int32": "<i4", "uint32": "<u4", "float32": "<f4", "float64": "<f8",
 }
-_REST = 45  # 15 coefficients of 3 channels
+_REST = [f"f_rest_{i}" for i in range(3 * TERMS[-1])]
 _GROUPS = {
     "means": ["x", "y", "z"],
     "normals": ["nx", "ny", "nz"],
     "sh_dc": [f"f_dc_{i}" for i in range(3)],
-    "sh_rest": [f"f_rest_{i}" for i in range(_REST)],
+    "sh_rest": _REST,
     "logit_opacities": ["opacity"],
     "log_scales": [f"scale_{i}" for i in range(3)],
     "quats": [f"rot_{i}" for i in range(4)],
@@ -38,36 +41,50 @@ _GROUPS = {
 def write_ply(path: Path, splats: Splats) -> None:
     """Writes `splats` to `path`, whole or not at all."""
     n = len(splats)
+    if not len(splats.sh_rest):
+        splats = splats.with_degree(0)
+    rest = _REST[: 3 * TERMS[splats.sh_degree]]
     raw = {name: value.detach().cpu().float() for name, value in splats.parameters().items()}
     columns = {
         **raw, "normals": torch.zeros(n, 3),
-        "sh_rest": raw["sh_rest"].transpose(1, 2).reshape(n, _REST),
+        "sh_rest": with_rows(raw["sh_rest"], n).transpose(1, 2).reshape(n, len(rest)),
         "logit_opacities": raw["logit_opacities"][:, None],
     }
     table = torch.cat([columns[name] for name in _GROUPS], dim=1).numpy()
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(n))
+        file.write(_header(n, splats.sh_degree))
         file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
 
 
-def _header(n: int) -> bytes:
-    names = [name for group in _GROUPS.values() for name in group]
+def _properties(sh_degree: int) -> list[str]:
+    rest = _REST[: 3 * TERMS[sh_degree]]
+    return [name for group in (_GROUPS | {"sh_rest": rest}).values() for name in group]
+
+
+def _header(n: int, sh_degree: int) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}",
-             *(f"property float {name}" for name in names), "end_header", ""]
+             *(f"property float {name}" for name in _properties(sh_degree)), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
 
-def most_gaussians(size: int) -> int:
-    """Returns how many Gaussians fit into a .ply of `size` bytes; 0 where not even one does."""
-    each = 4 * sum(len(names) for names in _GROUPS.values())
-    count = max(0, (size - len(_header(0))) // each)
-    while count and len(_header(count)) + each * count > size:  # the count has digits
+def most_gaussians(size: int, sh_degree: int) -> int:
+    """Returns how many Gaussians fit into a .ply of `size` bytes; 0 where not even one does.
+
+    Args:
+        size: of the file.
+        sh_degree: of the Gaussians.
+    """
+    each = 4 * len(_properties(sh_degree))
+    count = max(0, (size - len(_header(0, sh_degree))) // each)
+    while count and len(_header(count, sh_degree)) + each * count > size:  # the count has digits
         count -= 1
     return count
 
 
 def read_ply(path: Path) -> Splats:
-    """Returns the Gaussians of a .ply as float32 tensors.
+    """Returns the Gaussians of a .ply as float32 tensors, in the file's order.
+
+    Those behind the last one that has a coefficient other than zero are of degree 0.
 
     Raises:
         FormatError: the file is missing, truncated, of another kind of .ply, or holds values that
@@ -114,9 +131,11 @@ def _parse_header(head: bytes, path: Path) -> tuple[int, np.dtype[np.void], int]
 
 def _to_splats(table: NDArray[np.void], path: Path) -> Splats:
     present = set(table.dtype.names or ())
-    rest = sum(name in present for name in _GROUPS["sh_rest"])
-    if rest not in (0, 9, 24, _REST):
-        raise FormatError(f"{path} has {rest} f_rest properties; 0, 9, 24 or 45 make a degree.")
+    rest = [name for name in _REST if name in present]
+    if len(rest) not in [3 * terms for terms in TERMS] or rest != _REST[: len(rest)]:
+        raise FormatError(
+            f"{path} has {len(rest)} f_rest properties; 0, 9, 24 or 45, numbered from 0, make a "
+            "degree.")
     needed = [name for group, names in _GROUPS.items() if group not in ("normals", "sh_rest")
               for name in names]
     missing = [name for name in needed if name not in present]
@@ -128,14 +147,13 @@ def _to_splats(table: NDArray[np.void], path: Path) -> Splats:
             return np.zeros((len(table), 0), np.float32)
         return np.stack([table[name].astype(np.float32) for name in names], axis=1)
 
-    terms = rest // 3
-    sh_rest = np.zeros((len(table), 15, 3), np.float32)
-    by_channel = columns(_GROUPS["sh_rest"][:rest]).reshape(len(table), 3, terms)
-    sh_rest[:, :terms] = by_channel.transpose(0, 2, 1)
     values = {name: columns(_GROUPS[name])
               for name in ("means", "quats", "log_scales", "logit_opacities", "sh_dc")}
     values["logit_opacities"] = values["logit_opacities"][:, 0]
-    values["sh_rest"] = sh_rest
+    by_channel = columns(rest).reshape(len(table), 3, len(rest) // 3)
+    colored = np.flatnonzero(by_channel.any(axis=(1, 2)))
+    count = colored[-1] + 1 if len(colored) else 0
+    values["sh_rest"] = by_channel[:count].transpose(0, 2, 1)
     bad = [name for name, value in values.items() if not np.isfinite(value).all()]
     if bad:
         raise FormatError(f"{path} holds values that are not finite in {', '.join(bad)}.")

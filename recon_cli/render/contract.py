@@ -68,8 +68,9 @@ class Statistics:
         loo: [N] sum over pixels of ||alpha T (c - B)||^2, B the colour composited behind: the
             squared error that removing this one Gaussian causes; zeros until backward() has run.
         broken: how many Gaussians were culled because a value in use is not finite, or is projected
-            to one that is not; at degree d the values in use of sh_rest are its first (d+1)^2 - 1
-            rows. Those that lie behind the camera or beside the image anyway need not be counted.
+            to one that is not; at degree d the values in use of sh_rest are the first (d+1)^2 - 1
+            coefficients of the Gaussians that have any. Those that lie behind the camera or beside
+            the image anyway need not be counted.
     """
 
     radii: Tensor

@@ -56,6 +56,7 @@ def project(splats: Splats, camera: Camera, sh_degree: int) -> Projection:
     Culled are Gaussians nearer than NEAR, of opacity under 1/255, whose ellipse of alpha = 1/255
     misses the image, or that hold or are projected to a value that is not finite.
     """
+    sh_degree = min(sh_degree, splats.sh_degree)
     with torch.no_grad():
         every = torch.arange(len(splats), device=splats.means.device)
         finite = _finite(splats, sh_degree)
@@ -73,7 +74,7 @@ def project(splats: Splats, camera: Camera, sh_degree: int) -> Projection:
     cov2d, det = covariances(directions, log_scales)
     center = torch.as_tensor(camera.center, dtype=means2d.dtype, device=means2d.device)
     colors = colors_from_sh(
-        splats.means[ids] - center, splats.sh_dc[ids], splats.sh_rest[ids], sh_degree)
+        splats.means[ids] - center, splats.sh_dc[ids], splats.sh_rest, ids, sh_degree)
     opacities = torch.sigmoid(splats.logit_opacities[ids])
     projection = Projection(
         ids, means2d, directions, log_scales, cov2d, det, opacities, colors, depths, broken)
@@ -117,7 +118,7 @@ def _finite(splats: Splats, sh_degree: int) -> Tensor:
     finite = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
     for tensor in used.values():
         # 0 times a finite term is 0, times any other NaN: one sum tells, and no term overflows it
-        finite &= torch.isfinite((tensor[:, None] * 0).flatten(1).sum(1))
+        finite[: len(tensor)] &= torch.isfinite((tensor[:, None] * 0).flatten(1).sum(1))
     return finite
 
 

@@ -131,7 +131,8 @@ def render(
         splats: N Gaussians; gradients flow to every raw parameter that requires them.
         camera: a pinhole camera, OpenCV axes, pixel centres at +0.5.
         background: [3] colour behind everything.
-        sh_degree: spherical-harmonics degree in use, 0 to 3.
+        sh_degree: highest spherical-harmonics degree in use, 0 to 3; what the splats have beyond
+            it is left out, and what they do not have counts as zero.
         backend: a name from `available_backends`.
         scores: also gather hits, blend_sum and blend_max, and loo in the backward pass.
         mask: [H, W] bool, the pixels over which the scores are taken; None takes all. It changes

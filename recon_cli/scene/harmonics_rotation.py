@@ -6,6 +6,7 @@ A rotation mixes the coefficients of one degree among themselves and leaves degr
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ _DEGREE = 3
 # The 2l+1 functions of degree l are determined by their values in 2l+1 general directions. 64 of a
 # Fibonacci lattice keep the least squares at a condition number under 1.03 for every degree.
 _DIRECTIONS = 64
+_ROUNDING = 1e-9  # entries of a generator are 0 or at least 1
 
 
 def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
@@ -43,22 +45,46 @@ def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
     return tuple(blocks)
 
 
+@cache
+@torch.enable_grad()
+def generators() -> Tensor:
+    """Returns the matrices [3, 15, 15] of small turns about x, y and z, float64.
+
+    A turn by the small rotation vector w changes coefficients c of degrees 1 to 3 by
+    sum_i w_i (G_i c): with Y the row of basis functions, Y(R d) (c + w_i G_i c) = Y(d) c demands
+    Y(d) G_i = -dY(R d)/dw_i, solved as in `rotation_blocks`. Antisymmetric; 48 entries are not 0.
+    """
+    directions, matrices = _lattice(_DIRECTIONS).requires_grad_(), []
+    basis = basis_rest(directions, _DEGREE)
+    slopes = torch.stack([
+        torch.autograd.grad(function.sum(), directions, retain_graph=True)[0]
+        for function in basis.T])  # [15, directions, 3]
+    for axis in torch.eye(3, dtype=torch.float64):
+        turn = torch.linalg.cross(axis.expand_as(directions), directions.detach())
+        solved = torch.linalg.lstsq(basis.detach(), -(slopes * turn).sum(dim=2).T).solution
+        solved[solved.abs() < _ROUNDING] = 0
+        matrices.append((solved - solved.T) / 2)
+    return torch.stack(matrices)
+
+
 def rotated(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
     """Returns the coefficients of the same colours in turned axes.
 
     Args:
-        sh_rest: [N, 15, 3] coefficients of degrees 1 to 3.
+        sh_rest: [M, T, 3] coefficients of degrees 1 and up, T one of 0, 3, 8, 15.
         rotation: [3, 3] from old to new axes.
 
     Returns:
-        [N, 15, 3] of the same dtype and device; computed in float64.
+        [M, T, 3] of the same dtype and device; computed in float64.
     """
-    parts, start = [], 0
+    turned, start = torch.empty_like(sh_rest), 0
     for block in rotation_blocks(rotation):
-        terms = sh_rest[:, start:start + len(block)].double()
-        parts.append(block.to(sh_rest.device) @ terms)
-        start += len(block)
-    return torch.cat(parts, dim=1).to(sh_rest.dtype)
+        end = start + len(block)
+        if end <= sh_rest.shape[1]:
+            terms = sh_rest[:, start:end].double()
+            turned[:, start:end] = (block.to(sh_rest.device) @ terms).to(sh_rest.dtype)
+        start = end
+    return turned
 
 
 def _lattice(count: int) -> Tensor:

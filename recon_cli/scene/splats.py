@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 SH_C0 = 0.28209479177387814  # the constant basis function, 1 / (2 sqrt(pi))
+TERMS = (0, 3, 8, 15)  # coefficients a channel after the constant one, by degree
 
 
 @dataclass(eq=False)
 class Splats:
     """N Gaussians in the raw parameters that are optimized and stored.
+
+    Only what colours use is stored: the scene's degree sets T, and the first M Gaussians are those
+    that have coefficients of degrees 1 and up. The others are of degree 0.
 
     Attributes:
         means: [N, 3] centres in world units.
@@ -21,7 +25,8 @@ class Splats:
         log_scales: [N, 3] natural logarithm of the standard deviations along the own axes.
         logit_opacities: [N] opacity before the sigmoid.
         sh_dc: [N, 3] spherical-harmonics coefficients of degree 0; colour = SH_C0 * sh_dc + 0.5.
-        sh_rest: [N, 15, 3] coefficients of degrees 1 to 3.
+        sh_rest: [M, T, 3] coefficients of degrees 1 and up of the first M Gaussians, 0 <= M <= N
+            and T one of 0, 3, 8, 15.
     """
 
     means: Tensor
@@ -35,12 +40,17 @@ class Splats:
         n = self.means.shape[0]
         shapes = {
             "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,),
-            "sh_dc": (n, 3), "sh_rest": (n, 15, 3),
+            "sh_dc": (n, 3),
         }
         for name, shape in shapes.items():
             tensor = getattr(self, name)
             if tuple(tensor.shape) != shape:
                 raise ValueError(f"{name} has shape {tuple(tensor.shape)}, needed {shape}")
+        rest = tuple(self.sh_rest.shape)
+        if len(rest) != 3 or rest[0] > n or rest[1] not in TERMS or rest[2] != 3:
+            raise ValueError(
+                f"sh_rest has shape {rest}, needed (M, T, 3) with M <= {n} and T of {TERMS}")
+        for name, tensor in self.parameters().items():
             if tensor.dtype != self.means.dtype or tensor.device != self.means.device:
                 raise ValueError(f"{name} differs from means in dtype or device")
 
@@ -56,8 +66,34 @@ class Splats:
         return Splats(**{name: change(value) for name, value in self.parameters().items()})
 
     def select(self, rows: Tensor) -> Splats:
-        """Returns the Gaussians at `rows` ([K] indices or [N] mask), detached."""
-        return self.map(lambda tensor: tensor.detach()[rows])
+        """Returns the Gaussians at `rows` ([K] indices or [N] mask), detached, in that order.
+
+        Raises:
+            ValueError: the order puts a Gaussian of degree 0 before one with coefficients; no
+                mask and no ascending rows do.
+        """
+        if rows.dtype == torch.bool:
+            rows = torch.nonzero(rows)[:, 0]
+        rows = torch.where(rows < 0, rows + len(self), rows)
+        colored = rows < len(self.sh_rest)
+        count = int(colored.sum())
+        if not bool(colored[:count].all()):
+            raise ValueError("rows put Gaussians of degree 0 before some that have coefficients")
+        taken = {name: value.detach()[rows[:count] if name == "sh_rest" else rows]
+                 for name, value in self.parameters().items()}
+        return Splats(**taken)
+
+    def with_degree(self, degree: int) -> Splats:
+        """Returns the splats with the coefficients of this degree: cut, or filled up with zeros.
+
+        The same Gaussians have coefficients as before.
+        """
+        return replace(self, sh_rest=with_terms(self.sh_rest, TERMS[degree]))
+
+    @property
+    def sh_degree(self) -> int:
+        """The scene's degree, 0 to 3: that of the Gaussians that have coefficients."""
+        return TERMS.index(self.sh_rest.shape[1])
 
     @property
     def scales(self) -> Tensor:
@@ -68,3 +104,41 @@ class Splats:
     def opacities(self) -> Tensor:
         """Opacities in (0, 1), [N]."""
         return torch.sigmoid(self.logit_opacities)
+
+
+def with_terms(sh_rest: Tensor, terms: int) -> Tensor:
+    """Returns coefficients [M, T, 3] as [M, terms, 3]: cut, or filled up with zeros."""
+    missing = terms - sh_rest.shape[1]
+    if missing <= 0:
+        return sh_rest[:, :terms]
+    return torch.cat([sh_rest, sh_rest.new_zeros(len(sh_rest), missing, 3)], dim=1)
+
+
+def with_rows(sh_rest: Tensor, rows: int) -> Tensor:
+    """Returns coefficients [M, T, 3] as [rows, T, 3], rows >= M, filled up with zeros."""
+    missing = sh_rest.new_zeros(rows - len(sh_rest), *sh_rest.shape[1:])
+    return torch.cat([sh_rest, missing])
+
+
+def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
+    """Returns the Gaussians of all parts, those with coefficients first, and their order.
+
+    Args:
+        parts: of one degree.
+
+    Returns:
+        The Gaussians, and for each its row [N] in the plain concatenation of the parts. Where all
+        Gaussians have coefficients, or none has, that is their order.
+
+    Raises:
+        ValueError: the parts are of different degrees.
+    """
+    colored = torch.cat([
+        torch.arange(len(part), device=part.means.device) < len(part.sh_rest) for part in parts])
+    order = torch.cat([torch.nonzero(colored)[:, 0], torch.nonzero(~colored)[:, 0]])
+    if len({part.sh_degree for part in parts}) > 1:
+        raise ValueError("the parts are of different SH degrees; see with_degree")
+    together = {name: torch.cat([part.parameters()[name] for part in parts])
+                for name in parts[0].parameters()}
+    rest = together.pop("sh_rest")  # in that order already
+    return Splats(**{name: value[order] for name, value in together.items()}, sh_rest=rest), order

@@ -18,7 +18,7 @@ from pathlib import Path
 from torch import Tensor
 
 from recon_cli.atomic import read_json, write_bytes
-from recon_cli.config import PruneConfig, TrainConfig
+from recon_cli.config import PruneConfig, RunConfig
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.stages.fitting import (
     LOG,
@@ -101,7 +101,8 @@ class Course:
 
     def recovering(self, first: int, until: int) -> Task:
         """Returns the task with learning rates for a recovery between two steps."""
-        plan = Recovery(self.task.schedule.config, first=first, until=until)
+        config = dataclasses.replace(self.task.schedule.config, early_stop=False)
+        plan = Recovery(config, first=first, until=until)
         return dataclasses.replace(self.task, schedule=plan)
 
     def advance(
@@ -120,19 +121,21 @@ class Course:
 
         The seconds of passes that only score go into the log, like those of training.
         """
-        trained = 0.0
+        trained, trained_cpu = 0.0, 0.0
 
         def advance(state: TrainState, until: int, importance: Importance | None) -> None:
-            nonlocal trained
-            begin = time.perf_counter()
+            nonlocal trained, trained_cpu
+            begin, cpu_begin = time.perf_counter(), time.process_time()
             self.advance(task, number, state, until, importance)
             trained += time.perf_counter() - begin
+            trained_cpu += time.process_time() - cpu_begin
 
-        begin = time.perf_counter()
+        begin, cpu_begin = time.perf_counter(), time.process_time()
         score = scored(state, task, until, name=self.config.score, beta=self.config.beta,
                        advance=advance)
         Log(self.out / LOG, state.iteration, self.earlier_seconds).spend(
-            state.iteration, time.perf_counter() - begin - trained)
+            state.iteration, time.perf_counter() - begin - trained,
+            time.process_time() - cpu_begin - trained_cpu)
         return score
 
     def remove(
@@ -178,25 +181,27 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
-    source = train / ("mid.safetensors" if config.at == "mid" else "final.safetensors")
+    final = train / "final.safetensors"
+    source = train / "mid.safetensors" if config.at == "mid" else final
 
     def load(path: Path) -> TrainState:
         return load_state(
             path, train_config, task.extent, task.device, fused=fuses(task.backend))
 
-    first = load(source).iteration
+    start = load(source)
+    steps = config.recovery
+    if steps is None:
+        steps = _recovery(config, train_config, len(task.train), load(final).steps - start.steps)
     return Course(
-        config, task, lambda: load(source), load, out, ctx, first,
-        _until(config, train_config, first, len(task.train)), seconds_at(train / LOG, first))
+        config, task, lambda: load(source), load, out, ctx, start.iteration,
+        start.iteration + steps, seconds_at(train / LOG, start.iteration))
 
 
-def _until(config: PruneConfig, train: TrainConfig, first: int, views: int) -> int:
-    """Returns the total number of steps at which recovery ends."""
-    if config.recovery is not None:
-        return first + config.recovery
-    if config.at == "mid":
-        return train.iterations
-    return first + max(train.iterations // _END_RECOVERY, _END_EPOCHS * views)
+def _recovery(config: PruneConfig, train: RunConfig, views: int, rest: int) -> int:
+    """Returns how many steps the recovery takes; `rest` are those of training from its middle."""
+    if config.at == "mid":  # as many as the unpruned run took, which may have stopped early
+        return rest
+    return max(train.iterations // _END_RECOVERY, _END_EPOCHS * views)
 
 
 def _name(number: int | str) -> str:

@@ -14,7 +14,7 @@ import torch
 
 from recon_cli.atomic import read_json, write_bytes
 from recon_cli.capture.frames import read_frame_list
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.errors import TrainingError
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_masked_image
@@ -25,7 +25,7 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.train.fit import Report, Task, fit
 from recon_cli.train.importance import Importance
-from recon_cli.train.memory import estimate, refuse_what_does_not_fit
+from recon_cli.train.memory import MemoryEstimate, estimate, refuse_what_does_not_fit, room
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.step import TrainView, fuses
@@ -49,7 +49,7 @@ def load_scene(inputs: StageInputs, *, validation: float) -> Scene:
         undistorted, held_out=held_out_names(inputs.folders["ingest"]), validation=validation)
 
 
-def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
+def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     """Returns the training task at the training size, images in memory as uint8.
 
     Raises:
@@ -72,7 +72,7 @@ def load_task(scene: Scene, config: TrainConfig, ctx: StageContext) -> Task:
 
 
 def _load_views(
-    views: Sequence[View], config: TrainConfig, ctx: StageContext
+    views: Sequence[View], config: RunConfig, ctx: StageContext
 ) -> list[TrainView]:
     """Returns the views at the training size, without those whose mask leaves next to nothing."""
     loaded, hidden = [], []
@@ -108,44 +108,65 @@ def sizes_of(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     return sorted(sizes, key=lambda size: (size[0] * size[1], size), reverse=True)
 
 
-def _check_memory(scene: Scene, config: TrainConfig, ctx: StageContext) -> None:
+def gaussians_that_fit(scene: Scene, config: RunConfig, ctx: StageContext) -> int:
+    """Returns how many Gaussians memory has room for, before the images are loaded."""
+    one = _memory(scene, dataclasses.replace(config, max_gaussians=1), ctx)
+    return room(one, _free_bytes(ctx))
+
+
+def _memory(scene: Scene, config: RunConfig, ctx: StageContext) -> MemoryEstimate:
+    views = (*scene.train, *scene.validation)
+    width, height = sizes_of([fitted_camera(view.camera, config.max_size) for view in views])[0]
+    return estimate(
+        views=len(views), width=width, height=height, gaussians=config.max_gaussians,
+        fused=fuses(ctx.backend), sh_degree=config.sh_degree,
+        masks=sum(view.mask is not None for view in views))
+
+
+def _free_bytes(ctx: StageContext) -> int:
+    return torch.cuda.mem_get_info()[0] if ctx.device == "cuda" else free_memory_bytes()
+
+
+def _check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
     """Says what the run will take, and refuses what does not fit.
 
     Raises:
         TrainingError: there is not enough memory.
     """
-    views = (*scene.train, *scene.validation)
-    width, height = sizes_of([fitted_camera(view.camera, config.max_size) for view in views])[0]
-    needed = estimate(
-        views=len(views), width=width, height=height, gaussians=config.max_gaussians,
-        fused=fuses(ctx.backend), masks=sum(view.mask is not None for view in views))
-    free = free_memory_bytes()
-    if ctx.device == "cuda":
-        free = torch.cuda.mem_get_info()[0]
+    needed, free = _memory(scene, config, ctx), _free_bytes(ctx)
     logger.info("training takes %s at most; %.0f MB are free", needed.described(), free / 1e6)
     refuse_what_does_not_fit(needed, free)
 
 
-def write_config(folder: Path, config: TrainConfig) -> None:
+def write_config(folder: Path, config: RunConfig) -> None:
     """Writes the options of a run beside its checkpoints."""
     write_bytes(folder / "config.json", json.dumps(config.hashed(), indent=1).encode())
 
 
-def read_config(folder: Path) -> TrainConfig:
+def read_config(folder: Path) -> RunConfig:
     """Returns the options that `write_config` wrote."""
     values = read_json(folder / "config.json")
-    names = {item.name for item in dataclasses.fields(TrainConfig)}
-    return TrainConfig(**{name: value for name, value in values.items() if name in names})
+    names = {item.name for item in dataclasses.fields(RunConfig)}
+    return RunConfig(**{name: value for name, value in values.items() if name in names})
 
 
-def seconds_at(log: Path, iteration: int) -> float:
-    """Returns the training seconds that a log counts up to an iteration."""
+def seconds_at(log: Path, iteration: int, *, clock: str = "seconds") -> float:
+    """Returns the training seconds that a log counts up to an iteration, by one of its clocks."""
     seconds = 0.0
     for line in log.read_text(encoding="utf-8").splitlines() if log.exists() else []:
         row = json.loads(line)
         if row["iteration"] <= iteration:
-            seconds = float(row["seconds"])
+            seconds = float(row[clock])
     return seconds
+
+
+def jump_in(log: Path) -> tuple[int, int] | None:
+    """Returns (iteration, iteration at which it went on) of a run that stopped early, or None."""
+    for line in log.read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        if row.get("goes_on_at") is not None:
+            return row["iteration"], row["goes_on_at"]
+    return None
 
 
 class Log:
@@ -158,21 +179,23 @@ class Log:
         whole = [line for line in lines if line.endswith("\n")]
         kept = [line for line in whole if json.loads(line)["iteration"] <= iteration]
         if not kept:  # a branch starts where the other run stood
-            kept = [json.dumps({"iteration": iteration, "seconds": earlier_seconds}) + "\n"]
+            first = {"iteration": iteration, "seconds": earlier_seconds, "cpu_seconds": 0.0}
+            kept = [json.dumps(first) + "\n"]
         write_bytes(path, "".join(kept).encode())
         self._earlier = seconds_at(path, iteration)
+        self._earlier_cpu = seconds_at(path, iteration, clock="cpu_seconds")
 
     def add(self, report: Report) -> None:
         """Appends a report; its seconds count from the very start of training."""
-        row = dataclasses.asdict(report)
-        self.write({**row, "seconds": round(self._earlier + report.seconds, 3)})
+        self._write(dataclasses.asdict(report), report.seconds, report.cpu_seconds)
 
-    def spend(self, iteration: int, seconds: float) -> None:
-        """Counts seconds in which no step was taken."""
-        self.write({"iteration": iteration, "seconds": round(self._earlier + seconds, 3)})
+    def spend(self, iteration: int, seconds: float, cpu_seconds: float) -> None:
+        """Counts time in which no step was taken."""
+        self._write({"iteration": iteration}, seconds, cpu_seconds)
 
-    def write(self, row: dict[str, object]) -> None:
-        """Appends a line."""
+    def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
+        row["seconds"] = round(self._earlier + seconds, 3)
+        row["cpu_seconds"] = round(self._earlier_cpu + cpu_seconds, 3)
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
@@ -237,12 +260,13 @@ def run_fit(
         KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
     """
     log = Log(out / LOG, state.iteration, earlier_seconds)
-    every = task.schedule.config.checkpoint_every
+    every, counted = task.schedule.config.checkpoint_every, [state.iteration]
     with _deferred_interrupt() as pressed, ctx.progress.bar(
         label, (end or until) - first, unit="step", done=state.iteration - first
     ) as bar:
         def on_step(now: TrainState) -> None:
-            bar.advance()
+            bar.advance(now.iteration - counted[0])
+            counted[0] = now.iteration
             if keep and now.iteration in keep:
                 save_state(out / keep[now.iteration], now)
             if importance is None and (now.iteration % every == 0 or pressed):
@@ -256,5 +280,9 @@ def run_fit(
             value = report.validation_psnr_db
             shown = "" if value is None else f", validation {value:.2f} dB"
             bar.note(f"loss {report.loss:.4f}{shown}, {report.gaussians:,} Gaussians")
+            if report.goes_on_at is not None:
+                logger.info("the validation views gain nothing more after step %d: the run goes "
+                            "on at step %d, with falling rates", report.iteration,
+                            report.goes_on_at)
 
         fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance)

@@ -12,6 +12,7 @@ from pathlib import Path
 from recon_cli.config import PruneConfig
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import most_gaussians, write_ply
+from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.course import Round, course_of
 from recon_cli.stages.fitting import LOG, seconds_at
@@ -28,8 +29,9 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     course = course_of(config, inputs, out, ctx)
     before = course.start()
     n, psnr_before = len(before.splats), validation_psnr(before, course.task)
+    steps = before.steps
     if config.max_psnr_drop is None:
-        state, rounds = prune_to(course, _target(config, n))
+        state, rounds = prune_to(course, _target(config, before.splats))
     elif psnr_before is None:
         raise TrainingError(
             "--max-psnr-drop is measured on validation views, but the run has none.",
@@ -42,24 +44,25 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     write_ply(out / "splats.ply", state.splats)
     course.clear()
     return {
-        **_summary(config, state, rounds, n), "iterations": state.iteration,
-        "recovery_steps": state.iteration - course.first,
+        **_summary(config, state, rounds, n), "iterations": state.steps,
+        "recovery_steps": state.steps - steps,
         "validation_psnr_db_before": psnr_before,
         "validation_psnr_db": validation_psnr(state, course.task),
         "train_seconds": seconds_at(out / LOG, state.iteration),
     }
 
 
-def _target(config: PruneConfig, n: int) -> int:
-    """Returns how many of n Gaussians stay.
+def _target(config: PruneConfig, splats: Splats) -> int:
+    """Returns how many of the Gaussians stay.
 
     Raises:
         ConfigError: not even one fits into the .ply.
     """
+    n = len(splats)
     if config.max_gaussians is not None:
         return min(n, config.max_gaussians)
     if config.max_mb is not None:
-        count = most_gaussians(int(1e6 * config.max_mb))
+        count = most_gaussians(int(1e6 * config.max_mb), splats.sh_degree)
         if count == 0:
             raise ConfigError(
                 f"max_mb is {config.max_mb:g}, but a .ply of one Gaussian is larger.",

@@ -9,13 +9,13 @@ optimizer which rows stayed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from recon_cli.render.projection import rotation_matrices
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import Splats, joined
 
 _GROWTH = 0.5  # of the count, at most, at once: children need some steps to find their place
 # of the parent's: two halves at +-.5 sigma that together look like it (measured together, on the
@@ -60,11 +60,9 @@ def densify(
     alive[split] = False
     rows = torch.nonzero(alive)[:, 0]
     halves = _halves(splats.select(split))
-    result = Splats(**{
-        name: torch.cat([value[rows], halves.parameters()[name]])
-        for name, value in splats.parameters().items()})
+    result, order = joined([splats.select(rows), halves])
     new = torch.full((len(halves),), -1, device=rows.device)
-    return result, torch.cat([rows, new])
+    return result, torch.cat([rows, new])[order]
 
 
 def decayed(splats: Splats, factor: float) -> Splats:
@@ -102,6 +100,5 @@ def _halves(parent: Splats) -> Splats:
     child = parent.map(torch.clone)
     child.log_scales = parent.log_scales + shrink
     child.logit_opacities = torch.logit((_OPACITY * parent.opacities).clamp(*_RANGE))
-    return Splats(**{
-        name: torch.cat([value - offset, value + offset] if name == "means" else [value, value])
-        for name, value in child.parameters().items()})
+    sides = [replace(child, means=child.means + side * offset) for side in (-1, 1)]
+    return joined(sides)[0]

@@ -12,6 +12,7 @@ import torch
 
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
+from recon_cli.train.early_stop import next_iteration
 from recon_cli.train.importance import Importance
 from recon_cli.train.pyramid import Pyramid
 from recon_cli.train.schedule import Schedule
@@ -35,6 +36,8 @@ class Report:
         validation_psnr_db: mean over the validation views; None where there are none.
         gaussians: count.
         seconds: of this call, so far.
+        cpu_seconds: of all threads of this process in this call, so far.
+        goes_on_at: the iteration to which the run jumps now; None where it just goes on.
     """
 
     iteration: int
@@ -42,6 +45,8 @@ class Report:
     validation_psnr_db: float | None
     gaussians: int
     seconds: float
+    cpu_seconds: float = 0.0
+    goes_on_at: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,8 @@ class Task:
         extent: of the scene, world units.
         backend: name of the rasterizer.
         device: where the tensors live.
+        jump: (iteration, iteration at which it goes on) of the run that this one branches off;
+            this one does the same.
     """
 
     train: list[TrainView]
@@ -63,6 +70,7 @@ class Task:
     extent: float
     backend: str
     device: torch.device
+    jump: tuple[int, int] | None = None
 
     @cached_property
     def pyramid(self) -> Pyramid:
@@ -92,16 +100,32 @@ def fit(
     Raises:
         TrainingError: the loss is not finite, or no Gaussian is left.
     """
-    start = time.perf_counter()
+    start, cpu_start = time.perf_counter(), time.process_time()
     compute = gradient_step(task.backend)
     every = report_every(task.schedule)
     while state.iteration < until:
         loss = _step(state, task, compute, importance)
         if state.iteration % every == 0 or state.iteration == until:
+            psnr = validation_psnr(state, task)
+            regular = state.iteration % every == 0
+            goes_on_at = _goes_on_at(state, task, psnr) if regular else None
             on_report(Report(
-                state.iteration, loss, validation_psnr(state, task), len(state.splats),
-                time.perf_counter() - start))
+                state.iteration, loss, psnr, len(state.splats), time.perf_counter() - start,
+                time.process_time() - cpu_start, goes_on_at))
+            if goes_on_at is not None:
+                state.jump = state.iteration, goes_on_at
+                state.iteration = goes_on_at
         on_step(state)
+
+
+def _goes_on_at(state: TrainState, task: Task, psnr: float | None) -> int | None:
+    """Returns the iteration to which the run jumps now, None where it just goes on."""
+    if task.jump is not None:
+        return task.jump[1] if state.iteration == task.jump[0] else None
+    if psnr is None or not task.schedule.config.early_stop or state.jump:
+        return None
+    state.looks.append((state.iteration, psnr))
+    return next_iteration(task.schedule, state.iteration, state.looks)
 
 
 def report_every(schedule: Schedule) -> int:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from recon_cli.errors import TrainingError
-from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.scene.splats import SH_C0, TERMS, Splats
 
 _OPACITY = 0.1  # initial opacity of the reference implementation
 _NEIGHBOURS = 3
@@ -21,10 +21,12 @@ def splats_from_points(
     *,
     most: int,
     seed: int,
+    sh_degree: int,
 ) -> Splats:
     """Returns one round Gaussian a point, as large as the mean distance to its 3 nearest.
 
-    (Kerbl et al. 2023, section 5.2.) Of more than `most` points a seeded draw is taken.
+    (Kerbl et al. 2023, section 5.2.) Of more than `most` points a seeded draw is taken. Colours
+    have room for spherical harmonics up to `sh_degree`.
 
     Raises:
         TrainingError: there are fewer than 4 points.
@@ -46,5 +48,5 @@ def splats_from_points(
         log_scales=torch.tensor(np.log(scales), dtype=torch.float32)[:, None].repeat(1, 3),
         logit_opacities=torch.logit(torch.full((n,), _OPACITY)),
         sh_dc=(torch.tensor(colors, dtype=torch.float32) / 255 - 0.5) / SH_C0,
-        sh_rest=torch.zeros(n, 15, 3),
+        sh_rest=torch.zeros(n, TERMS[sh_degree], 3),
     )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.projection import rotation_matrices
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import Splats, joined
 from recon_cli.train.budget import drawn
 
 _GROWTH = 0.5  # of the count, at most, at once
@@ -38,10 +38,9 @@ def relocate(
     shared = _shared(splats.select(source))
     alive[source] = False
     rows = torch.nonzero(alive)[:, 0]
-    result = Splats(**{
-        name: torch.cat([value[rows], *[shared.parameters()[name]] * 2])
-        for name, value in splats.parameters().items()})
-    return result, torch.cat([rows, torch.full((2 * len(source),), -1, device=rows.device)])
+    result, order = joined([splats.select(rows), shared, shared])
+    new = torch.full((2 * len(source),), -1, device=rows.device)
+    return result, torch.cat([rows, new])[order]
 
 
 def _shared(parent: Splats) -> Splats:

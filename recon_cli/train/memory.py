@@ -9,10 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from recon_cli.errors import TrainingError
+from recon_cli.scene.splats import TERMS
 
-# values, gradients and two moments of 59 float32, and a copy of the values and of one moment
-# while densification rebuilds them
-_PER_GAUSSIAN = 4 * 4 * 59 + 4 * 59 + 4 * 45
+_FLOATS = 14  # of a Gaussian, its higher SH coefficients apart
+_LARGEST = 4  # numbers of the largest parameter, these apart: a quaternion
+# values, gradients and two moments, and a copy of the values while densification rebuilds them
+_COPIES = 4 + 1
 # a record, indices and the gradient sums of about six tiles
 _BUFFERS_PER_GAUSSIAN = 128 + 6 * 72
 _BUFFERS_PER_PIXEL = 96  # image, its gradient, three maps of the loss, transmittance
@@ -52,7 +54,8 @@ class MemoryEstimate:
 
 
 def estimate(
-    *, views: int, width: int, height: int, gaussians: int, fused: bool, masks: int = 0
+    *, views: int, width: int, height: int, gaussians: int, fused: bool, sh_degree: int = 3,
+    masks: int = 0,
 ) -> MemoryEstimate:
     """Returns the memory that training takes.
 
@@ -62,14 +65,29 @@ def estimate(
         height: of the largest view in pixels.
         gaussians: the most that there will be.
         fused: the backend computes gradients without autograd.
+        sh_degree: highest of the colours; every Gaussian may have its coefficients.
         masks: held in memory.
     """
     pixels = width * height
+    rest = 3 * TERMS[sh_degree]
+    # and of one moment of one parameter at a time
+    per_gaussian = 4 * (_COPIES * (_FLOATS + rest) + max(_LARGEST, rest))
     factor = 1 if fused else _TORCH_FACTOR
     return MemoryEstimate(
         images=pixels * (3 * views + masks), pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
-        gaussians=gaussians * _PER_GAUSSIAN,
+        gaussians=gaussians * per_gaussian,
         gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM)
+
+
+def room(one: MemoryEstimate, free: int) -> int:
+    """Returns the most Gaussians that fit into `free` bytes; 0 where not even the rest does.
+
+    Args:
+        one: estimate with a single Gaussian.
+        free: bytes.
+    """
+    each = one.gaussians + one.gaussian_buffers
+    return max(0, (free - one.total + each) // each)
 
 
 def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:

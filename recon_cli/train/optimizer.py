@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from recon_cli.config import TrainConfig
-from recon_cli.scene.splats import Splats
+from recon_cli.config import RunConfig
+from recon_cli.scene.splats import Splats, with_terms
 
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-15  # of the reference: gradients of single Gaussians are tiny
@@ -36,7 +38,7 @@ class SplatOptimizer:
     """
 
     def __init__(
-        self, splats: Splats, config: TrainConfig, extent: float, *, fused: bool = False
+        self, splats: Splats, config: RunConfig, extent: float, *, fused: bool = False
     ) -> None:
         self._extent, self._fused = extent, fused
         self._rates = {
@@ -47,29 +49,34 @@ class SplatOptimizer:
         self.count = 0
         self._factor = 1.0
         self._buffers: dict[str, dict[str, Tensor]] = {}
-        self._reserve(splats, max(len(splats), config.max_gaussians))
-        self._show(len(splats))
+        self._capacity = max(len(splats), config.max_gaussians)
+        self._show(splats)
         with torch.no_grad():
             for name, value in splats.parameters().items():
                 getattr(self.splats, name).copy_(value)
                 for role in _MOMENTS:
                     self._view(name, role).zero_()
 
-    def _reserve(self, like: Splats, capacity: int) -> None:
-        self._capacity = capacity
-        for name, value in like.parameters().items():
-            roles = _ROLES if self._fused else [role for role in _ROLES if role != "gradient"]
-            self._buffers[name] = {
-                role: torch.empty(
-                    capacity, *value.shape[1:], dtype=value.dtype, device=value.device)
-                for role in roles}
+    def _reserve(self, name: str, like: Tensor, rows: int) -> None:
+        roles = _ROLES if self._fused else [role for role in _ROLES if role != "gradient"]
+        self._buffers[name] = {
+            role: torch.empty(rows, *like.shape[1:], dtype=like.dtype, device=like.device)
+            for role in roles}
 
     def _view(self, name: str, role: str) -> Tensor:
-        return self._buffers[name][role][: self._n]
+        return self._buffers[name][role][: self._rows[name]]
 
-    def _show(self, n: int) -> None:
-        """Makes the first n rows of the buffers the Gaussians of the moment."""
-        self._n = n
+    def _show(self, like: Splats) -> None:
+        """Makes as many rows of the buffers as `like` has the Gaussians of the moment."""
+        self._capacity = max(self._capacity, len(like))
+        self._rows = {name: len(value) for name, value in like.parameters().items()}
+        for name, value in like.parameters().items():
+            # higher SH coefficients that only some have get no room that stays empty: on a GPU it
+            # would cost, and giving it back is why they are few
+            room = self._capacity if len(value) == len(like) else len(value)
+            held = self._buffers.get(name, {}).get("value")
+            if held is None or held.shape != (room, *value.shape[1:]):
+                self._reserve(name, value, room)
         self.splats = Splats(**{
             name: self._view(name, "value").detach().requires_grad_() for name in self._buffers})
         self.gradients = Splats(**{
@@ -78,8 +85,8 @@ class SplatOptimizer:
 
     @property
     def bytes_per_gaussian(self) -> int:
-        """Memory of values, gradients and moments of one Gaussian."""
-        held = sum(buffer[0].nbytes
+        """Memory of values, gradients and moments of one Gaussian that has all of them."""
+        held = sum(math.prod(buffer.shape[1:]) * buffer.element_size()
                    for roles in self._buffers.values() for buffer in roles.values())
         return held if self._fused else held // 3 * 4  # autograd holds the gradients
 
@@ -151,21 +158,17 @@ class SplatOptimizer:
         """Goes on with other Gaussians.
 
         Args:
-            splats: the new Gaussians, M of them; views of this optimizer's own only where every row
-                stays in its place.
-            source: [M] the old row that each continues, whose moments it keeps; -1 for a new one,
-                which starts with zeros.
+            splats: the new Gaussians, N of them, of any degree; views of this optimizer's own only
+                where every row stays in its place.
+            source: [N] the old row that each continues, whose moments it keeps; -1 for a new one,
+                which starts with zeros. So do coefficients that the old row did not have.
         """
-        fresh, rows = source < 0, source.clamp_min(0)
         moments = {(name, role): self._view(name, role)
                    for name in self._buffers for role in _MOMENTS}
-        if len(splats) > self._capacity:
-            self._reserve(splats, len(splats))
-        self._show(len(splats))
+        self._show(splats)
         for name, value in splats.parameters().items():
             for role in _MOMENTS:  # one parameter at a time: the copies stay small
-                kept = moments.pop((name, role))[rows]
-                kept[fresh] = 0
+                kept = _followed(moments.pop((name, role)), source[: len(value)], value)
                 self._view(name, role).copy_(kept)
             self._view(name, "value").copy_(value)
 
@@ -189,3 +192,19 @@ class SplatOptimizer:
         for name in self._buffers:
             for role in _MOMENTS:
                 self._view(name, role).copy_(tensors[f"adam.{name}.{role}"])
+
+
+def _followed(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
+    """Returns the old rows of a moment in their new places, zeros where there was none.
+
+    Args:
+        moment: [rows before, ...].
+        source: [K] old row of each; -1, or one that has no such parameter, stands for none.
+        like: [K, ...] the parameter now; of coefficients there may be more or fewer than before.
+    """
+    if moment.shape[1:] != like.shape[1:]:
+        moment = with_terms(moment, like.shape[1])
+    result = torch.zeros_like(like)
+    known = (source >= 0) & (source < len(moment))
+    result[known] = moment[source[known]]
+    return result

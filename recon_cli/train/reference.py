@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.projection import rotation_matrices
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import Splats, joined
 from recon_cli.train.gathered import Gathered
 
 _SPLIT = 2  # Gaussians that replace one that is split
@@ -56,12 +56,9 @@ def densify(
     kept[splits] = False
     rows = torch.nonzero(kept)[:, 0]
     parts = [splats.select(rows), splats.select(clones), halves]
-    result = Splats(**{
-        name: torch.cat([part.parameters()[name] for part in parts])
-        for name in splats.parameters()
-    })
+    result, order = joined(parts)
     new = torch.full((len(clones) + len(halves),), -1, device=rows.device)
-    return result, torch.cat([rows, new])
+    return result, torch.cat([rows, new])[order]
 
 
 def _hardest_pulled(pull: Tensor, rule: DensifyRule, n: int) -> Tensor:
@@ -77,7 +74,7 @@ def _hardest_pulled(pull: Tensor, rule: DensifyRule, n: int) -> Tensor:
 
 def _halves(splats: Splats, rows: Tensor, generator: torch.Generator) -> Splats:
     """Returns two smaller Gaussians for each row, drawn from the one that they replace."""
-    parent = splats.select(rows.repeat(_SPLIT))
+    parent, _ = joined([splats.select(rows)] * _SPLIT)
     noise = torch.randn(len(parent), 3, generator=generator).to(parent.means)
     offsets = rotation_matrices(parent.quats) @ (parent.scales * noise)[..., None]
     parent.means = parent.means + offsets[..., 0]

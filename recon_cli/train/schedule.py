@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.train.recipe import RECIPES, Recipe
 
 _REFERENCE = 30_000  # iterations of INRIA's default run
@@ -26,7 +26,7 @@ class Schedule:
         recipe: of the strategy that the options name.
     """
 
-    config: TrainConfig
+    config: RunConfig
     recipe: Recipe = None  # type: ignore[assignment]  # filled in below
 
     def __post_init__(self) -> None:

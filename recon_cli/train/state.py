@@ -16,13 +16,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from recon_cli.atomic import replacing
-from recon_cli.config import TrainConfig
+from recon_cli.config import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import Splats
 from recon_cli.train.gathered import Gathered
 from recon_cli.train.optimizer import SplatOptimizer
 
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass(eq=False)
@@ -37,6 +37,9 @@ class TrainState:
         queue: indices of the views still to come in this epoch, last first.
         first_count: Gaussians before the first step; budgets grow from there.
         skipped: steps whose loss was not finite, and that changed nothing.
+        looks: (iteration, validation PSNR in dB) at each regular report so far.
+        jump: (iteration, iteration at which it went on) of an early stop; None where there was
+            none. The steps between were never taken.
     """
 
     optimizer: SplatOptimizer
@@ -46,6 +49,13 @@ class TrainState:
     queue: list[int] = field(default_factory=list)
     first_count: int = 0
     skipped: int = 0
+    looks: list[tuple[int, float]] = field(default_factory=list)
+    jump: tuple[int, int] | None = None
+
+    @property
+    def steps(self) -> int:
+        """Steps really taken."""
+        return self.iteration - (self.jump[1] - self.jump[0] if self.jump else 0)
 
     @property
     def splats(self) -> Splats:
@@ -54,7 +64,7 @@ class TrainState:
 
 
 def new_state(
-    splats: Splats, config: TrainConfig, extent: float, *, fused: bool = False
+    splats: Splats, config: RunConfig, extent: float, *, fused: bool = False
 ) -> TrainState:
     """Returns the state before the first step; `fused` as in `SplatOptimizer`."""
     generator = torch.Generator().manual_seed(config.seed)
@@ -75,14 +85,15 @@ def save_state(path: Path, state: TrainState) -> None:
     tensors["generator"] = state.generator.get_state()
     check_finite(tensors, "Training diverged")
     scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue,
-               "first_count": state.first_count, "skipped": state.skipped}
+               "first_count": state.first_count, "skipped": state.skipped,
+               "looks": state.looks, "jump": state.jump}
     with replacing(path) as temporary:
         save_file({name: value.contiguous().cpu() for name, value in tensors.items()},
                   temporary, metadata={"state": json.dumps(scalars)})
 
 
 def load_state(
-    path: Path, config: TrainConfig, extent: float, device: torch.device, *, fused: bool = False
+    path: Path, config: RunConfig, extent: float, device: torch.device, *, fused: bool = False
 ) -> TrainState:
     """Returns the state that `save_state` wrote.
 
@@ -104,7 +115,8 @@ def load_state(
             SplatOptimizer(splats, config, extent, fused=fused),
             Gathered(**_under("gathered.", tensors)), generator, int(scalars["iteration"]),
             [int(i) for i in scalars["queue"]], int(scalars["first_count"]),
-            int(scalars["skipped"]))
+            int(scalars["skipped"]), [(int(at), float(psnr)) for at, psnr in scalars["looks"]],
+            (int(scalars["jump"][0]), int(scalars["jump"][1])) if scalars["jump"] else None)
         state.optimizer.restore(tensors)
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise FormatError(

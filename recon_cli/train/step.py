@@ -14,6 +14,7 @@ from recon_cli.render import Statistics, render
 from recon_cli.scene.camera import Camera
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.poses import camera_gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +51,30 @@ class GradientStep(Protocol):
     Pixels that the view's mask ignores have no error and no gradient.
     """
 
+    @property
+    def log_gain_gradient(self) -> NDArray[np.float64]:
+        """Gradient [3] of the logarithm of the gain, of the last view that was given one."""
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera of the last view.
+
+        As `poses.camera_gradient`; to be asked before the optimizer uses the gradients up, and only
+        where the view saw a Gaussian.
+        """
+
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
-        *, variance: bool = False, scores: bool = False, loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view; None where it sees no Gaussian.
 
         The statistics are valid until the next call. Their `variance` is computed where it is
-        asked for, and so are the scores (hits and blend weights) and loo, over the pixels that
-        the view's mask counts.
+        asked for. The rendered channels are multiplied by `gain` [3] before they are compared;
+        None stands for ones. With `scores` there are hits and blend weights too, and with `loo`
+        loo, over the pixels that the view's mask counts.
         """
 
 
@@ -81,14 +97,28 @@ class _FusedStep:
         self._compute = PhotometricStep()
         self._background = torch.zeros(3)
 
+    @property
+    def log_gain_gradient(self) -> NDArray[np.float64]:
+        """Gradient [3] of the logarithm of the gain."""
+        return self._compute.log_gain_gradient
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        from recon_cli.render.numba.camera_gradient import pull_of_scene
+
+        return -pull_of_scene(optimizer.splats, optimizer.gradients, camera, sh_degree)
+
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
-        *, variance: bool = False, scores: bool = False, loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
-            sh_degree, ssim_weight, mask=view.mask, details=variance,
+            sh_degree, ssim_weight, mask=view.mask, gain=gain, details=variance,
             scores=scores, loo=loo)
         return loss, self._compute.statistics if self._compute.instances else None
 
@@ -98,10 +128,20 @@ class _AutogradStep:
 
     def __init__(self, backend: str) -> None:
         self._backend = backend
+        self.log_gain_gradient = np.zeros(3)
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        gradients = optimizer.splats.map(
+            lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
+        return camera_gradient(optimizer.splats, gradients, camera, sh_degree)
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float,
-        *, variance: bool = False, scores: bool = False, loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
@@ -109,10 +149,18 @@ class _AutogradStep:
         output = render(
             splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
             scores=variance or scores or loo, mask=counting)
-        loss = photometric_loss(output.rgb, view.pixels(device), ssim_weight, mask=counting)
+        rgb = output.rgb
+        log_gain = None
+        if gain is not None:
+            log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
+            rgb = rgb * log_gain.exp()
+        loss = photometric_loss(
+            rgb, view.pixels(device), ssim_weight, mask=counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None
         if np.isfinite(value):
             loss.backward()  # type: ignore[no-untyped-call]
+            if log_gain is not None and log_gain.grad is not None:
+                self.log_gain_gradient = log_gain.grad.cpu().double().numpy()
         return value, output.statistics

@@ -108,7 +108,7 @@ def composited(
         alphas[i] = torch.where(part, alpha, 0.0).detach()
         weight = torch.where(part, alpha * left, 0.0)
         weights[i] = weight.detach()
-        rgb = rgb + weight[..., None] * _color(splats, i, camera, sh_degree)
+        rgb = rgb + weight[..., None] * color_towards(splats, i, camera, sh_degree)
         depth = depth + weight * local[i, 2]
         left = torch.where(part, left * (1 - alpha), left)
     return Composite(
@@ -145,12 +145,16 @@ def _project(
     return mean, J @ R @ cov @ R.T @ J.T + DILATION * torch.eye(2, dtype=torch.float64)
 
 
-def _color(splats: Splats, i: int, camera: Camera, degree: int) -> Tensor:
+def color_towards(splats: Splats, i: int, camera: Camera, degree: int) -> Tensor:
+    """Returns the colour of one Gaussian, [3]."""
     center = torch.from_numpy(camera.center)
     direction = splats.means[i] - center
     basis = sh_basis(direction / direction.norm(), degree)
-    coefficients = torch.cat([splats.sh_dc[i][None], splats.sh_rest[i]])[: len(basis)]
-    return (basis @ coefficients + 0.5).clamp_min(0)
+    coefficients = splats.sh_dc[i][None]
+    if i < len(splats.sh_rest):  # the others have no more
+        coefficients = torch.cat([coefficients, splats.sh_rest[i]])
+    used = min(len(basis), len(coefficients))
+    return (basis[:used] @ coefficients[:used] + 0.5).clamp_min(0)
 
 
 class _Harmonic(torch.autograd.Function):

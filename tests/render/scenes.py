@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -36,6 +37,11 @@ def random_splats(n: int, *, seed: int = 0, dtype: torch.dtype = torch.float64) 
         "sh_rest": rng.normal(0, 0.1, (n, 15, 3)),
     }
     return Splats(**{k: torch.tensor(v, dtype=dtype) for k, v in values.items()})
+
+
+def with_harmonics(splats: Splats, degree: int, colored: int) -> Splats:
+    """The same, of a scene's degree, of which the first `colored` have coefficients."""
+    return replace(splats, sh_rest=splats.with_degree(degree).sh_rest[:colored])
 
 
 def one_splat(

@@ -7,7 +7,7 @@ from dataclasses import fields
 import pytest
 import torch
 from backends import CASES, GREENISH, Case
-from scenes import camera_at, random_splats
+from scenes import camera_at, random_splats, with_harmonics
 
 from recon_cli.render import Statistics
 from recon_cli.scene.splats import Splats
@@ -49,9 +49,14 @@ def everything(case: Case, splats: Splats, degree: int) -> dict[str, torch.Tenso
 
 
 @pytest.mark.parametrize("case", OTHERS, ids=str)
-@pytest.mark.parametrize(("seed", "degree"), [(0, 0), (1, 2), (2, 3)])
-def test_all_outputs_and_gradients_agree_on_two_thousand_gaussians(case, seed, degree):
-    splats = scene(seed).map(lambda tensor: tensor.float().double())
+@pytest.mark.parametrize(("seed", "degree", "stored", "colored"), [
+    (0, 0, 3, 2000), (1, 2, 3, 2000), (2, 3, 3, 2000), (3, 3, 3, 701), (4, 2, 2, 1500),
+    (5, 3, 1, 1999), (6, 3, 0, 0)])
+def test_all_outputs_and_gradients_agree_on_two_thousand_gaussians(
+    case, seed, degree, stored, colored
+):
+    splats = with_harmonics(scene(seed), stored, colored)
+    splats = splats.map(lambda tensor: tensor.float().double())
     truth, ours = everything(EXACT, splats, degree), everything(case, splats, degree)
     assert truth.keys() == ours.keys()
     for name in ("rgb", "alpha", "depth"):

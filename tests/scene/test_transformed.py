@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import camera_at, random_splats
+from scenes import camera_at, random_splats, with_harmonics
 from test_similarity import random_rotation
 
 from recon_cli.render import render
@@ -36,6 +36,19 @@ def test_a_moved_camera_sees_the_same_image_of_moved_gaussians(seed, scale):
     assert torch.allclose(before.rgb, after.rgb, rtol=0, atol=PIXEL)
     assert torch.allclose(before.alpha, after.alpha, rtol=0, atol=PIXEL)
     assert torch.allclose(scale * before.depth, after.depth, rtol=0, atol=PIXEL)
+
+
+@pytest.mark.parametrize(("degree", "colored"), [(0, 80), (1, 30), (2, 80), (3, 0), (3, 31)])
+def test_splats_of_any_degree_and_share_move_alike(degree, colored):
+    rng = np.random.default_rng(7)
+    similarity = Similarity(1.5, random_rotation(rng), rng.normal(size=3))
+    splats = with_harmonics(random_splats(80, seed=7), degree, colored)
+    splats.means[:, 2] += 2
+    splats.sh_rest[:] *= 5
+    moved = transformed(splats, similarity)
+    assert moved.sh_rest.shape == splats.sh_rest.shape
+    before, after = seen(splats, camera_at()), seen(moved, similarity.camera(camera_at()))
+    assert torch.allclose(before.rgb, after.rgb, rtol=0, atol=PIXEL)
 
 
 def test_without_turning_the_colours_the_image_would_change():

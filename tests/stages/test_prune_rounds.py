@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tiny_scene import make_inputs
 
-from recon_cli.config import PRUNE_SCORES, PruneConfig, TrainConfig
+from recon_cli.config import PRUNE_SCORES, PruneConfig, RunConfig, TrainConfig
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import use_threads
@@ -20,6 +20,7 @@ from recon_cli.train.state import save_state
 CONFIG = TrainConfig(
     iterations=120, densify_every=10, max_gaussians=120, sh_rate=0.05, checkpoint_every=3,
     validation=0.2)
+RUN = RunConfig(**{**vars(CONFIG), "max_size": 400})
 CONTEXT = StageContext()
 THREE = PruneConfig(ratio=0.6, rounds=3, recovery=60)
 SEARCH = PruneConfig(max_psnr_drop=1.0, rounds=3, recovery=30)
@@ -77,7 +78,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     config, inputs, whole, tmp_path, monkeypatch
 ):
     """Each time one write of a state or of the list succeeds more than the time before."""
-    monkeypatch.setattr(course, "read_config", lambda _: CONFIG)  # a checkpoint every 3 steps
+    monkeypatch.setattr(course, "read_config", lambda _: RUN)  # a checkpoint every 3 steps
     expected, summary = whole[config]
     kills = 0
     while True:
@@ -193,7 +194,7 @@ def test_where_every_removal_costs_too_much_nothing_goes(inputs, tmp_path, caplo
 
 
 def test_a_loss_of_psnr_without_validation_views_is_refused(inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(course, "read_config", lambda _: replace(CONFIG, validation=0.0))
+    monkeypatch.setattr(course, "read_config", lambda _: replace(RUN, validation=0.0))
     with pytest.raises(TrainingError, match="validation views") as caught:
         run(SEARCH, inputs, tmp_path / "out")
     assert "--validation" in caught.value.hint

@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from scenes import camera_at, random_splats
+from scenes import camera_at, random_splats, with_harmonics
 
 from recon_cli.config import TrainConfig
 from recon_cli.errors import FormatError, TrainingError
@@ -56,8 +56,9 @@ def masked_task(backend, device="cpu"):
     return task
 
 
-def first_state(config=CONFIG, device="cpu", backend="torch"):
-    splats = random_splats(40, seed=0, dtype=torch.float32)
+def first_state(config=CONFIG, device="cpu", backend="torch", *, colored=40):
+    splats = with_harmonics(
+        random_splats(40, seed=0, dtype=torch.float32), config.sh_degree, colored)
     splats.sh_dc = torch.zeros(40, 3)
     return new_state(splats.map(lambda tensor: tensor.to(device)), config, EXTENT,
                      fused=fuses(backend))
@@ -184,6 +185,28 @@ def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(
         save_state(tmp_path / name, state)
         bytes_of[name] = (tmp_path / name).read_bytes()
     assert bytes_of["whole"] == bytes_of["resumed"]
+
+
+@every_run
+@pytest.mark.parametrize(("degree", "colored"), [(0, 40), (1, 40), (2, 17), (3, 17), (3, 0)])
+def test_a_run_in_which_only_some_have_harmonics_resumes_to_the_same_bits(
+    tmp_path, degree, colored, backend, device
+):
+    config = TrainConfig(**{**vars(CONFIG), "sh_degree": degree})
+    task = tiny_task(config, device, backend)
+    whole, part = (first_state(config, device, backend, colored=colored) for _ in range(2))
+    run(whole, task, 45)
+    run(part, task, 27)
+    resumed = saved_and_loaded(part, tmp_path, device, backend)
+    run(resumed, task, 45)
+    assert same(whole, resumed)
+    splats = whole.splats
+    assert splats.sh_degree == degree
+    assert len(splats) > 40  # densification added some, and those with coefficients came first
+    assert (0 < len(splats.sh_rest) < len(splats)) == (0 < colored < 40)
+    save_state(tmp_path / "whole", whole)
+    save_state(tmp_path / "resumed", resumed)
+    assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
 
 
 @pytest.mark.parametrize(("first", "second"), [("torch", "numba"), ("numba", "torch")])

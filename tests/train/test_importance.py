@@ -5,7 +5,7 @@ import pytest
 import torch
 from scenes import camera_at, joined, one_splat, random_splats
 
-from recon_cli.config import PRUNE_SCORES, TrainConfig
+from recon_cli.config import PRUNE_SCORES, RunConfig
 from recon_cli.render import render
 from recon_cli.train.importance import (
     Importance,
@@ -132,7 +132,7 @@ def test_a_training_step_leaves_the_scores_of_its_view(backend):
     splats = random_splats(60, dtype=torch.float32)
     mask = np.random.default_rng(0).random((20, 30)) < 0.5
     view = blank(camera_at(30, 20), mask)
-    optimizer = SplatOptimizer(splats, TrainConfig(), 1.0, fused=fuses(backend))
+    optimizer = SplatOptimizer(splats, RunConfig(), 1.0, fused=fuses(backend))
     _, statistics = gradient_step(backend)(optimizer, view, 0, 0.2, scores=True, loo=True)
     trained = Importance.zeros(60, CPU)
     trained.add(statistics)

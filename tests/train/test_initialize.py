@@ -13,28 +13,34 @@ GREY = np.full((27, 3), 128, np.uint8)
 
 
 def test_a_gaussian_is_as_large_as_the_mean_distance_to_its_three_nearest():
-    splats = splats_from_points(GRID, GREY, most=100, seed=0)
+    splats = splats_from_points(GRID, GREY, most=100, seed=0, sh_degree=3)
     assert torch.allclose(splats.scales, torch.ones(27, 3))  # a grid of spacing one
     assert splats.opacities.tolist() == pytest.approx([0.1] * 27)
 
 
 def test_the_base_colour_is_the_points_colour():
-    splats = splats_from_points(GRID, GREY, most=100, seed=0)
+    splats = splats_from_points(GRID, GREY, most=100, seed=0, sh_degree=3)
     assert torch.allclose(SH_C0 * splats.sh_dc + 0.5, torch.tensor(128 / 255), atol=1e-6)
     assert splats.sh_rest.abs().max() == 0
 
 
+@pytest.mark.parametrize("degree", range(4))
+def test_no_coefficient_beyond_the_degree_is_stored(degree):
+    splats = splats_from_points(GRID, GREY, most=100, seed=0, sh_degree=degree)
+    assert splats.sh_rest.shape == (27, (degree + 1) ** 2 - 1, 3)
+
+
 def test_points_at_one_place_get_a_finite_scale():
-    splats = splats_from_points(np.zeros((5, 3)), GREY[:5], most=10, seed=0)
+    splats = splats_from_points(np.zeros((5, 3)), GREY[:5], most=10, seed=0, sh_degree=3)
     assert torch.isfinite(splats.log_scales).all()
 
 
 def test_of_too_many_points_a_seeded_draw_is_taken():
-    first, second = (splats_from_points(GRID, GREY, most=10, seed=1) for _ in range(2))
+    first, second = (splats_from_points(GRID, GREY, most=10, seed=1, sh_degree=3) for _ in range(2))
     assert len(first) == 10
     assert torch.equal(first.means, second.means)
 
 
 def test_too_few_points_are_refused():
     with pytest.raises(TrainingError, match="3 points"):
-        splats_from_points(GRID[:3], GREY[:3], most=10, seed=0)
+        splats_from_points(GRID[:3], GREY[:3], most=10, seed=0, sh_degree=3)

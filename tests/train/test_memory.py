@@ -23,6 +23,12 @@ def test_a_gaussian_takes_at_most_one_and_a_half_kilobytes():
     assert needed().gaussians <= 1500 * 100_000
 
 
+def test_a_gaussian_without_higher_harmonics_takes_a_quarter():
+    # 14 of 59 numbers and the copy of a quaternion instead of 45 coefficients
+    assert needed(sh_degree=0).gaussians == 100_000 * 4 * (5 * 14 + 4)
+    assert needed(sh_degree=3).gaussians == 100_000 * 4 * (5 * 59 + 45)
+
+
 def test_what_fits_is_not_refused():
     refuse_what_does_not_fit(needed(), needed().total)
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render.contract import EXACT, Approximation, RenderOutput, Statistics
-from recon_cli.render.numba.frame import Lease, Parameters
+from recon_cli.render.numba.frame import Lease, Parameters, flat
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
@@ -30,17 +28,11 @@ def render(
             f"{splats.means.device}; the torch backend takes both")
     statistics = Statistics.zeros(splats.means)
     tensors = list(splats.parameters().values())
-    if sh_degree == 0:
+    if min(sh_degree, splats.sh_degree) == 0:
         tensors[5] = tensors[5].detach()  # no part of the picture
     rgb, alpha, depth = _Render.apply(
         *tensors, background, camera, sh_degree, scores, mask, statistics, approximation)
     return RenderOutput(rgb, alpha, depth, statistics)
-
-
-def flat(tensor: Tensor) -> NDArray[np.float32]:
-    """Returns a CPU tensor as a flat array: the same memory where it is contiguous."""
-    array: NDArray[np.float32] = tensor.detach().contiguous().numpy().reshape(-1)
-    return array
 
 
 class _Render(torch.autograd.Function):
@@ -58,7 +50,7 @@ class _Render(torch.autograd.Function):
                              means.new_empty(size))
         lease = Lease()
         lease.frame.forward(
-            Parameters(*map(flat, tensors)), camera, flat(background).copy(), sh_degree,
+            Parameters.of(tensors), camera, flat(background).copy(), sh_degree,
             rgb=flat(rgb), alpha=flat(alpha), depth=flat(depth), radii=flat(statistics.radii),
             approximation=approximation, scores=scores,
             counting=None if mask is None else mask.contiguous().numpy())
@@ -79,9 +71,9 @@ class _Render(torch.autograd.Function):
         gradients = [torch.empty_like(tensor, memory_format=torch.contiguous_format)
                      for tensor in tensors]
         ctx.lease.frame.backward(
-            Parameters(*map(flat, tensors)), Parameters(*map(flat, gradients)),
-            grad_rgb=flat(grad_rgb), grad_alpha=flat(grad_alpha), grad_depth=flat(grad_depth),
-            details=True, scores=ctx.scores, means2d_grad=flat(statistics.means2d_grad),
+            Parameters.of(tensors), Parameters.of(gradients), grad_rgb=flat(grad_rgb),
+            grad_alpha=flat(grad_alpha), grad_depth=flat(grad_depth), details=True,
+            scores=ctx.scores, means2d_grad=flat(statistics.means2d_grad),
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))
         background = None

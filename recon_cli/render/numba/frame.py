@@ -6,11 +6,13 @@ A frame owns its memory and is used again: fresh pages cost as much as the arith
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from recon_cli.render.contract import EXACT, Approximation, Statistics
 from recon_cli.render.numba import binning
@@ -31,7 +33,17 @@ _MARGIN = 0.15  # of the image on each side, within which x/z and y/z are held
 
 @dataclass(frozen=True)
 class Parameters:
-    """The raw parameters (or their gradients) of N Gaussians as flat float32 arrays."""
+    """The raw parameters (or their gradients) of N Gaussians as flat float32 arrays.
+
+    Attributes:
+        means: [N * 3].
+        quats: [N * 4].
+        log_scales: [N * 3].
+        logit_opacities: [N].
+        sh_dc: [N * 3].
+        sh_rest: [M * stride] of the first M Gaussians.
+        stride: higher SH coefficients of such a Gaussian: 0, 9, 24 or 45.
+    """
 
     means: NDArray[np.float32]
     quats: NDArray[np.float32]
@@ -39,6 +51,21 @@ class Parameters:
     logit_opacities: NDArray[np.float32]
     sh_dc: NDArray[np.float32]
     sh_rest: NDArray[np.float32]
+    stride: int
+
+    @staticmethod
+    def of(tensors: Iterable[Tensor]) -> Parameters:
+        """Returns the raw parameters of splats; the same memory where they are contiguous."""
+        means, quats, log_scales, logits, sh_dc, sh_rest = tensors
+        return Parameters(
+            flat(means), flat(quats), flat(log_scales), flat(logits), flat(sh_dc), flat(sh_rest),
+            stride=3 * sh_rest.shape[1])
+
+
+def flat(tensor: Tensor) -> NDArray[np.float32]:
+    """Returns a CPU tensor as a flat array: the same memory where it is contiguous."""
+    array: NDArray[np.float32] = tensor.detach().contiguous().numpy().reshape(-1)
+    return array
 
 
 def viewpoint(camera: Camera) -> Viewpoint:
@@ -84,11 +111,12 @@ class Frame:
     ) -> None:
         """Renders into rgb [H*W*3], alpha [H*W] and depth [H*W]; radii [N] must hold zeros.
 
-        The scores, in this pass and the next backward one, are taken over the pixels where
-        counting [H, W] is True; over all where it is None.
+        Of `sh_degree` is used what the splats have. The scores, in this pass and the next backward
+        one, are taken over the pixels where counting [H, W] is True; over all where it is None.
         """
         self.view = viewpoint(camera)
-        self.terms = (sh_degree + 1) ** 2 - 1
+        stored = splats.stride // 3 if len(splats.sh_rest) else 0
+        self.terms = min((sh_degree + 1) ** 2 - 1, stored)
         self.background = background
         self.cutoff = np.float32(np.log2(approximation.alpha_min))
         self._project(splats, radii, approximation)
@@ -128,9 +156,9 @@ class Frame:
         self.depths = self.take("depths", m, np.float64)
         self.rows = self.take("rows", 2 * m, np.int32)
         crew.run(project, self.ids, splats.means, splats.quats, splats.log_scales,
-                 splats.logit_opacities, splats.sh_dc, splats.sh_rest, self.terms, self.view,
-                 approximation.alpha_min, approximation.square, self.records, self.depths,
-                 self.rows, radii, broken)
+                 splats.logit_opacities, splats.sh_dc, splats.sh_rest, splats.stride, self.terms,
+                 self.view, approximation.alpha_min, approximation.square, self.records,
+                 self.depths, self.rows, radii, broken)
         self.broken = int(broken[0])
 
     def _bin(self, square: bool) -> None:
@@ -202,7 +230,7 @@ class Frame:
         crew.run(
             unproject, self.ids, self.block_starts, self.slot_start, sums, self.depths,
             splats.means, splats.quats, splats.log_scales, splats.logit_opacities, splats.sh_dc,
-            splats.sh_rest,
+            splats.sh_rest, splats.stride,
             self.terms, self.view, self.records, gradients.means, gradients.quats,
             gradients.log_scales, gradients.logit_opacities, gradients.sh_dc, gradients.sh_rest,
             means2d_grad, absolute_grad, variance, loo)

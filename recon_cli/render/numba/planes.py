@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from recon_cli.render.numba.coefficients import rows_to_planes
 from recon_cli.render.numba.kernel import inlined
 from recon_cli.render.numba.lane_functions import absolute, maximum, minimum, select, square_root
-from recon_cli.render.numba.lane_memory import copy, load, transpose
+from recon_cli.render.numba.lane_memory import load
 from recon_cli.render.numba.lanes import LANES
 from recon_cli.render.numba.layout import RECORD
 
@@ -46,12 +47,11 @@ P_BASIS = P_REST + 45
 OUT = P_BASIS + 15
 SQUARE = OUT + RECORD  # LANES planes in which blocks are turned
 PROJECTION_FLOATS = (SQUARE + LANES) * LANES
-_REST_FLOATS = 45  # of a Gaussian's higher SH coefficients
 
 
 @inlined
-def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest, terms,
-           view, depths):
+def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest, stride,
+           terms, view, depths):
     """Fills the planes of `scratch` with Gaussians ids[first : first + count], `depths` too."""
     R = view.R
     for k in range(LANES):
@@ -81,12 +81,8 @@ def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, 
             scratch[(P_S0 + c) * LANES + k] = log_scales[3 * i + c]
             scratch[(P_DC + c) * LANES + k] = sh_dc[3 * i + c]
         scratch[P_LOGIT * LANES + k] = logits[i]
-    for block in range(0, 3 * terms, LANES):
-        at = min(block, _REST_FLOATS - LANES)
-        for k in range(LANES):
-            i = np.int64(ids[first + min(k, count - 1)])
-            copy(sh_rest, _REST_FLOATS * i + at, scratch, (SQUARE + k) * LANES)
-        transpose(scratch, SQUARE * LANES, scratch, (P_REST + at) * LANES)
+    if terms > 0:
+        rows_to_planes(sh_rest, stride, ids, first, count, terms, scratch, P_REST, SQUARE)
 
 
 @inlined

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from recon_cli.render.contract import DILATION
+from recon_cli.render.numba.coefficients import terms_of_group
 from recon_cli.render.numba.culling import INFINITE
 from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.lane_functions import (
@@ -82,8 +83,8 @@ _F = np.float32
 
 
 @kernel
-def project(counter, ids, means, quats, log_scales, logits, sh_dc, sh_rest, terms, view, alpha_min,
-            square, records, depths, rows, radii, broken, scratch):
+def project(counter, ids, means, quats, log_scales, logits, sh_dc, sh_rest, stride, terms, view,
+            alpha_min, square, records, depths, rows, radii, broken, scratch):
     """Writes record, depth (float64), rows of tiles and radius of every Gaussian in `ids`."""
     n = len(ids)
     blocks = (n + BLOCK - 1) // BLOCK
@@ -95,10 +96,11 @@ def project(counter, ids, means, quats, log_scales, logits, sh_dc, sh_rest, term
             break
         for first in range(block * BLOCK, min((block + 1) * BLOCK, n), LANES):
             count = min(LANES, n - first)
+            used = terms_of_group(ids, first, sh_rest, stride, terms)
             gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest,
-                   terms, view, depths)
+                   stride, used, view, depths)
             sound = shape(scratch, view, _F(alpha_min), square)
-            sound &= (bits(colour(scratch, terms)))
+            sound &= (bits(colour(scratch, used)))
             for plane in range(0, RECORD, LANES):
                 transpose(scratch, (OUT + plane) * LANES, scratch, SQUARE * LANES)
                 for k in range(count):

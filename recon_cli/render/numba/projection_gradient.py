@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.contract import DILATION
+from recon_cli.render.numba.coefficients import planes_to_rows, terms_of_group
 from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.lane_functions import (
     exp2,
@@ -84,8 +85,9 @@ GRADIENT_FLOATS = (_PULL + 15) * LANES
 
 @kernel
 def unproject(counter, ids, block_starts, slot_start, sums, depths, means, quats, log_scales,
-              logits, sh_dc, sh_rest, terms, view, records, g_means, g_quats, g_log_scales,
-              g_logits, g_sh_dc, g_sh_rest, means2d_grad, absolute_grad, variance, loo, scratch):
+              logits, sh_dc, sh_rest, stride, terms, view, records, g_means, g_quats,
+              g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad, absolute_grad, variance,
+              loo, scratch):
     """Writes the gradients of all Gaussians, zero for those that were not seen."""
     n = len(logits)
     blocks = len(block_starts) - 1
@@ -100,7 +102,7 @@ def unproject(counter, ids, block_starts, slot_start, sums, depths, means, quats
         clear(g_logits, low, high)
         clear(g_sh_dc, 3 * low, 3 * high)
         if terms > 0:
-            clear(g_sh_rest, 45 * low, 45 * high)
+            clear(g_sh_rest, min(stride * low, len(sh_rest)), min(stride * high, len(sh_rest)))
         clear(means2d_grad, 2 * low, 2 * high)
         clear(absolute_grad, 2 * low, 2 * high)
         clear(variance, low, high)
@@ -110,8 +112,9 @@ def unproject(counter, ids, block_starts, slot_start, sums, depths, means, quats
             any_slot = slot_start[first + count] > slot_start[first]
             if not any_slot:
                 continue
+            used = terms_of_group(ids, first, sh_rest, stride, terms)
             gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest,
-                   terms, view, depths)
+                   stride, used, view, depths)
             for plane in range(0, SLOT, LANES):
                 for k in range(LANES):
                     j = first + min(k, count - 1)
@@ -124,7 +127,7 @@ def unproject(counter, ids, block_starts, slot_start, sums, depths, means, quats
                     j = first + min(k, count - 1)
                     copy(records, j * RECORD + plane, scratch, (SQUARE + k) * LANES)
                 transpose(scratch, SQUARE * LANES, scratch, (_RECORD + plane) * LANES)
-            colour_gradient(scratch, terms)
+            colour_gradient(scratch, used)
             shape_gradient(scratch, view)
             for k in range(count):
                 j = first + k
@@ -143,13 +146,9 @@ def unproject(counter, ids, block_starts, slot_start, sums, depths, means, quats
                     absolute_grad[2 * i + c] = scratch[(G_ABSOLUTE + c) * LANES + k]
                 variance[i] = scratch[G_VARIANCE * LANES + k]
                 loo[i] = scratch[(_SUMS + LEAVE_ONE_OUT) * LANES + k]
-            for plane in range(0, 3 * terms, LANES):
-                at = min(plane, 45 - LANES)
-                transpose(scratch, (G_REST + at) * LANES, scratch, SQUARE * LANES)
-                for k in range(count):
-                    if slot_start[first + k + 1] > slot_start[first + k]:
-                        copy(scratch, (SQUARE + k) * LANES, g_sh_rest,
-                             45 * np.int64(ids[first + k]) + at)
+            if used > 0:
+                planes_to_rows(scratch, G_REST, SQUARE, used, ids, first, count, slot_start,
+                               g_sh_rest, stride)
 
 
 @inlined

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from recon_cli.render.numba.backend import render
+from recon_cli.render.numba.camera_gradient import pull_of_scene
 from recon_cli.render.numba.crew import crew
 from recon_cli.render.numba.kernel import cache_folder
 from recon_cli.render.numba.optimizer import step
@@ -24,7 +25,7 @@ from recon_cli.scene.splats import Splats
 
 logger = logging.getLogger("recon")
 
-KERNELS = 11  # that threads share; the progress counts these
+KERNELS = 12  # that threads share; the progress counts these
 _SCIPY = "scipy.linalg"
 _READY = "ready"  # file in the cache folder once every kernel is there
 _DAMAGE = (pickle.UnpicklingError, EOFError, ImportError, AttributeError, IndexError, KeyError,
@@ -107,6 +108,7 @@ def _run_all() -> None:
     gradients = splats.map(torch.zeros_like)
     PhotometricStep()(
         splats, gradients, camera, np.zeros((20, 20, 3), np.uint8), torch.zeros(3), 3, 0.2)
+    pull_of_scene(splats, gradients, camera, 3)
     render(splats, camera, torch.zeros(3), 3, scores=True)
     flat = [tensor.reshape(-1) for tensor in gradients.parameters().values()]
     step(flat, flat, flat, flat, [0.0] * len(flat), count=1, betas=(0.9, 0.999), epsilon=1e-15)

@@ -1,0 +1,268 @@
+"""What a run takes: a few timed steps at each resolution, summed over the schedule.
+
+The steps are taken on Gaussians of their own, made from the sparse points and thrown away, so that
+timing never changes a run.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon_cli.scene.splats import Splats
+from recon_cli.train import budget
+from recon_cli.train.fit import Task, fit, report_every, validation_psnr
+from recon_cli.train.initialize import splats_from_points
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.state import TrainState, new_state, save_state
+from recon_cli.train.step import fuses
+
+# Of the Gaussians that stand for trained ones. With the .1 that training begins with a step takes
+# 15 to 25% less than a real one of the same level and count on the room `living`, with .3 it
+# takes the same within 10% (CPU milliseconds, one thread).
+_OPACITY = 0.3
+_STEPS = 6  # timed at each level and count; views differ by a third in what they take
+_WARM = 1  # steps before them: the first one makes buffers
+_FEW = 3  # the smaller of the two counts is the larger one by this
+_MOST = 100_000  # Gaussians that are timed; to make more takes as long as some hundred steps
+_GROWTH = 0.5  # of the count at once, as in `budget`
+_LENGTH = 1000  # steps of the run that stands for any other while steps are timed
+_SEGMENTS = 400  # into which a run is cut; more do not change the sum by .1%
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class LevelCost:
+    """Milliseconds of one step at one resolution: fixed + each x thousands of Gaussians.
+
+    Attributes:
+        level: factor by which images are reduced.
+        fixed_ms: for the pixels.
+        each_ms: for every thousand Gaussians.
+    """
+
+    level: int
+    fixed_ms: float
+    each_ms: float
+
+    def ms(self, count: float) -> float:
+        """Returns the milliseconds of a step with so many Gaussians."""
+        return self.fixed_ms + self.each_ms * count / 1000
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """What the parts of a run take on this machine.
+
+    Attributes:
+        levels: of the steps, finest first.
+        report: of one look at all validation views.
+        save_ms: of one checkpoint, for every thousand Gaussians.
+        seconds: that the calibration took.
+    """
+
+    levels: tuple[LevelCost, ...]
+    report: LevelCost
+    save_ms: float
+    seconds: float
+
+    def run_seconds(self, schedule: Schedule, first: int) -> float:
+        """Returns the seconds of a whole run that begins with `first` Gaussians."""
+        costs = {cost.level: cost for cost in self.levels}
+        config, total = schedule.config, 0.0
+        every, saves = report_every(schedule), config.checkpoint_every
+        for begin, end, count in counts(schedule, first):
+            steps = end - begin
+            total += steps * costs[schedule.level((begin + end) // 2 + 1)].ms(count)
+            total += steps / every * self.report.ms(count)
+            total += steps / saves * self.save_ms * count / 1000
+        return total / 1000
+
+
+def counts(schedule: Schedule, first: int) -> list[tuple[int, int, int]]:
+    """Returns the run cut into (begin, end, Gaussians), the count as the schedule lets it grow."""
+    config = schedule.config
+    stride = max(1, math.ceil(config.iterations / _SEGMENTS))
+    if config.densify_every < stride:
+        stride = config.densify_every * math.ceil(stride / config.densify_every)
+    result, count, begin = [], min(first, config.max_gaussians), 0
+    while begin < config.iterations:
+        end = min(begin + stride, config.iterations)
+        result.append((begin, end, count))
+        grows = any(schedule.densifies(i) for i in range(begin + 1, end + 1))
+        if grows:
+            most = count + int(_GROWTH * count) * max(1, (end - begin) // config.densify_every)
+            count = max(count, min(schedule.target(end, first), most))
+        begin = end
+    return result
+
+
+def calibrate(
+    task: Task,
+    points: NDArray[np.float64],  # [P, 3]
+    colors: NDArray[np.uint8],  # [P, 3]
+    *,
+    scratch: Path,
+    clock: Clock = time.perf_counter,
+    seconds: float,
+) -> CostModel:
+    """Returns what the parts of a run take, found by a few timed steps at each level.
+
+    Coarse levels come first. Once `seconds` are used up, those that are left are told from the
+    level before them, by their pixels.
+
+    Args:
+        task: of the run; its schedule's cap is the larger count that is timed.
+        points: sparse points.
+        colors: of the points.
+        scratch: file that a checkpoint may be written to; it is deleted again.
+        clock: seconds.
+        seconds: that may be spent, a step or two more or less.
+    """
+    start = clock()
+    probe = _Probe(task, points, colors, clock, until=start + seconds)
+    levels: list[LevelCost] = []
+    for level in sorted({1, *_levels(task.schedule)}, reverse=True):
+        if levels and clock() >= probe.until:
+            levels.append(_scaled(levels[-1], level))
+        else:
+            levels.append(probe.level(level))
+    report = probe.report() if clock() < probe.until else _guessed_report(levels[-1], task)
+    save_ms = probe.save_ms(scratch)
+    return CostModel(tuple(reversed(levels)), report, save_ms, clock() - start)
+
+
+def _levels(schedule: Schedule) -> set[int]:
+    return {factor for _, factor in schedule.recipe.levels}
+
+
+def _scaled(cost: LevelCost, level: int) -> LevelCost:
+    """Returns what a finer level takes if everything grows with the pixels; rather too much."""
+    pixels = (cost.level / level) ** 2
+    return LevelCost(level, cost.fixed_ms * pixels, cost.each_ms * pixels)
+
+
+def _guessed_report(finest: LevelCost, task: Task) -> LevelCost:
+    """Returns a third of a step for each validation view: the forward pass."""
+    share = len(task.validation) / 3
+    return LevelCost(1, finest.fixed_ms * share, finest.each_ms * share)
+
+
+class _Enough(Exception):  # noqa: N818 - an event, not an error
+    """The time for timing is used up."""
+
+
+class _Probe:
+    """Times steps on Gaussians of its own."""
+
+    def __init__(
+        self, task: Task, points: NDArray[np.float64], colors: NDArray[np.uint8], clock: Clock,
+        *, until: float,
+    ) -> None:
+        config = task.schedule.config
+        # shares decide the levels, so any length has them; nothing is added in so few steps
+        plan = replace(config, iterations=_LENGTH, densify_every=2 * _LENGTH, mid=1.0)
+        self._task = replace(task, validation=[], schedule=replace(task.schedule, config=plan))
+        self._looks = task.validation[:1]
+        self._factor = len(task.validation)
+        self._clock, self.until = clock, until
+        most = min(config.max_gaussians, _MOST)
+        self.small, self.large = (
+            _grown(points, colors, count, config.sh_degree).map(
+                lambda tensor: tensor.to(task.device))
+            for count in (max(1, most // _FEW), most))
+        views = np.linspace(0, len(task.train) - 1, _STEPS + _WARM).round().astype(int)
+        self._views: list[int] = views.tolist()
+
+    def level(self, level: int) -> LevelCost:
+        """Returns the cost of a step at a level, from those at two counts."""
+        for view in set(self._views):
+            self._task.pyramid.view(view, level)
+        few = self._step_ms(self.small, level)
+        if self._clock() >= self.until:
+            return LevelCost(level, few, 0.0)
+        return self._line(level, few, self._step_ms(self.large, level))
+
+    def _line(self, level: int, few: float, many: float) -> LevelCost:
+        small, large = len(self.small) / 1000, len(self.large) / 1000
+        each = max(0.0, (many - few) / (large - small)) if large > small else 0.0
+        return LevelCost(level, max(0.0, few - each * small), each)
+
+    def _state(self, splats: Splats) -> TrainState:
+        task = self._task
+        return new_state(splats, task.schedule.config, task.extent, fused=fuses(task.backend))
+
+    def _step_ms(self, splats: Splats, level: int) -> float:
+        """Returns the median of a few steps in the middle of a level; at least of one."""
+        state = self._state(splats)
+        state.iteration = _middle(self._task.schedule, level)
+        state.queue = list(self._views)
+        marks = [self._now()]
+
+        def on_step(_: TrainState) -> None:
+            marks.append(self._now())
+            if marks[-1] >= self.until:
+                raise _Enough
+
+        with suppress(_Enough):
+            fit(state, self._task, state.iteration + len(self._views), on_step=on_step,
+                on_report=_nothing)
+        times = [1e3 * (end - begin) for begin, end in pairwise(marks)]
+        return statistics.median(times[_WARM:] or times)
+
+    def report(self) -> LevelCost:
+        """Returns the cost of a look at all validation views, from one at the first of them."""
+        values = []
+        for splats in (self.small, self.large):
+            state = self._state(splats)
+            state.iteration = _LENGTH
+            begin = self._now()
+            validation_psnr(state, replace(self._task, validation=self._looks))
+            values.append(1e3 * (self._now() - begin) * self._factor)
+        return self._line(1, *values)
+
+    def save_ms(self, scratch: Path) -> float:
+        """Returns the milliseconds that a checkpoint takes for every thousand Gaussians."""
+        state = self._state(self.small)
+        begin = self._now()
+        save_state(scratch, state)
+        scratch.unlink()
+        return 1e3 * (self._now() - begin) / (len(self.small) / 1000)
+
+    def _now(self) -> float:
+        if self._task.device.type == "cuda":  # pragma: no cover
+            torch.cuda.synchronize(self._task.device)
+        return self._clock()
+
+
+def _nothing(_: object) -> None:
+    """Ignores what it is told."""
+
+
+def _middle(schedule: Schedule, level: int) -> int:
+    """Returns the iteration in the middle of the steps of a level."""
+    steps = [i for i in range(1, _LENGTH + 1) if schedule.level(i) == level]
+    return steps[len(steps) // 2] - 1
+
+
+def _grown(
+    points: NDArray[np.float64], colors: NDArray[np.uint8], count: int, sh_degree: int
+) -> Splats:
+    """Returns `count` Gaussians that cost what trained ones do: the points', split at random."""
+    splats = splats_from_points(points, colors, most=max(count, 1), seed=0, sh_degree=sh_degree)
+    rule, generator = budget.BudgetRule(count, 0.0, 1.0), torch.Generator().manual_seed(0)
+    while 1 < len(splats) < count:
+        splats, _ = budget.densify(splats, torch.ones(len(splats)), rule, generator)
+    splats.logit_opacities = torch.logit(torch.full((len(splats),), _OPACITY))
+    return splats

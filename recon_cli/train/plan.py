@@ -1,0 +1,184 @@
+"""How long a run is and how many Gaussians it may have, where the user left that open.
+
+A plan is made once, before the first step. It is recorded, and a run that was interrupted goes on
+by the record: whatever a clock said, the same three numbers give the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from recon_cli.config import RunConfig, TrainConfig
+from recon_cli.train.cost import CostModel
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.step import TrainView
+
+CALIBRATION_SHARE = 0.05  # of the minutes, at most
+CALIBRATION_SECONDS = 0.5  # where no time is given: a twentieth of a draft
+
+_SMALLEST_RUN = 100  # steps; fewer show nothing of a room
+_LONGEST_RUN = 100_000  # steps; three times the reference's
+_DETAIL = 4.0  # grey levels a pixel; camera noise stays below it after denoising
+_DETAIL_VIEWS = 16  # looked at; the mean of more differs by less than 3%
+_FULL_AT = 6000  # steps after which there may be a Gaussian for each pixel with detail
+_VIEWS_EACH = 8  # views that must show a Gaussian, about, to tell where it is
+_FEWEST = 5000
+_ROUND = 100  # counts are told in hundreds
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What --quality stands for; the same on every machine, so that results are, too.
+
+    Attributes:
+        iterations: steps.
+        max_size: longest side of a training image in pixels.
+    """
+
+    iterations: int
+    max_size: int
+
+
+QUALITIES = {
+    "draft": Quality(1500, 400), "normal": Quality(3000, 600), "high": Quality(10_000, 960)}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was decided before the first step, and why.
+
+    Attributes:
+        iterations: steps.
+        max_gaussians: cap of the count.
+        max_size: longest side of a training image, pixels.
+        first_gaussians: at the start.
+        detail: pixels of a mean training view that hold detail.
+        seconds: that the training is expected to take, reports and checkpoints included.
+        cost: what the parts of the run take.
+    """
+
+    iterations: int
+    max_gaussians: int
+    max_size: int
+    first_gaussians: int
+    detail: int
+    seconds: float
+    cost: CostModel
+
+    def config(self, asked: TrainConfig) -> RunConfig:
+        """Returns the options of the run: what was asked for, and numbers for the rest."""
+        return _resolved(asked, self.iterations, self.max_gaussians, self.max_size)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a plan needs to know about a scene.
+
+    Attributes:
+        detail: of `detail`.
+        views: to train on.
+        points: sparse ones, from which the Gaussians begin.
+        room: the most Gaussians that memory has room for.
+    """
+
+    detail: int
+    views: int
+    points: int
+    room: int
+
+
+def first_config(asked: TrainConfig) -> RunConfig:
+    """Returns the options as far as they are known before any image is read.
+
+    Iterations and cap are those of the quality and of the smallest run where they are open.
+    """
+    quality = QUALITIES[asked.quality]
+    return _resolved(
+        asked, asked.iterations or quality.iterations, asked.max_gaussians or _FEWEST,
+        asked.max_size or quality.max_size)
+
+
+def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
+    """Returns the options whose cap is worth timing: of the run if its length is known."""
+    config = first_config(asked)
+    return dataclasses.replace(config, max_gaussians=cap(asked, facts, config.iterations))
+
+
+def make_plan(asked: TrainConfig, facts: Facts, cost: CostModel) -> Plan:
+    """Returns the plan: the steps asked for, those of the quality, or as many as fill the time.
+
+    Args:
+        asked: what the user asked for.
+        facts: about the scene.
+        cost: what steps take here; with --minutes its own seconds count as well.
+    """
+    def at(iterations: int) -> Plan:
+        most = cap(asked, facts, iterations)
+        config = _resolved(asked, iterations, most, first_config(asked).max_size)
+        first = min(facts.points, most)
+        return Plan(iterations, most, config.max_size, first, facts.detail,
+                    round(cost.run_seconds(Schedule(config), first), 2), cost)
+
+    if asked.minutes is None:
+        return at(first_config(asked).iterations)
+    left = 60 * asked.minutes - cost.seconds
+    return at(_most(lambda steps: at(steps).seconds <= left, _SMALLEST_RUN, _LONGEST_RUN))
+
+
+def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
+    """Returns the cap of the count: what was asked for, or what images, steps and memory bear.
+
+    A Gaussian for each pixel of a mean view that holds detail, after 6,000 steps; of shorter and
+    longer runs the square root of that, for a Gaussian that is added must still find its place.
+    No more than an eighth of the detail of all views together: who is seen by few views fits
+    each of them and nothing between. Measured on living, office and fox (docs/benchmarks.md,
+    "The cap of the count").
+    """
+    if asked.max_gaussians is not None:
+        return asked.max_gaussians
+    return min(wanted(facts, iterations), max(1, facts.room))
+
+
+def wanted(facts: Facts, iterations: int) -> int:
+    """Returns the cap that `cap` describes, memory aside."""
+    share = min(math.sqrt(iterations / _FULL_AT), facts.views / _VIEWS_EACH)
+    return max(_FEWEST, round(facts.detail * share / _ROUND) * _ROUND)
+
+
+def detail(views: Sequence[TrainView]) -> int:
+    """Returns how many pixels of a mean view hold detail: a gradient above 4 grey levels.
+
+    Pixels that a mask ignores do not count.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, _DETAIL_VIEWS).round().astype(int))
+    return round(float(np.mean([_detailed_pixels(views[i]) for i in chosen])))
+
+
+def _detailed_pixels(view: TrainView) -> int:
+    grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    found = np.hypot(across, down) > _DETAIL
+    return int((found if view.mask is None else found & view.mask).sum())
+
+
+def _resolved(
+    asked: TrainConfig, iterations: int, max_gaussians: int, max_size: int
+) -> RunConfig:
+    values = {item.name: getattr(asked, item.name) for item in dataclasses.fields(asked)}
+    return RunConfig(**{
+        **values, "minutes": None, "iterations": iterations, "max_gaussians": max_gaussians,
+        "max_size": max_size})
+
+
+def _most(fits: Callable[[int], bool], low: int, high: int) -> int:
+    """Returns the largest whole number in [low, high] that fits; `low` where none does."""
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle - 1)
+    return low

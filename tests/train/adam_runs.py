@@ -1,0 +1,60 @@
+"""Runs of both kinds of Adam on gradients as training has them, and how they are compared."""
+
+import pytest
+import torch
+from scenes import random_splats
+
+from recon_cli.config import TrainConfig
+from recon_cli.train.optimizer import SplatOptimizer
+
+# float32 in another order of operations, over 20 steps: a few units in the last place.
+STEPS_TOLERANCE = 1e-6
+ROLES = "exp_avg", "exp_avg_sq"
+CONFIG = TrainConfig(max_gaussians=50)
+both_kinds = pytest.mark.parametrize("fused", [False, True])
+
+
+def optimizer_of(n, *, fused, config=CONFIG):
+    splats = random_splats(n, dtype=torch.float32)
+    return SplatOptimizer(splats, config, extent=2.0, fused=fused)
+
+
+def gradients_of(n, step):
+    """Gradients as they are in training: of any size, many of them zero, some denormal."""
+    generator = torch.Generator().manual_seed(step)
+
+    def draw(tensor):
+        sizes = 10 ** (torch.randn(tensor.shape, generator=generator) * 4 - 6)
+        signs = torch.randint(-1, 2, tensor.shape, generator=generator)
+        return sizes * signs
+
+    return random_splats(n, dtype=torch.float32).map(draw)
+
+
+def feed(optimizer, gradients, *, fused):
+    """Leaves gradients where each kind of optimizer looks for them."""
+    for name, value in gradients.parameters().items():
+        if fused:
+            getattr(optimizer.gradients, name).copy_(value)
+        else:
+            getattr(optimizer.splats, name).grad = value.clone()
+
+
+def walk(optimizer, steps, *, fused, start=0, sh_rest=True):
+    for step in range(start, start + steps):
+        feed(optimizer, gradients_of(len(optimizer.splats), step), fused=fused)
+        optimizer.step(1e-4, sh_rest=sh_rest)
+
+
+def held(optimizer):
+    return {name: value.clone() for name, value in optimizer.tensors().items()}
+
+
+def assert_close(ours, theirs):
+    for name, value in theirs.items():
+        assert ours[name].shape == value.shape
+        if not value.numel():
+            continue
+        scale = max(1.0, value.abs().max().item()) if name.startswith("splats") else (
+            value.abs().max().item())
+        assert (ours[name] - value).abs().max() <= STEPS_TOLERANCE * scale, name

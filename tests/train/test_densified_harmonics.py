@@ -1,0 +1,68 @@
+"""Every way of densifying on Gaussians of which only some have higher spherical harmonics."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from scenes import random_splats, with_harmonics
+
+from recon_cli.scene.splats import with_rows
+from recon_cli.train import budget, mcmc, reference
+from recon_cli.train.gathered import Gathered
+
+N, COLORED = 40, 13
+
+
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+def by_reference(splats):
+    gathered = Gathered.zeros(N, torch.device("cpu"))
+    gathered.pull[::3] = 2.0
+    gathered.count[:] = 1
+    rule = reference.DensifyRule(1.0, 100.0, 0.05, None, 60)  # all are small: cloned
+    return reference.densify(splats, gathered, rule, generator())
+
+
+def by_budget(splats):
+    score = torch.rand(N, generator=generator())
+    return budget.densify(splats, score, budget.BudgetRule(55, 0.05, 0.99), generator())
+
+
+def by_mcmc(splats):
+    return mcmc.relocate(splats, 55, 0.3, generator())
+
+
+@pytest.mark.parametrize("densify", [by_reference, by_budget, by_mcmc])
+@pytest.mark.parametrize("degree", [1, 3])
+def test_children_have_what_their_parents_have_and_those_with_coefficients_come_first(
+    densify, degree
+):
+    few = with_harmonics(random_splats(N, dtype=torch.float32), degree, COLORED)
+    whole = replace(few, sh_rest=with_rows(few.sh_rest, N))  # the same with rows of zeros
+    result, source = densify(few)
+    expected, plain = densify(whole)
+    colored = (expected.sh_rest != 0).flatten(1).any(1)
+    order = torch.cat([torch.nonzero(colored)[:, 0], torch.nonzero(~colored)[:, 0]])
+    assert len(result) > N
+    assert 0 < len(result.sh_rest) == int(colored.sum()) < len(result)
+    assert torch.equal(source, plain[order])
+    for name, value in expected.parameters().items():
+        ours = with_rows(result.sh_rest, len(result)) if name == "sh_rest" else (
+            getattr(result, name))
+        assert torch.equal(ours, value[order]), name
+
+
+def test_halves_of_a_split_have_what_their_parent_has():
+    few = with_harmonics(random_splats(N, dtype=torch.float32), 2, COLORED)
+    gathered = Gathered.zeros(N, torch.device("cpu"))
+    gathered.pull[:] = 2.0
+    gathered.count[:] = 1
+    few.logit_opacities[:] = 1.0
+    rule = reference.DensifyRule(1.0, 0.0, 0.005, None, 200)  # all are large: split
+    result, source = reference.densify(few, gathered, rule, generator())
+    assert source.tolist() == [-1] * 2 * N
+    assert torch.equal(result.sh_rest, few.sh_rest.repeat(2, 1, 1))
+    assert torch.equal(result.sh_dc[: 2 * COLORED], few.sh_dc[:COLORED].repeat(2, 1))
+    assert torch.equal(result.sh_dc[2 * COLORED :], few.sh_dc[COLORED:].repeat(2, 1))
