@@ -229,8 +229,6 @@ class RunConfig(TrainConfig):
 
 
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
-
-
 PRUNE_SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
 LIMITS = ("ratio", "max_gaussians", "max_mb", "max_psnr_drop")  # of which one may be given
 
@@ -251,8 +249,7 @@ class PruneConfig(StageConfig):
         "recovery.", unit="dB", minimum=0.0, automatic="no limit")
     rounds: int | None = option(
         None, "Rounds of removal, with recovery and new scores in between; 1 removes all at once.",
-        unit="rounds", minimum=1, automatic="one an epoch in the first half of the recovery, 3 "
-        "to 8")
+        unit="rounds", minimum=1, automatic="one an epoch of half the recovery, 3 to 8")
     score: str = option(
         "loo", "What ranks a Gaussian: loo (the squared error of leaving it out), paper (the "
         "significance of equations 3 to 5), lightgaussian (the same, volume not clamped), "
@@ -280,8 +277,7 @@ class PruneConfig(StageConfig):
             raise ConfigError(
                 "max_psnr_drop is given for pruning in mid-training, where there is no finished "
                 "model to hold the pruned one against.",
-                hint="Run `recon train`, then `recon prune --max-psnr-drop "
-                f"{self.max_psnr_drop:g}`.")
+                hint=f"`recon train`, then `recon prune --max-psnr-drop {self.max_psnr_drop:g}`.")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from tiny_scene import VIEWS, make_inputs
 
-from recon_cli.config import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
+from recon_cli.config import EvaluateConfig, ExportConfig, PruneConfig, RunConfig, TrainConfig
 from recon_cli.errors import (
     ConfigError,
     FormatError,
@@ -31,6 +31,7 @@ from recon_cli.train.state import save_state
 CONFIG = TrainConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
     checkpoint_every=7)
+RUN = RunConfig(**{**vars(CONFIG), "max_size": 400})
 PRUNE = PruneConfig(ratio=0.5, at="mid")
 CONTEXT = StageContext()
 
@@ -148,7 +149,7 @@ def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(input
 def test_a_killed_recovery_ends_with_the_same_bytes(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         stopping_after(119, patch)
-        patch.setattr(course, "read_config", lambda _: CONFIG)  # checkpoints every 7 steps
+        patch.setattr(course, "read_config", lambda _: RUN)  # checkpoints every 7 steps
         with pytest.raises(Killed):
             run(prune, PRUNE, inputs, tmp_path / "out")
     run(prune, PRUNE, inputs, tmp_path / "out")
