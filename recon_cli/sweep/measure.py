@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +19,7 @@ from recon_cli.render import render
 from recon_cli.stages.course import Course
 from recon_cli.train.fit import Report, Task, fit
 from recon_cli.train.importance import Importance
-from recon_cli.train.pruning import remaining, removals, remove, scored, survivors
+from recon_cli.train.pruning import Advance, remaining, removals, remove, scored, survivors
 from recon_cli.train.state import TrainState
 
 NONE = "none"  # stands for no score where nothing is removed
@@ -89,7 +89,7 @@ def _control(course: Course, ratio: float | None, steps: int) -> Trial:
     """Trains on without removing anything."""
     state, begin = course.start(), time.perf_counter()
     task = course.recovering(course.first, course.first + steps)
-    _advance(task)(state, course.first + steps, None)
+    advancing(task)(state, course.first + steps, None)
     seconds = time.perf_counter() - begin
     return Trial(NONE, ratio, len(state.splats), steps, seconds, None, quality(state, task))
 
@@ -104,19 +104,19 @@ def _trial(course: Course, name: str, ratio: float) -> Trial:
         begin = time.perf_counter()
         score = scored(
             state, task, first + removal.after, name=name, beta=course.config.beta,
-            advance=_advance(task))
+            advance=advancing(task))
         remove(state, survivors(score, removal.count))
         seconds += time.perf_counter() - begin
     if plan:
         removed = quality(state, task)
     begin = time.perf_counter()
-    _advance(task)(state, until, None)
+    advancing(task)(state, until, None)
     seconds += time.perf_counter() - begin
     return Trial(
         name, ratio, len(state.splats), until - first, seconds, removed, quality(state, task))
 
 
-def _advance(task: Task) -> Callable[[TrainState, int, Importance | None], None]:
+def advancing(task: Task) -> Advance:
     """Returns the function that trains; validation views are not looked at meanwhile."""
     blind = dataclasses.replace(task, validation=[])
 
