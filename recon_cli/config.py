@@ -168,8 +168,17 @@ class TrainConfig(StageConfig):
     early_stop: bool = option(
         True, "Go on to the final phase once the validation views gain nothing more.")
     images: str = option(
-        "denoised", "Pixels to train on; scores always use the originals.",
-        choices=("denoised", "original"))
+        "auto", "Pixels to train on; scores always use the originals. auto: denoised where a trial "
+        "shows that it pays.", choices=("auto", "denoised", "original"))
+    far: str = option(
+        "auto", "Gaussians far outside, for what is seen through windows. auto: where several "
+        "views see nothing near and a trial shows that it pays.", choices=("auto", "on", "off"))
+    exposure: str = option(
+        "auto", "A gain for each image and channel, for cameras that set their exposure. auto: "
+        "where the images drift and a trial shows that it pays.", choices=("auto", "on", "off"))
+    poses: str = option(
+        "auto", "Refine the training cameras. auto: where their error is large and a trial shows "
+        "that it pays.", choices=("auto", "on", "off"))
     validation: float = option(
         0.05, "Share of the training views kept out to watch progress.", unit="share",
         minimum=0.0, maximum=0.5)
@@ -245,25 +254,23 @@ class PruneConfig(StageConfig):
     max_mb: float | None = option(
         None, "Largest .ply that is written.", unit="MB", minimum=0.0, automatic="no limit")
     max_psnr_drop: float | None = option(
-        None, "Remove as many as cost no more than this, on the validation views and after "
-        "recovery.", unit="dB", minimum=0.0, automatic="no limit")
+        None, "Remove as many as cost no more than this on the validation views, after recovery.",
+        unit="dB", minimum=0.0, automatic="no limit")
     rounds: int | None = option(
         None, "Rounds of removal, with recovery and new scores in between; 1 removes all at once.",
         unit="rounds", minimum=1, automatic="one an epoch of half the recovery, 3 to 8")
     score: str = option(
-        "loo", "What ranks a Gaussian: loo (the squared error of leaving it out), paper (the "
-        "significance of equations 3 to 5), lightgaussian (the same, volume not clamped), "
-        "blend_sum and blend_max (of its weights in the pixels), opacity, or random.",
-        choices=PRUNE_SCORES)
+        "loo", "What ranks a Gaussian: loo (the squared error of leaving it out), paper (equations "
+        "3 to 5), lightgaussian (the same, volume not clamped), blend_sum and blend_max (of its "
+        "weights in the pixels), opacity, or random.", choices=PRUNE_SCORES)
     beta: float = option(
         0.1, "With paper: exponent of the normalised volume (equation 4).", minimum=0.0)
     at: str = option(
         "end", "Prune the finished model, or branch off in mid-training and train the rest of "
         "the run (what train --prune does).", choices=("end", "mid"))
     recovery: int | None = option(
-        None, "Training steps from the first removal on; with --max-psnr-drop each round takes "
-        "its share of them.", unit="steps", minimum=0,
-        automatic="the rest of the run at mid; a sixth of it, at least six epochs, at end")
+        None, "Training steps while and after Gaussians are removed; with --max-psnr-drop each "
+        "round takes its share.", unit="steps", minimum=0, automatic="the rest of the run at mid; a sixth of it, at least six epochs, at end")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -271,12 +278,10 @@ class PruneConfig(StageConfig):
         if len(given) > 1:
             raise ConfigError(
                 f"{' and '.join(given)} are given, but only one of them can say how much goes.",
-                hint="Leave out all but one of --ratio, --max-gaussians, --max-mb and "
-                "--max-psnr-drop, in recon.toml too.")
+                hint="Leave out all but one of " + ", ".join(LIMITS) + ", in recon.toml too.")
         if self.max_psnr_drop is not None and self.at == "mid":
             raise ConfigError(
-                "max_psnr_drop is given for pruning in mid-training, where there is no finished "
-                "model to hold the pruned one against.",
+                "max_psnr_drop needs a finished model to hold the pruned one against.",
                 hint=f"`recon train`, then `recon prune --max-psnr-drop {self.max_psnr_drop:g}`.")
 
 

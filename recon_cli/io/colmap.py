@@ -158,6 +158,23 @@ def read_points(
     return positions, np.array([row[4:7] for row in rows], np.uint8).reshape(-1, 3)
 
 
+def mean_point_error(path: Path) -> float | None:
+    """Returns the mean reprojection error of a points3D.bin in pixels of its images.
+
+    None where no point has any: depth maps give points that were never matched.
+
+    Raises:
+        FormatError: the file is missing or damaged.
+    """
+    reader = Reader(path, _HINT)
+    errors = []
+    for _ in range(reader.count(minimum=51)):
+        errors.append(float(reader.take("<Q3d3Bd")[7]))
+        reader.skip(8 * reader.count(minimum=8))
+    known = [error for error in errors if error > 0]
+    return float(np.mean(known)) if known else None
+
+
 def _check_size(path: Path, camera: Camera) -> None:
     """Raises FormatError unless an image is there and as large as its camera says."""
     try:

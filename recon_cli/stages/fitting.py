@@ -61,17 +61,17 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
             hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
 
     _check_memory(scene, config, ctx)
-    train = _load_views(scene.train, config, ctx)
+    train = load_views(scene.train, config, ctx)
     if len(train) < 2:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
             hint=MASK_HINT)
     return Task(
-        train, _load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
+        train, load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device))
 
 
-def _load_views(
+def load_views(
     views: Sequence[View], config: RunConfig, ctx: StageContext
 ) -> list[TrainView]:
     """Returns the views at the training size, without those whose mask leaves next to nothing."""

@@ -6,7 +6,8 @@ photograph, so that the Gaussians need not explain the camera.
 
 Gains and colours of the scene are known only up to a common factor: the mean log-gain over the
 training images is held at 0. Novel views, which have no gain, thus lie at the mean (geometric)
-exposure of the capture.
+exposure of the capture. The plain PSNR of a held-out photograph of another exposure falls with
+that; the one after its best gain (`trials.corrected_psnr`) tells what was gained.
 
 There is no offset. A gain acts on linear light and the pixels are gamma-coded, so that a power of
 the pixel would be right, and clipping bends it; but measured on two rooms of 100 frames whose gain

@@ -21,8 +21,8 @@ _POINTS = 4000  # enough for medians of hundreds of points in two views that sha
 _LEAST = 40  # points that two views must share; their median is known to a fifth of their spread
 _DARK, _BRIGHT = 12 / 255, 243 / 255  # means over a block; beyond, pixels of it may be clipped
 # Spread from which a capture drifts. Measured: .003 to .0194 in clean room videos (the larger ones
-# from gloss), .0326 to .0519 in rooms whose gain drifts by .82 to
-# 1.42, .06 in photos from a phone video, .14 and more in a walk from a window and in loose photos.
+# from gloss), .0326 to .0519 in rooms whose gain drifts by .82 to 1.42, .06 in photos from a phone
+# video, .14 and more in a walk from a window and in loose photos.
 _DRIFTS = 0.025
 _FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known better
 

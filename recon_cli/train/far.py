@@ -32,6 +32,7 @@ _COVER_RANGE = 1, 4
 _SAMPLES = 500  # points that this median is taken over
 _AGREE = 2  # views that must see nothing in front
 _SHARE = 0.1  # of the views that look there: elsewhere a surface lacks points in some views only
+_FACING = 5  # directions that must be free in a view that sees some of it; 50 square degrees
 _FILL_DEGREES = 12.0  # directions this close to a far one become far: frames and trees hide some
 _OPACITY = 0.5
 _SPACING = 0.6  # of the distance between directions: the standard deviation
@@ -84,6 +85,13 @@ def far_content(
     far, colors = _filled(directions, far, colors)
     spacing = _RADIUS * extent * np.sqrt(4 * np.pi / _DIRECTIONS)
     return FarContent(sphere[far], colors[far], float(_SPACING * spacing), share)
+
+
+def faces(view: TrainView, content: FarContent, points: NDArray[np.float64]) -> bool:
+    """Tells whether a view sees some of what lies far outside, past the points [P, 3]."""
+    small = reduced(view, _LEVEL)
+    _, column, line = _projected(small, content.positions)
+    return int((~_covered(small, points)[line, column]).sum()) >= _FACING
 
 
 def fibonacci_sphere(n: int) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -141,11 +141,15 @@ def _step(
         state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
     iteration = state.iteration + 1
     schedule, strategy = task.schedule, STRATEGIES[task.schedule.config.densify]
-    view = task.pyramid.view(state.queue.pop(), schedule.level(iteration))
+    index = state.queue.pop()
+    view = task.pyramid.view(index, schedule.level(iteration))
+    if state.poses is not None:
+        view = replace(view, camera=state.poses.camera(index, view.camera))
     degree, gathers = schedule.sh_degree(iteration), schedule.gathers(iteration)
     loss, statistics = compute(
         state.optimizer, view, degree, schedule.config.ssim_weight,
         variance=gathers and strategy.variance,
+        gain=None if state.exposure is None else state.exposure.gain(index),
         scores=importance is not None and importance.weighs,
         loo=importance is not None and importance.leaves_out)
     state.iteration = iteration
@@ -157,6 +161,11 @@ def _step(
             importance.add(statistics)
         if gathers:
             state.gathered.add(statistics, view.camera.width, view.camera.height)
+        if state.poses is not None:
+            pull = compute.camera_gradient(state.optimizer, view.camera, degree)
+            state.poses.step(index, pull, schedule.share(iteration))
+        if state.exposure is not None:
+            state.exposure.step(index, compute.log_gain_gradient, schedule.share(iteration))
         state.optimizer.regularize(schedule.recipe.regularize)
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),

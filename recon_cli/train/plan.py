@@ -110,13 +110,16 @@ def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
     return dataclasses.replace(config, max_gaussians=cap(asked, facts, config.iterations))
 
 
-def make_plan(asked: TrainConfig, facts: Facts, cost: CostModel) -> Plan:
+def make_plan(
+    asked: TrainConfig, facts: Facts, cost: CostModel, *, spent: float = 0.0
+) -> Plan:
     """Returns the plan: the steps asked for, those of the quality, or as many as fill the time.
 
     Args:
         asked: what the user asked for.
         facts: about the scene.
         cost: what steps take here; with --minutes its own seconds count as well.
+        spent: seconds of the time given that went before, on trials.
     """
     def at(iterations: int) -> Plan:
         most = cap(asked, facts, iterations)
@@ -127,7 +130,7 @@ def make_plan(asked: TrainConfig, facts: Facts, cost: CostModel) -> Plan:
 
     if asked.minutes is None:
         return at(first_config(asked).iterations)
-    left = 60 * asked.minutes - cost.seconds
+    left = 60 * asked.minutes - cost.seconds - spent
     return at(_most(lambda steps: at(steps).seconds <= left, _SMALLEST_RUN, _LONGEST_RUN))
 
 

@@ -1,8 +1,12 @@
-"""Refinement of the training cameras during training: a twist on top of each one that SfM gave.
+"""Refinement of the training cameras during training: a twist on top of each one that was found.
+
+It helps where cameras are off by half a pixel and more, as those of a tracker can be, and harms
+where they are better, as those of SfM mostly are: see `worth_a_trial`.
 
 Held-out views are not refined. Scores on them take their cameras as they were found: they rise by
 what the scene gains in sharpness, and not by what their own cameras would gain. A scene that moved
-as a whole would look worse through them, which is why the mean twist is held at 0.
+as a whole would look worse through them, which is why the mean twist is held at 0 and the size of
+the path as it was; a path that bends is not held.
 """
 
 from __future__ import annotations
@@ -20,16 +24,19 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.rows import Rows
 
-# Measured on a room of 100 views with each camera off by 1 degree and 1 cm, at 300 pixels: in 1,200
-# steps, 12 for a camera, .99 degrees came down to .21; with a tenth of the final rate to .31, with
-# .001 to .81. In 2,400 steps .005 left .19 and .0025 .20 degrees, and .2 dB less at novel views.
-# In a longer run a camera may go twice as far, but not farther: right cameras lost .1 degrees to
-# .005.
-_RATE, _REACH = 5e-3, 0.12  # rad: the most that a step starts with, and first step x steps
-_FINAL = 0.1  # of the first rate, at the end of the run
+# First rate times steps of a camera, in units of the expected error; over the run a camera can go
+# .39 of that. Measured on a room of 100 views, 10 to 12 steps each: of 1 degree .005 (3.4) left .21
+# and .001 left .81; of .3 degrees .002 (3.8) left .11 and novel views within .02 dB of those that
+# true cameras give, .005 left .14 and .17 dB.
+_REACH = 4.0
+_FINAL = 0.1  # of the first rate, at the end of the run; .01 left .31 of 1 degree
 # Share of the scene's extent that a camera moves while it turns by a rad. A turn and a move across
 # the view look alike, and 1 left a centimetre as 1.5 centimetres.
 _MOVE = 0.3
+# Mean reprojection error, in training pixels. Measured as above: cameras off by .17 pixels gained
+# nothing, by .5 pixels .27 dB, by 1.7 pixels 2 dB and more. Cameras of SfM lost: 50 photos .65 dB
+# at a rate of 2e-4, a room's video .7 dB at 1e-3.
+_WORTH_PX = 0.5
 _PREFIX = "poses"
 
 
@@ -38,19 +45,24 @@ class Poses:
 
     A twist is a turn about the camera's own centre, as a rotation vector, and a move of that
     centre, both in world axes: C' = exp(w) C for the camera-to-world rotation, c' = c + v.
-    The scene can turn and move with its cameras, so that only twists of mean 0 are told apart: the
-    mean over the training images is held there. A camera that is never seen keeps its place.
+    The scene can turn, move and grow with its cameras without a change of any picture: so the mean
+    twist is held at 0, and moves do not widen or narrow the path. A camera that is never seen keeps
+    its place.
 
     Args:
-        images: F, how many there are.
+        centers: [F, 3] of the cameras as they were found, world units.
         extent: of the scene in world units; scales the rate of the moves.
         visits: steps that the run takes for each image.
+        error: how far a camera may be off, in rad; a reprojection error over the focal length.
     """
 
-    def __init__(self, images: int, extent: float, *, visits: float) -> None:
-        self._rows = Rows(torch.zeros(images, 6))
+    def __init__(
+        self, centers: NDArray[np.float64], extent: float, *, visits: float, error: float
+    ) -> None:
+        self._rows = Rows(torch.zeros(len(centers), 6))
+        self._arms = torch.from_numpy(centers - centers.mean(axis=0))
         self._unit = _MOVE * extent
-        self._rate = min(_RATE, _REACH / visits)
+        self._rate = _REACH * error / visits
 
     @property
     def twists(self) -> NDArray[np.float64]:
@@ -78,6 +90,9 @@ class Poses:
         """
         self._rows.step(image, gradient, self._rate * _FINAL**done)
         self._rows.center()
+        if self._rows.complete and self._arms.any():
+            moves = self._rows.value[:, 3:]
+            moves -= (moves * self._arms).sum() / self._arms.square().sum() * self._arms
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns twists, moments and counts by name, for a checkpoint."""
@@ -86,6 +101,16 @@ class Poses:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Takes back what `tensors` returned."""
         self._rows.restore(_PREFIX, tensors)
+
+
+def worth_a_trial(error_px: float | None) -> bool:
+    """Returns whether cameras may be off far enough for a refinement to help.
+
+    Args:
+        error_px: mean reprojection error of the sparse points in pixels of the training images;
+            None where nothing is known, as for cameras without points.
+    """
+    return error_px is not None and error_px > _WORTH_PX
 
 
 def moved(

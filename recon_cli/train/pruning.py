@@ -8,6 +8,7 @@ between.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from recon_cli.train.gathered import Gathered
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
+from recon_cli.train.step import TrainView
 
 # Share of the recovery by which the last round is over; what is left mends it. docs/pruning.md
 LAST_ROUND = 0.5
@@ -149,6 +151,14 @@ def scored(
             advance(state, until, found)
             left = state.queue
         add_views(
-            found, state.splats, [task.train[i] for i in sorted(left)],
+            found, state.splats, [_as_trained(state, task, i) for i in sorted(left)],
             sh_degree=task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend)
     return found.score(name, state.splats, beta=beta, generator=state.generator)
+
+
+def _as_trained(state: TrainState, task: Task, index: int) -> TrainView:
+    """Returns a training view with its camera as it was refined."""
+    view = task.train[index]
+    if state.poses is None:
+        return view
+    return dataclasses.replace(view, camera=state.poses.camera(index, view.camera))

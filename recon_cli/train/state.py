@@ -10,7 +10,9 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -19,10 +21,12 @@ from recon_cli.atomic import replacing
 from recon_cli.config import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import Splats
+from recon_cli.train.exposure import Exposure
 from recon_cli.train.gathered import Gathered
 from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.poses import Poses
 
-_VERSION = 4
+_VERSION = 5
 
 
 @dataclass(eq=False)
@@ -40,6 +44,8 @@ class TrainState:
         looks: (iteration, validation PSNR in dB) at each regular report so far.
         jump: (iteration, iteration at which it went on) of an early stop; None where there was
             none. The steps between were never taken.
+        exposure: gains of the training images; None where that part is off.
+        poses: refinement of their cameras; None where that part is off.
     """
 
     optimizer: SplatOptimizer
@@ -51,6 +57,8 @@ class TrainState:
     skipped: int = 0
     looks: list[tuple[int, float]] = field(default_factory=list)
     jump: tuple[int, int] | None = None
+    exposure: Exposure | None = None
+    poses: Poses | None = None
 
     @property
     def steps(self) -> int:
@@ -64,13 +72,29 @@ class TrainState:
 
 
 def new_state(
-    splats: Splats, config: RunConfig, extent: float, *, fused: bool = False
+    splats: Splats, config: RunConfig, extent: float, *, fused: bool = False, images: int = 0,
+    log_gains: NDArray[np.float64] | None = None,
 ) -> TrainState:
-    """Returns the state before the first step; `fused` as in `SplatOptimizer`."""
+    """Returns the state before the first step.
+
+    Args:
+        splats: to begin with.
+        config: of the run; says which optional parts are on.
+        extent: of the scene, world units.
+        fused: as in `SplatOptimizer`.
+        images: to train on; needed where exposures or poses are part of the model.
+        log_gains: [images, 3] to begin with; None for zeros.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     gathered = Gathered.zeros(len(splats), splats.means.device)
-    return TrainState(SplatOptimizer(splats, config, extent, fused=fused), gathered, generator,
+    state = TrainState(
+        SplatOptimizer(splats, config, extent, fused=fused), gathered, generator,
         first_count=len(splats))
+    if config.exposure == "on":
+        state.exposure = Exposure(images, start=log_gains)
+    if config.poses == "on":
+        state.poses = Poses(images, extent, visits=config.iterations / max(1, images))
+    return state
 
 
 def save_state(path: Path, state: TrainState) -> None:
@@ -83,6 +107,8 @@ def save_state(path: Path, state: TrainState) -> None:
     for name, value in vars(state.gathered).items():
         tensors[f"gathered.{name}"] = value
     tensors["generator"] = state.generator.get_state()
+    for part in (state.exposure, state.poses):
+        tensors |= {} if part is None else part.tensors()
     check_finite(tensors, "Training diverged")
     scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue,
                "first_count": state.first_count, "skipped": state.skipped,
@@ -118,12 +144,26 @@ def load_state(
             int(scalars["skipped"]), [(int(at), float(psnr)) for at, psnr in scalars["looks"]],
             (int(scalars["jump"][0]), int(scalars["jump"][1])) if scalars["jump"] else None)
         state.optimizer.restore(tensors)
+        _restore_parts(state, config, extent, tensors)
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise FormatError(
             f"The checkpoint {path} cannot be read: {error}.",
             hint="Run the stage again with --again; it starts from the beginning.") from error
     check_finite(tensors, f"The checkpoint {path} is damaged")
     return state
+
+
+def _restore_parts(
+    state: TrainState, config: RunConfig, extent: float, tensors: dict[str, Tensor]
+) -> None:
+    """Gives a state the optional parts that the options say are on."""
+    if config.exposure == "on":
+        state.exposure = Exposure(len(tensors["exposure.value"]))
+        state.exposure.restore(tensors)
+    if config.poses == "on":
+        images = len(tensors["poses.value"])
+        state.poses = Poses(images, extent, visits=config.iterations / max(1, images))
+        state.poses.restore(tensors)
 
 
 def check_finite(tensors: dict[str, Tensor], what: str) -> None:

@@ -10,7 +10,7 @@ from recon_cli.render import render
 from recon_cli.render.numba.crew import crew
 from recon_cli.scene.camera import Camera
 from recon_cli.train.losses import photometric_loss
-from recon_cli.train.poses import Poses, camera_gradient, moved
+from recon_cli.train.poses import Poses, camera_gradient, moved, worth_a_trial
 from recon_cli.train.state import new_state
 from recon_cli.train.step import TrainView, fuses, gradient_step
 
@@ -65,6 +65,12 @@ def slopes(splats, camera, degree, reach=REACH):
                              for s in (step, -step))
         result[k] = (ahead - behind) / (2 * reach)
     return result
+
+
+def some_poses(count):
+    """Cameras on a line."""
+    centers = np.linspace([0.0, 0.0, 0.0], [1.0, 2.0, 0.0], count)
+    return Poses(centers, 2.0, visits=3, error=0.01)
 
 
 def test_a_picture_shifts_as_the_camera_turns_and_moves():
@@ -139,7 +145,7 @@ def test_a_camera_turns_about_its_own_centre():
 
 
 def test_a_camera_that_was_never_stepped_is_the_one_that_was_found():
-    poses, camera = Poses(3, 2.0, visits=3), camera_at()
+    poses, camera = some_poses(3), camera_at()
     poses.step(0, np.ones(6), 0.0)
     poses.step(1, -np.ones(6), 0.0)
     assert poses.camera(2, camera) is camera
@@ -147,15 +153,37 @@ def test_a_camera_that_was_never_stepped_is_the_one_that_was_found():
 
 
 def test_the_mean_twist_stays_zero():
-    poses, rng = Poses(4, 2.0, visits=3), np.random.default_rng(0)
+    poses, rng = some_poses(4), np.random.default_rng(0)
     for i in range(9):
         poses.step(i % 4, rng.normal(size=6), i / 9)
         assert poses.twists.mean(axis=0) == pytest.approx(0, abs=1e-15)
     assert np.abs(poses.twists).max() > 0
 
 
+def test_the_path_is_neither_widened_nor_narrowed():
+    poses, rng = some_poses(4), np.random.default_rng(0)
+    for i in range(9):
+        poses.step(i % 4, rng.normal(size=6), i / 9)
+    arms = np.linspace([-0.5, -1.0, 0.0], [0.5, 1.0, 0.0], 4)
+    assert (poses.twists[:, 3:] * arms).sum() == pytest.approx(0, abs=1e-15)
+    assert np.abs(poses.twists[:, 3:]).max() > 0
+
+
+def test_a_camera_goes_as_far_as_it_may_be_off():
+    poses = some_poses(2)
+    for i in range(6):
+        poses.step(i % 2, np.full(6, 1.0 - 2 * (i % 2)), i / 6)
+    assert 0.01 < abs(poses.twists[0, 0]) < 0.04
+
+
+def test_only_cameras_off_by_more_than_half_a_pixel_are_worth_a_trial():
+    assert worth_a_trial(0.9)
+    assert not worth_a_trial(0.3)
+    assert not worth_a_trial(None)
+
+
 def test_a_camera_is_refined_at_any_size():
-    poses, camera = Poses(2, 2.0, visits=3), camera_at()
+    poses, camera = some_poses(2), camera_at()
     poses.step(0, np.ones(6), 0.0)
     poses.step(1, -np.ones(6), 0.0)
     small = poses.camera(0, camera.resized(25, 18))
@@ -166,7 +194,7 @@ def test_a_camera_is_refined_at_any_size():
 def test_poses_that_go_on_from_a_checkpoint_are_the_same_to_the_bit():
     rng = np.random.default_rng(0)
     pulls = rng.normal(size=(24, 6))
-    whole, resumed = Poses(4, 2.0, visits=3), Poses(4, 2.0, visits=3)
+    whole, resumed = some_poses(4), some_poses(4)
     for i in range(12):
         whole.step(i % 4, pulls[i], i / 24)
     resumed.restore({name: value.clone() for name, value in whole.tensors().items()})

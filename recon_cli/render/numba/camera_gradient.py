@@ -2,7 +2,9 @@
 
 The derivation stands in recon_cli.train.poses, with a reference in torch. Here the colours are
 turned by their coefficients: torque_i(sh) = sum (G_i sh_rest) . dL/dsh_rest with the generators
-G_i, which needs no direction and no derivative of the basis.
+G_i, which needs no direction and no derivative of the basis. Reading the coefficients is what takes
+time: 6 ms for 100,000 Gaussians of which 31,000 are seen, where the step before takes 21 (one
+thread); .6 ms in degree 0.
 """
 
 from __future__ import annotations

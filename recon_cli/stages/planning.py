@@ -1,0 +1,127 @@
+"""What the train stage decides before its first step, and records: parts of the model, the plan.
+
+A run that was interrupted goes on by the record, whatever a clock or a trial would say now.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import filecmp
+import logging
+from pathlib import Path
+
+from recon_cli.atomic import read_json, write_json
+from recon_cli.config import RunConfig, TrainConfig
+from recon_cli.io.colmap import mean_point_error
+from recon_cli.scene.scene import Scene
+from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.stages.fitting import (
+    gaussians_that_fit,
+    load_task,
+    load_views,
+    read_config,
+    write_config,
+)
+from recon_cli.train import plan
+from recon_cli.train.cost import calibrate
+from recon_cli.train.fit import Task
+from recon_cli.train.gates import Candidate, Needs, described, examine
+from recon_cli.train.plan import Facts, Plan
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.start import first_state
+from recon_cli.train.state import TrainState, load_state
+from recon_cli.train.step import TrainView, fuses
+
+PLAN = "plan.json"
+
+logger = logging.getLogger("recon")
+
+
+def planned_task(
+    config: TrainConfig, scene: Scene, inputs: StageInputs, out: Path, ctx: StageContext
+) -> Task:
+    """Returns the task of a run by its plan: a recorded one, or one that is made and recorded."""
+    if (out / PLAN).exists():
+        recorded = dataclasses.replace(
+            read_config(out), checkpoint_every=config.checkpoint_every)
+        return load_task(scene, recorded, ctx)
+    first = plan.first_config(config)
+    fit_memory = gaussians_that_fit(scene, first, ctx)
+    task = load_task(scene, first, ctx)
+    needs = _needs(task, scene, inputs, ctx)
+    if needs.config.images == "denoised" and first.images != "denoised":
+        task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
+    parts = {name: getattr(needs.config, name) for name in ("far", "exposure", "poses", "images")}
+    asked = dataclasses.replace(config, **parts)
+    facts = Facts(plan.detail(task.train), len(task.train), len(scene.points), fit_memory)
+    made = _plan(asked, facts, task, scene, out, needs.seconds)
+    _tell(made, asked, facts, ctx)
+    run_config = made.config(asked)
+    write_config(out, run_config)
+    write_json(out / PLAN, {**dataclasses.asdict(made), "needs": described(needs.decisions)})
+    return _with(task, run_config)
+
+
+def recorded_plan(out: Path) -> Summary:
+    """Returns what `planned_task` recorded."""
+    record: Summary = read_json(out / PLAN)
+    return record
+
+
+def _needs(task: Task, scene: Scene, inputs: StageInputs, ctx: StageContext) -> Needs:
+    """Returns which parts of the model the scene needs, and says so."""
+    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    config = task.schedule.config
+    error = mean_point_error(sparse / "points3D.bin")
+    if error is not None:
+        error *= task.train[0].camera.width / scene.train[0].camera.width
+
+    def twins() -> tuple[list[TrainView], list[TrainView]]:
+        denoised = dataclasses.replace(config, images="denoised")
+        return load_views(scene.train, denoised, ctx), load_views(scene.validation, denoised, ctx)
+
+    changed = config.images == "auto" and any(
+        not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
+    needs = examine(Candidate(
+        task, scene.points, scene.colors, twins if changed else None, error))
+    for decision in needs.decisions:
+        logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
+    return needs
+
+
+def _plan(
+    config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, spent: float
+) -> Plan:
+    """Returns a plan, by the time that steps are found to take and that was spent already."""
+    seconds = plan.CALIBRATION_SECONDS
+    if config.minutes is not None:
+        seconds = plan.CALIBRATION_SHARE * 60 * config.minutes
+    cost = calibrate(
+        _with(task, plan.probe_config(config, facts)), scene.points, scene.colors,
+        scratch=out / "calibration.safetensors", seconds=seconds)
+    return plan.make_plan(config, facts, cost, spent=spent)
+
+
+def _with(task: Task, config: RunConfig) -> Task:
+    return dataclasses.replace(task, schedule=Schedule(config))
+
+
+def _tell(made: Plan, config: TrainConfig, facts: Facts, ctx: StageContext) -> None:
+    logger.info(
+        "training takes about %.0f s: %s steps, up to %s Gaussians, images of up to %d pixels",
+        made.seconds, f"{made.iterations:,}", f"{made.max_gaussians:,}", made.max_size)
+    wanted = plan.wanted(facts, made.iterations)
+    if config.max_gaussians is None and made.max_gaussians < wanted:
+        ctx.notice(f"memory has room for {made.max_gaussians:,} Gaussians; {wanted:,} would suit "
+                   "the images")
+    if config.minutes is not None and made.seconds > 60 * config.minutes:
+        ctx.notice(f"{config.minutes:g} minutes are too short: the smallest run of "
+                   f"{made.iterations} steps takes about {made.seconds:.1f} s")
+
+
+def first_or_saved(task: Task, scene: Scene, checkpoint: Path) -> TrainState:
+    """Returns the state that a checkpoint holds, or the first one."""
+    config, fused = task.schedule.config, fuses(task.backend)
+    if checkpoint.exists():
+        return load_state(checkpoint, config, task.extent, task.device, fused=fused)
+    return first_state(task, scene.points, scene.colors, most=config.max_gaussians)
