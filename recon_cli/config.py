@@ -239,7 +239,6 @@ class RunConfig(TrainConfig):
 
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 PRUNE_SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
-LIMITS = ("ratio", "max_gaussians", "max_mb", "max_psnr_drop")  # of which one may be given
 
 
 @dataclass(frozen=True)
@@ -247,42 +246,40 @@ class PruneConfig(StageConfig):
     """Which Gaussians go, and how the rest recovers."""
 
     ratio: float | None = option(
-        None, "Share of the Gaussians that is removed; at least one stays.", unit="share",
-        minimum=0.0, maximum=1.0, automatic="0.5 where no other limit is given")
+        None, "Share that is removed; one stays.", unit="share", minimum=0.0, maximum=1.0,
+        automatic="0.5 where no other limit is given")
     max_gaussians: int | None = option(
         None, "Most Gaussians that stay.", unit="Gaussians", minimum=1, automatic="no limit")
     max_mb: float | None = option(
         None, "Largest .ply that is written.", unit="MB", minimum=0.0, automatic="no limit")
     max_psnr_drop: float | None = option(
-        None, "Remove as many as cost no more than this on the validation views, after recovery.",
-        unit="dB", minimum=0.0, automatic="no limit")
+        None, "Most PSNR that validation views lose.", unit="dB", minimum=0.0, automatic="no limit")
     rounds: int | None = option(
-        None, "Rounds of removal, with recovery and new scores in between; 1 removes all at once.",
+        None, "Rounds of removal, with training and new scores in between; 1 removes all at once.",
         unit="rounds", minimum=1, automatic="one an epoch of half the recovery, 3 to 8")
     score: str = option(
-        "loo", "What ranks a Gaussian: loo (the squared error of leaving it out), paper (equations "
-        "3 to 5), lightgaussian (the same, volume not clamped), blend_sum and blend_max (of its "
-        "weights in the pixels), opacity, or random.", choices=PRUNE_SCORES)
-    beta: float = option(
-        0.1, "With paper: exponent of the normalised volume (equation 4).", minimum=0.0)
+        "loo", "Rank by loo (error of leaving one out), paper (equations 3 to 5), lightgaussian "
+        "(unclamped), blend_sum, blend_max (its weights), opacity or random.", choices=PRUNE_SCORES)
+    beta: float = option(0.1, "With paper: exponent of the volume (equation 4).", minimum=0.0)
     at: str = option(
-        "end", "Prune the finished model, or branch off in mid-training and train the rest of "
-        "the run (what train --prune does).", choices=("end", "mid"))
+        "end", "Prune the finished model, or at mid branch off there and train the rest of the run "
+        "(what train --prune does).", choices=("end", "mid"))
     recovery: int | None = option(
-        None, "Training steps while and after Gaussians are removed; with --max-psnr-drop each "
-        "round takes its share.", unit="steps", minimum=0, automatic="the rest of the run at mid; a sixth of it, at least six epochs, at end")
+        None, "Training steps from first to last; with --max-psnr-drop shared out to the rounds.",
+        unit="steps", minimum=0, automatic="the rest of the run at mid; a sixth or 6 epochs at end")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given = [name for name in LIMITS if getattr(self, name) is not None]
+        limits = ("ratio", "max_gaussians", "max_mb", "max_psnr_drop")
+        given = [name for name in limits if getattr(self, name) is not None]
         if len(given) > 1:
             raise ConfigError(
-                f"{' and '.join(given)} are given, but only one of them can say how much goes.",
-                hint="Leave out all but one of " + ", ".join(LIMITS) + ", in recon.toml too.")
+                f"{' and '.join(given)} are given, but only one can say how much goes.",
+                hint=f"Leave out all but one of {', '.join(limits)}.")
         if self.max_psnr_drop is not None and self.at == "mid":
             raise ConfigError(
                 "max_psnr_drop needs a finished model to hold the pruned one against.",
-                hint=f"`recon train`, then `recon prune --max-psnr-drop {self.max_psnr_drop:g}`.")
+                hint="`recon train` and then `recon prune`, both without --prune and --at mid.")
 
 
 @dataclass(frozen=True)

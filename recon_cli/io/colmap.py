@@ -78,7 +78,8 @@ def read_scene(
     if not views or not len(points):
         raise damaged(undistorted / "sparse", f"{len(views)} views and {len(points)} points", _HINT)
     missing = sorted(held_out - {view.name for view in views})
-    return Scene(train, chosen, test, tuple(missing), points, colors)
+    error = mean_point_error(undistorted / "sparse" / "points3D.bin")
+    return Scene(train, chosen, test, tuple(missing), points, colors, error)
 
 
 def read_pinholes(sparse: Path) -> dict[str, Pinhole]:

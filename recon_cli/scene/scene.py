@@ -42,6 +42,8 @@ class Scene:
         unregistered_test: names of held-out frames that have no camera.
         points: [P, 3] float64 sparse points in world units.
         colors: [P, 3] uint8 their RGB colours.
+        error_px: mean reprojection error of the points in pixels of the undistorted images; None
+            where it is not known, as of points that come from depth maps.
     """
 
     train: tuple[View, ...]
@@ -50,6 +52,7 @@ class Scene:
     unregistered_test: tuple[str, ...]
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
+    error_px: float | None = None
 
     @property
     def extent(self) -> float:

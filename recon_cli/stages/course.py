@@ -32,8 +32,8 @@ from recon_cli.stages.fitting import (
 from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.pruning import Recovery, remove, rounds_within, scored, survivors
-from recon_cli.train.state import TrainState, load_state, save_state
-from recon_cli.train.step import fuses
+from recon_cli.train.start import saved_state
+from recon_cli.train.state import TrainState, save_state
 
 logger = logging.getLogger("recon")
 
@@ -185,8 +185,7 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
     source = train / "mid.safetensors" if config.at == "mid" else final
 
     def load(path: Path) -> TrainState:
-        return load_state(
-            path, train_config, task.extent, task.device, fused=fuses(task.backend))
+        return saved_state(path, task)
 
     start = load(source)
     steps = config.recovery

@@ -66,9 +66,10 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
             hint=MASK_HINT)
+    error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
     return Task(
         train, load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
-        ctx.backend, torch.device(ctx.device))
+        ctx.backend, torch.device(ctx.device), camera_error=error)
 
 
 def load_views(

@@ -12,9 +12,8 @@ from pathlib import Path
 
 from recon_cli.atomic import read_json, write_json
 from recon_cli.config import RunConfig, TrainConfig
-from recon_cli.io.colmap import mean_point_error
 from recon_cli.scene.scene import Scene
-from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.stages.context import StageContext, Summary
 from recon_cli.stages.fitting import (
     gaussians_that_fit,
     load_task,
@@ -28,18 +27,16 @@ from recon_cli.train.fit import Task
 from recon_cli.train.gates import Candidate, Needs, described, examine
 from recon_cli.train.plan import Facts, Plan
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.start import first_state
-from recon_cli.train.state import TrainState, load_state
-from recon_cli.train.step import TrainView, fuses
+from recon_cli.train.start import first_state, saved_state
+from recon_cli.train.state import TrainState
+from recon_cli.train.step import TrainView
 
 PLAN = "plan.json"
 
 logger = logging.getLogger("recon")
 
 
-def planned_task(
-    config: TrainConfig, scene: Scene, inputs: StageInputs, out: Path, ctx: StageContext
-) -> Task:
+def planned_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext) -> Task:
     """Returns the task of a run by its plan: a recorded one, or one that is made and recorded."""
     if (out / PLAN).exists():
         recorded = dataclasses.replace(
@@ -48,7 +45,7 @@ def planned_task(
     first = plan.first_config(config)
     fit_memory = gaussians_that_fit(scene, first, ctx)
     task = load_task(scene, first, ctx)
-    needs = _needs(task, scene, inputs, ctx)
+    needs = _needs(task, scene, ctx)
     if needs.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     parts = {name: getattr(needs.config, name) for name in ("far", "exposure", "poses", "images")}
@@ -68,13 +65,9 @@ def recorded_plan(out: Path) -> Summary:
     return record
 
 
-def _needs(task: Task, scene: Scene, inputs: StageInputs, ctx: StageContext) -> Needs:
+def _needs(task: Task, scene: Scene, ctx: StageContext) -> Needs:
     """Returns which parts of the model the scene needs, and says so."""
-    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
     config = task.schedule.config
-    error = mean_point_error(sparse / "points3D.bin")
-    if error is not None:
-        error *= task.train[0].camera.width / scene.train[0].camera.width
 
     def twins() -> tuple[list[TrainView], list[TrainView]]:
         denoised = dataclasses.replace(config, images="denoised")
@@ -83,7 +76,7 @@ def _needs(task: Task, scene: Scene, inputs: StageInputs, ctx: StageContext) -> 
     changed = config.images == "auto" and any(
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
     needs = examine(Candidate(
-        task, scene.points, scene.colors, twins if changed else None, error))
+        task, scene.points, scene.colors, twins if changed else None))
     for decision in needs.decisions:
         logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
     return needs
@@ -121,7 +114,7 @@ def _tell(made: Plan, config: TrainConfig, facts: Facts, ctx: StageContext) -> N
 
 def first_or_saved(task: Task, scene: Scene, checkpoint: Path) -> TrainState:
     """Returns the state that a checkpoint holds, or the first one."""
-    config, fused = task.schedule.config, fuses(task.backend)
     if checkpoint.exists():
-        return load_state(checkpoint, config, task.extent, task.device, fused=fused)
-    return first_state(task, scene.points, scene.colors, most=config.max_gaussians)
+        return saved_state(checkpoint, task)
+    return first_state(
+        task, scene.points, scene.colors, most=task.schedule.config.max_gaussians)

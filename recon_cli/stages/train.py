@@ -24,7 +24,7 @@ from recon_cli.train.state import TrainState, save_state
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs, validation=config.validation)
-    task = planned_task(config, scene, inputs, out, ctx)
+    task = planned_task(config, scene, out, ctx)
     state = first_or_saved(task, scene, out / CHECKPOINT)
     run_fit(
         state, task, task.schedule.config.iterations, out, ctx, label="train",

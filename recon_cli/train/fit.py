@@ -62,6 +62,7 @@ class Task:
         device: where the tensors live.
         jump: (iteration, iteration at which it goes on) of the run that this one branches off;
             this one does the same.
+        camera_error: how far cameras may be off, in rad; for their refinement.
     """
 
     train: list[TrainView]
@@ -71,6 +72,7 @@ class Task:
     backend: str
     device: torch.device
     jump: tuple[int, int] | None = None
+    camera_error: float | None = None
 
     @cached_property
     def pyramid(self) -> Pyramid:

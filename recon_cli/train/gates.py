@@ -22,11 +22,11 @@ from recon_cli.scene.splats import Splats
 from recon_cli.train.exposure_start import Estimate, estimated
 from recon_cli.train.far import FarContent, faces, far_content
 from recon_cli.train.fit import Task, fit
+from recon_cli.train.poses import worth_a_trial
 from recon_cli.train.pyramid import reduced
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.start import first_splats
-from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView, fuses
+from recon_cli.train.start import first_state
+from recon_cli.train.step import TrainView
 from recon_cli.train.trials import Decision, corrected_psnr, decide, skipped, split
 
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
@@ -34,7 +34,6 @@ _STEPS = 400
 _POINTS = 5000
 _CAP = 10_000
 _FAR_SHARE = 0.003  # of the directions; a single window across the room is about this
-_ERROR_PX = 0.5  # reprojection error at the training size from which cameras may be in the way
 PARTS = ("far", "exposure", "poses", "images")
 
 
@@ -66,14 +65,12 @@ class Candidate:
         colors: [P, 3] uint8.
         twins: reads the training and validation views from the denoised images, where the task
             holds the originals; None where both are the same.
-        error_px: mean reprojection error at the training size; None where it is not known.
     """
 
     task: Task
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
     twins: Callable[[], tuple[list[TrainView], list[TrainView]]] | None
-    error_px: float | None
 
 
 def examine(scene: Candidate) -> Needs:
@@ -100,8 +97,9 @@ def examine(scene: Candidate) -> Needs:
             f"points cover {100 * (1 - bench.far.share):.1f}% of what the views see")
     settled("exposure", "on" if bench.drift.drifts else None,
             f"brightness of the same points differs by {100 * bench.drift.spread:.1f}% only")
-    error = scene.error_px
-    settled("poses", "on" if error is not None and error > _ERROR_PX else None,
+    task = scene.task
+    error = None if task.camera_error is None else task.camera_error * task.train[0].camera.fx
+    settled("poses", "on" if worth_a_trial(error) else None,
             "the reprojection error is not known" if error is None
             else f"the reprojection error is {error:.2f} px of a training image")
     return Needs(config, tuple(decisions))
@@ -182,12 +180,8 @@ class _Bench:
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         schedule = Schedule(config, dataclasses.replace(Schedule(config).recipe, levels=()))
         small = Task([reduced(train[i], LEVEL) for i in rows], [], schedule, task.extent,
-                     task.backend, task.device)
-        splats = first_splats(config, scene.points, scene.colors,
-                              self.far if config.far == "on" else None, most=_POINTS)
-        gains = self.drift.log_gains[list(rows)] if config.exposure == "on" else None
-        state = new_state(splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
-                          fused=fuses(task.backend), images=len(small.train), log_gains=gains)
+                     task.backend, task.device, camera_error=task.camera_error)
+        state = first_state(small, scene.points, scene.colors, most=_POINTS)
         fit(state, small, _STEPS, on_step=lambda _: None, on_report=lambda _: None)
         return [_score(state.splats, reduced(view, LEVEL), config, task) for view in held_out]
 

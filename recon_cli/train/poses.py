@@ -36,7 +36,7 @@ _MOVE = 0.3
 # Mean reprojection error, in training pixels. Measured as above: cameras off by .17 pixels gained
 # nothing, by .5 pixels .27 dB, by 1.7 pixels 2 dB and more. Cameras of SfM lost: 50 photos .65 dB
 # at a rate of 2e-4, a room's video .7 dB at 1e-3.
-_WORTH_PX = 0.5
+WORTH_PX = 0.5
 _PREFIX = "poses"
 
 
@@ -110,7 +110,7 @@ def worth_a_trial(error_px: float | None) -> bool:
         error_px: mean reprojection error of the sparse points in pixels of the training images;
             None where nothing is known, as for cameras without points.
     """
-    return error_px is not None and error_px > _WORTH_PX
+    return error_px is not None and error_px > WORTH_PX
 
 
 def moved(

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.config import RunConfig
 from recon_cli.scene.splats import Splats, joined
+from recon_cli.train.exposure import Exposure
 from recon_cli.train.exposure_start import estimated
 from recon_cli.train.far import FarContent, far_content, splats_of
 from recon_cli.train.fit import Task
 from recon_cli.train.initialize import splats_from_points
-from recon_cli.train.state import TrainState, new_state
+from recon_cli.train.poses import WORTH_PX, Poses
+from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.step import fuses
 
 
@@ -34,9 +38,39 @@ def first_state(
     far = far_content(task.train, points, task.extent) if config.far == "on" else None
     gains = estimated(task.train, points).log_gains if config.exposure == "on" else None
     splats = first_splats(config, points, colors, far, most=most)
+    exposure, poses = _parts(task, gains)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
-        fused=fuses(task.backend), images=len(task.train), log_gains=gains)
+        fused=fuses(task.backend), exposure=exposure, poses=poses)
+
+
+def saved_state(path: Path, task: Task) -> TrainState:
+    """Returns the state of a run from its checkpoint.
+
+    Raises:
+        FormatError: the file is truncated or of another version.
+        TrainingError: it holds values that are not finite.
+    """
+    exposure, poses = _parts(task, None)
+    return load_state(
+        path, task.schedule.config, task.extent, task.device, fused=fuses(task.backend),
+        exposure=exposure, poses=poses)
+
+
+def _parts(
+    task: Task, log_gains: NDArray[np.float64] | None
+) -> tuple[Exposure | None, Poses | None]:
+    """Returns the optional parts that the options switch on, before any step."""
+    config, images = task.schedule.config, len(task.train)
+    exposure = Exposure(images, start=log_gains) if config.exposure == "on" else None
+    poses = None
+    if config.poses == "on":
+        centers = np.stack([view.camera.center for view in task.train])
+        error = task.camera_error
+        if error is None:  # asked for without a sign: as far as makes it worth while
+            error = WORTH_PX / float(np.mean([view.camera.fx for view in task.train]))
+        poses = Poses(centers, task.extent, visits=config.iterations / images, error=error)
+    return exposure, poses
 
 
 def first_splats(

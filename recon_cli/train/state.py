@@ -10,9 +10,7 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -72,29 +70,24 @@ class TrainState:
 
 
 def new_state(
-    splats: Splats, config: RunConfig, extent: float, *, fused: bool = False, images: int = 0,
-    log_gains: NDArray[np.float64] | None = None,
+    splats: Splats, config: RunConfig, extent: float, *, fused: bool = False,
+    exposure: Exposure | None = None, poses: Poses | None = None,
 ) -> TrainState:
     """Returns the state before the first step.
 
     Args:
         splats: to begin with.
-        config: of the run; says which optional parts are on.
+        config: of the run.
         extent: of the scene, world units.
         fused: as in `SplatOptimizer`.
-        images: to train on; needed where exposures or poses are part of the model.
-        log_gains: [images, 3] to begin with; None for zeros.
+        exposure: gains of the training images, where they are part of the model.
+        poses: refinement of their cameras, likewise.
     """
     generator = torch.Generator().manual_seed(config.seed)
     gathered = Gathered.zeros(len(splats), splats.means.device)
-    state = TrainState(
+    return TrainState(
         SplatOptimizer(splats, config, extent, fused=fused), gathered, generator,
-        first_count=len(splats))
-    if config.exposure == "on":
-        state.exposure = Exposure(images, start=log_gains)
-    if config.poses == "on":
-        state.poses = Poses(images, extent, visits=config.iterations / max(1, images))
-    return state
+        first_count=len(splats), exposure=exposure, poses=poses)
 
 
 def save_state(path: Path, state: TrainState) -> None:
@@ -119,9 +112,10 @@ def save_state(path: Path, state: TrainState) -> None:
 
 
 def load_state(
-    path: Path, config: RunConfig, extent: float, device: torch.device, *, fused: bool = False
+    path: Path, config: RunConfig, extent: float, device: torch.device, *, fused: bool = False,
+    exposure: Exposure | None = None, poses: Poses | None = None,
 ) -> TrainState:
-    """Returns the state that `save_state` wrote.
+    """Returns the state that `save_state` wrote; `exposure` and `poses` take theirs back.
 
     Raises:
         FormatError: the file is truncated or of another version.
@@ -144,26 +138,16 @@ def load_state(
             int(scalars["skipped"]), [(int(at), float(psnr)) for at, psnr in scalars["looks"]],
             (int(scalars["jump"][0]), int(scalars["jump"][1])) if scalars["jump"] else None)
         state.optimizer.restore(tensors)
-        _restore_parts(state, config, extent, tensors)
+        for part in (exposure, poses):
+            if part is not None:
+                part.restore(tensors)
+        state.exposure, state.poses = exposure, poses
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise FormatError(
             f"The checkpoint {path} cannot be read: {error}.",
             hint="Run the stage again with --again; it starts from the beginning.") from error
     check_finite(tensors, f"The checkpoint {path} is damaged")
     return state
-
-
-def _restore_parts(
-    state: TrainState, config: RunConfig, extent: float, tensors: dict[str, Tensor]
-) -> None:
-    """Gives a state the optional parts that the options say are on."""
-    if config.exposure == "on":
-        state.exposure = Exposure(len(tensors["exposure.value"]))
-        state.exposure.restore(tensors)
-    if config.poses == "on":
-        images = len(tensors["poses.value"])
-        state.poses = Poses(images, extent, visits=config.iterations / max(1, images))
-        state.poses.restore(tensors)
 
 
 def check_finite(tensors: dict[str, Tensor], what: str) -> None:
