@@ -69,8 +69,10 @@ class Work:
                     costs[name] * min(count, self._request.seeds)
                     + max(costs.values()) * max(0, count - self._request.seeds)
                     for name, count in left.items())
-        text = f"{missing} runs are to be made, {kept} are kept from before"
-        return f"{text}; about {max(1, round(seconds / 60))} minutes" if missing else text
+        text = f"at most {missing} runs are to be made, {kept} are kept from before"
+        if not missing:
+            return f"all {kept} runs are kept from before"
+        return f"{text}; about {max(1, round(seconds / 60))} minutes"
 
     def _costs(self, ground: Ground, progress: Progress) -> dict[str, float]:
         """Returns the seconds of a run by arm, from pilots, which warm the caches too."""

@@ -115,10 +115,10 @@ def test_a_study_that_was_killed_gives_the_same_figures(ground, made, tmp_path, 
 
 def test_what_is_kept_is_announced(ground, made, tmp_path):
     before = work(tmp_path / "out", seeds=1).announced([ground], NullProgress())
-    assert before.startswith("8 runs are to be made, 0 are kept from before; about")
+    assert before.startswith("at most 8 runs are to be made, 0 are kept from before; about")
     work(tmp_path / "out", seeds=1).done(ground, NullProgress())
     after = work(tmp_path / "out", seeds=1).announced([ground], NullProgress())
-    assert after == "0 runs are to be made, 8 are kept from before"
+    assert after == "all 8 runs are kept from before"
     assert made
 
 
@@ -212,7 +212,7 @@ def test_a_second_call_runs_nothing_and_says_the_same(studied, capsys, monkeypat
     assert main(words) == 0
     said = capsys.readouterr()
     assert (base / "out" / "study.md").read_bytes() == before
-    assert "0 runs are to be made, 16 are kept from before" in said.err
+    assert "all 16 runs are kept from before" in said.err
     assert "Scores at equal seconds" in said.out
 
 
