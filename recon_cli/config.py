@@ -163,8 +163,9 @@ class TrainConfig(StageConfig):
     max_size: int | None = option(
         None, "Longest side of a training image; larger ones are reduced by area.",
         unit="pixels", minimum=16, automatic="by --quality: 400, 600 or 800")
-    sh_degree: int = option(
-        3, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3)
+    sh_degree: int | None = option(
+        None, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3,
+        automatic="the lowest that a higher one does not beat by enough in a trial")
     max_gaussians: int | None = option(
         None, "Densification stops at this count.", unit="Gaussians", minimum=MIN_GAUSSIANS,
         automatic="by the detail of the images, the length of the run and the memory")
@@ -236,6 +237,7 @@ class RunConfig(TrainConfig):
 
     iterations: int = option(3000, "Optimization steps.", unit="steps", minimum=1)
     max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)
+    sh_degree: int = option(3, "Highest degree of the colours.", minimum=0, maximum=3)
     max_gaussians: int = option(
         60_000, "Densification stops at this count.", unit="Gaussians", minimum=MIN_GAUSSIANS)
 

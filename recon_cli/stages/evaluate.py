@@ -53,6 +53,7 @@ from recon_cli.stages.fitting import (
     size_summary,
     sizes_of,
 )
+from recon_cli.train.trials import corrected_psnr
 
 _LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}
 _GAIN = 4  # of the difference images
@@ -80,18 +81,22 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
     for truth in truths:
         _save(out / "truth" / f"{Path(truth.name).stem}.png", truth.image)
     scores: dict[str, ModelScore] = {}
+    corrected: dict[str, float] = {}
     with ctx.progress.bar("evaluate", len(truths) * len(folders), unit="view") as bar:
         for model, folder in folders.items():
-            scores[model] = _score(
+            scores[model], corrected[model] = _score(
                 model, folder, truths, train_config.sh_degree, out, ctx, bar)
     if scene.unregistered_test:
         ctx.notice(f"{len(scene.unregistered_test)} held-out views have no camera and are not "
                    f"scored: {', '.join(scene.unregistered_test)}")
-    _write_tables(out, scores, truths, scene)
+    if train_config.exposure != "on":
+        corrected = {}
+    _write_tables(out, scores, truths, scene, corrected)
     return {
         **_counts(truths, scene),
         **{f"{model}_{key}": round(getattr(score, key), 4)
            for model, score in scores.items() for key in ("psnr_db", "ssim", "gaussians")},
+        **{f"{model}_gain_psnr_db": round(value, 4) for model, value in corrected.items()},
     }
 
 
@@ -126,15 +131,21 @@ def _scorable(truths: Sequence[_Truth], ctx: StageContext) -> list[_Truth]:
 def _score(
     model: str, folder: Path, truths: Sequence[_Truth], sh_degree: int, out: Path,
     ctx: StageContext, bar: Bar,
-) -> ModelScore:
-    """Renders every view of one model, saves the pictures and returns its scores."""
+) -> tuple[ModelScore, float]:
+    """Renders every view of one model and saves the pictures.
+
+    Returns:
+        Its scores, and its mean PSNR after the best gain per channel of each view: a model with
+        exposures shows the mean one, and cannot know that of a view that it was not trained on.
+    """
     path = folder / "splats.ply"
     splats = read_ply(path).map(lambda tensor: tensor.to(ctx.device))
-    views, milliseconds = [], []
+    views, milliseconds, corrected = [], [], []
     for truth in truths:
         image, elapsed = _timed_render(splats, truth.camera, sh_degree, ctx)
         milliseconds.append(elapsed)
         views.append(_view_score(truth, image))
+        corrected.append(corrected_psnr(image, truth.image, truth.mask))
         name = f"{Path(truth.name).stem}.png"
         shown = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
         _save(out / "renders" / model / name, shown)
@@ -143,9 +154,10 @@ def _score(
             difference[~truth.mask] = 0
         _save(out / "difference" / model / name, difference.clip(0, 255).astype(np.uint8))
         bar.advance()
-    return ModelScore(
+    score = ModelScore(
         _LABELS[model], tuple(views), len(splats), path.stat().st_size,
         statistics.median(milliseconds), seconds_at(folder / LOG, _EVER))
+    return score, statistics.fmean(corrected)
 
 
 def _view_score(truth: _Truth, image: NDArray[np.float32]) -> ViewScore:
@@ -172,7 +184,8 @@ def _save(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 def _write_tables(
-    out: Path, scores: dict[str, ModelScore], truths: Sequence[_Truth], scene: Scene
+    out: Path, scores: dict[str, ModelScore], truths: Sequence[_Truth], scene: Scene,
+    corrected: dict[str, float],
 ) -> None:
     write_json(out / "metrics.json", {
         "models": {
@@ -180,6 +193,7 @@ def _write_tables(
                 "psnr_db": score.psnr_db, "ssim": score.ssim, "gaussians": score.gaussians,
                 "bytes": score.bytes, "render_ms": score.render_ms,
                 "train_seconds": score.train_seconds,
+                **({"gain_psnr_db": corrected[model]} if corrected else {}),
                 "views": [{key: value for key, value in vars(view).items() if value is not None}
                           for view in score.views],
             } for model, score in scores.items()
@@ -189,6 +203,8 @@ def _write_tables(
         **size_summary([truth.camera for truth in truths]), **_counts(truths, scene),
     })
     table, note = list(scores.values()), _note(truths, scene)
+    for model, value in corrected.items():
+        note += f"{_LABELS[model]}, after the best gain per channel of each view: {value:.2f} dB\n"
     write_bytes(out / "table.txt", f"{text_table(table)}\n{note}".encode())
     write_bytes(out / "metrics.md", f"{markdown_table(table)}\n{note}".encode())
     write_bytes(out / "metrics.csv", csv_table(scores).encode())

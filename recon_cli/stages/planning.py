@@ -9,6 +9,7 @@ import dataclasses
 import filecmp
 import logging
 from pathlib import Path
+from typing import Any
 
 from recon_cli.atomic import read_json, write_json
 from recon_cli.config import RunConfig, TrainConfig
@@ -24,7 +25,7 @@ from recon_cli.stages.fitting import (
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate
 from recon_cli.train.fit import Task
-from recon_cli.train.gates import Candidate, Needs, described, examine
+from recon_cli.train.gates import PARTS, Candidate, Needs, described, examine
 from recon_cli.train.plan import Facts, Plan
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.start import first_state, saved_state
@@ -45,11 +46,10 @@ def planned_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext
     first = plan.first_config(config)
     fit_memory = gaussians_that_fit(scene, first, ctx)
     task = load_task(scene, first, ctx)
-    needs = parts_needed(task, scene, ctx)
+    needs = parts_needed(task, scene, ctx, harmonics=config.sh_degree is None)
     if needs.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
-    parts = {name: getattr(needs.config, name) for name in ("far", "exposure", "poses", "images")}
-    asked = dataclasses.replace(config, **parts)
+    asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = Facts(plan.detail(task.train), len(task.train), len(scene.points), fit_memory)
     made = _plan(asked, facts, task, scene, out, needs.seconds)
     _tell(made, asked, facts, ctx)
@@ -59,13 +59,20 @@ def planned_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext
     return _with(task, run_config)
 
 
+def model_parts(config: RunConfig) -> dict[str, Any]:
+    """Returns the parts of the model that trials decide on, by the names of their options."""
+    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
+
+
 def recorded_plan(out: Path) -> Summary:
     """Returns what `planned_task` recorded."""
     record: Summary = read_json(out / PLAN)
     return record
 
 
-def parts_needed(task: Task, scene: Scene, ctx: StageContext) -> Needs:
+def parts_needed(
+    task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False
+) -> Needs:
     """Returns which parts of the model the scene needs, and says so."""
     config = task.schedule.config
 
@@ -76,7 +83,7 @@ def parts_needed(task: Task, scene: Scene, ctx: StageContext) -> Needs:
     changed = config.images == "auto" and any(
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
     needs = examine(Candidate(
-        task, scene.points, scene.colors, twins if changed else None))
+        task, scene.points, scene.colors, twins if changed else None, harmonics))
     for decision in needs.decisions:
         logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
     return needs

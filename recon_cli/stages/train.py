@@ -16,7 +16,7 @@ from recon_cli.config import TrainConfig
 from recon_cli.io.ply import write_ply
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.fitting import CHECKPOINT, LOG, load_scene, run_fit, size_summary
-from recon_cli.stages.planning import first_or_saved, planned_task, recorded_plan
+from recon_cli.stages.planning import first_or_saved, model_parts, planned_task, recorded_plan
 from recon_cli.train.fit import Task
 from recon_cli.train.state import TrainState, save_state
 
@@ -46,7 +46,7 @@ def _summary(state: TrainState, task: Task, out: Path, ctx: StageContext) -> Sum
         "training_views": len(task.train), "validation_views": len(task.validation),
         **size_summary([view.camera for view in task.train]),
         "validation_psnr_db": last["validation_psnr_db"], "train_seconds": last["seconds"],
-        "parts": {name: getattr(config, name) for name in ("far", "exposure", "poses", "images")},
+        "parts": model_parts(config),
         "skipped_steps": state.skipped, "estimated_seconds": made["seconds"],
         "calibration_seconds": round(made["cost"]["seconds"], 3),
         "cuda_peak_bytes": torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,

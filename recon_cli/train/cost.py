@@ -27,9 +27,9 @@ from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, new_state, save_state
 from recon_cli.train.step import fuses
 
-# Of the Gaussians that stand for trained ones. With the .1 that training begins with a step takes
-# 15 to 25% less than a real one of the same level and count on the room `living`, with .3 it
-# takes the same within 10% (CPU milliseconds, one thread).
+# Of the Gaussians that stand for trained ones. With .3 a step takes what a real one of the same
+# level and count takes, within 10%, with the .1 that training begins with up to 25% less (room
+# `living`, CPU milliseconds of one thread).
 _OPACITY = 0.3
 _STEPS = 6  # timed at each level and count; views differ by a third in what they take
 _WARM = 1  # steps before them: the first one makes buffers
