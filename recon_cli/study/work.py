@@ -176,9 +176,10 @@ class Work:
     def _made(self, ground: Ground, run: Run, on_step: Callable[[], None]) -> Record:
         """Makes a run and keeps it."""
         points = run_trial(ground.stand, run, (), on_step=on_step)
-        config = ground.stand.task(run.config).schedule.config
+        config = ground.stand.task(run).schedule.config
         on = [name for name in ("far", "exposure", "poses") if getattr(config, name) == "on"]
-        record = Record(points[-1], self._machine, ", ".join([f"{config.images} images", *on]))
+        record = Record(points[-1], self._machine, ", ".join(
+            [f"{config.images} images", f"degree {config.sh_degree}", *on]))
         self._records.add_run(
             key_of(ground.stand, ground.digest, run), record, run, ground.stand.name)
         return record
