@@ -137,8 +137,8 @@ def notes(result: Result) -> list[str]:
     clock = {"wall": "on the wall", "cpu": "of the CPU"}[result.clock]
     found = [
         f"Equal seconds: each arm takes as many steps as fit into the seconds {clock} that the "
-        "slowest arm's take at equal steps, by the medians over the seeds measured first; the "
-        "steps are then fixed. Seconds are of training, pruning included, without scoring.",
+        "slowest arm's take at equal steps, as measured first; the steps are "
+        "then fixed. Seconds are of training, pruning included, without scoring.",
         "Each arm is trained on " + "; ".join(
             f"{scene}: {_parts(result, scene)}" for scene in result.scenes)
         + ". The trials that decide so are not timed.",

@@ -14,6 +14,8 @@ from recon_cli.study.records import Record, Records, key_of
 from recon_cli.study.request import ARMS, EQUAL_SECONDS, EQUAL_STEPS, Request
 from recon_cli.study.result import SceneResult
 
+_NEAR = 0.05  # the same run takes seconds that differ by as much when it is repeated
+
 
 @dataclass(frozen=True, eq=False)
 class Ground:
@@ -33,7 +35,7 @@ def equal_seconds(
 ) -> dict[str, int]:
     """Returns the steps of each arm that take as long as the slowest arm's `iterations`.
 
-    A recipe scales with its run, so that a step of it costs on average the same in a longer one.
+    A first guess: steps of a longer run cost as much where the count has reached its cap in both.
 
     Args:
         iterations: steps that every arm took.
@@ -42,6 +44,25 @@ def equal_seconds(
     slowest = max(seconds.values())
     return {name: max(iterations, round(iterations * slowest / own)) if own > 0 else iterations
             for name, own in seconds.items()}
+
+
+def corrected(
+    iterations: int, guess: int, seconds: float, guess_seconds: float, target: float
+) -> int:
+    """Returns the steps that take `target` seconds, on the line through two measured runs.
+
+    Args:
+        iterations: of the shorter run.
+        guess: of the longer run.
+        seconds: that the shorter run took.
+        guess_seconds: that the longer run took.
+        target: seconds to fill.
+    """
+    near = abs(guess_seconds - target) <= _NEAR * target
+    if near or guess <= iterations or guess_seconds <= seconds:
+        return guess
+    steps = iterations + (target - seconds) * (guess - iterations) / (guess_seconds - seconds)
+    return max(iterations, round(steps))
 
 
 class Work:
@@ -69,8 +90,10 @@ class Work:
                     costs[name] * min(count, self._request.seeds)
                     + max(costs.values()) * max(0, count - self._request.seeds)
                     for name, count in left.items())
-        text = f"{missing} runs are to be made, {kept} are kept from before"
-        return f"{text}; about {max(1, round(seconds / 60))} minutes" if missing else text
+        text = f"about {missing} runs are to be made, {kept} are kept from before"
+        if not missing:
+            return f"all {kept} runs are kept from before"
+        return f"{text}; about {max(1, round(seconds / 60))} minutes"
 
     def _costs(self, ground: Ground, progress: Progress) -> dict[str, float]:
         """Returns the seconds of a run by arm, from pilots, which warm the caches too."""
@@ -94,7 +117,7 @@ class Work:
         """Returns all runs on a scene, those that are missing made now."""
         steps = dict.fromkeys((arm.name for arm in ARMS), self._request.iterations)
         equal = self._all(ground, EQUAL_STEPS, steps, progress)
-        steps = dict(self._fixed(ground, equal))
+        steps = dict(self._fixed(ground, equal, progress))
         longer = self._all(ground, EQUAL_SECONDS, steps, progress)
         runs = {EQUAL_STEPS: equal, EQUAL_SECONDS: longer}
         size = ground.stand.scored[0].camera
@@ -102,16 +125,32 @@ class Work:
             len(ground.stand.scored), size.width, size.height, ground.digest, runs)
 
     def _fixed(
-        self, ground: Ground, equal: Mapping[str, tuple[Record, ...]]
+        self, ground: Ground, equal: Mapping[str, tuple[Record, ...]], progress: Progress
     ) -> Mapping[str, int]:
         """Returns the steps at equal seconds; once computed they are kept, whatever comes."""
         key = self._steps_key(ground)
         steps = self._records.steps(key)
         if steps is None:
-            steps = equal_seconds(self._request.iterations, {
-                name: statistics.median(self._seconds(record.point) for record in records)
-                for name, records in equal.items()})
+            seconds = {name: statistics.median(self._seconds(record.point) for record in records)
+                       for name, records in equal.items()}
+            steps = self._tried(ground, seconds, progress)
             self._records.add_steps(key, steps)
+        return steps
+
+    def _tried(
+        self, ground: Ground, seconds: Mapping[str, float], progress: Progress
+    ) -> dict[str, int]:
+        """Returns the steps of each arm at equal seconds, corrected by one run of its guess."""
+        count, target = self._request.iterations, max(seconds.values())
+        steps = equal_seconds(count, seconds)
+        label = f"{ground.stand.name}, finding {EQUAL_SECONDS}"
+        with progress.bar(label, sum(steps.values()), unit="step") as bar:
+            for arm in ARMS:
+                guess = self._run(arm, steps[arm.name], 0)
+                record = self._kept(ground, guess) or self._made(ground, guess, bar.advance)
+                steps[arm.name] = corrected(
+                    count, guess.iterations, seconds[arm.name], self._seconds(record.point),
+                    target)
         return steps
 
     def _all(
@@ -137,9 +176,10 @@ class Work:
     def _made(self, ground: Ground, run: Run, on_step: Callable[[], None]) -> Record:
         """Makes a run and keeps it."""
         points = run_trial(ground.stand, run, (), on_step=on_step)
-        config = ground.stand.task(run.config).schedule.config
+        config = ground.stand.task(run).schedule.config
         on = [name for name in ("far", "exposure", "poses") if getattr(config, name) == "on"]
-        record = Record(points[-1], self._machine, ", ".join([f"{config.images} images", *on]))
+        record = Record(points[-1], self._machine, ", ".join(
+            [f"{config.images} images", f"degree {config.sh_degree}", *on]))
         self._records.add_run(
             key_of(ground.stand, ground.digest, run), record, run, ground.stand.name)
         return record

@@ -143,7 +143,7 @@ def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: trial.Stand)
 
 
 def test_a_run_trains_on_no_view_that_is_scored(tiny: trial.Stand) -> None:
-    task = tiny.task(BUDGET.config(BASE, iterations=5, seed=0))
+    task = tiny.task(Run(BUDGET, BASE, 5, 0))
     assert len(task.train) == len(tiny.scene.train)
     assert task.validation == []
     assert {view.name for view in tiny.scene.validation}.isdisjoint(

@@ -31,7 +31,7 @@ from recon_cli.train.state import save_state
 CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
     checkpoint_every=7)
-RUN = RunConfig(**{**vars(CONFIG), "max_size": 400})
+RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
 PRUNE = PruneConfig(ratio=0.5, at="mid")
 CONTEXT = StageContext()
 

@@ -20,7 +20,7 @@ from recon_cli.study import records as records_module
 from recon_cli.study import work as work_module
 from recon_cli.study.records import FILE, Record, Records, key_of
 from recon_cli.study.request import ARMS, EQUAL_SECONDS, EQUAL_STEPS, Request
-from recon_cli.study.work import Ground, Work, equal_seconds
+from recon_cli.study.work import Ground, Work, corrected, equal_seconds
 
 STEPS = 20
 BASE = RunConfig(
@@ -66,6 +66,28 @@ def work(folder, seeds=2, **changes):
 def test_cheaper_steps_give_more_of_them():
     assert equal_seconds(100, {"a": 10.0, "b": 5.0, "c": 4.0}) == {"a": 100, "b": 200, "c": 250}
     assert equal_seconds(100, {"a": 10.0, "b": 0.0}) == {"a": 100, "b": 100}
+
+
+def test_a_guess_is_corrected_on_the_line_through_two_runs():
+    # 100 steps in 4 s and 250 in 13 s: 6 s for 100 steps, so that 10 s hold 200
+    assert corrected(100, 250, 4.0, 13.0, 10.0) == 200
+    assert corrected(100, 250, 4.0, 10.4, 10.0) == 250  # near enough
+    assert corrected(100, 100, 10.0, 12.0, 10.0) == 100  # the slowest arm
+    assert corrected(100, 250, 4.0, 3.0, 10.0) == 250  # a line that falls says nothing
+
+
+def test_arms_whose_steps_grow_dearer_still_take_the_same_seconds(
+    ground, made, tmp_path, monkeypatch
+):
+    class Dearer(float):
+        def __mul__(self, steps):  # 0.25 s a step at first, 0.5 s after the first 20
+            return 0.25 * steps + 0.25 * max(0, steps - STEPS)
+
+    monkeypatch.setitem(COSTS, "budget", Dearer())
+    found = work(tmp_path / "out", seeds=2).done(ground, NullProgress())
+    assert found.values(EQUAL_SECONDS, ARMS[2], "steps") == [30, 30]
+    assert found.values(EQUAL_SECONDS, ARMS[2], "seconds") == pytest.approx([10.0, 10.0])
+    assert made.count(("budget", 40, 0)) == 1  # the guess
 
 
 def test_arms_take_the_steps_that_fit_into_the_seconds_of_the_slowest(ground, made, tmp_path):
@@ -115,10 +137,10 @@ def test_a_study_that_was_killed_gives_the_same_figures(ground, made, tmp_path, 
 
 def test_what_is_kept_is_announced(ground, made, tmp_path):
     before = work(tmp_path / "out", seeds=1).announced([ground], NullProgress())
-    assert before.startswith("8 runs are to be made, 0 are kept from before; about")
+    assert before.startswith("about 8 runs are to be made, 0 are kept from before; about")
     work(tmp_path / "out", seeds=1).done(ground, NullProgress())
     after = work(tmp_path / "out", seeds=1).announced([ground], NullProgress())
-    assert after == "0 runs are to be made, 8 are kept from before"
+    assert after == "all 8 runs are kept from before"
     assert made
 
 
@@ -128,7 +150,7 @@ def test_a_line_that_a_kill_cut_short_is_dropped(ground, made, tmp_path):
     path = tmp_path / "out" / FILE
     text = path.read_text()
     lines = text.splitlines(True)
-    path.write_text("".join(lines[:-1]) + lines[-1][:40])
+    path.write_text("".join(lines[:-2]) + lines[-2][:40])  # the last one holds the fixed steps
     made.clear()
     assert work(tmp_path / "out", seeds=1).done(ground, NullProgress()).runs == first.runs
     assert len(made) == 1
@@ -212,7 +234,7 @@ def test_a_second_call_runs_nothing_and_says_the_same(studied, capsys, monkeypat
     assert main(words) == 0
     said = capsys.readouterr()
     assert (base / "out" / "study.md").read_bytes() == before
-    assert "0 runs are to be made, 16 are kept from before" in said.err
+    assert "all 16 runs are kept from before" in said.err
     assert "Scores at equal seconds" in said.out
 
 

@@ -41,12 +41,14 @@ class Arm:
         label: for the tables.
         options: fields of the training options that differ from the base.
         prune: None where nothing is removed.
+        tries_degree: a trial decides on the degree of the colours, as in `recon train`.
     """
 
     name: str
     label: str
     options: Mapping[str, Any] = field(default_factory=dict)
     prune: Prune | None = None
+    tries_degree: bool = False
 
     def config(self, base: RunConfig, *, iterations: int, seed: int) -> RunConfig:
         """Returns the options of one run.
@@ -61,7 +63,8 @@ class Arm:
         """Returns what decides about the outcome, as JSON keeps it."""
         prune = self.prune and {
             "at": self.prune.at, "restarts": self.prune.restarts, **self.prune.config.hashed()}
-        return {"name": self.name, "options": dict(self.options), "prune": prune}
+        return {"name": self.name, "options": dict(self.options), "prune": prune,
+                "tries_degree": self.tries_degree}
 
 
 # LightGaussian, whose score the paper takes over, removes 60% at step 20,000 of 30,000.
@@ -73,12 +76,13 @@ DEFAULT_PRUNE = Prune(_MID, PruneConfig(at="mid"))
 _PLAIN = {"densify": "reference", "far": "off", "exposure": "off", "poses": "off"}
 REFERENCE = Arm("reference", "3DGS", _PLAIN)
 PAPER = Arm("paper", "paper", _PLAIN, PAPER_PRUNE)
-BUDGET = Arm("budget", "ours", {"densify": "budget"})
-BUDGET_PRUNED = Arm("budget-pruned", "ours pruned", {"densify": "budget"}, DEFAULT_PRUNE)
+BUDGET = Arm("budget", "ours", {"densify": "budget"}, tries_degree=True)
+BUDGET_PRUNED = Arm(
+    "budget-pruned", "ours pruned", {"densify": "budget"}, DEFAULT_PRUNE, tries_degree=True)
 KNOWN: dict[str, Arm] = {arm.name: arm for arm in (
     REFERENCE, PAPER, BUDGET, BUDGET_PRUNED,
-    Arm("mcmc", "mcmc", {"densify": "mcmc"}),
-    Arm("budget-l1", "budget-l1", {"densify": "budget", "ssim_weight": 0.0}),
+    Arm("mcmc", "mcmc", {"densify": "mcmc"}, tries_degree=True),
+    Arm("budget-l1", "budget-l1", {"densify": "budget", "ssim_weight": 0.0}, tries_degree=True),
     Arm("budget-degree-1", "budget-degree-1", {"densify": "budget", "sh_degree": 1}),
 )}
 
@@ -101,7 +105,8 @@ def parse(text: str) -> Arm:
             f"The recipe {text!r} sets {', '.join(sorted(fixed))}, which all recipes share.",
             hint="Use --iterations, --seeds and --max-size.")
     label = known.name if not changes else text
-    arm = Arm(text, label, {**known.options, **options}, known.prune)
+    tries = known.tries_degree and "sh_degree" not in options
+    arm = Arm(text, label, {**known.options, **options}, known.prune, tries)
     arm.config(RunConfig(), iterations=1, seed=0)  # refuses values out of range
     return arm
 

@@ -19,7 +19,7 @@ SIZE, STEPS, CAP = 600, 3000, 60_000
 SECTIONS = ("ingest", "denoise", "sfm", "train")  # that --set may reach
 # of training, that have options of their own here, or no effect
 _OWN = {"iterations", "max_size", "max_gaussians", "seed", "densify", "mid", "checkpoint_every",
-        "quality", "minutes", "early_stop"}
+        "quality", "minutes", "early_stop", "sh_degree"}
 
 
 @dataclass(frozen=True)
@@ -106,4 +106,4 @@ def base_config(
 def shared(base: RunConfig) -> dict[str, Any]:
     """Returns the options that all arms share, without those that each run has of its own."""
     return {name: value for name, value in base.hashed().items()
-            if name not in _OWN - {"max_size", "max_gaussians"}}
+            if name not in _OWN - {"max_size", "max_gaussians", "sh_degree"}}

@@ -18,7 +18,7 @@ from recon_cli.errors import ConfigError
 from recon_cli.scene.scene import Scene
 from recon_cli.stages.context import StageContext
 from recon_cli.stages.fitting import MASK_HINT, load_task
-from recon_cli.stages.planning import parts_needed
+from recon_cli.stages.planning import model_parts, parts_needed
 from recon_cli.train.fit import Task, fit
 from recon_cli.train.gates import PARTS
 from recon_cli.train.importance import Importance
@@ -101,17 +101,18 @@ class Stand:
         return self.place.name
 
     @cached_property
-    def parts(self) -> dict[str, str]:
-        """The optional parts of the model that the scene needs, as `recon train` finds them."""
-        config = parts_needed(self._loaded(self.base), self.scene, self.ctx).config
-        return {name: getattr(config, name) for name in PARTS}
+    def parts(self) -> dict[str, Any]:
+        """The parts of the model that the scene needs, as `recon train` finds them by trials."""
+        task = self._loaded(self.base)
+        return model_parts(parts_needed(task, self.scene, self.ctx, harmonics=True).config)
 
-    def task(self, config: RunConfig) -> Task:
+    def task(self, run: Run) -> Task:
         """Returns the task of a run; training itself looks at no view that it does not fit."""
-        open_parts = [name for name in PARTS if getattr(config, name) == "auto"]
-        if open_parts:  # not before it is asked for: it may take trials
-            changes: dict[str, Any] = {name: self.parts[name] for name in open_parts}
-            config = dataclasses.replace(config, **changes)
+        config = run.config
+        left = [name for name in PARTS if getattr(config, name) == "auto"]
+        left += ["sh_degree"] if run.arm.tries_degree else []
+        if left:  # not before it is asked for: it may take trials
+            config = dataclasses.replace(config, **{name: self.parts[name] for name in left})
         return dataclasses.replace(
             self._loaded(config), validation=[], schedule=Schedule(config))
 
@@ -162,7 +163,7 @@ def run_trial(
     Raises:
         TrainingError: memory is short, or training diverged.
     """
-    task = where.task(run.config)
+    task = where.task(run)
     state = first_state(
         task, where.scene.points, where.scene.colors,
         most=first_count(task.schedule.config, len(where.scene.points)))
