@@ -170,13 +170,15 @@ class TrainConfig(StageConfig):
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0)
     means_rate: float = option(
-        1.6e-4, "Initial learning rate of the means, times the scene extent; it falls to a "
-        "hundredth.", minimum=0.0)
+        1.6e-4, "Initial learning rate of the means, times the scene extent, and 6 with budget; it "
+        "falls to a hundredth.", minimum=0.0)
     quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0)
-    scales_rate: float = option(5e-3, "Learning rate of the log-scales.", minimum=0.0)
+    scales_rate: float = option(
+        5e-3, "Learning rate of the log-scales, twice that with budget.", minimum=0.0)
     opacities_rate: float = option(5e-2, "Learning rate of the opacity logits.", minimum=0.0)
     sh_rate: float = option(
-        2.5e-3, "Learning rate of the base colours; higher degrees get a twentieth.", minimum=0.0)
+        2.5e-3, "Learning rate of the base colours, twice that with budget; higher degrees get a "
+        "twentieth.", minimum=0.0)
     densify_every: int = option(
         100, "Add and delete Gaussians this often.", unit="steps", minimum=1)
     densify_gradient: float = option(

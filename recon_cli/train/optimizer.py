@@ -10,6 +10,7 @@ from torch.optim.adam import adam
 
 from recon_cli.config import RunConfig
 from recon_cli.scene.splats import Splats, with_terms
+from recon_cli.train.recipe import RECIPES
 
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-15  # of the reference: gradients of single Gaussians are tiny
@@ -41,10 +42,12 @@ class SplatOptimizer:
         self, splats: Splats, config: RunConfig, extent: float, *, fused: bool = False
     ) -> None:
         self._extent, self._fused = extent, fused
+        recipe = RECIPES[config.densify]
         self._rates = {
             "means": config.means_rate * extent, "quats": config.quats_rate,
-            "log_scales": config.scales_rate, "logit_opacities": config.opacities_rate,
-            "sh_dc": config.sh_rate, "sh_rest": config.sh_rate * _REST_FACTOR,
+            "log_scales": recipe.scales_rate * config.scales_rate,
+            "logit_opacities": config.opacities_rate, "sh_dc": recipe.sh_rate * config.sh_rate,
+            "sh_rest": recipe.sh_rate * config.sh_rate * _REST_FACTOR,
         }
         self.count = 0
         self._factor = 1.0

@@ -22,6 +22,10 @@ class Recipe:
         sh_every: the higher degrees are moved every so many steps.
         opacity_decay: opacities are multiplied by this at each densification.
         resets: opacities are lowered to .01 now and then, as in the reference.
+        means_rate: factor of the option of that name, and so on: a run of some thousand steps has
+            to go as far as the reference's 30,000.
+        scales_rate: likewise.
+        sh_rate: likewise.
         means_final: rate of the means at the end, of that at the start; exponential between.
         final_from: share from which all other rates fall.
         final_rate: to which they fall at the end, of their own; exponential.
@@ -37,6 +41,9 @@ class Recipe:
     sh_every: int
     opacity_decay: float
     resets: bool
+    means_rate: float = 1.0
+    scales_rate: float = 1.0
+    sh_rate: float = 1.0
     means_final: float = 0.01
     final_from: float = 1.0
     final_rate: float = 1.0
@@ -50,9 +57,9 @@ REFERENCE = Recipe(
     sh_at=(1000 / 30_000, 2000 / 30_000, 3000 / 30_000), sh_every=1, opacity_decay=1.0,
     resets=True)
 BUDGET = Recipe(
-    densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.3, 4), (0.55, 2)),
-    sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False, final_from=0.8,
-    final_rate=0.1)
+    densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
+    sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False, means_rate=6.0,
+    scales_rate=2.0, sh_rate=2.0, final_from=0.8, final_rate=0.1)
 # Kheradmand et al. 2024 as in gsplat: relocation from 500 of 30,000, noise 5e5, both regularisers
 # .01; it ends with the others, so that a pruned branch is not filled up again
 MCMC = Recipe(

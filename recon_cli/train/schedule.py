@@ -63,7 +63,8 @@ class Schedule:
 
     def means_rate(self, iteration: int) -> float:
         """Returns the learning rate of the means in units of the scene extent."""
-        return float(self.config.means_rate * self.recipe.means_final**self.share(iteration))
+        first = self.recipe.means_rate * self.config.means_rate
+        return float(first * self.recipe.means_final**self.share(iteration))
 
     def rate_factor(self, iteration: int) -> float:
         """Returns the factor of all other learning rates."""
