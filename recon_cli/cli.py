@@ -27,9 +27,10 @@ from recon_cli.errors import ReconError
 from recon_cli.options import Call, pass_call
 from recon_cli.pipeline import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress
-from recon_cli.settings import Settings
+from recon_cli.settings import C, Settings
 from recon_cli.stages import STAGES
 from recon_cli.study.command import study
+from recon_cli.sweep import command as sweeping
 from recon_cli.workspace import SETTINGS, Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
@@ -67,31 +68,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except click.ClickException as error:
-        _complain(error.format_message(), _usage_hint(error))
+        console.complain(error.format_message(), console.usage_hint(error))
         return error.exit_code
     except ReconError as error:
         logger.debug("failed", exc_info=True)
-        _complain(error.message, error.hint)
+        console.complain(error.message, error.hint)
         return error.exit_code
     except Exception as error:
         logger.debug("failed", exc_info=True)
-        _complain(
+        console.complain(
             f"{type(error).__name__}: {error}",
             "This is a bug in recon. Run the command again with -v and report what it prints.")
         return 1
     finally:
         logger.removeHandler(handler)
-
-
-def _complain(message: str, hint: str) -> None:
-    click.echo(f"error: {message}", err=True)
-    if hint:
-        click.echo(f"hint: {hint}", err=True)
-
-
-def _usage_hint(error: click.ClickException) -> str:
-    ctx = error.ctx if isinstance(error, click.UsageError) else None
-    return f"See `{ctx.command_path} --help`." if ctx else ""
 
 
 def _explicit(call: Call) -> Settings:
@@ -138,6 +128,15 @@ def _perform(
         click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
 
 
+def _beside(call: Call, kind: type[C]) -> tuple[Job, C]:
+    """Returns what a command needs that only looks at a stage, and the stage's options."""
+    explicit = _explicit(call)
+    values = layers.merged([explicit, call.settings])
+    compute = layers.build(ComputeConfig, values)
+    job = Job(Workspace(call.workspace), explicit, compute, TqdmProgress(), table=STAGES)
+    return job, layers.build(kind, values)
+
+
 def _tell(outcome: Outcome) -> None:
     if outcome.ran:
         run = outcome.manifest.run
@@ -170,9 +169,7 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 def denoise(call: Call, compare: bool) -> None:
     """Filter noisy frames and pass the others through."""
     if compare:
-        config = layers.build(DenoiseConfig, layers.merged([_explicit(call), call.settings]))
-        job = Job(Workspace(call.workspace), _explicit(call), progress=TqdmProgress(), table=STAGES)
-        click.echo(comparing.compare_filters(job, config))
+        click.echo(comparing.compare_filters(*_beside(call, DenoiseConfig)))
         return
     _perform(call, "denoise", ["denoise"])
 
@@ -190,7 +187,7 @@ def sfm(call: Call) -> None:
     "--prune", "with_prune", is_flag=True,
     help="Then branch off in mid-training, prune there and train the rest of the run again.  "
          "[default: off]")
-@options.of(PruneConfig, without=("at",), lead="With --prune: ")
+@options.of(PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"), lead="With --prune: ")
 @options.stage(TrainConfig, renders=True)
 @pass_call
 def train(call: Call, with_prune: bool) -> None:
@@ -204,10 +201,14 @@ def train(call: Call, with_prune: bool) -> None:
 
 
 @cli.command()
+@options.sweep()
 @options.stage(PruneConfig, renders=True)
 @pass_call
-def prune(call: Call) -> None:
+def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
     """Remove the least important Gaussians; the rest recovers."""
+    if sweep:
+        click.echo(sweeping.sweep(*_beside(call, PruneConfig), ratios))
+        return
     _perform(call, "prune", ["prune"])
 
 

@@ -10,12 +10,7 @@ from dataclasses import dataclass
 
 from recon_cli.errors import ConfigError
 from recon_cli.fields import StageConfig, option
-
-SCALE_BETWEEN = (
-    "Make one unit a metre: A and B are METRES apart. Each is a frame's name (where its camera "
-    "was), x,y,z (a point of the scene as it is without this option) or FRAME:u,v (what the "
-    "undistorted frame shows at that pixel).")
-_MEASURE = "For example --scale-between 000003.png:120,200 000003.png:480,210 1.5"
+from recon_cli.measure_option import SCALE_BETWEEN, check_scale_between
 
 
 @dataclass(frozen=True)
@@ -119,20 +114,6 @@ class SfmConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_scale_between(self.scale_between)
-
-
-def check_scale_between(value: tuple[str, str, float] | None) -> None:
-    """Raises ConfigError where --scale-between measures nothing."""
-    if value is None:
-        return
-    a, b, metres = value
-    if a.strip() == b.strip() or not a.strip() or not b.strip():
-        raise ConfigError(
-            f"scale_between goes from {a!r} to {b!r}, but it must name two different places.",
-            hint=_MEASURE)
-    if metres <= 0:
-        raise ConfigError(
-            f"scale_between says {metres:g} metres, but it must be more than 0.", hint=_MEASURE)
 
 
 MIN_GAUSSIANS = 4  # the first ones are as large as the mean distance to 3 neighbours
@@ -243,26 +224,48 @@ class RunConfig(TrainConfig):
 
 
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
+PRUNE_SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
 
 
 @dataclass(frozen=True)
 class PruneConfig(StageConfig):
     """Which Gaussians go, and how the rest recovers."""
 
-    ratio: float = option(
-        0.5, "Share of the Gaussians that is removed.", unit="share", minimum=0.0, maximum=1.0)
-    beta: float = option(
-        0.1, "Exponent of the normalised volume in the significance score (equation 4).",
-        minimum=0.0)
+    ratio: float | None = option(
+        None, "Share that is removed; one stays.", unit="share", minimum=0.0, maximum=1.0,
+        automatic="0.5 where no other limit is given")
+    max_gaussians: int | None = option(
+        None, "Most Gaussians that stay.", unit="Gaussians", minimum=1, automatic="no limit")
+    max_mb: float | None = option(
+        None, "Largest .ply that is written.", unit="MB", minimum=0.0, automatic="no limit")
+    max_psnr_drop: float | None = option(
+        None, "Most PSNR that validation views lose.", unit="dB", minimum=0.0, automatic="no limit")
+    rounds: int | None = option(
+        None, "Rounds of removal, with training and new scores in between; 1 removes all at once.",
+        unit="rounds", minimum=1, automatic="one an epoch of half the recovery, 3 to 8")
     score: str = option(
-        "paper", "Significance: the paper's score (equations 3 to 5), or a control.",
-        choices=("paper", "blend_max", "loo", "opacity", "random"))
+        "loo", "Rank by loo (error of leaving one out), paper (equations 3 to 5), lightgaussian "
+        "(unclamped), blend_sum, blend_max (its weights), opacity or random.", choices=PRUNE_SCORES)
+    beta: float = option(0.1, "With paper: exponent of the volume (equation 4).", minimum=0.0)
     at: str = option(
-        "end", "Prune the finished model, or branch off in mid-training and train the rest of "
-        "the run (what train --prune does).", choices=("end", "mid"))
+        "end", "Prune the finished model, or at mid branch off there and train the rest of the run "
+        "(what train --prune does).", choices=("end", "mid"))
     recovery: int | None = option(
-        None, "Training steps after pruning.", unit="steps", minimum=0,
-        automatic="the rest of the run at mid, a sixth of it at end")
+        None, "Training steps from first to last; with --max-psnr-drop shared out to the rounds.",
+        unit="steps", minimum=0, automatic="the rest of the run at mid; a sixth or 6 epochs at end")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        limits = ("ratio", "max_gaussians", "max_mb", "max_psnr_drop")
+        given = [name for name in limits if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ConfigError(
+                f"{' and '.join(given)} are given, but only one can say how much goes.",
+                hint=f"Leave out all but one of {', '.join(limits)}.")
+        if self.max_psnr_drop is not None and self.at == "mid":
+            raise ConfigError(
+                "max_psnr_drop needs a finished model to hold the pruned one against.",
+                hint="`recon train` and then `recon prune`, both without --prune and --at mid.")
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
-"""How the log appears on stderr: plain, with what must not be missed marked as a notice."""
+"""What appears on stderr: the log, plain, notices marked as such, and errors with their hints."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+
+import click
 
 logger = logging.getLogger("recon")
 
@@ -30,3 +32,16 @@ def show_log(*, detailed: Callable[[], bool]) -> logging.Handler:
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG)
     return handler
+
+
+def complain(message: str, hint: str) -> None:
+    """Prints an error and what to type next."""
+    click.echo(f"error: {message}", err=True)
+    if hint:
+        click.echo(f"hint: {hint}", err=True)
+
+
+def usage_hint(error: click.ClickException) -> str:
+    """Returns where the verb that was typed is explained; empty where none was."""
+    ctx = error.ctx if isinstance(error, click.UsageError) else None
+    return f"See `{ctx.command_path} --help`." if ctx else ""

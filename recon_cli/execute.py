@@ -97,7 +97,7 @@ def run_stage(
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = job.workspace.begin(basis)
     with machine.Meter() as meter, _no_trace_of_nothing(job.workspace, row.name):
-        ctx = _context(job, row, _recorder(job.workspace, earlier, meter))
+        ctx = context_for(job, row, _recorder(job.workspace, earlier, meter))
         summary = importlib.import_module(row.module).run(config, inputs, out, ctx)
     outputs = job.workspace.seal(row.name)
     manifest = Manifest(
@@ -179,7 +179,8 @@ def _recorder(
     return record
 
 
-def _context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:
+def context_for(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:
+    """Returns what a stage is given, with device and threads set up."""
     if row.renders:
         return dataclasses.replace(rendering(job.compute, job.progress), record=record)
     threads = job.compute.threads or machine.usable_threads()

@@ -108,6 +108,31 @@ def compare() -> Decorator:
              "the workspace, and stop.  [default: off]")
 
 
+def sweep() -> Decorator:
+    """Returns a decorator that adds --sweep and --ratios."""
+    def parse(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[float, ...]:
+        try:
+            ratios = tuple(sorted({float(word) for word in text.split(",")}))
+        except ValueError:
+            ratios = ()
+        if not ratios or not 0 < ratios[0] <= ratios[-1] < 1:
+            raise click.BadParameter(
+                f"{text!r} is no list of shares between 0 and 1, such as 0.5,0.8.",
+                param=parameter)
+        return ratios
+
+    return _stacked([
+        click.option(
+            "--sweep", is_flag=True,
+            help="Print what every score costs at every ratio on the validation views, with "
+                 "controls, write sweep.json and sweep.svg into the workspace, and stop.  "
+                 "[default: off]"),
+        click.option(
+            "--ratios", default="0.5,0.66,0.8,0.9", metavar="X,X,...", callback=parse,
+            show_default=True, help="With --sweep: shares that are removed."),
+    ])
+
+
 def assignments(example: str = "train.iterations=1000") -> Decorator:
     """Returns a decorator that adds --set, for the verbs that run many stages.
 

@@ -25,7 +25,8 @@ ALLOWED: dict[str, set[str]] = {
     "console": {"errors"},
     "fields": {"errors"},
     "atomic": {"errors"},
-    "config": {"errors", "fields"},
+    "measure_option": {"errors"},
+    "config": {"errors", "fields", "measure_option"},
     "settings": OPTIONS,
     "digests": BOTTOM,
     "manifest": BOTTOM | {"digests"},
@@ -45,6 +46,9 @@ ALLOWED: dict[str, set[str]] = {
     "pipeline": OPTIONS | RECORDS | {"settings", "stages", "freshness", "execute"},
     "cleaning": RECORDS | {"errors", "execute"},
     "comparing": OPTIONS | BOTTOM | {"capture", "execute", "pipeline", "workspace"},
+    "sweep": OPTIONS | BOTTOM | {
+        "metrics", "scene", "render", "train", "stages", "execute", "pipeline", "workspace",
+        "progress"},
     "doctor": {"errors", "machine", "render"},
     "report": {"doctor", "pipeline"},
     "options": OPTIONS | {"settings"},
@@ -56,12 +60,12 @@ ALLOWED: dict[str, set[str]] = {
         "execute", "bench"},
     "cli": OPTIONS | {
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
-        "progress", "stages", "workspace", "bench", "study"},
+        "progress", "stages", "workspace", "bench", "study", "sweep"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "options", "bench", "study"},
-    "matplotlib": {"bench", "study"},
+    "click": {"cli", "options", "bench", "study", "console"},
+    "matplotlib": {"bench", "study", "sweep"},
     "numba": {"render"},
     "llvmlite": {"render"},
     "tqdm": {"progress"},

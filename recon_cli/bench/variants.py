@@ -63,17 +63,19 @@ def renderer_of(variant: Variant, backend: str) -> Renderer:
         draw = registry.renderer(backend)
     else:
         def draw(
-            splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool
+            splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
+            mask: Tensor | None = None,
         ) -> RenderOutput:
             return numba_backend.render(
-                splats, camera, background, sh_degree, scores, variant.approximation)
+                splats, camera, background, sh_degree, scores, mask, variant.approximation)
 
     def render(
-        splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool
+        splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
+        mask: Tensor | None = None,
     ) -> RenderOutput:
         if variant.half_colors:
             splats = _rounded(splats)
-        return draw(splats, camera, background, _cut(variant, sh_degree), scores)
+        return draw(splats, camera, background, _cut(variant, sh_degree), scores, mask)
 
     return render
 

@@ -51,12 +51,34 @@ def write_ply(path: Path, splats: Splats) -> None:
         "logit_opacities": raw["logit_opacities"][:, None],
     }
     table = torch.cat([columns[name] for name in _GROUPS], dim=1).numpy()
-    names = [name for group in (_GROUPS | {"sh_rest": rest}).values() for name in group]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}",
-              *(f"property float {name}" for name in names), "end_header", ""]
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
+        file.write(_header(n, splats.sh_degree))
         file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
+
+
+def _properties(sh_degree: int) -> list[str]:
+    rest = _REST[: 3 * TERMS[sh_degree]]
+    return [name for group in (_GROUPS | {"sh_rest": rest}).values() for name in group]
+
+
+def _header(n: int, sh_degree: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}",
+             *(f"property float {name}" for name in _properties(sh_degree)), "end_header", ""]
+    return "\n".join(lines).encode("ascii")
+
+
+def most_gaussians(size: int, sh_degree: int) -> int:
+    """Returns how many Gaussians fit into a .ply of `size` bytes; 0 where not even one does.
+
+    Args:
+        size: of the file.
+        sh_degree: of the Gaussians.
+    """
+    each = 4 * len(_properties(sh_degree))
+    count = max(0, (size - len(_header(0, sh_degree))) // each)
+    while count and len(_header(count, sh_degree)) + each * count > size:  # the count has digits
+        count -= 1
+    return count
 
 
 def read_ply(path: Path) -> Splats:

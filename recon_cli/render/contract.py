@@ -8,8 +8,8 @@ autograd in every raw parameter and bit-deterministic on one machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -50,11 +50,14 @@ EXACT = Approximation()
 class Statistics:
     """What densification and pruning need, gathered by the same passes that render.
 
+    Pixels that a mask ignores are drawn, but count in none of hits, blend_sum, blend_max and loo.
+
     Attributes:
         radii: [N] three standard deviations along the longer axis of the projection in pixels;
             0 where the Gaussian was culled.
         hits: [N] int64, pixels that the Gaussian contributes to: alpha >= 1/255 and T (1 - alpha)
             >= 1e-4 after it (LightGaussian's hit).
+        blend_sum: [N] sum of alpha T over the pixels.
         blend_max: [N] greatest alpha T over the pixels.
         means2d_grad: [N, 2] gradient of the loss with respect to the projected mean, per pixel;
             zeros until backward() has run.
@@ -72,6 +75,7 @@ class Statistics:
 
     radii: Tensor
     hits: Tensor
+    blend_sum: Tensor
     blend_max: Tensor
     means2d_grad: Tensor
     absolute_grad: Tensor
@@ -86,6 +90,7 @@ class Statistics:
         return Statistics(
             radii=like.new_zeros(n),
             hits=like.new_zeros(n, dtype=torch.int64),
+            blend_sum=like.new_zeros(n),
             blend_max=like.new_zeros(n),
             means2d_grad=like.new_zeros(n, 2),
             absolute_grad=like.new_zeros(n, 2),
@@ -102,9 +107,9 @@ class RenderOutput:
         rgb: [H, W, 3] colour over the background, not clamped.
         alpha: [H, W] coverage, 1 minus the final transmittance.
         depth: [H, W] sum of alpha T z, world units; divide by alpha for the expected depth.
-        statistics: see `Statistics`; `hits`, `blend_max` and `loo` stay zero unless they were
-            asked for with `scores=True`, with the torch backend `absolute_grad` and `variance`
-            too.
+        statistics: see `Statistics`; `hits`, `blend_sum`, `blend_max` and `loo` stay zero unless
+            they were asked for with `scores=True`, with the torch backend `absolute_grad` and
+            `variance` too.
     """
 
     rgb: Tensor
@@ -113,10 +118,19 @@ class RenderOutput:
     statistics: Statistics
 
 
-Renderer = Callable[[Splats, Camera, Tensor, int, bool], RenderOutput]
+class Renderer(Protocol):
+    """The function that every backend is. See `recon_cli.render.registry.render`."""
+
+    def __call__(
+        self, splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
+        mask: Tensor | None = None,
+    ) -> RenderOutput:
+        """Renders; `mask` [H, W] bool says which pixels the scores are taken over."""
 
 
-def check_inputs(splats: Splats, background: Tensor, sh_degree: int) -> None:
+def check_inputs(
+    splats: Splats, camera: Camera, background: Tensor, sh_degree: int, mask: Tensor | None
+) -> None:
     """Raises ValueError where a shape, dtype, device or degree breaks the contract."""
     if tuple(background.shape) != (3,):
         raise ValueError(f"background has shape {tuple(background.shape)}, needed (3,)")
@@ -126,3 +140,8 @@ def check_inputs(splats: Splats, background: Tensor, sh_degree: int) -> None:
         raise ValueError(f"dtype {splats.means.dtype}, needed float32 or float64")
     if not 0 <= sh_degree <= 3:
         raise ValueError(f"sh_degree is {sh_degree}, needed 0 to 3")
+    if mask is not None and (
+            tuple(mask.shape) != (camera.height, camera.width) or mask.dtype != torch.bool):
+        raise ValueError(
+            f"the mask is {tuple(mask.shape)} of {mask.dtype}, needed "
+            f"{(camera.height, camera.width)} of bool")

@@ -123,6 +123,7 @@ def render(
     *,
     backend: str = "torch",
     scores: bool = False,
+    mask: Tensor | None = None,  # [H, W]
 ) -> RenderOutput:
     """Renders `splats` as `camera` sees them (3D Gaussian Splatting, Kerbl et al. 2023).
 
@@ -133,7 +134,9 @@ def render(
         sh_degree: highest spherical-harmonics degree in use, 0 to 3; what the splats have beyond
             it is left out, and what they do not have counts as zero.
         backend: a name from `available_backends`.
-        scores: also gather hits and blend_max, and loo in the backward pass.
+        scores: also gather hits, blend_sum and blend_max, and loo in the backward pass.
+        mask: [H, W] bool, the pixels over which the scores are taken; None takes all. It changes
+            neither the picture nor a gradient.
 
     Returns:
         The image, alpha, depth and statistics; see `RenderOutput`.
@@ -142,5 +145,5 @@ def render(
         ValueError: a shape, dtype or device does not fit.
         BackendError: there is no such backend here.
     """
-    check_inputs(splats, background, sh_degree)
-    return renderer(backend)(splats, camera, background, sh_degree, scores)
+    check_inputs(splats, camera, background, sh_degree, mask)
+    return renderer(backend)(splats, camera, background, sh_degree, scores, mask)

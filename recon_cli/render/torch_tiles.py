@@ -36,7 +36,8 @@ from recon_cli.scene.splats import Splats
 
 
 def render(
-    splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool
+    splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
+    mask: Tensor | None = None,
 ) -> RenderOutput:
     """Renders by the contract; see `recon_cli.render.registry.render`."""
     projection = project(splats, camera, sh_degree)
@@ -52,7 +53,8 @@ def render(
     channels = torch.cat([projection.colors, projection.depths[:, None]], dim=-1)
     rgb, depth, alpha = _Rasterize.apply(  # type: ignore[no-untyped-call]
         projection.means2d, projection.directions, projection.log_scales, log_opacities, channels,
-        background, projection, instances, (camera.height, camera.width), statistics, scores)
+        background, projection, instances, (camera.height, camera.width), statistics, scores,
+        mask)
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
@@ -64,14 +66,17 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,
         means2d: Tensor, directions: Tensor, log_scales: Tensor, log_opacities: Tensor,
         channels: Tensor, background: Tensor, projection: Projection, instances: Instances,
-        size: tuple[int, int], statistics: Statistics, scores: bool,
+        size: tuple[int, int], statistics: Statistics, scores: bool, mask: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
         image = means2d.new_zeros(len(instances.counts), PIXELS, CHANNELS)
         # a pixel beyond the image is stopped from the start: it counts in no statistic
         transmittance = _to_tiles(means2d.new_ones(*size, 1), instances)[..., 0]
         monomials, scratch = pixel_monomials(means2d)[:3], Scratch(means2d)
-        tally = _Tally(instances, means2d) if scores else None
+        counting = None
+        if scores and mask is not None:
+            counting = _to_tiles(mask.to(means2d)[..., None], instances)[..., 0]
+        tally = _Tally(instances, means2d, counting) if scores else None
         lists = TileLists.of(instances)
 
         def composite_group(tiles: Tensor) -> list[Block]:
@@ -93,7 +98,7 @@ class _Rasterize(torch.autograd.Function):
             tally.write(projection.ids, statistics)
         ctx.save_for_backward(
             means2d, directions, log_scales, log_opacities, channels, background, image)
-        ctx.rest = projection, instances, statistics, scores, groups
+        ctx.rest = projection, instances, statistics, scores, counting, groups
         left = 1 - image[..., 4:]
         rgb = _to_image(image[..., :3] + left * background, instances, size)
         depth = _to_image(image[..., 3:4], instances, size)[..., 0]
@@ -105,7 +110,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         means2d, directions, log_scales, log_opacities, channels, background, image = (
             ctx.saved_tensors)
-        projection, instances, statistics, scores, groups = ctx.rest
+        projection, instances, statistics, scores, counting, groups = ctx.rest
         table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
         monomials, scratch = pixel_monomials(means2d), Scratch(means2d)
         grads = torch.cat([grad_rgb, grad_depth[..., None], grad_alpha[..., None]], dim=-1)
@@ -130,7 +135,7 @@ class _Rasterize(torch.autograd.Function):
                 used = table.channels[block.rows]
                 if composited is not None and scored is not None:
                     scored[block.positions, 4] = _leave_one_out(
-                        used, odds, live, composited, block, upper[:k, :k])
+                        used, odds, live, composited, block, upper[:k, :k], counting)
                 shade = torch.bmm(
                     used, grad.transpose(1, 2), out=scratch.take("q", alpha.shape)).mul_(live)
                 weighted = torch.mul(shade, odds, out=after)  # w (g . f)
@@ -159,24 +164,28 @@ class _Rasterize(torch.autograd.Function):
             per_gaussian[:, 5:10], table.whitening[:-1], directions, log_scales)]
         statistics.means2d_grad[projection.ids] = shape[0]
         return (*shape, per_gaussian[:, 10], per_gaussian[:, :4], grad_background,
-                None, None, None, None, None)
+                None, None, None, None, None, None)
 
 
 def _leave_one_out(
-    used: Tensor, odds: Tensor, live: Tensor, composited: Tensor, block: Block, upper: Tensor
+    used: Tensor, odds: Tensor, live: Tensor, composited: Tensor, block: Block, upper: Tensor,
+    counting: Tensor | None,
 ) -> Tensor:
     """Returns the block's part [n, K] of loo and moves `composited` in front of the block.
 
     alpha T (c - B) = odds (T_after c - T_after B), and T_after B is what is composited behind.
     """
     total = torch.zeros_like(used[..., 0])
+    part = (live > 0).to(odds.dtype)
+    if counting is not None:
+        part *= counting[block.tiles, None]
     for channel in range(3):
         own = used[..., channel : channel + 1] * live
         weighted = own * odds
         later = torch.matmul(upper, weighted) + composited[block.tiles, None, :, channel]
         composited[block.tiles, :, channel] += weighted.sum(1)
         # `later` still counts what lies behind a stopped pixel; there the Gaussian is no part
-        total += (((own - later) * odds) ** 2 * (live > 0)).sum(-1)
+        total += (((own - later) * odds) ** 2 * part).sum(-1)
     return total
 
 
@@ -192,23 +201,34 @@ def _write_scores(
 
 
 class _Tally:
-    """Counts hits and greatest blend weights of the instances while they are composited."""
+    """Counts hits and blend weights of the instances while they are composited.
 
-    def __init__(self, instances: Instances, like: Tensor) -> None:
-        self._instances = instances
-        self._hits = like.new_zeros(len(instances.gaussians) + 1)
-        self._blend = like.new_zeros(len(instances.gaussians) + 1)
+    Args:
+        instances: of the view.
+        like: of the dtype and device to count in.
+        counting: [tiles, 256] 1 at the pixels that count and 0 elsewhere; None where all do.
+    """
+
+    def __init__(self, instances: Instances, like: Tensor, counting: Tensor | None) -> None:
+        self._instances, self._counting = instances, counting
+        self._hits, self._sum, self._max = (
+            like.new_zeros(len(instances.gaussians) + 1) for _ in range(3))
 
     def add(self, block: Block, weights: Tensor) -> None:
         """Takes the blend weights [n, K, 256] of a block."""
+        if self._counting is not None:
+            weights = weights * self._counting[block.tiles, None]
         self._hits[block.positions] = (weights > 0).sum(-1).to(weights.dtype)
-        self._blend[block.positions] = weights.amax(-1)
+        self._sum[block.positions] = weights.sum(-1)
+        self._max[block.positions] = weights.amax(-1)
 
     def write(self, ids: Tensor, statistics: Statistics) -> None:
         """Writes the totals of each Gaussian into `statistics`."""
         hits = _reduce(self._hits[:, None].double(), self._instances)[:, 0]
         statistics.hits[ids] = hits.round().long()
-        statistics.blend_max[ids] = _reduce(self._blend[:, None], self._instances, "max")[:, 0]
+        sums = _reduce(self._sum[:, None].double(), self._instances)[:, 0]
+        statistics.blend_sum[ids] = sums.to(statistics.blend_sum.dtype)
+        statistics.blend_max[ids] = _reduce(self._max[:, None], self._instances, "max")[:, 0]
 
 
 def _reduce(values: Tensor, instances: Instances, how: str = "sum") -> Tensor:

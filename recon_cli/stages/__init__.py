@@ -54,7 +54,7 @@ STAGES: tuple[Stage, ...] = (
           ("database.db", "log.txt", "steps.json", "verdict.json", "model/*")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 4, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
-    Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 3, False,
+    Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 1, False,
           "recon_cli.stages.evaluate", renders=True),

@@ -24,6 +24,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.train.fit import Report, Task, fit
+from recon_cli.train.importance import Importance
 from recon_cli.train.memory import MemoryEstimate, estimate, refuse_what_does_not_fit, room
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
@@ -177,7 +178,7 @@ def jump_in(log: Path) -> tuple[int, int] | None:
     return None
 
 
-class _Log:
+class Log:
     """One JSON line a report; what a crash left behind the checkpoint is cut off."""
 
     def __init__(self, path: Path, iteration: int, earlier_seconds: float) -> None:
@@ -195,9 +196,15 @@ class _Log:
 
     def add(self, report: Report) -> None:
         """Appends a report; its seconds count from the very start of training."""
-        row = dataclasses.asdict(report)
-        row["seconds"] = round(self._earlier + report.seconds, 3)
-        row["cpu_seconds"] = round(self._earlier_cpu + report.cpu_seconds, 3)
+        self._write(dataclasses.asdict(report), report.seconds, report.cpu_seconds)
+
+    def spend(self, iteration: int, seconds: float, cpu_seconds: float) -> None:
+        """Counts time in which no step was taken."""
+        self._write({"iteration": iteration}, seconds, cpu_seconds)
+
+    def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
+        row["seconds"] = round(self._earlier + seconds, 3)
+        row["cpu_seconds"] = round(self._earlier_cpu + cpu_seconds, 3)
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
@@ -237,6 +244,9 @@ def run_fit(
     first: int = 0,
     earlier_seconds: float = 0.0,
     keep: dict[int, str] | None = None,
+    end: int | None = None,
+    checkpoint: str = CHECKPOINT,
+    importance: Importance | None = None,
 ) -> None:
     """Fits until `until` steps, saving the state in `out` as it goes.
 
@@ -250,23 +260,27 @@ def run_fit(
         first: step at which this stage's own work begins.
         earlier_seconds: training seconds before that.
         keep: file names under which the state after certain steps is kept.
+        end: step at which this stage's own work ends; `until` where it is None.
+        checkpoint: file name of the state that a later run goes on from.
+        importance: gets the scores of these steps. They are in no checkpoint, so none is written
+            while they are gathered.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
     """
-    log = _Log(out / LOG, state.iteration, earlier_seconds)
+    log = Log(out / LOG, state.iteration, earlier_seconds)
     every, counted = task.schedule.config.checkpoint_every, [state.iteration]
     with _deferred_interrupt() as pressed, ctx.progress.bar(
-        label, until - first, unit="step", done=state.iteration - first
+        label, (end or until) - first, unit="step", done=state.iteration - first
     ) as bar:
         def on_step(now: TrainState) -> None:
             bar.advance(now.iteration - counted[0])
             counted[0] = now.iteration
             if keep and now.iteration in keep:
                 save_state(out / keep[now.iteration], now)
-            if now.iteration % every == 0 or pressed:
-                save_state(out / CHECKPOINT, now)
-                ctx.record(now.iteration - first, until - first)
+            if importance is None and (now.iteration % every == 0 or pressed):
+                save_state(out / checkpoint, now)
+                ctx.record(now.iteration - first, (end or until) - first)
             if pressed:
                 raise KeyboardInterrupt
 
@@ -280,4 +294,4 @@ def run_fit(
                             "on at step %d, with falling rates", report.iteration,
                             report.goes_on_at)
 
-        fit(state, task, until, on_step=on_step, on_report=on_report)
+        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance)

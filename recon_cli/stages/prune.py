@@ -1,93 +1,81 @@
-"""prune: removes the Gaussians that matter least to the training views, then lets the rest recover.
+"""prune: removes the Gaussians that matter least to the training views, and lets the rest recover.
 
 Branches off the finished run, or off its middle (what `recon train --prune` does): then the rest
-of the run is trained without the pruned Gaussians, and both models have seen as many steps. The
+of the run is trained with fewer and fewer Gaussians, and both models have seen as many steps. The
 unpruned model stays in train/, so that evaluation can set them side by side.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import torch
-
-from recon_cli.config import PruneConfig, RunConfig
-from recon_cli.io.ply import write_ply
+from recon_cli.config import PruneConfig
+from recon_cli.errors import ConfigError, TrainingError
+from recon_cli.io.ply import most_gaussians, write_ply
 from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.stages.fitting import (
-    CHECKPOINT,
-    LOG,
-    jump_in,
-    load_scene,
-    load_task,
-    read_config,
-    run_fit,
-    seconds_at,
-)
-from recon_cli.train.fit import Task, validation_psnr
-from recon_cli.train.gathered import Gathered
-from recon_cli.train.importance import kept_rows, significance
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.start import saved_state
+from recon_cli.stages.course import Round, course_of
+from recon_cli.stages.fitting import LOG, seconds_at
+from recon_cli.stages.rounds import prune_to, prune_while_good
+from recon_cli.train.fit import validation_psnr
+from recon_cli.train.pruning import RATIO, remaining
 from recon_cli.train.state import TrainState
-
-_END_RECOVERY = 6  # the reference recovers for 5,000 steps after 30,000
 
 
 def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Prunes, recovers and returns what was removed and what it cost."""
-    train = inputs.folders["train"]
-    train_config = read_config(train)
-    scene = load_scene(inputs, validation=train_config.validation)
-    task = _following(load_task(scene, train_config, ctx), train)
-    source = train / ("mid.safetensors" if config.at == "mid" else "final.safetensors")
-    start = saved_state(source, task)
-    until = _until(config, train_config, start.iteration)
-    before, first, steps = len(start.splats), start.iteration, start.steps
-    psnr_before = validation_psnr(start, task)
-    if (out / CHECKPOINT).exists():
-        state = saved_state(out / CHECKPOINT, task)
+    course = course_of(config, inputs, out, ctx)
+    before = course.start()
+    n, psnr_before = len(before.splats), validation_psnr(before, course.task)
+    steps = before.steps
+    if config.max_psnr_drop is None:
+        state, rounds = prune_to(course, _target(config, before.splats))
+    elif psnr_before is None:
+        raise TrainingError(
+            "--max-psnr-drop is measured on validation views, but the run has none.",
+            hint="Run `recon train --validation 0.05` first, or prune by --ratio.")
     else:
-        state = _pruned(start, task, config)
-    psnr_pruned = None if state.iteration > first else validation_psnr(state, task)
-    run_fit(
-        state, task, until, out, ctx, label="recover", first=first,
-        earlier_seconds=seconds_at(train / LOG, first))
+        state, rounds = prune_while_good(course, psnr_before, config.max_psnr_drop)
+        if len(state.splats) == n:
+            ctx.notice(f"nothing was removed: {rounds[0].removed:.1%} already cost more than "
+                       f"{config.max_psnr_drop:g} dB" if rounds else "nothing was removed")
     write_ply(out / "splats.ply", state.splats)
-    (out / CHECKPOINT).unlink(missing_ok=True)
+    course.clear()
     return {
-        "at": config.at, "score": config.score, "ratio": config.ratio,
-        "gaussians_before": before, "gaussians": len(state.splats),
-        "recovery_steps": state.steps - steps, "iterations": state.steps,
-        "validation_psnr_db_before": psnr_before, "validation_psnr_db_pruned": psnr_pruned,
-        "validation_psnr_db": validation_psnr(state, task),
-        "train_seconds": seconds_at(out / LOG, until),
+        **_summary(config, state, rounds, n), "iterations": state.steps,
+        "recovery_steps": state.steps - steps,
+        "validation_psnr_db_before": psnr_before,
+        "validation_psnr_db": validation_psnr(state, course.task),
+        "train_seconds": seconds_at(out / LOG, state.iteration),
     }
 
 
-def _following(task: Task, train: Path) -> Task:
-    """Returns a task that stops early exactly where the training did, and nowhere else."""
-    config = replace(task.schedule.config, early_stop=False)
-    return replace(task, schedule=Schedule(config), jump=jump_in(train / LOG))
+def _target(config: PruneConfig, splats: Splats) -> int:
+    """Returns how many of the Gaussians stay.
+
+    Raises:
+        ConfigError: not even one fits into the .ply.
+    """
+    n = len(splats)
+    if config.max_gaussians is not None:
+        return min(n, config.max_gaussians)
+    if config.max_mb is not None:
+        count = most_gaussians(int(1e6 * config.max_mb), splats.sh_degree)
+        if count == 0:
+            raise ConfigError(
+                f"max_mb is {config.max_mb:g}, but a .ply of one Gaussian is larger.",
+                hint="Use --max-mb 1 or more: about 4,000 Gaussians.")
+        return min(n, count)
+    return remaining(n, RATIO if config.ratio is None else config.ratio)
 
 
-def _until(config: PruneConfig, train: RunConfig, first: int) -> int:
-    """Returns the total number of steps at which recovery ends."""
-    if config.recovery is not None:
-        return first + config.recovery
-    return train.iterations if config.at == "mid" else first + train.iterations // _END_RECOVERY
-
-
-def _pruned(state: TrainState, task: Task, config: PruneConfig) -> TrainState:
-    """Removes the lowest-ranked Gaussians of `state`, moments included."""
-    degree = task.schedule.sh_degree(state.iteration)
-    score = significance(
-        config.score, state.splats, [view.camera for view in task.train], beta=config.beta,
-        sh_degree=degree, backend=task.backend, generator=state.generator)
-    rows = kept_rows(score, config.ratio)
-    kept: Splats = state.splats.select(rows)
-    state.optimizer.replace(kept, rows)
-    state.gathered = Gathered.zeros(len(kept), torch.device(task.device))
-    return state
+def _summary(config: PruneConfig, state: TrainState, rounds: list[Round], n: int) -> Summary:
+    """Returns the counts of all, and of each round what went and how good the rest is."""
+    return {
+        "at": config.at, "score": config.score, "ratio": round(1 - len(state.splats) / n, 4),
+        "gaussians_before": n, "gaussians": len(state.splats),
+        "validation_psnr_db_pruned": rounds[0].validation_psnr_db_removed if rounds else None,
+        "rounds": [{
+            "gaussians": one.gaussians, "removed": one.gaussians_before - one.gaussians,
+            "validation_psnr_db": one.validation_psnr_db, "kept": one.kept} for one in rounds],
+    }

@@ -13,6 +13,7 @@ import torch
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
 from recon_cli.train.early_stop import next_iteration
+from recon_cli.train.importance import Importance
 from recon_cli.train.pyramid import Pyramid
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
@@ -86,6 +87,7 @@ def fit(
     *,
     on_step: Callable[[TrainState], None],
     on_report: Callable[[Report], None],
+    importance: Importance | None = None,
 ) -> None:
     """Runs `state` on until it has done `until` steps.
 
@@ -95,6 +97,7 @@ def fit(
         until: total number of steps, those already done included.
         on_step: called after each step; may save the state.
         on_report: called every hundred steps and at the end.
+        importance: gets the scores of every step's view, from the very passes that train.
 
     Raises:
         TrainingError: the loss is not finite, or no Gaussian is left.
@@ -103,7 +106,7 @@ def fit(
     compute = gradient_step(task.backend)
     every = report_every(task.schedule)
     while state.iteration < until:
-        loss = _step(state, task, compute)
+        loss = _step(state, task, compute, importance)
         if state.iteration % every == 0 or state.iteration == until:
             psnr = validation_psnr(state, task)
             regular = state.iteration % every == 0
@@ -132,7 +135,9 @@ def report_every(schedule: Schedule) -> int:
     return _REPORT_EVERY * max(1, schedule.config.iterations // (_REPORTS * _REPORT_EVERY))
 
 
-def _step(state: TrainState, task: Task, compute: GradientStep) -> float:
+def _step(
+    state: TrainState, task: Task, compute: GradientStep, importance: Importance | None
+) -> float:
     """Takes one optimization step and returns its loss."""
     if not state.queue:
         state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
@@ -146,12 +151,16 @@ def _step(state: TrainState, task: Task, compute: GradientStep) -> float:
     loss, statistics = compute(
         state.optimizer, view, degree, schedule.config.ssim_weight,
         variance=gathers and strategy.variance,
-        gain=None if state.exposure is None else state.exposure.gain(index))
+        gain=None if state.exposure is None else state.exposure.gain(index),
+        scores=importance is not None and importance.weighs,
+        loo=importance is not None and importance.leaves_out)
     state.iteration = iteration
     if not np.isfinite(loss):
         _skip(state, task)
         return loss
     if statistics is not None:
+        if importance is not None:
+            importance.add(statistics)
         if gathers:
             state.gathered.add(statistics, view.camera.width, view.camera.height)
         if state.poses is not None:

@@ -1,18 +1,100 @@
-"""How much each Gaussian matters to the training views, and which ones go."""
+"""How much each Gaussian matters to the training views.
+
+What the rasterizer finds in a pass is added up over the views, and every score is read off the
+sums. A training step leaves the same statistics as a rendering, so that scores need no pass of
+their own where training goes on.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from recon_cli.render import Statistics, render
-from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+from recon_cli.train.step import TrainView
 
 _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
+_BETA_SHIPPED = 0.1  # LightGaussian's --v_pow
+
+
+@dataclass(eq=False)
+class Importance:
+    """What the training views say about N Gaussians, added up; see `Statistics`.
+
+    Attributes:
+        hits: [N] int64, pixels that the Gaussian contributes to.
+        blend_sum: [N] float64, sum of alpha T.
+        blend_max: [N] float64, greatest alpha T.
+        loo: [N] float64, squared error that removing it alone causes.
+        views: how many were added.
+        weighs: hits and blend weights are gathered.
+        leaves_out: loo is gathered.
+    """
+
+    hits: Tensor
+    blend_sum: Tensor
+    blend_max: Tensor
+    loo: Tensor
+    views: int = 0
+    weighs: bool = True
+    leaves_out: bool = True
+
+    @staticmethod
+    def zeros(n: int, device: torch.device) -> Importance:
+        """Returns the record of no view, for every score."""
+        zeros = torch.zeros(n, dtype=torch.float64, device=device)
+        return Importance(
+            torch.zeros(n, dtype=torch.int64, device=device), zeros, zeros.clone(), zeros.clone())
+
+    @staticmethod
+    def of_score(name: str, n: int, device: torch.device) -> Importance:
+        """Returns the record of no view that gathers no more than one score needs."""
+        found = Importance.zeros(n, device)
+        found.leaves_out = name == "loo"
+        found.weighs = name in ("paper", "lightgaussian", "blend_sum", "blend_max")
+        return found
+
+    @property
+    def needs_views(self) -> bool:
+        """Whether the score is about what views show at all."""
+        return self.weighs or self.leaves_out
+
+    def add(self, statistics: Statistics) -> None:
+        """Adds what one view's passes found, as far as it is gathered."""
+        self.views += 1
+        if self.weighs:
+            self.hits += statistics.hits
+            self.blend_sum += statistics.blend_sum
+            self.blend_max = torch.maximum(self.blend_max, statistics.blend_max.double())
+        if self.leaves_out:
+            self.loo += statistics.loo
+
+    def score(
+        self, name: str, splats: Splats, *, beta: float, generator: torch.Generator
+    ) -> Tensor:
+        """Returns the score [N] float64 by which Gaussians are ranked; the lowest go first.
+
+        Args:
+            name: one of PRUNE_SCORES.
+            splats: the N Gaussians as they are now.
+            beta: exponent of the volume in the paper's score.
+            generator: draws the random score, and nothing else.
+        """
+        if name == "paper":
+            return paper_score(self.hits, splats, beta)
+        if name == "lightgaussian":
+            return lightgaussian_score(self.hits, splats)
+        if name == "opacity":
+            return splats.opacities.detach().double()
+        if name == "random":
+            drawn = torch.rand(len(splats), generator=generator, dtype=torch.float64)
+            return drawn.to(splats.means.device)
+        return {"blend_sum": self.blend_sum, "blend_max": self.blend_max, "loo": self.loo}[name]
 
 
 def paper_score(hits: Tensor, splats: Splats, beta: float) -> Tensor:
@@ -27,65 +109,64 @@ def paper_score(hits: Tensor, splats: Splats, beta: float) -> Tensor:
         splats: N Gaussians.
         beta: exponent of the volume.
     """
-    # in log space: the product of three scales of 1e-15 leaves the range of float32
-    log_volumes = splats.log_scales.detach().double().sum(-1)
+    log_volumes = _log_volumes(splats)
     rank = math.ceil(_PERCENTILE * len(splats)) - 1
     reference = log_volumes.sort().values[rank]
     gamma = torch.exp(beta * (log_volumes - reference).clamp_max(0))
     return hits.double() * splats.opacities.detach().double() * gamma
 
 
-def significance(
-    name: str,
-    splats: Splats,
-    cameras: Iterable[Camera],
-    *,
-    beta: float,
-    sh_degree: int,
-    backend: str,
-    generator: torch.Generator,
-) -> Tensor:
-    """Returns the score [N] by which Gaussians are ranked; the lowest go first.
+def lightgaussian_score(hits: Tensor, splats: Splats) -> Tensor:
+    """Returns hits_j o_j (V_j / V_k)^0.1, [N] float64, as LightGaussian's code has it.
 
-    Masks are left out: hits, blend weights and leave-one-out errors come from the rasterizer, which
-    knows no masks, so pixels that training ignores count here like any other.
+    There the volume is not clamped, so V_k (the volume at the 90th percentile) divides every score
+    by the same number V_k^0.1 and cannot change the ranking; it is kept for the scale.
 
     Args:
-        name: paper, blend_max, loo, opacity or random.
+        hits: [N] pixels over all training views that each Gaussian contributes to.
         splats: N Gaussians.
-        cameras: training views at their training size; never validation or test views.
-        beta: exponent of the volume in the paper's score.
+    """
+    log_volumes = _log_volumes(splats)
+    reference = log_volumes.sort(descending=True).values[int(_PERCENTILE * len(splats))]
+    ratio = torch.exp(_BETA_SHIPPED * (log_volumes - reference))
+    return hits.double() * splats.opacities.detach().double() * ratio
+
+
+def _log_volumes(splats: Splats) -> Tensor:
+    """Returns the logarithm of the product of the scales, [N] float64.
+
+    The product itself leaves the range of float32 where the scales are 1e-15.
+    """
+    return splats.log_scales.detach().double().sum(-1)
+
+
+def add_views(
+    found: Importance, splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str
+) -> None:
+    """Adds what a pass over views finds, each with its mask.
+
+    Args:
+        found: changed in place.
+        splats: N Gaussians.
+        views: training views; never validation or test views.
         sh_degree: degree in use.
-        backend: rasterizer that counts hits and blend weights while it renders.
-        generator: draws the random score.
+        backend: rasterizer.
     """
-    if name == "opacity":
-        return splats.opacities.detach().double()
-    if name == "random":
-        return torch.rand(len(splats), generator=generator, dtype=torch.float64).to(
-            splats.means.device)
-    total = Statistics.zeros(splats.means.detach().double())
-    background = torch.zeros(3, dtype=splats.means.dtype, device=splats.means.device)
-    leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(name == "loo"))
-    for camera in cameras:
-        output = render(leaves, camera, background, sh_degree, backend=backend, scores=True)
-        if name == "loo" and output.rgb.requires_grad:
+    device = splats.means.device
+    background = torch.zeros(3, dtype=splats.means.dtype, device=device)
+    leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(found.leaves_out))
+    for view in views:
+        output = render(leaves, view.camera, background, sh_degree, backend=backend, scores=True,
+                        mask=view.counting(device))
+        if output.rgb.requires_grad:
             output.rgb.sum().backward()  # type: ignore[no-untyped-call]
-        total.hits += output.statistics.hits
-        total.blend_max = torch.maximum(total.blend_max, output.statistics.blend_max.double())
-        total.loo += output.statistics.loo
-    if name == "paper":
-        return paper_score(total.hits, splats, beta)
-    return total.blend_max if name == "blend_max" else total.loo
+        found.add(output.statistics)
 
 
-def kept_rows(score: Tensor, ratio: float) -> Tensor:
-    """Returns the rows [K] that stay, ascending, when a share of `ratio` is removed by rank.
-
-    By rank and not by threshold: equal scores would otherwise all go at once. Of equal scores
-    the later rows go first. At least one Gaussian stays.
-    """
-    n = len(score)
-    count = max(1, n - int(ratio * n))
-    order = torch.argsort(score, descending=True, stable=True)
-    return order[:count].sort().values
+def importance_of(
+    splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str
+) -> Importance:
+    """Returns all that a pass over views finds; the arguments are those of `add_views`."""
+    found = Importance.zeros(len(splats), splats.means.device)
+    add_views(found, splats, views, sh_degree=sh_degree, backend=backend)
+    return found

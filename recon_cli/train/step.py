@@ -66,13 +66,15 @@ class GradientStep(Protocol):
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view; None where it sees no Gaussian.
 
         The statistics are valid until the next call. Their `variance` is computed where it is
         asked for. The rendered channels are multiplied by `gain` [3] before they are compared;
-        None stands for ones.
+        None stands for ones. With `scores` there are hits and blend weights too, and with `loo`
+        loo, over the pixels that the view's mask counts.
         """
 
 
@@ -110,12 +112,14 @@ class _FusedStep:
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
-            sh_degree, ssim_weight, mask=view.mask, gain=gain, details=variance)
+            sh_degree, ssim_weight, mask=view.mask, gain=gain, details=variance,
+            scores=scores, loo=loo)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -136,20 +140,22 @@ class _AutogradStep:
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
+        device, counting = splats.means.device, view.counting(splats.means.device)
         output = render(
             splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
-            scores=variance)
-        device, rgb = splats.means.device, output.rgb
+            scores=variance or scores or loo, mask=counting)
+        rgb = output.rgb
         log_gain = None
         if gain is not None:
             log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
             rgb = rgb * log_gain.exp()
         loss = photometric_loss(
-            rgb, view.pixels(device), ssim_weight, mask=view.counting(device))
+            rgb, view.pixels(device), ssim_weight, mask=counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None

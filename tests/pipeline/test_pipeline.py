@@ -108,7 +108,7 @@ def test_a_stale_optional_stage_is_left_out_with_a_notice(
     other: Settings = {"prune": {"ratio": 0.25}}
     assert bring(job_at(job.workspace.root, other), "evaluate") == ["evaluate"]
     assert set(fake_stages.seen["evaluate"].folders) == {"ingest", "sfm", "train"}
-    assert ("prune is left out of eval: it is stale: prune.ratio changed: 0.5 -> 0.25"
+    assert ("prune is left out of eval: it is stale: prune.ratio changed: automatic -> 0.25"
             in caplog.text)
 
 

@@ -55,12 +55,13 @@ class Case:
 
     def render(
         self, splats: Splats, camera: Camera, background: Tensor = BLACK, degree: int = 0, *,
-        scores: bool = False,
+        scores: bool = False, mask: Tensor | None = None,
     ) -> RenderOutput:
         """Renders splats of any precision on this backend; gradients reach them."""
         color = background.to(device=self.device, dtype=self.dtype)
         return render(
-            self.cast(splats), camera, color, degree, backend=self.backend, scores=scores)
+            self.cast(splats), camera, color, degree, backend=self.backend, scores=scores,
+            mask=mask)
 
 
 def _cases() -> list[Case]:

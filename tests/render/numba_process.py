@@ -32,7 +32,8 @@ from recon_cli.render.numba import (
 )
 from recon_cli.render.numba.crew import crew
 
-STATISTICS = ("radii", "hits", "blend_max", "means2d_grad", "absolute_grad", "variance", "loo")
+STATISTICS = ("radii", "hits", "blend_sum", "blend_max", "means2d_grad", "absolute_grad",
+              "variance", "loo")
 _MODULES = (binning, culling, loss, optimizer, projection, projection_gradient, raster_backward,
             raster_forward)
 

@@ -57,6 +57,7 @@ def test_hits_and_blend_weights_match_their_definition(case):
     statistics = case.render(splats, camera, scores=True).statistics
     weights = composited(splats, camera, BLACK, 0).weights
     assert torch.equal(statistics.hits.cpu(), (weights > 0).sum((1, 2)))
+    assert close(statistics.blend_sum, weights.sum((1, 2)), SUM_TOLERANCE[case.dtype])
     expected = weights.amax((1, 2))
     assert close(statistics.blend_max, expected, SUM_TOLERANCE[case.dtype])
     assert (expected == 0).any()  # some Gaussians are not seen, and count as such
@@ -68,6 +69,7 @@ def test_scores_are_zero_unless_they_are_asked_for(case):
     out = case.render(case.leaves(splats), camera)
     target_loss(out.rgb).backward()
     assert out.statistics.hits.sum() == 0
+    assert out.statistics.blend_sum.sum() == 0
     assert out.statistics.blend_max.sum() == 0
     assert out.statistics.loo.sum() == 0
     assert out.statistics.means2d_grad.abs().max() > 0
@@ -117,6 +119,44 @@ def test_leave_one_out_is_the_squared_change_of_removing_that_gaussian(case):
         (composited(splats.select(torch.arange(30) != i), camera, GREENISH, 2).rgb - whole)
         .square().sum() for i in range(30)])
     assert close(out.statistics.loo, changes, SQUARE_TOLERANCE[case.dtype])
+
+
+def test_pixels_that_a_mask_ignores_count_in_no_score(case):
+    splats, camera = scene(seed=6)
+    mask = torch.rand(20, 33, generator=torch.Generator().manual_seed(0)) < 0.5
+    out = case.render(case.leaves(splats), camera, GREENISH, scores=True,
+                      mask=mask.to(case.device))
+    out.rgb.sum().backward()
+    found, weights = out.statistics, composited(splats, camera, BLACK, 0).weights * mask
+    assert torch.equal(found.hits.cpu(), (weights > 0).sum((1, 2)))
+    assert close(found.blend_sum, weights.sum((1, 2)), SUM_TOLERANCE[case.dtype])
+    assert close(found.blend_max, weights.amax((1, 2)), SUM_TOLERANCE[case.dtype])
+    whole = composited(splats, camera, GREENISH, 0).rgb
+    changes = torch.stack([
+        (mask[..., None] * (composited(splats.select(
+            torch.arange(len(splats)) != i), camera, GREENISH, 0).rgb - whole)).square().sum()
+        for i in range(len(splats))])
+    assert close(found.loo, changes, SQUARE_TOLERANCE[case.dtype])
+
+
+def test_a_mask_of_the_scores_changes_neither_picture_nor_gradient(case):
+    splats, camera = scene(seed=6)
+    pictures = []
+    for mask in (None, torch.zeros(20, 33, dtype=torch.bool, device=case.device)):
+        tracked = case.leaves(splats)
+        out = case.render(tracked, camera, GREENISH, scores=True, mask=mask)
+        target_loss(out.rgb).backward()
+        pictures.append((out.rgb, tracked.means.grad, out.statistics.variance))
+    assert all(torch.equal(a, b) for a, b in zip(*pictures, strict=True))
+    assert out.statistics.hits.sum() == 0
+    assert out.statistics.loo.sum() == 0
+
+
+def test_a_mask_of_another_size_or_type_is_refused(case):
+    splats, camera = scene(seed=6)
+    for mask in (torch.ones(33, 20, dtype=torch.bool), torch.ones(20, 33)):
+        with pytest.raises(ValueError, match="mask"):
+            case.render(splats, camera, scores=True, mask=mask.to(case.device))
 
 
 def test_the_gradient_of_the_projected_mean_moves_the_image(case):

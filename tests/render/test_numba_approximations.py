@@ -14,7 +14,7 @@ CAMERA = camera_at(120, 90, focal=100.0)
 
 
 def alpha_of(splats, approximation):
-    return render(splats, CAMERA, BLACK, 0, False, approximation).alpha
+    return render(splats, CAMERA, BLACK, 0, False, None, approximation).alpha
 
 
 @pytest.fixture(params=range(40))
@@ -49,5 +49,5 @@ def test_without_an_early_stop_every_layer_counts():
     camera = camera_at(8, 8)
     for least, seen in ((0.0, 12), (2e-2, 1), (0.9e-2, 2)):
         rule = Approximation(transmittance_min=least)
-        hits = render(layers, camera, BLACK, 0, True, rule).statistics.hits
+        hits = render(layers, camera, BLACK, 0, True, None, rule).statistics.hits
         assert (hits > 0).sum() == seen

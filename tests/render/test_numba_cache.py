@@ -11,7 +11,7 @@ import pytest
 from numba_process import STATISTICS, picture
 from numba_runs import HASWELL, after_damage, after_repair, for_avx2
 
-from recon_cli.execute import Job, _context
+from recon_cli.execute import Job, context_for
 from recon_cli.render import registry
 from recon_cli.render.numba import kernel, lanes, warm
 from recon_cli.render.numba.crew import crew
@@ -254,7 +254,7 @@ def stage_context(tmp_path, monkeypatch):
     monkeypatch.setattr(crew, "threads", 1)
     bars = Bars()
     row = next(row for row in STAGES if row.name == "train")
-    _context(Job(Workspace(tmp_path), progress=bars), row, lambda *_: None)
+    context_for(Job(Workspace(tmp_path), progress=bars), row, lambda *_: None)
     return bars
 
 

@@ -72,3 +72,33 @@ def test_a_read_only_photograph_is_taken():
     splats = random_splats(5, dtype=torch.float32)
     assert np.isfinite(PhotometricStep()(
         splats, splats.map(torch.empty_like), camera, truth, BLACK, 0, 0.2))
+
+
+def test_the_fused_step_gives_the_scores_of_the_renderer():
+    camera = camera_at(60, 41)
+    truth = np.random.default_rng(0).integers(0, 256, (41, 60, 3), np.uint8)
+    mask = np.random.default_rng(1).random((41, 60)) < 0.5
+    splats = leaves(random_splats(200, seed=13, dtype=torch.float32))
+    step = PhotometricStep()
+    for counting in (None, mask, None):  # one after the other: nothing adds up
+        step(splats, splats.map(torch.empty_like), camera, truth, BLACK, 3, 0.2, mask=counting,
+             scores=True, loo=True)
+        output = render(splats, camera, BLACK, 3, backend="numba", scores=True,
+                        mask=None if counting is None else torch.from_numpy(counting))
+        output.rgb.sum().backward()
+        for name in ("hits", "blend_sum", "blend_max", "loo"):
+            assert torch.equal(
+                getattr(step.statistics, name), getattr(output.statistics, name)), name
+
+
+def test_asking_for_scores_changes_no_gradient():
+    camera = camera_at(60, 41)
+    truth = np.random.default_rng(0).integers(0, 256, (41, 60, 3), np.uint8)
+    splats = random_splats(200, seed=13, dtype=torch.float32)
+    found = []
+    for scores in (False, True):
+        gradients = splats.map(torch.empty_like)
+        PhotometricStep()(
+            splats, gradients, camera, truth, BLACK, 3, 0.2, scores=scores, loo=scores)
+        found.append(gradients.parameters().values())
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))

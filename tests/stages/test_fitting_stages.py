@@ -24,13 +24,14 @@ from recon_cli.errors import (
 from recon_cli.io.images import read_image
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.metrics import psnr, ssim
-from recon_cli.stages import evaluate, export, fitting, prune, train
+from recon_cli.stages import course, evaluate, export, fitting, prune, train
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train.state import save_state
 
 CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
     checkpoint_every=7)
+RUN = RunConfig(**{**vars(CONFIG), "max_size": 400})
 PRUNE = PruneConfig(ratio=0.5, at="mid")
 CONTEXT = StageContext()
 
@@ -118,12 +119,12 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
 
     original = fitting.fit
 
-    def fit_and_press(state, task, until, *, on_step, on_report):
+    def fit_and_press(state, task, until, *, on_step, **others):
         def step(now):
             if now.iteration == 10:
                 os.kill(os.getpid(), signal.SIGINT)
             on_step(now)
-        original(state, task, until, on_step=step, on_report=on_report)
+        original(state, task, until, on_step=step, **others)
 
     with monkeypatch.context() as patch:
         patch.setattr(fitting, "fit", fit_and_press)
@@ -149,7 +150,7 @@ def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(input
 def test_a_killed_recovery_ends_with_the_same_bytes(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         stopping_after(119, patch)
-        patch.setattr(prune, "read_config", lambda _: CONFIG)  # checkpoints every 7 steps
+        patch.setattr(course, "read_config", lambda _: RUN)  # checkpoints every 7 steps
         with pytest.raises(Killed):
             run(prune, PRUNE, inputs, tmp_path / "out")
     run(prune, PRUNE, inputs, tmp_path / "out")

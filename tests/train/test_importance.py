@@ -1,13 +1,32 @@
-"""Significance scores in closed form, and pruning by rank."""
+"""Significance scores in closed form."""
 
-import math
-
+import numpy as np
 import pytest
 import torch
 from scenes import camera_at, joined, one_splat, random_splats
 
+from recon_cli.config import PRUNE_SCORES, RunConfig
 from recon_cli.render import render
-from recon_cli.train.importance import kept_rows, paper_score, significance
+from recon_cli.train.importance import (
+    Importance,
+    importance_of,
+    lightgaussian_score,
+    paper_score,
+)
+from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.step import TrainView, fuses, gradient_step
+
+CPU = torch.device("cpu")
+
+
+def blank(camera, mask=None):
+    return TrainView(camera, np.zeros((camera.height, camera.width, 3), np.uint8), mask)
+
+
+def scored(name, splats, cameras, *, beta=0.1, backend="torch"):
+    found = importance_of(
+        splats, [blank(camera) for camera in cameras], sh_degree=0, backend=backend)
+    return found.score(name, splats, beta=beta, generator=torch.Generator())
 
 
 def test_the_papers_score_is_hits_times_opacity_times_normalised_volume():
@@ -22,61 +41,110 @@ def test_the_papers_score_is_hits_times_opacity_times_normalised_volume():
         assert score[i].item() == pytest.approx(i * 0.5 * gamma, rel=1e-12)
 
 
+def test_lightgaussians_score_is_not_clamped_and_its_reference_only_scales_it():
+    splats = joined(*[
+        one_splat((0.0, 0.0, 2.0), scale=0.1 * (i + 1), opacity=0.5, color=(0.5, 0.5, 0.5))
+        for i in range(10)])
+    score = lightgaussian_score(torch.arange(10), splats)
+    for i in range(10):  # of ten descending volumes the tenth, the smallest, is taken
+        volume = (0.1 * (i + 1)) ** 3 / 0.1**3
+        assert score[i].item() == pytest.approx(i * 0.5 * volume**0.1, rel=1e-6)
+    plain = torch.arange(10) * 0.5 * splats.scales.double().prod(-1) ** 0.1
+    assert torch.equal(score.argsort(), plain.argsort())
+
+
+def test_the_papers_clamp_ranks_large_gaussians_otherwise_than_lightgaussian():
+    sizes = [0.1] * 18 + [1.0, 3.0]  # the 90th percentile is .1
+    splats = joined(*[
+        one_splat((0.0, 0.0, 2.0), scale=size, opacity=0.5, color=(0.5, 0.5, 0.5))
+        for size in sizes])
+    hits = torch.full((20,), 10)
+    hits[18] = 11
+    assert paper_score(hits, splats, beta=0.1).argmax() == 18
+    assert lightgaussian_score(hits, splats).argmax() == 19
+
+
 def test_a_beta_of_zero_leaves_the_volume_out():
     splats = random_splats(20)
     hits = torch.full((20,), 7)
     assert torch.allclose(paper_score(hits, splats, beta=0.0), 7 * splats.opacities)
 
 
-def test_volumes_beyond_the_range_of_float32_are_still_ranked():
+@pytest.mark.parametrize("of", [lambda h, s: paper_score(h, s, beta=0.1), lightgaussian_score])
+def test_volumes_beyond_the_range_of_float32_are_still_ranked(of):
     splats = random_splats(10).map(lambda tensor: tensor.float())
     splats.log_scales[:] = torch.linspace(-60, -40, 10)[:, None]
-    score = paper_score(torch.ones(10, dtype=torch.int64), splats, beta=0.1)
+    score = of(torch.ones(10, dtype=torch.int64), splats)
     assert torch.isfinite(score).all()
     assert (score > 0).all()
 
 
-def test_a_gaussian_behind_an_opaque_wall_scores_zero():
+@pytest.mark.parametrize("name", ["paper", "lightgaussian", "blend_sum", "blend_max", "loo"])
+def test_a_gaussian_behind_an_opaque_wall_scores_zero(name):
     wall = joined(*[
         one_splat((0.0, 0.0, 2.0 + 0.01 * i), scale=9.0, opacity=0.98, color=(0.5, 0.5, 0.5))
         for i in range(4)])
     hidden = one_splat((0.0, 0.0, 5.0), scale=0.1, opacity=0.9, color=(1.0, 0.0, 0.0))
-    for name in ("paper", "blend_max", "loo"):
-        score = significance(
-            name, joined(wall, hidden), [camera_at(20, 20)], beta=0.1, sh_degree=0,
-            backend="torch", generator=torch.Generator())
-        assert score[4] == 0
-        assert score[0] > 0
+    score = scored(name, joined(wall, hidden), [camera_at(20, 20)])
+    assert score[4] == 0
+    assert score[0] > 0
+
+
+def test_one_gaussian_alone_has_the_score_that_its_picture_gives():
+    splats = one_splat((0.0, 0.0, 2.0), scale=0.3, opacity=0.6, color=(0.9, 0.5, 0.1))
+    camera = camera_at(24, 20)
+    alpha = render(splats, camera, torch.zeros(3, dtype=torch.float64), 0).alpha
+    found = importance_of(splats, [blank(camera)] * 2, sh_degree=0, backend="torch")
+    assert found.views == 2
+    assert found.hits.item() == 2 * (alpha > 0).sum()
+    assert found.blend_sum.item() == pytest.approx(2 * alpha.sum().item())
+    assert found.blend_max.item() == pytest.approx(alpha.max().item())
+    squares = 0.9**2 + 0.5**2 + 0.1**2  # of the colour over black
+    assert found.loo.item() == pytest.approx(2 * squares * alpha.square().sum().item())
+
+
+@pytest.mark.parametrize("name", [name for name in PRUNE_SCORES if name != "random"])
+def test_a_view_whose_mask_ignores_all_adds_nothing(name):
+    splats, camera = random_splats(30), camera_at(30, 20)
+    views = [blank(camera), blank(camera, np.zeros((20, 30), bool))]
+    both, one = (
+        importance_of(splats, some, sh_degree=0, backend="torch").score(
+            name, splats, beta=0.1, generator=torch.Generator()) for some in (views, views[:1]))
+    assert torch.equal(both, one)
+    assert one.max() > 0
 
 
 def test_scores_add_up_over_views():
     splats = random_splats(30)
     cameras = [camera_at(30, 20), camera_at(41, 33, focal=30.0)]
-    args = {"beta": 0.0, "sh_degree": 0, "backend": "torch", "generator": torch.Generator()}
-    both = significance("paper", splats, cameras, **args)
-    parts = [significance("paper", splats, [camera], **args) for camera in cameras]
-    assert torch.allclose(both, parts[0] + parts[1])
-    hits = sum(render(splats, camera, torch.zeros(3, dtype=torch.float64), 0,
-                      scores=True).statistics.hits for camera in cameras)
-    assert torch.allclose(both, hits * splats.opacities)
+    for name in ("blend_sum", "loo", "lightgaussian"):
+        both = scored(name, splats, cameras)
+        parts = [scored(name, splats, [camera]) for camera in cameras]
+        assert torch.allclose(both, parts[0] + parts[1]), name
+    parts = [scored("blend_max", splats, [camera]) for camera in cameras]
+    assert torch.equal(scored("blend_max", splats, cameras), torch.maximum(*parts))
 
 
-def test_exactly_the_asked_share_goes_even_when_all_scores_are_equal():
-    assert kept_rows(torch.ones(10), 0.3).tolist() == [0, 1, 2, 3, 4, 5, 6]
-    assert len(kept_rows(torch.rand(101), 0.66)) == 101 - math.floor(0.66 * 101)
-
-
-def test_the_lowest_scores_go_and_the_order_of_the_rest_stays():
-    assert kept_rows(torch.tensor([5.0, 1.0, 4.0, 2.0, 3.0]), 0.4).tolist() == [0, 2, 4]
-
-
-def test_pruning_everything_leaves_the_most_significant_one():
-    assert kept_rows(torch.tensor([1.0, 3.0, 2.0]), 1.0).tolist() == [1]
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_a_training_step_leaves_the_scores_of_its_view(backend):
+    if backend == "numba":
+        pytest.importorskip("numba")
+    splats = random_splats(60, dtype=torch.float32)
+    mask = np.random.default_rng(0).random((20, 30)) < 0.5
+    view = blank(camera_at(30, 20), mask)
+    optimizer = SplatOptimizer(splats, RunConfig(), 1.0, fused=fuses(backend))
+    _, statistics = gradient_step(backend)(optimizer, view, 0, 0.2, scores=True, loo=True)
+    trained = Importance.zeros(60, CPU)
+    trained.add(statistics)
+    expected = importance_of(splats, [view], sh_degree=0, backend=backend)
+    for name in ("hits", "blend_sum", "blend_max", "loo"):
+        assert torch.allclose(getattr(trained, name), getattr(expected, name)), name
+    assert trained.loo.max() > 0
 
 
 def test_the_random_score_is_seeded():
-    args = {"beta": 0.0, "sh_degree": 0, "backend": "torch"}
     splats = random_splats(8)
-    draws = [significance("random", splats, [], generator=torch.Generator().manual_seed(3), **args)
-             for _ in range(2)]
+    draws = [Importance.zeros(8, CPU).score(
+        "random", splats, beta=0.1, generator=torch.Generator().manual_seed(3))
+        for _ in range(2)]
     assert torch.equal(*draws)

@@ -23,10 +23,13 @@ class Prune:
     Attributes:
         at: share of the run's steps.
         config: which Gaussians go. Its `at` and `recovery` are those of the run.
+        restarts: learning rates start anew for the rest of the run, as in `recon prune`; otherwise
+            the run goes on as if nothing had happened.
     """
 
     at: float
     config: PruneConfig
+    restarts: bool = True
 
 
 @dataclass(frozen=True)
@@ -58,13 +61,15 @@ class Arm:
 
     def record(self) -> dict[str, Any]:
         """Returns what decides about the outcome, as JSON keeps it."""
-        prune = self.prune and {"at": self.prune.at, **self.prune.config.hashed()}
+        prune = self.prune and {
+            "at": self.prune.at, "restarts": self.prune.restarts, **self.prune.config.hashed()}
         return {"name": self.name, "options": dict(self.options), "prune": prune,
                 "tries_degree": self.tries_degree}
 
 
 # LightGaussian, whose score the paper takes over, removes 60% at step 20,000 of 30,000.
-PAPER_PRUNE = Prune(2 / 3, PruneConfig(ratio=0.6, score="paper", at="mid"))
+PAPER_PRUNE = Prune(
+    2 / 3, PruneConfig(ratio=0.6, score="paper", at="mid", rounds=1), restarts=False)
 DEFAULT_PRUNE = Prune(_MID, PruneConfig(at="mid"))
 
 # 3DGS has Gaussians alone; which pixels are trained on is decided for all arms alike

@@ -21,6 +21,7 @@ from recon_cli.stages.fitting import MASK_HINT, load_task
 from recon_cli.stages.planning import model_parts, parts_needed
 from recon_cli.train.fit import Task, fit
 from recon_cli.train.gates import PARTS
+from recon_cli.train.importance import Importance
 from recon_cli.train.plan import first_count
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.start import first_state
@@ -178,10 +179,11 @@ def run_trial(
             state.iteration, round(seconds, 3), round(cpu_seconds, 3), found.gaussians,
             found.bytes, found.psnr_db, found.ssim))
 
-    def advance(task: Task, until: int) -> None:
+    def advance(task: Task, until: int, importance: Importance | None = None) -> None:
         while state.iteration < until:
             stop = min(until, *(stop for stop in stops if stop > state.iteration))
-            fit(state, task, stop, on_step=lambda _state: on_step(), on_report=lambda _report: None)
+            fit(state, task, stop, on_step=lambda _state: on_step(),
+                on_report=lambda _report: None, importance=importance)
             if stop in stops:
                 look()
 

@@ -15,7 +15,7 @@ from recon_cli.scene.splats import Splats
 
 def render(
     splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
-    approximation: Approximation = EXACT,
+    mask: Tensor | None = None, approximation: Approximation = EXACT,
 ) -> RenderOutput:
     """Renders by the contract, or by a cheaper one; see `recon_cli.render.registry.render`.
 
@@ -31,7 +31,7 @@ def render(
     if min(sh_degree, splats.sh_degree) == 0:
         tensors[5] = tensors[5].detach()  # no part of the picture
     rgb, alpha, depth = _Render.apply(
-        *tensors, background, camera, sh_degree, scores, statistics, approximation)
+        *tensors, background, camera, sh_degree, scores, mask, statistics, approximation)
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
@@ -42,7 +42,7 @@ class _Render(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor,
         sh_dc: Tensor, sh_rest: Tensor, background: Tensor, camera: Camera, sh_degree: int,
-        scores: bool, statistics: Statistics, approximation: Approximation,
+        scores: bool, mask: Tensor | None, statistics: Statistics, approximation: Approximation,
     ) -> tuple[Tensor, Tensor, Tensor]:
         tensors = means, quats, log_scales, logit_opacities, sh_dc, sh_rest
         size = camera.height, camera.width
@@ -52,10 +52,11 @@ class _Render(torch.autograd.Function):
         lease.frame.forward(
             Parameters.of(tensors), camera, flat(background).copy(), sh_degree,
             rgb=flat(rgb), alpha=flat(alpha), depth=flat(depth), radii=flat(statistics.radii),
-            approximation=approximation, scores=scores)
+            approximation=approximation, scores=scores,
+            counting=None if mask is None else mask.contiguous().numpy())
         statistics.broken = lease.frame.broken
         if scores:
-            lease.frame.tally(statistics.hits.numpy(), flat(statistics.blend_max))
+            lease.frame.tally(statistics)
         ctx.save_for_backward(*tensors)
         ctx.lease, ctx.statistics, ctx.scores = lease, statistics, scores
         # the output itself would hold its own graph, and with it the frame, for ever
@@ -79,4 +80,4 @@ class _Render(torch.autograd.Function):
         if ctx.needs_input_grad[6]:
             left = 1 - ctx.alpha
             background = (grad_rgb * left[..., None]).sum((0, 1))
-        return (*gradients, background, None, None, None, None, None)
+        return (*gradients, background, None, None, None, None, None, None)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.render.contract import EXACT, Approximation
+from recon_cli.render.contract import EXACT, Approximation, Statistics
 from recon_cli.render.numba import binning
 from recon_cli.render.numba.crew import SCRATCH_FLOATS, aligned, crew
 from recon_cli.render.numba.culling import compact, cull
@@ -107,10 +107,12 @@ class Frame:
         sh_degree: int, *, rgb: NDArray[np.float32], alpha: NDArray[np.float32],
         depth: NDArray[np.float32], radii: NDArray[np.float32],
         approximation: Approximation = EXACT, scores: bool = False,
+        counting: NDArray[np.bool_] | None = None,
     ) -> None:
         """Renders into rgb [H*W*3], alpha [H*W] and depth [H*W]; radii [N] must hold zeros.
 
-        Of `sh_degree` is used what the splats have.
+        Of `sh_degree` is used what the splats have. The scores, in this pass and the next backward
+        one, are taken over the pixels where counting [H, W] is True; over all where it is None.
         """
         self.view = viewpoint(camera)
         stored = splats.stride // 3 if len(splats.sh_rest) else 0
@@ -123,15 +125,19 @@ class Frame:
         self.final = self.take("final", tiles * TILE_PIXELS)
         self.last = self.take("last", tiles * TILE_PIXELS)
         evaluated = np.zeros(1, np.int64)
-        counted = len(self.members) if scores else 0
-        self.hits = self.take("hits", counted, np.int32)
-        self.peaks = self.take("peaks", counted)
-        self.hits[:], self.peaks[:] = 0, 0
+        scored = len(self.members) if scores else 0
+        self.hits = self.take("hits", scored, np.int32)
+        self.weights, self.peaks = self.take("weights", scored), self.take("peaks", scored)
+        self.hits[:], self.weights[:], self.peaks[:] = 0, 0, 0
+        self.counting = self.take("counting", 0 if counting is None else counting.size, np.bool_)
+        if counting is not None:  # a copy: writeable, or kernels would be compiled once more
+            self.counting[:] = counting.reshape(-1)
         crew.run(
             composite, self.tile_start, self.members, self.records, self.view.width,
             self.view.height, self.tiles_x, self.cutoff,
             np.float32(approximation.transmittance_min), background, rgb, alpha, depth,
-            self.final, self.last, scores, self.slots, self.hits, self.peaks, evaluated)
+            self.final, self.last, scores, self.counting, self.slots, self.hits, self.weights,
+            self.peaks, evaluated)
         self.pairs_forward = int(evaluated[0])
 
     def _project(
@@ -183,9 +189,13 @@ class Frame:
         crew.run(binning.fill_tiles, cuts, order, self.rows, span_starts, spans, self.tiles_x,
                  self.slot_start, places, self.members, self.slots, scratch=False)
 
-    def tally(self, hits: NDArray[np.int64], blend_max: NDArray[np.float32]) -> None:
-        """Adds the scores of the last forward pass to hits [N] and blend_max [N], both zeros."""
-        tally(self.ids, self.slot_start, self.hits, self.peaks, hits, blend_max)
+    def tally(self, statistics: Statistics) -> None:
+        """Writes the scores of the last forward pass over those of `statistics`."""
+        found = statistics.hits, statistics.blend_sum, statistics.blend_max
+        for values in found:
+            values.zero_()
+        tally(self.ids, self.slot_start, self.hits, self.weights, self.peaks,
+              *(values.numpy() for values in found))
 
     def backward(
         self, splats: Parameters, gradients: Parameters, *, grad_rgb: NDArray[np.float32],
@@ -203,7 +213,7 @@ class Frame:
             grad_alpha: [H * W], or empty for zeros.
             grad_depth: [H * W], or empty for zeros.
             details: fill absolute_grad and variance.
-            scores: fill loo.
+            scores: fill loo, over the pixels that counted in the forward pass.
             means2d_grad: [N * 2] out.
             absolute_grad: [N * 2] out.
             variance: [N] out.
@@ -214,8 +224,8 @@ class Frame:
         crew.run(
             decompose, self.tile_start, self.members, self.slots, self.records, self.view.width,
             self.view.height, self.tiles_x, self.cutoff, self.background,
-            self.final, self.last, grad_rgb, grad_alpha, grad_depth, details, scores, sums,
-            evaluated)
+            self.final, self.last, grad_rgb, grad_alpha, grad_depth, details, scores,
+            self.counting, sums, evaluated)
         self.pairs_backward = int(evaluated[0])
         crew.run(
             unproject, self.ids, self.block_starts, self.slot_start, sums, self.depths,

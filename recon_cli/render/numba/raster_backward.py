@@ -57,14 +57,15 @@ from recon_cli.render.numba.raster_forward import log2_alpha
 
 _T, _R, _LAST, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH = (i * TILE_PIXELS for i in range(7))
 _BEHIND_RED, _BEHIND_GREEN, _BEHIND_BLUE = (i * TILE_PIXELS for i in range(7, 10))
-_BATCH = 10 * TILE_PIXELS
+_COUNTS = 10 * TILE_PIXELS  # 1 where a pixel counts in the scores, 0 elsewhere
+_BATCH = 11 * TILE_PIXELS
 BACKWARD_FLOATS = _BATCH + BATCH_FLOATS
 
 
 @kernel
 def decompose(counter, tile_start, members, slots, records, width, height, tiles_x, cutoff,
-              background, final, last, grad_rgb, grad_alpha, grad_depth, details, scores, sums,
-              evaluated, scratch):
+              background, final, last, grad_rgb, grad_alpha, grad_depth, details, scores, counting,
+              sums, evaluated, scratch):
     """Sums the gradients of every instance over the pixels of its tile.
 
     Args:
@@ -85,6 +86,7 @@ def decompose(counter, tile_start, members, slots, records, width, height, tiles
         grad_depth: [H * W] dL/ddepth, or empty for zeros.
         details: also sum |s u|, |s y|, s^2 and the number of fragments.
         scores: also sum what leaving one out would change.
+        counting: [H * W] which pixels count in that, or empty for all.
         sums: [E * 16] out by slot, see layout.
         evaluated: [1] pairs of an instance and a pixel are added.
         scratch: of the thread.
@@ -122,10 +124,13 @@ def decompose(counter, tile_start, members, slots, records, width, height, tiles
                     if has_alpha:  # coverage is 1 - T at the end: a colour of -1 behind all
                         behind -= grad_alpha[p]
                     scratch[_R + at + i] = behind
+                    if scores:
+                        counts = len(counting) == 0 or counting[p]
+                        scratch[_COUNTS + at + i] = np.float32(1 if counts else 0)
                     if has_depth:
                         scratch[_G_DEPTH + at + i] = grad_depth[p]
                 else:
-                    for plane in (_G_RED, _G_GREEN, _G_BLUE, _R, _G_DEPTH):
+                    for plane in (_G_RED, _G_GREEN, _G_BLUE, _R, _G_DEPTH, _COUNTS):
                         scratch[plane + at + i] = np.float32(0)
             if scores:
                 store(scratch, _BEHIND_RED + at, spread(background, 0))
@@ -195,7 +200,7 @@ def decompose(counter, tile_start, members, slots, records, width, height, tiles
                         away = spread(batch, i + L_BLUE) - behind
                         store(scratch, _BEHIND_BLUE + at, fma(a, away, behind))
                         error = fma(away, away, error)
-                        loo = fma(weight * weight, error, loo)
+                        loo = fma(weight * weight * load(scratch, _COUNTS + at), error, loo)
                 pairs += (r1 - r0) * TILE_WIDTH
                 to = np.int64(slots[first + k]) * SLOT
                 abs_x = abs_x * spread(batch, i + L_U_X)

@@ -40,8 +40,10 @@ from recon_cli.render.numba.lane_functions import (
     lane_numbers,
     largest,
     lowest_bit,
+    maximum,
     minimum,
     select,
+    total,
 )
 from recon_cli.render.numba.lane_memory import fetch_add, load, spread, store
 from recon_cli.render.numba.lanes import LANES
@@ -54,8 +56,12 @@ from recon_cli.render.numba.layout import (
 )
 
 _T, _FINAL, _LAST, _RED, _GREEN, _BLUE, _DEPTH = (i * TILE_PIXELS for i in range(7))
-_ALPHA = 7 * TILE_PIXELS  # alpha of a row for each instance of a batch
-_BATCH = _ALPHA + BATCH * LANES
+_COUNTS = 7 * TILE_PIXELS  # 1 where a pixel counts in the scores, 0 elsewhere
+_ALPHA = 8 * TILE_PIXELS  # alpha of a row for each instance of a batch
+# Scores of each instance of a batch, column by column: a sum along the row for each row and each
+# of them would take three times as long.
+_HITS, _SUMS, _PEAKS = (_ALPHA + i * BATCH * LANES for i in range(1, 4))
+_BATCH = _ALPHA + 4 * BATCH * LANES
 FORWARD_FLOATS = _BATCH + BATCH_FLOATS
 _ONE = np.float32(1)
 
@@ -79,10 +85,28 @@ def row_bits(batch, row):
     return found
 
 
+@inlined
+def clear_scores(scratch):
+    """Sets the scores of the instances of a batch to zero."""
+    for i in range(_HITS, _BATCH, LANES):
+        store(scratch, i, fill(0.0))
+
+
+@inlined
+def load_counts(scratch, counting, width, height, left, top):
+    """Takes over which pixels of a tile count in the scores."""
+    for r in range(TILE_HEIGHT):
+        for i in range(TILE_WIDTH):
+            ignored = False
+            if len(counting) > 0 and top + r < height and left + i < width:
+                ignored = not counting[(top + r) * width + left + i]
+            scratch[_COUNTS + r * TILE_WIDTH + i] = np.float32(0) if ignored else _ONE
+
+
 @kernel
 def composite(counter, tile_start, members, records, width, height, tiles_x, cutoff, t_min,
-              background, rgb, alpha, depth, final, last, scores, slots, hits, peaks, evaluated,
-              scratch):
+              background, rgb, alpha, depth, final, last, scores, counting, slots, hits, weights,
+              peaks, evaluated, scratch):
     """Composites tile by tile.
 
     Args:
@@ -101,9 +125,11 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
         depth: [H * W] out, sum of alpha T z.
         final: [tiles * TILE_PIXELS] out, T at the end.
         last: [tiles * TILE_PIXELS] out, number of the last instance that contributed, from 1.
-        scores: count hits and find the greatest blend weights.
+        scores: count hits, and sum and compare blend weights.
+        counting: [H * W] which pixels count in the scores, or empty for all.
         slots: [E] slot of each instance.
         hits: [E] out by slot, pixels that the instance contributes to; zeros before.
+        weights: [E] out by slot, sum of alpha T; zeros before.
         peaks: [E] out by slot, greatest alpha T; zeros before.
         evaluated: [1] pairs of an instance and a pixel are added.
         scratch: of the thread.
@@ -129,6 +155,9 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
             store(scratch, _FINAL + at, fill(1.0))
             for plane in range(2, 7):
                 store(scratch, plane * TILE_PIXELS + at, fill(0.0))
+        if scores:
+            clear_scores(scratch)
+            load_counts(scratch, counting, width, height, left, top)
         begin, end = tile_start[tile], tile_start[tile + 1]
         for first in range(begin, end, BATCH):
             load_batch(batch, records, members, first, min(BATCH, end - first), left, top)
@@ -172,9 +201,13 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                     hit = weight > 0.0
                     latest = select(hit, fill(np.float32(first - begin + k + 1)), latest)
                     if scores:
-                        slot = slots[first + k]
-                        hits[slot] += np.int32(count_bits(bits(hit)))
-                        peaks[slot] = max(peaks[slot], largest(weight))
+                        weight = weight * load(scratch, _COUNTS + at)
+                        i = k * LANES
+                        store(scratch, _HITS + i, load(scratch, _HITS + i)
+                              + select(weight > 0.0, fill(1.0), fill(0.0)))
+                        store(scratch, _SUMS + i, load(scratch, _SUMS + i) + weight)
+                        store(scratch, _PEAKS + i,
+                              maximum(load(scratch, _PEAKS + i), weight))
                 store(scratch, _T + at, T)
                 store(scratch, _FINAL + at, kept)
                 store(scratch, _LAST + at, latest)
@@ -184,6 +217,13 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                 store(scratch, _DEPTH + at, z)
                 if bits(t_min <= T) == 0:
                     alive &= ~(np.uint64(1) << np.uint64(r))
+            if scores:
+                for k in range(min(BATCH, end - first)):
+                    slot = slots[first + k]
+                    hits[slot] = np.int32(total(load(scratch, _HITS + k * LANES)))
+                    weights[slot] = total(load(scratch, _SUMS + k * LANES))
+                    peaks[slot] = largest(load(scratch, _PEAKS + k * LANES))
+                clear_scores(scratch)
             if alive == 0:
                 break
         for r in range(TILE_HEIGHT):
@@ -204,9 +244,12 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
 
 
 @kernel
-def tally(ids, slot_start, hits, peaks, total_hits, blend_max):
-    """Sums hits and takes the greatest peak over the slots of each Gaussian."""
+def tally(ids, slot_start, hits, weights, peaks, total_hits, blend_sum, blend_max):
+    """Sums hits and weights and takes the greatest peak over the slots of each Gaussian."""
     for j in range(len(ids)):
+        summed = 0.0  # float64
         for slot in range(slot_start[j], slot_start[j + 1]):
             total_hits[ids[j]] += hits[slot]
+            summed += weights[slot]
             blend_max[ids[j]] = max(blend_max[ids[j]], peaks[slot])
+        blend_sum[ids[j]] = np.float32(summed)

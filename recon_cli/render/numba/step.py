@@ -47,7 +47,7 @@ class PhotometricStep:
         self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
         background: Tensor, sh_degree: int, ssim_weight: float, *,
         mask: NDArray[np.bool_] | None = None, gain: NDArray[np.float32] | None = None,
-        details: bool = False,
+        details: bool = False, scores: bool = False, loo: bool = False,
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
@@ -63,6 +63,9 @@ class PhotometricStep:
             ssim_weight: w in [0, 1].
             mask: [H, W], True where a pixel counts; None where all do.
             details: the statistics absolute_grad and variance are wanted too.
+            scores: hits and blend weights too, over the pixels that count; without it they mean
+                nothing.
+            loo: loo too, likewise.
             gain: [3], what the rendered channels are multiplied by before they are compared; its
                 gradient is left in `log_gain_gradient`. None for ones.
         """
@@ -77,8 +80,11 @@ class PhotometricStep:
         ours = Parameters.of(splats.parameters().values())
         frame.forward(
             ours, camera, flat(background), sh_degree, rgb=rgb, alpha=frame.take("alpha", pixels),
-            depth=frame.take("depth", pixels), radii=flat(statistics.radii))
+            depth=frame.take("depth", pixels), radii=flat(statistics.radii), scores=scores,
+            counting=mask if scores or loo else None)
         statistics.broken = frame.broken
+        if scores:
+            frame.tally(statistics)
         if gain is not None:
             rgb.reshape(height, -1)[:] *= np.tile(gain, width)  # whole rows: ten times faster
         grad_rgb = frame.take("grad_rgb", CHANNELS * pixels)
@@ -99,7 +105,7 @@ class PhotometricStep:
         nothing = frame.take("nothing", 0)
         frame.backward(
             ours, Parameters.of(gradients.parameters().values()), grad_rgb=grad_rgb,
-            grad_alpha=nothing, grad_depth=nothing, details=details, scores=False,
+            grad_alpha=nothing, grad_depth=nothing, details=details, scores=loo,
             means2d_grad=flat(statistics.means2d_grad),
             absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
             loo=flat(statistics.loo))

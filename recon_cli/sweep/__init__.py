@@ -1,0 +1,1 @@
+"""`recon prune --sweep`: what every score costs at every ratio, against controls."""

@@ -1,0 +1,112 @@
+"""`recon prune --sweep`: runs the sweep of a workspace; no result of a stage is touched.
+
+sweep.json and sweep.svg go into the workspace, beside the stages, so that nothing turns stale.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from recon_cli import atomic, execute, pipeline
+from recon_cli.config import PruneConfig
+from recon_cli.errors import TrainingError
+from recon_cli.execute import Job
+from recon_cli.stages import stage
+from recon_cli.stages.context import StageInputs
+from recon_cli.workspace import disk_errors
+
+if TYPE_CHECKING:
+    from recon_cli.stages.course import Course
+    from recon_cli.sweep.measure import Trial
+
+RESULT = "sweep.json"
+PICTURE = "sweep.svg"
+
+logger = logging.getLogger("recon")
+
+
+def sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
+    """Writes sweep.json and sweep.svg into the workspace and returns the table.
+
+    Args:
+        job: whose workspace holds a trained model.
+        config: the options that `recon prune` would run with; score, ratio and limits are swept.
+        ratios: shares that are removed, each in (0, 1).
+
+    Raises:
+        StageError: there is no fresh model.
+        TrainingError: there are no validation views.
+        WorkspaceError: the workspace is in use or cannot be written.
+    """
+    # torch is slow to import; --help does not wait for it
+    from recon_cli.stages.course import course_of
+    from recon_cli.sweep import measure
+
+    root, row = job.workspace.root, stage("prune")
+    pipeline.plan(job.inspect(), "prune")
+    with disk_errors(root, "sweeping"), job.workspace.writing("prune --sweep"):
+        context = execute.context_for(job, row, lambda _done, _total: None)
+        inputs = StageInputs({name: job.workspace.folder(name) for name in row.needs})
+        course = course_of(config, inputs, root, context)
+        if not course.task.validation:
+            raise TrainingError(
+                "A sweep is scored on validation views, but the run has none.",
+                hint="Run `recon train --validation 0.05` first.")
+        start = measure.quality(course.start(), course.task)
+        found: list[Trial] = []
+        with job.progress.bar("sweep", measure.trials(ratios), unit="run") as bar:
+            for trial in measure.sweep(course, ratios):
+                found.append(trial)
+                bar.advance()
+        atomic.write_json(root / RESULT, {
+            "validation_views": len(course.task.validation), "at": config.at,
+            "rounds": course.rounds, "recovery_steps": course.until - course.first,
+            "equal_seconds_of": config.score, "before": dataclasses.asdict(start),
+            "trials": [dataclasses.asdict(trial) for trial in found]})
+        _draw(found, start.psnr_db, root / PICTURE)
+    return f"{_heading(course, start.psnr_db, start.ssim)}\n\n{table(found, config.score)}"
+
+
+def _draw(found: Sequence[Trial], before: float, path: Path) -> None:
+    """Draws the picture, or says what is missing for it."""
+    if importlib.util.find_spec("matplotlib") is None:
+        logger.warning("%s is not drawn: matplotlib is not installed; "
+                       "pip install 'recon-cli[plot]'", path.name)
+        return
+    from recon_cli.sweep.picture import draw
+
+    draw(found, before, path)
+
+
+def _heading(course: Course, psnr_db: float, ssim: float) -> str:
+    gaussians = len(course.start().splats)
+    return (
+        f"PSNR in dB and SSIM on {len(course.task.validation)} validation views, right after the "
+        f"last removal and after {course.until - course.first} steps of recovery with up to "
+        f"{course.rounds} rounds. Before: {gaussians:,} Gaussians, {psnr_db:.2f}, {ssim:.4f}.")
+
+
+def table(found: Sequence[Trial], score: str) -> str:
+    """Returns the trials as a table; the controls are called by what is equal in them."""
+    rows = [["score", "removed", "Gaussians", "steps", "seconds", "PSNR removed", "SSIM removed",
+             "PSNR recovered", "SSIM recovered"]]
+    for one in found:
+        name = one.score
+        if one.removed is None:
+            name = "(no prune, equal steps)" if one.ratio is None else (
+                f"(no prune, seconds of {score} {one.ratio:g})")
+        removed = ["-", "-"] if one.removed is None else [
+            f"{one.removed.psnr_db:.2f}", f"{one.removed.ssim:.4f}"]
+        share = "-" if one.removed is None else f"{one.ratio:.0%}"
+        rows.append([name, share, f"{one.gaussians:,}", f"{one.steps}", f"{one.seconds:.1f}",
+                     *removed, f"{one.recovered.psnr_db:.2f}", f"{one.recovered.ssim:.4f}"])
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(cell.rjust(width) if place else cell.ljust(width)
+                  for place, (cell, width) in enumerate(zip(row, widths, strict=True)))
+        for row in rows)

@@ -1,0 +1,150 @@
+"""Pruning by rank, in rounds, and the rates of the recovery."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scenes import camera_at, random_splats
+
+from recon_cli.config import PRUNE_SCORES, RunConfig
+from recon_cli.train.fit import Task, fit
+from recon_cli.train.importance import importance_of
+from recon_cli.train.pruning import (
+    LAST_ROUND,
+    Recovery,
+    Removal,
+    remaining,
+    removals,
+    remove,
+    rounds_within,
+    scored,
+    survivors,
+)
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.state import new_state
+from recon_cli.train.step import TrainView
+
+CONFIG = RunConfig(iterations=100, max_gaussians=40)
+
+
+def task_of(count=5):
+    rng = np.random.default_rng(0)
+    views = [TrainView(camera_at(20 + i, 16), rng.integers(0, 256, (16, 20 + i, 3), np.uint8))
+             for i in range(count)]
+    return Task(views, [], Recovery(CONFIG, first=100, until=200), 1.0, "torch",
+                torch.device("cpu"))
+
+
+def state_of(splats=None):
+    state = new_state(splats or random_splats(40, dtype=torch.float32), CONFIG, 1.0)
+    state.iteration = 100
+    return state
+
+
+def fitting(task):
+    def advance(state, until, importance):
+        fit(state, task, until, on_step=lambda _: None, on_report=lambda _: None,
+            importance=importance)
+    return advance
+
+
+def test_exactly_the_asked_count_stays_even_when_all_scores_are_equal():
+    assert survivors(torch.ones(10), 7).tolist() == [0, 1, 2, 3, 4, 5, 6]
+
+
+def test_the_lowest_scores_go_and_the_order_of_the_rest_stays():
+    assert survivors(torch.tensor([5.0, 1.0, 4.0, 2.0, 3.0]), 3).tolist() == [0, 2, 4]
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_pruning_everything_leaves_the_most_significant_one(count):
+    assert survivors(torch.tensor([1.0, 3.0, 2.0]), count).tolist() == [1]
+
+
+def test_a_ratio_is_the_share_that_goes_and_one_always_stays():
+    assert remaining(101, 0.66) == 101 - math.floor(0.66 * 101)
+    assert remaining(10, 0.0) == 10
+    assert remaining(10, 1.0) == 1
+    assert remaining(1, 0.5) == 1
+
+
+def test_rounds_remove_the_same_share_each_and_leave_the_rest_of_the_recovery_in_peace():
+    plan = removals(1000, 125, 3, 300)
+    assert plan == (Removal(50, 500), Removal(100, 250), Removal(150, 125))
+    assert plan[-1].after == LAST_ROUND * 300
+
+
+def test_one_round_removes_all_at_once():
+    assert removals(1000, 200, 1, 300) == (Removal(0, 200),)
+
+
+def test_there_is_a_round_an_epoch_within_bounds():
+    assert rounds_within(800, 95) == 4
+    assert rounds_within(0, 95) == 3
+    assert rounds_within(10**6, 95) == 8
+
+
+def test_rounds_that_would_remove_nothing_are_left_out():
+    assert removals(10, 10, 5, 100) == ()
+    plan = removals(10, 8, 5, 100)
+    assert [removal.count for removal in plan] == sorted(
+        {removal.count for removal in plan}, reverse=True)
+    assert plan[-1].count == 8
+
+
+def test_a_recovery_begins_at_the_first_rates_and_ends_at_the_last():
+    run, recovery = Schedule(CONFIG), Recovery(CONFIG, first=100, until=150)
+    assert recovery.means_rate(100) == CONFIG.means_rate
+    assert recovery.means_rate(150) == pytest.approx(run.means_rate(100))
+    assert recovery.rate_factor(101) == 1
+    assert recovery.rate_factor(150) == pytest.approx(run.rate_factor(100))
+
+
+def test_a_recovery_looks_at_full_images_with_all_degrees_and_adds_nothing():
+    recovery = Recovery(CONFIG, first=60, until=100)
+    for iteration in range(61, 101):
+        assert recovery.level(iteration) == 1
+        assert recovery.sh_degree(iteration) == 3
+        assert not recovery.densifies(iteration)
+        assert not recovery.resets(iteration)
+
+
+def test_removed_gaussians_are_gone_and_the_others_keep_their_moments():
+    task, state = task_of(), state_of()
+    fitting(task)(state, 103, None)
+    means, moment = (state.optimizer.tensors()[name].clone()
+                     for name in ("splats.means", "adam.means.exp_avg"))
+    rows = torch.tensor([1, 5, 7])
+    remove(state, rows)
+    assert torch.equal(state.splats.means, means[rows])
+    assert torch.equal(state.optimizer.tensors()["adam.means.exp_avg"], moment[rows])
+    assert moment[rows].abs().max() > 0
+    fitting(task)(state, 106, None)  # and training goes on
+
+
+@pytest.mark.parametrize("name", PRUNE_SCORES)
+def test_scoring_takes_exactly_the_steps_that_it_was_given(name):
+    task, state = task_of(), state_of()
+    score = scored(state, task, 112, name=name, beta=0.1, advance=fitting(task))
+    assert state.iteration == 112
+    assert score.shape == (40,)
+    assert (score >= 0).all()
+    assert score.max() > 0
+
+
+@pytest.mark.parametrize("steps", [0, 2, 5])
+def test_every_view_counts_once_however_few_steps_there_are(steps, monkeypatch):
+    task, state = task_of(), state_of()
+    monkeypatch.setattr(type(state.optimizer), "step", lambda *_, **__: None)  # nothing moves
+    score = scored(state, task, 100 + steps, name="blend_sum", beta=0.1, advance=fitting(task))
+    expected = importance_of(state.splats, task.train, sh_degree=3, backend="torch").blend_sum
+    assert torch.allclose(score, expected)
+
+
+def test_scores_come_from_the_last_epoch_and_not_from_steps_before_it(monkeypatch):
+    task, state = task_of(), state_of()
+    monkeypatch.setattr(type(state.optimizer), "step", lambda *_, **__: None)
+    score = scored(state, task, 113, name="loo", beta=0.1, advance=fitting(task))
+    expected = importance_of(state.splats, task.train, sh_degree=3, backend="torch").loo
+    assert torch.allclose(score, expected)
