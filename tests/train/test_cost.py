@@ -26,9 +26,9 @@ def plan(**changes):
 
 
 def test_a_fixed_cost_is_paid_at_each_step_of_its_level():
-    assert model(_4=(10.0, 0.0)).run_seconds(plan(), 2000) == pytest.approx(3.0, rel=0.02)
-    assert model(_2=(10.0, 0.0)).run_seconds(plan(), 2000) == pytest.approx(2.5, rel=0.02)
-    assert model(_1=(10.0, 0.0)).run_seconds(plan(), 2000) == pytest.approx(4.5, rel=0.02)
+    assert model(_4=(10.0, 0.0)).run_seconds(plan(), 2000) == 0
+    assert model(_2=(10.0, 0.0)).run_seconds(plan(), 2000) == pytest.approx(4.0, rel=0.02)
+    assert model(_1=(10.0, 0.0)).run_seconds(plan(), 2000) == pytest.approx(6.0, rel=0.02)
 
 
 def test_a_run_whose_count_stays_pays_for_it_at_every_step():
@@ -81,7 +81,7 @@ def calibrated(tmp_path, *, seconds=100.0, clock=None, task=None):
 def test_what_every_step_takes_is_found_at_each_level_and_nothing_is_left_behind(tmp_path):
     clock = Ticks()
     cost = calibrated(tmp_path, clock=clock)
-    assert [level.level for level in cost.levels] == [1, 2, 4]
+    assert [level.level for level in cost.levels] == [1, 2]
     for level in cost.levels:
         assert level.ms(30) == pytest.approx(1.0)
         assert level.each_ms == pytest.approx(0.0, abs=1e-6)
@@ -91,11 +91,10 @@ def test_what_every_step_takes_is_found_at_each_level_and_nothing_is_left_behind
 
 def test_when_time_is_used_up_finer_levels_are_told_by_their_pixels(tmp_path):
     cost = calibrated(tmp_path, seconds=0.0)
-    fine, half, coarse = cost.levels
-    assert coarse.fixed_ms == pytest.approx(1.0)
-    assert half.fixed_ms == pytest.approx(4.0)
-    assert fine.fixed_ms == pytest.approx(16.0)
-    assert cost.report.fixed_ms == pytest.approx(16 / 3)
+    fine, half = cost.levels
+    assert half.fixed_ms == pytest.approx(1.0)
+    assert fine.fixed_ms == pytest.approx(4.0)
+    assert cost.report.fixed_ms == pytest.approx(4 / 3)
 
 
 def test_timing_changes_nothing_of_the_run(tmp_path):

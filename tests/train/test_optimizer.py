@@ -13,8 +13,9 @@ from recon_cli.train.optimizer import SplatOptimizer
 BYTES = 1500  # a Gaussian may take in training: what is promised for a million on a laptop
 
 
-def stepped(splats, times=3):
-    optimizer = SplatOptimizer(splats.map(lambda t: t.float()), RunConfig(), extent=2.0)
+def stepped(splats, times=3, densify="reference"):
+    optimizer = SplatOptimizer(
+        splats.map(lambda t: t.float()), RunConfig(densify=densify), extent=2.0)
     for _ in range(times):
         loss = sum(p.square().sum() for p in optimizer.splats.parameters().values())
         loss.backward()
@@ -22,14 +23,15 @@ def stepped(splats, times=3):
     return optimizer
 
 
-def test_the_first_step_moves_each_parameter_by_its_learning_rate():
+@pytest.mark.parametrize(("densify", "scales", "colors"), [("reference", 1, 1), ("budget", 2, 2)])
+def test_the_first_step_moves_each_parameter_by_its_learning_rate(densify, scales, colors):
     splats = random_splats(4).map(lambda tensor: tensor.float())
     before = splats.map(lambda tensor: tensor.clone())
-    optimizer = stepped(splats, times=1)
+    optimizer = stepped(splats, times=1, densify=densify)
     moved = {name: (getattr(before, name) - value).abs().median().item()
              for name, value in optimizer.splats.parameters().items()}
-    rates = {"means": 2e-4, "quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 5e-2,
-             "sh_dc": 2.5e-3, "sh_rest": 1.25e-4}
+    rates = {"means": 2e-4, "quats": 1e-3, "log_scales": scales * 5e-3, "logit_opacities": 5e-2,
+             "sh_dc": colors * 2.5e-3, "sh_rest": colors * 1.25e-4}
     for name, rate in rates.items():
         assert abs(moved[name] - rate) < 0.02 * rate, name
 

@@ -67,11 +67,11 @@ def test_the_same_numbers_given_make_the_same_config():
 
 def test_the_cap_grows_with_the_root_of_the_steps_and_with_the_detail():
     asked = TrainConfig()
-    assert plan.cap(asked, FACTS, 6000) == 60_000
-    assert plan.cap(asked, FACTS, 1500) == 30_000
-    assert plan.cap(asked, replace(FACTS, detail=30_000), 6000) == 30_000
-    assert plan.cap(asked, replace(FACTS, views=2), 6000) == 15_000
-    assert plan.cap(asked, replace(FACTS, detail=0), 6000) == 5000
+    assert plan.cap(asked, FACTS, 3000) == 60_000
+    assert plan.cap(asked, FACTS, 750) == 30_000
+    assert plan.cap(asked, replace(FACTS, detail=30_000), 3000) == 30_000
+    assert plan.cap(asked, replace(FACTS, views=2), 3000) == 15_000
+    assert plan.cap(asked, replace(FACTS, detail=0), 3000) == 5000
     assert plan.cap(TrainConfig(max_gaussians=77), FACTS, 6000) == 77
 
 
@@ -81,9 +81,9 @@ def test_memory_lowers_the_cap():
     assert make_plan(TrainConfig(), replace(FACTS, room=0), COST).max_gaussians == 4
 
 
-def test_a_count_that_grows_begins_with_a_quarter_of_its_cap_and_never_with_more_than_points():
+def test_a_count_that_grows_begins_with_half_of_its_cap_and_never_with_more_than_points():
     config = RunConfig(max_gaussians=80_000)
-    assert plan.first_count(config, 100_000) == 20_000
+    assert plan.first_count(config, 100_000) == 40_000
     assert plan.first_count(config, 9000) == 9000
     assert plan.first_count(replace(config, max_gaussians=50), 100_000) == 50
     assert plan.first_count(replace(config, densify="reference"), 100_000) == 80_000
