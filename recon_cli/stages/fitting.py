@@ -119,15 +119,17 @@ def gaussians_that_fit(scene: Scene, config: RunConfig, ctx: StageContext) -> in
         TrainingError: fewer than two views are left to train on.
     """
     _refuse_too_few_views(scene)
-    one = _memory(scene, dataclasses.replace(config, max_gaussians=1), ctx)
+    one = _memory(scene, config, ctx, gaussians=1)
     return room(one, _free_bytes(ctx))
 
 
-def _memory(scene: Scene, config: RunConfig, ctx: StageContext) -> MemoryEstimate:
+def _memory(
+    scene: Scene, config: RunConfig, ctx: StageContext, *, gaussians: int
+) -> MemoryEstimate:
     views = (*scene.train, *scene.validation)
     width, height = sizes_of([fitted_camera(view.camera, config.max_size) for view in views])[0]
     return estimate(
-        views=len(views), width=width, height=height, gaussians=config.max_gaussians,
+        views=len(views), width=width, height=height, gaussians=gaussians,
         fused=fuses(ctx.backend), sh_degree=config.sh_degree,
         masks=sum(view.mask is not None for view in views))
 
@@ -142,7 +144,8 @@ def _check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
     Raises:
         TrainingError: there is not enough memory.
     """
-    needed, free = _memory(scene, config, ctx), _free_bytes(ctx)
+    needed = _memory(scene, config, ctx, gaussians=config.max_gaussians)
+    free = _free_bytes(ctx)
     logger.info("training takes %s at most; %.0f MB are free", needed.described(), free / 1e6)
     refuse_what_does_not_fit(needed, free)
 
