@@ -12,7 +12,7 @@ from tiny_scene import Shape, make_inputs
 from recon_cli.config import PruneConfig, TrainConfig
 from recon_cli.errors import TrainingError
 from recon_cli.io.ply import read_ply
-from recon_cli.stages import fitting, prune, train
+from recon_cli.stages import fitting, planning, prune, train
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train import fit
 from recon_cli.train.memory import estimate
@@ -60,7 +60,7 @@ def same_bytes(one, other):
 def test_the_plan_is_recorded_with_what_it_was_made_from(done):
     out, summary = done
     plan = json.loads((out / "plan.json").read_text())
-    assert [level["level"] for level in plan["cost"]["levels"]] == [1, 2, 4]
+    assert [level["level"] for level in plan["cost"]["levels"]] == [1, 2]
     assert plan["iterations"] == summary["planned_iterations"] >= 100
     assert plan["max_gaussians"] == summary["max_gaussians"]
     assert plan["seconds"] == summary["estimated_seconds"]
@@ -88,7 +88,7 @@ def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monke
             run(OPEN, inputs, out)
     recorded = (out / "plan.json").read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(train, "calibrate", None)  # would fail if it were called
+        patch.setattr(planning, "calibrate", None)  # would fail if it were called
         summary = run(OPEN, inputs, out)
     assert (out / "plan.json").read_bytes() == recorded
     whole = replace(
@@ -101,7 +101,7 @@ def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monke
 def test_memory_that_is_short_lowers_the_cap_and_says_so(inputs, tmp_path, monkeypatch, caplog):
     needed = estimate(views=9, width=48, height=36, gaussians=5500, fused=True)
     monkeypatch.setattr(fitting, "free_memory_bytes", lambda: needed.total)
-    monkeypatch.setattr(train.plan, "wanted", lambda *_: 9000)
+    monkeypatch.setattr(planning.plan, "wanted", lambda *_: 9000)
     summary = run(TrainConfig(iterations=2), inputs, tmp_path / "out")
     assert summary["max_gaussians"] == pytest.approx(5500, abs=10)
     assert "9,000 would suit" in caplog.text
