@@ -206,7 +206,8 @@ class _Bench:
         schedule = Schedule(config, dataclasses.replace(Schedule(config).recipe, levels=()))
         small = Task([reduced(train[i], LEVEL) for i in rows], [], schedule, task.extent,
                      task.backend, task.device, camera_error=task.camera_error)
-        state = first_state(small, scene.points, scene.colors, most=_POINTS)
+        # reduced views would be reduced once more in the search for what lies far outside
+        state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS, on_step=lambda _: None, on_report=lambda _: None)
         return [_score(state.splats, reduced(view, LEVEL), config, task) for view in held_out]
 

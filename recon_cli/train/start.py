@@ -25,6 +25,7 @@ def first_state(
     colors: NDArray[np.uint8],  # [P, 3]
     *,
     most: int,
+    far: FarContent | None = None,
 ) -> TrainState:
     """Returns the state of a run before its first step; the same for the same task and points.
 
@@ -33,9 +34,13 @@ def first_state(
         points: sparse points in world units.
         colors: of them.
         most: Gaussians that begin at points; fewer where the cap must hold what lies far outside.
+        far: what lies there, where it is known already; taken only if that part is on.
     """
     config = task.schedule.config
-    far = far_content(task.train, points, task.extent) if config.far == "on" else None
+    if config.far != "on":
+        far = None
+    elif far is None:
+        far = far_content(task.train, points, task.extent)
     gains = estimated(task.train, points).log_gains if config.exposure == "on" else None
     splats = first_splats(config, points, colors, far, most=most)
     exposure, poses = _parts(task, gains)
