@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 # A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
 # alone were .07 +- .06 dB apart (17 views, 500 steps at 200 pixels): the errors decide as well.
 THRESHOLD_DB = 0.05
-_ERRORS = 2.0  # standard errors, a chance of about one in forty
+_ERRORS = 1.65  # standard errors, a chance of about one in twenty
 LEAST_VIEWS = 8  # whose mean has a standard error that can be told; fewer, and the split is own
 _SPLIT = 6  # each sixth training view is held out by an own split, or sooner each third or more
 _DENSEST = 3  # of few views; what is left must still hang together
@@ -65,7 +65,7 @@ def decide(
 ) -> Decision:
     """Returns whether the second arm is better than the first.
 
-    On, if the mean gain is above the threshold and above two standard errors of it. The standard
+    On, if the mean gain is above the threshold and above 1.65 standard errors of it. The standard
     error is that of paired differences: views differ by decibels, arms on one view by tenths.
 
     Args:
