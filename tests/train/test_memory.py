@@ -46,9 +46,9 @@ def test_the_error_says_what_to_lower(changes, option):
 
 @pytest.mark.parametrize("fused", [True, False])
 def test_as_many_gaussians_fit_as_there_is_room_for_and_no_more(fused):
-    bare, free = needed(gaussians=0, fused=fused), 1_500_000_000
-    most = room(bare, free, fused=fused)
+    one, free = needed(gaussians=1, fused=fused), 1_500_000_000
+    most = room(one, free)
     refuse_what_does_not_fit(needed(gaussians=most, fused=fused), free)
     with pytest.raises(TrainingError):
         refuse_what_does_not_fit(needed(gaussians=most + 1, fused=fused), free)
-    assert room(bare, 1000, fused=fused) == 0
+    assert room(one, 1000) == 0

@@ -95,7 +95,7 @@ def test_rounds_that_would_remove_nothing_are_left_out():
 
 def test_a_recovery_begins_at_the_first_rates_and_ends_at_the_last():
     run, recovery = Schedule(CONFIG), Recovery(CONFIG, first=100, until=150)
-    assert recovery.means_rate(100) == CONFIG.means_rate
+    assert recovery.means_rate(100) == run.means_rate(0)
     assert recovery.means_rate(150) == pytest.approx(run.means_rate(100))
     assert recovery.rate_factor(101) == 1
     assert recovery.rate_factor(150) == pytest.approx(run.rate_factor(100))
