@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 
+_LEAST_EXTENT = 0.05  # of the median distance of the points; a step aside in a room
+_SAMPLES = 2000  # points looked at
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -56,9 +59,24 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """1.1 times the greatest distance of a training camera from their mean (INRIA 3DGS)."""
+        """1.1 times the greatest distance of a training camera from their mean (INRIA 3DGS).
+
+        At least a twentieth of the median distance of the points from there: cameras in one place
+        have no extent of their own, and rates that are multiplied by it would move nothing.
+        """
         centers = np.stack([view.camera.center for view in self.train])
-        return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+        middle = centers.mean(axis=0)
+        path = 1.1 * np.linalg.norm(centers - middle, axis=1).max()
+        reach = np.median(np.linalg.norm(self.points - middle, axis=1)) if len(self.points) else 0
+        return float(max(path, _LEAST_EXTENT * reach))
+
+    @property
+    def nearness(self) -> float:
+        """Median distance of the points from the nearest training camera, world units."""
+        centers = np.stack([view.camera.center for view in self.train])
+        nearest = np.min(np.linalg.norm(
+            self.points[:: max(1, len(self.points) // _SAMPLES), None] - centers, axis=2), axis=1)
+        return float(np.median(nearest))
 
 
 def split_views(

@@ -20,6 +20,7 @@ from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_masked_image
 from recon_cli.machine import free_memory_bytes
 from recon_cli.metrics import MIN_PIXELS, leaves_enough
+from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
@@ -56,6 +57,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         TrainingError: fewer than two views are left to train on, or memory is short.
     """
     _refuse_too_few_views(scene)
+    _refuse_tiny_units(scene)
     _check_memory(scene, config, ctx)
     train = load_views(scene.train, config, ctx)
     if len(train) < 2:
@@ -73,6 +75,16 @@ def _refuse_too_few_views(scene: Scene) -> None:
         raise TrainingError(
             f"{len(scene.train)} views are left to train on; at least 2 are needed.",
             hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
+
+
+def _refuse_tiny_units(scene: Scene) -> None:
+    """Raises TrainingError where half of the scene lies in front of the rasterizer's near plane."""
+    if scene.nearness < NEAR:
+        raise TrainingError(
+            f"Half of the points are nearer than {scene.nearness:.2g} units to a camera, and what "
+            f"is nearer than {NEAR:g} is not drawn: the units of this scene are too large.",
+            hint="Give it a scale with `recon sfm --scale-between A B METRES`, or scale the poses "
+            "of the data set.")
 
 
 def load_views(
