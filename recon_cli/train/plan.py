@@ -31,6 +31,9 @@ _FULL_AT = 3000  # steps after which there may be a Gaussian for each pixel with
 _VIEWS_EACH = 8  # views that must show a Gaussian, about, to tell where it is
 _FIRST = 0.5  # of the cap, at the start
 _FEWEST = 5000
+# Real Gaussians cover more tiles than those that are timed: ten runs on living, office and fox took
+# 1% less to 17% more than was told without this, 9% more on the mean.
+_LONGER = 1.09
 _ROUND = 100  # counts are told in hundreds
 
 
@@ -130,7 +133,7 @@ def make_plan(
         config = _resolved(asked, iterations, most, first_config(asked).max_size)
         first = first_count(config, facts.points)
         return Plan(iterations, most, config.max_size, first, facts.detail,
-                    round(cost.run_seconds(Schedule(config), first), 2), cost)
+                    round(_LONGER * cost.run_seconds(Schedule(config), first), 2), cost)
 
     if asked.minutes is None:
         return at(first_config(asked).iterations)
