@@ -147,6 +147,9 @@ class TrainConfig(StageConfig):
     sh_degree: int | None = option(
         None, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3,
         automatic="the lowest that a higher one does not beat by enough in a trial")
+    sh_uniform: float = option(
+        0.0, "Gaussians whose colour deviates less over the training views lose their harmonics "
+        "once densification has ended; 0 keeps all.", minimum=0.0, maximum=1.0)
     max_gaussians: int | None = option(
         None, "Densification stops at this count.", unit="Gaussians", minimum=MIN_GAUSSIANS,
         automatic="by the detail of the images, the length of the run and the memory")

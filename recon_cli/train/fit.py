@@ -13,9 +13,11 @@ import torch
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
 from recon_cli.train.early_stop import next_iteration
+from recon_cli.train.gathered import Gathered
 from recon_cli.train.importance import Importance
 from recon_cli.train.pyramid import Pyramid
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.sh import color_spread, needed, reduced, visibility
 from recon_cli.train.state import TrainState
 from recon_cli.train.step import GradientStep, TrainView, gradient_step
 from recon_cli.train.strategies import STRATEGIES
@@ -24,6 +26,7 @@ _REPORT_EVERY = 100  # steps between looks at the validation views, at least
 _REPORTS = 40  # of a long run; each costs a picture of every validation view
 _SKIPPED = 0.02  # share of the run's steps that may come to nothing
 _SKIPPED_FLOOR = 5
+_COLOR_VIEWS = 30  # from which colours are compared
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,26 @@ def _step(
             schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
             factor=schedule.rate_factor(iteration))
     strategy.control(state, task)
+    if iteration == schedule.review:
+        drop_harmonics(state, task)
     return loss
+
+
+def drop_harmonics(state: TrainState, task: Task) -> None:
+    """Takes the harmonics from Gaussians that look alike from all training views.
+
+    (Papantonakis et al. 2024; `train.sh`.) Over a sample of the views.
+    """
+    threshold = task.schedule.config.sh_uniform
+    if threshold <= 0 or len(state.splats.sh_rest) == 0:
+        return
+    every = max(1, -(-len(task.train) // _COLOR_VIEWS))
+    cameras = [view.camera for view in task.train[::every]]
+    splats = state.splats.map(lambda tensor: tensor.detach())
+    spread = color_spread(splats, cameras, visibility(splats, cameras))
+    few, order = reduced(splats, needed(spread, threshold=threshold), colors=spread.mean)
+    state.optimizer.replace(few, order)
+    state.gathered = Gathered.zeros(len(few), few.means.device)
 
 
 def _skip(state: TrainState, task: Task) -> None:

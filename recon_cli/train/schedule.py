@@ -47,6 +47,11 @@ class Schedule:
         """The iteration whose state is kept for pruning."""
         return max(1, round(self.config.mid * self.config.iterations))
 
+    @property
+    def review(self) -> int:
+        """The step after which Gaussians may lose their harmonics: none is added any more."""
+        return int(self.recipe.densify_until * self.config.iterations) + 1
+
     def level(self, iteration: int) -> int:
         """Returns the factor by which images are reduced in this step."""
         before = self.share(iteration - 1)

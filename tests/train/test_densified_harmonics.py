@@ -5,9 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from scenes import random_splats, with_harmonics
+from tiny_task import STRATEGIES, first_state, same, saved_and_loaded, tiny_task
 
+from recon_cli.config import RunConfig
 from recon_cli.scene.splats import with_rows
 from recon_cli.train import budget, mcmc, reference
+from recon_cli.train.fit import fit
 from recon_cli.train.gathered import Gathered
 
 N, COLORED = 40, 13
@@ -66,3 +69,28 @@ def test_halves_of_a_split_have_what_their_parent_has():
     assert torch.equal(result.sh_rest, few.sh_rest.repeat(2, 1, 1))
     assert torch.equal(result.sh_dc[: 2 * COLORED], few.sh_dc[:COLORED].repeat(2, 1))
     assert torch.equal(result.sh_dc[2 * COLORED :], few.sh_dc[COLORED:].repeat(2, 1))
+
+
+@pytest.mark.parametrize("stop", [30, 36, 40])
+def test_harmonics_that_no_view_needs_go_once_densification_has_ended(tmp_path, stop):
+    config = RunConfig(**{**vars(STRATEGIES["budget"]), "sh_uniform": 1.0})
+    whole, part = first_state(config, backend="numba"), first_state(config, backend="numba")
+    task = tiny_task(config, backend="numba")
+    quiet = {"on_step": lambda _: None, "on_report": lambda _: None}
+    fit(whole, task, 36, **quiet)
+    assert len(whole.splats.sh_rest) == len(whole.splats)
+    fit(whole, task, 37, **quiet)
+    assert len(whole.splats.sh_rest) == 0
+    fit(whole, task, 45, **quiet)
+    fit(part, task, stop, **quiet)
+    resumed = saved_and_loaded(part, tmp_path, backend="numba", config=config)
+    fit(resumed, task, 45, **quiet)
+    assert same(whole, resumed)
+
+
+def test_harmonics_stay_where_nothing_is_asked():
+    config = STRATEGIES["budget"]
+    state = first_state(config, backend="numba")
+    fit(state, tiny_task(config, backend="numba"), 45, on_step=lambda _: None,
+        on_report=lambda _: None)
+    assert len(state.splats.sh_rest) == len(state.splats)
