@@ -21,7 +21,7 @@ from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.pyramid import reduced
 from recon_cli.train.step import TrainView
 
-_RADIUS = 100.0  # x extent: a step through the room then moves it by less than a pixel
+_RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart
 _VIEWS = 50  # looked at, at most
 _LEVEL = 4  # images are reduced by this for the search

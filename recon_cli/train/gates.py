@@ -30,10 +30,11 @@ from recon_cli.train.step import TrainView
 from recon_cli.train.trials import Decision, corrected_psnr, decide, skipped, split
 
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
+# One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
 _STEPS = 400
 _POINTS = 5000
 _CAP = 10_000
-_FAR_SHARE = 0.003  # of the directions; a single window across the room is about this
+_FAR_SHARE = 0.003  # of the directions; the window of one room is .012, that of another .045
 PARTS = ("far", "exposure", "poses", "images")
 # Gain from which higher harmonics are worth 45 of 59 parameters. Trials gave .24 dB on photos of a
 # glossy thing (.59 dB in the whole run) and .08 to .12 dB in two rooms (.07 dB in the whole run),
