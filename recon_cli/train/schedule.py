@@ -49,8 +49,11 @@ class Schedule:
 
     @property
     def review(self) -> int:
-        """The step after which Gaussians may lose their harmonics: none is added any more."""
-        return int(self.recipe.densify_until * self.config.iterations) + 1
+        """The step after which Gaussians may lose their harmonics: none is added any more.
+
+        Not after `mid`: a pruned branch must not reorder the Gaussians whose scores it gathers.
+        """
+        return int(self.recipe.densify_until * self.config.iterations)
 
     def level(self, iteration: int) -> int:
         """Returns the factor by which images are reduced in this step."""

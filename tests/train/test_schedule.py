@@ -57,6 +57,13 @@ def test_a_budget_starts_small_and_coarse_and_ends_calm():
     assert not any(plan.resets(i) or plan.deletes_large(i) for i in range(1, 1001))
 
 
+@pytest.mark.parametrize("iterations", [1, 7, 35, 55, 1000, 2999])
+def test_harmonics_are_reviewed_after_the_last_densification_and_not_after_the_middle(iterations):
+    plan = Schedule(RunConfig(iterations=iterations, densify_every=1))
+    added = [i for i in range(1, iterations + 1) if plan.densifies(i)]
+    assert max(added, default=0) <= plan.review <= plan.mid
+
+
 def test_the_target_never_falls_below_what_the_run_began_with():
     plan = Schedule(RunConfig(iterations=1000, max_gaussians=5000))
     assert plan.target(900, 5000) == 5000
