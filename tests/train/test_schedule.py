@@ -57,6 +57,11 @@ def test_a_budget_starts_small_and_coarse_and_ends_calm():
     assert not any(plan.resets(i) or plan.deletes_large(i) for i in range(1, 1001))
 
 
+def test_rates_do_not_fall_where_the_fall_would_be_too_short_to_settle_anything():
+    assert Schedule(RunConfig(iterations=240)).rate_factor(240) == 1
+    assert Schedule(RunConfig(iterations=260)).rate_factor(260) == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize("iterations", [1, 7, 35, 55, 1000, 2999])
 def test_harmonics_are_reviewed_after_the_last_densification_and_not_after_the_middle(iterations):
     plan = Schedule(RunConfig(iterations=iterations, densify_every=1))
