@@ -6,20 +6,15 @@ from pathlib import Path
 
 import click
 
-from recon_cli import options, settings
+from recon_cli import settings
+from recon_cli.bench.training import flags
 from recon_cli.config import ComputeConfig
 from recon_cli.options import Call, pass_call
 from recon_cli.progress import TqdmProgress
 
-_scene = click.Path(path_type=Path)
-
 
 @click.command("study")
-@click.argument("more", metavar="[SCENE]...", nargs=-1, type=_scene)
-@click.option(
-    "--scenes", multiple=True, type=_scene, metavar="SCENE...",
-    help="Workspaces with cameras, or data sets with poses; the words after it are scenes too.  "
-         "[default: none]")
+@flags.scenes
 @click.option(
     "--seeds", type=click.IntRange(min=1), default=5, metavar="N",
     help="Runs of each arm, with seeds 0 to N - 1.  [default: 5]")
@@ -27,21 +22,13 @@ _scene = click.Path(path_type=Path)
     "--iterations", type=click.IntRange(min=1), default=3000, metavar="N",
     help="Steps of every arm where steps are equal.  [default: 3000]")
 @click.option(
-    "--max-size", type=click.IntRange(min=16), default=600, metavar="N",
-    help="Longest side of the images.  [pixels; default: 600]")
-@click.option(
-    "--max-gaussians", type=click.IntRange(min=1), default=60_000, metavar="N",
-    help="Cap of the count.  [default: 60000]")
-@click.option(
     "--clock", type=click.Choice(["wall", "cpu"]), default="wall",
     help="Which seconds are made equal; cpu on a machine that others use too.  [default: wall]")
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("study"),
     help="Folder of finished runs, study.json, study.md and study.svg; what lies there is not run "
          "again.  [default: study]")
-@options.assignments("ingest.frames=200")
-@options.of(ComputeConfig)
-@options.verbosity()
+@flags.settings
 @pass_call
 def study(
     call: Call, more: tuple[Path, ...], scenes: tuple[Path, ...], seeds: int, iterations: int,

@@ -6,21 +6,17 @@ from pathlib import Path
 
 import click
 
-from recon_cli import options, settings
+from recon_cli import settings
+from recon_cli.bench.training import flags
 from recon_cli.config import ComputeConfig
 from recon_cli.options import Call, pass_call
 from recon_cli.progress import TqdmProgress
 
 _file = click.Path(dir_okay=False, path_type=Path)
-_scene = click.Path(path_type=Path)
 
 
 @click.command("train")
-@click.argument("more", metavar="[SCENE]...", nargs=-1, type=_scene)
-@click.option(
-    "--scenes", multiple=True, type=_scene, metavar="SCENE...",
-    help="Workspaces with cameras, or data sets with poses; the words after it are scenes too.  "
-         "[default: none]")
+@flags.scenes
 @click.option(
     "--recipes", multiple=True, metavar="NAME,...",
     help="reference, budget, mcmc, paper, budget-pruned, budget-l1 or budget-degree-1, each with "
@@ -37,12 +33,6 @@ _scene = click.Path(path_type=Path)
 @click.option(
     "--target-db", "targets", multiple=True, type=float, metavar="DB",
     help="PSNR whose time is told; may be repeated.  [default: what all runs of a scene reach]")
-@click.option(
-    "--max-size", type=click.IntRange(min=16), default=600, metavar="N",
-    help="Longest side of the images.  [pixels; default: 600]")
-@click.option(
-    "--max-gaussians", type=click.IntRange(min=1), default=60_000, metavar="N",
-    help="Cap of the count.  [default: 60000]")
 @click.option("--json", "json_file", type=_file, help="Write all figures to FILE.  "
               "[default: nowhere]")
 @click.option(
@@ -52,9 +42,7 @@ _scene = click.Path(path_type=Path)
     "--markdown", type=_file,
     help="Write the tables between the lines `<!-- recon bench: begin -->` and "
          "`<!-- recon bench: end -->` of FILE.  [default: nowhere]")
-@options.assignments("ingest.frames=200")
-@options.of(ComputeConfig)
-@options.verbosity()
+@flags.settings
 @pass_call
 def train(
     call: Call, more: tuple[Path, ...], scenes: tuple[Path, ...], recipes: tuple[str, ...],
