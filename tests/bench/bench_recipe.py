@@ -1,0 +1,136 @@
+"""Trains with a changed recipe and scores: `python tests/bench/bench_recipe.py --help`.
+
+WORKSPACES have their sfm done and are only read. Optional parts are as `--set` says, far content
+on where it is not said; no trial is made, no step is skipped, all views that are not held out are
+trained on. Each row is one change, the first none:
+
+    python tests/bench/bench_recipe.py living --set sh_degree=0 --change means_rate=2 \
+        --change final_from=.6,final_rate=.03 --change max_gaussians=40000
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from recon_cli.bench.training.scenes import Place
+from recon_cli.bench.training.scoring import load_scored, score
+from recon_cli.config import RunConfig
+from recon_cli.render.registry import use_threads
+from recon_cli.scene.scene import Scene
+from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages.fitting import load_task
+from recon_cli.train.fit import Task, fit
+from recon_cli.train.plan import first_count
+from recon_cli.train.recipe import RECIPES, Recipe
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.start import first_state
+from recon_cli.train.state import TrainState
+
+WARM = 20  # steps that load what is compiled
+SHOWN = 20  # training views that are scored, at most
+FIELDS = {field.name for field in dataclasses.fields(Recipe)}
+
+
+def parsed(text: str) -> dict[str, Any]:
+    """Returns {name: value} of `name=value,...`; values are numbers where they can be."""
+    def value(word: str) -> Any:
+        for kind in (int, float):
+            try:
+                return kind(word)
+            except ValueError:
+                pass
+        return word
+
+    return {name: value(word) for name, word in (
+        pair.split("=", 1) for pair in text.split(",") if pair)}
+
+
+def planned(task: Task, changes: dict[str, Any], seed: int) -> Task:
+    """Returns the task with a changed recipe where it has the name, and changed options.
+
+    `half=S` stands for levels=((S, 2),), images at half their size until that share.
+    """
+    changes = dict(changes)
+    if "half" in changes:
+        changes["levels"] = ((changes.pop("half"), 2),)
+    config = dataclasses.replace(task.schedule.config, seed=seed, **{
+        name: value for name, value in changes.items() if name not in FIELDS})
+    recipe = dataclasses.replace(RECIPES[config.densify], **{
+        name: value for name, value in changes.items() if name in FIELDS})
+    return dataclasses.replace(task, schedule=Schedule(config, recipe))
+
+
+def trained(task: Task, scene: Scene) -> TrainState:
+    """Returns the state at the end of a run."""
+    config = task.schedule.config
+    state = first_state(
+        task, scene.points, scene.colors, most=first_count(config, len(scene.points)))
+    fit(state, task, config.iterations, on_step=lambda _: None, on_report=lambda _: None)
+    return state
+
+
+def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: range,
+        ctx: StageContext) -> str:
+    """Returns the means over seeds as a line of a table."""
+    size = task.schedule.config.max_size
+    held_out = load_scored(scene.test, size, ctx)
+    shown = task.train[::max(1, -(-len(task.train) // SHOWN))]
+    found = []
+    for seed in seeds:
+        run = planned(task, changes, seed)
+        begin = time.process_time()
+        state = trained(run, scene)
+        seconds = time.process_time() - begin
+        splats = state.splats.map(lambda tensor: tensor.detach())
+        test, train = (score(splats, views, run.schedule.config.sh_degree, ctx)
+                       for views in (held_out, shown))
+        found.append((test.psnr_db, test.ssim, train.psnr_db, seconds, len(splats)))
+    middle = [statistics.mean(column) for column in zip(*found, strict=True)]
+    spread = f"{statistics.stdev(f[0] for f in found):.2f}" if len(found) > 1 else ""
+    words = ",".join(f"{key}={value}" for key, value in changes.items()) or "nothing"
+    return (f"| {name} | {words} | {middle[0]:.2f} / {middle[1]:.3f} | {spread} | {middle[2]:.2f} "
+            f"| {middle[4]:,.0f} | {middle[3]:.0f} |")
+
+
+@click.command()
+@click.argument("workspaces", nargs=-1, required=True,
+                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--set", "common", multiple=True, help="NAME=VALUE,...: options of all rows.")
+@click.option("--change", "changed", multiple=True, help="NAME=VALUE,...: of one row.")
+@click.option("--seeds", default="1", show_default=True, help="N for 0 to N - 1, or A-B.")
+@click.option("--iterations", default=3000, show_default=True)
+@click.option("--max-size", default=600, show_default=True)
+@click.option("--max-gaussians", default=100_000, show_default=True)
+@click.option("--threads", default=1, show_default=True)
+def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[str, ...],
+         seeds: str, iterations: int, max_size: int, max_gaussians: int, threads: int) -> None:
+    """Print held-out and training PSNR of each change."""
+    use_threads("numba", threads)
+    ctx = StageContext(backend="numba")
+    first, _, last = seeds.partition("-")
+    chosen = range(int(first), int(last) + 1) if last else range(int(first))
+    base = RunConfig(
+        iterations=iterations, max_size=max_size, max_gaussians=max_gaussians, validation=0.0,
+        images="original", far="on", exposure="off", poses="off", early_stop=False)
+    shared = {name: value for text in common for name, value in parsed(text).items()}
+    click.echo("| scene | change | PSNR / SSIM | deviation | training views | Gaussians | CPU s |\n"
+               "|---|---|---:|---:|---:|---:|---:|")
+    for workspace in workspaces:
+        scene = Place(workspace.name, StageInputs(
+            {name: workspace / name for name in ("ingest", "sfm")})).load(base)
+        task = load_task(scene, base, ctx)
+        trained(planned(task, {"iterations": WARM}, 0), scene)
+        for changes in ({}, *map(parsed, changed)):
+            click.echo(row(workspace.name, task, scene, {**shared, **changes}, chosen, ctx))
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
