@@ -23,6 +23,7 @@ from recon_cli.train.pruning import Advance, remaining, removals, remove, scored
 from recon_cli.train.state import TrainState
 
 NONE = "none"  # stands for no score where nothing is removed
+_WARM_STEPS = 10  # before anything is timed: the first steps load kernels and make buffers
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ def sweep(course: Course, ratios: Sequence[float]) -> Iterator[Trial]:
     Equal seconds are those of the score that the options name.
     """
     steps = course.until - course.first
+    _control(course, None, min(_WARM_STEPS, steps))
     idle = _control(course, None, steps)
     yield idle
     for ratio in ratios:
