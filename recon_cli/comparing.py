@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from recon_cli import atomic, pipeline
 from recon_cli.config import DenoiseConfig
 from recon_cli.execute import Job
+from recon_cli.tables import Table
 from recon_cli.workspace import disk_errors
 
 if TYPE_CHECKING:
@@ -85,11 +86,7 @@ def _table(scores: Sequence[Score]) -> str:
             name if own[0].offered else f"({name})", f"{strength:g}" if strength else "-",
             *(f"{one.psnr_db:.1f} {one.edges_kept:4.0%}" for one in own),
             f"{seconds:.2f}"])
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(cell.rjust(width) if place else cell.ljust(width)
-                  for place, (cell, width) in enumerate(zip(row, widths, strict=True)))
-        for row in rows)
+    return Table(tuple(rows[0]), tuple(map(tuple, rows[1:]))).text()
 
 
 def _advice(config: DenoiseConfig, noise: float, chosen: Score | None, gained: float) -> str:

@@ -20,7 +20,8 @@ RECORDS = {"digests", "manifest", "workspace"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "progress": {"errors"},
-    "metrics": {"errors"},
+    "tables": set(),
+    "metrics": {"errors", "tables"},
     "machine": {"errors"},
     "console": {"errors"},
     "fields": {"errors"},
@@ -45,15 +46,16 @@ ALLOWED: dict[str, set[str]] = {
         "settings", "stages", "freshness", "machine", "progress", "render"},
     "pipeline": OPTIONS | RECORDS | {"settings", "stages", "freshness", "execute"},
     "cleaning": RECORDS | {"errors", "execute"},
-    "comparing": OPTIONS | BOTTOM | {"capture", "execute", "pipeline", "workspace"},
+    "comparing": OPTIONS | BOTTOM | {"tables", "capture", "execute", "pipeline", "workspace"},
     "sweep": OPTIONS | BOTTOM | {
-        "metrics", "scene", "render", "train", "stages", "execute", "pipeline", "workspace",
-        "progress"},
+        "metrics", "tables", "scene", "render", "train", "stages", "execute", "pipeline",
+        "workspace", "progress"},
     "doctor": {"errors", "machine", "render"},
     "report": {"doctor", "pipeline"},
     "options": OPTIONS | {"settings"},
     "bench": BOTTOM | OPTIONS | {
-        "settings", "options", "machine", "progress", "metrics", "scene", "render", "train", "io",
+        "settings", "options", "machine", "progress", "metrics", "tables", "scene", "render",
+        "train", "io",
         "stages", "digests", "workspace", "execute", "pipeline"},
     "study": BOTTOM | OPTIONS | {
         "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",

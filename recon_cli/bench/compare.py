@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from recon_cli.bench.result import FIGURES
-from recon_cli.bench.tables import Table, number
+from recon_cli.bench.tables import TitledTable, number
 from recon_cli.errors import ConfigError
 
 _SETTINGS = ("gaussians", "width", "height", "sh_degree")
@@ -36,7 +36,7 @@ def _told(settings: Mapping[str, int], threads: int) -> str:
             f"SH degree {settings['sh_degree']}, {threads} threads")
 
 
-def compared(old: Mapping[str, Any], new: Mapping[str, Any]) -> Table:
+def compared(old: Mapping[str, Any], new: Mapping[str, Any]) -> TitledTable:
     """Returns the table of old, new and old/new for each scene, backend and figure of both.
 
     Args:
@@ -52,7 +52,7 @@ def compared(old: Mapping[str, Any], new: Mapping[str, Any]) -> Table:
                 rows.append((
                     f"{scene} {backend} {figure}", number(was), number(now),
                     number(ratio(was, now))))
-    return Table("Old against new", ("figure", "old", "new", "old / new"), rows)
+    return TitledTable("Old against new", ("figure", "old", "new", "old / new"), rows)
 
 
 def ratio(old: float | None, new: float | None) -> float | None:

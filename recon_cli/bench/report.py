@@ -7,13 +7,13 @@ from collections.abc import Callable
 from recon_cli.bench.accuracy import Accuracy
 from recon_cli.bench.clock import Timing
 from recon_cli.bench.result import BackendResult, Result, SceneResult, Speed
-from recon_cli.bench.tables import Table, number, percent
+from recon_cli.bench.tables import TitledTable, number, percent
 
 _REFERENCE = "torch"  # what the other backends and losses are compared with
 _RATED = {"forward: composite": "forward", "backward: decompose": "backward"}
 
 
-def tables(result: Result) -> list[Table]:
+def tables(result: Result) -> list[TitledTable]:
     """Returns all tables of a result, in the order in which they are read."""
     found = []
     for name, scene in result.scenes.items():
@@ -44,7 +44,7 @@ def _both(speed: Speed) -> float:
     return speed.forward.ms + speed.backward.ms
 
 
-def _figures(where: str, scene: SceneResult, warm_start: Timing | None) -> Table:
+def _figures(where: str, scene: SceneResult, warm_start: Timing | None) -> TitledTable:
     """The figures that are quoted, one row each, a column a backend."""
     backends = scene.backends
     rows = [(what, *(figure(one) for one in backends.values()))
@@ -57,7 +57,7 @@ def _figures(where: str, scene: SceneResult, warm_start: Timing | None) -> Table
         rows.append((f"loss {name}, ms", timed(timing), *[""] * width))
         if fused and timing is not fused:
             rows.append((f"loss {name} : fused", _ratio(timing.ms, fused.ms), *[""] * width))
-    return Table(f"Figures ({where})", ("what", *backends), rows)
+    return TitledTable(f"Figures ({where})", ("what", *backends), rows)
 
 
 def _quoted(scene: SceneResult) -> list[tuple[str, Callable[[BackendResult], str]]]:
@@ -104,7 +104,7 @@ def _millions(pairs: tuple[int, int] | None, which: int) -> str:
     return number(pairs[which] / 1e6 if pairs else None)
 
 
-def _stages(where: str, scene: SceneResult) -> Table:
+def _stages(where: str, scene: SceneResult) -> TitledTable:
     """Every stage of every backend, with one thread and with all."""
     threads = next(iter(scene.backends.values())).speed.threads
     several = threads > 1 and _has_core(scene)  # otherwise both columns would say the same
@@ -117,7 +117,7 @@ def _stages(where: str, scene: SceneResult) -> Table:
                 (f"{name} {part}", *(timed(_time(speed, part)) for speed in speeds),
                  *_rates(_core(one), part)) for part in (label, *parts)]
     columns = ("ms, 1 thread", f"ms, {threads} threads") if several else ("ms",)
-    return Table(
+    return TitledTable(
         f"Stages ({where})", ("stage", *columns, "Gpairs/s a core", "of peak"), rows)
 
 
@@ -137,11 +137,11 @@ def _rates(speed: Speed, part: str) -> tuple[str, str]:
 _ERRORS = ("image max", "image RMS", "pixels > 1e-5", "gradient rel.", "worst", "gradient 1 - cos")
 
 
-def _errors(where: str, scene: SceneResult) -> Table:
+def _errors(where: str, scene: SceneResult) -> TitledTable:
     """Every backend against the oracle."""
     rows = [(name, number(_both(one.speed)), *_accuracy_cells(one.accuracy))
             for name, one in scene.backends.items()]
-    return Table(f"Error against float64 ({where})", ("backend", "ms", *_ERRORS), rows)
+    return TitledTable(f"Error against float64 ({where})", ("backend", "ms", *_ERRORS), rows)
 
 
 def _accuracy_cells(found: Accuracy) -> tuple[str, ...]:
@@ -151,13 +151,13 @@ def _accuracy_cells(found: Accuracy) -> tuple[str, ...]:
             found.gradient_worst, number(1 - found.gradient_cosine, 2))
 
 
-def _variants(where: str, scene: SceneResult) -> Table:
+def _variants(where: str, scene: SceneResult) -> TitledTable:
     """Every approximation against the oracle, and what it saves."""
     contract = scene.variants[0].time
     rows = []
     for one in scene.variants:
         saved = None if one.time is None or contract is None else contract.ms - one.time.ms
         rows.append((one.name, timed(one.time), number(saved, 2), *_accuracy_cells(one.accuracy)))
-    return Table(
+    return TitledTable(
         f"Approximations on {scene.variants_of} ({where})",
         ("what", "ms", "ms saved", *_ERRORS), rows)

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from recon_cli.tables import Table
+
 
 @dataclass(frozen=True)
-class Table:
-    """A titled table; the first column is text, the others are figures.
+class TitledTable:
+    """A table with a title.
 
     Attributes:
         title: what it is about.
         header: of the columns.
-        rows: cells, as many in each as the header has.
+        rows: cells, as many in each as the header has; the first is text, the others figures.
     """
 
     title: str
@@ -22,20 +24,15 @@ class Table:
 
     def text(self) -> str:
         """Returns aligned columns under the title."""
-        lines = [self.header, *self.rows]
-        widths = [max(len(line[i]) for line in lines) for i in range(len(self.header))]
-        shown = [
-            "  ".join(cell.rjust(width) if i else cell.ljust(width)
-                      for i, (cell, width) in enumerate(zip(line, widths, strict=True))).rstrip()
-            for line in lines]
-        return "\n".join([self.title, *shown])
+        return f"{self.title}\n{self._table.text()}"
 
     def markdown(self) -> str:
         """Returns a pipe table under a heading."""
-        rule = ["---", *["---:"] * (len(self.header) - 1)]
-        lines = [list(self.header), rule, *[list(row) for row in self.rows]]
-        return "\n".join([
-            f"### {self.title}", "", *("| " + " | ".join(line) + " |" for line in lines)])
+        return f"### {self.title}\n\n{self._table.markdown()}".rstrip()
+
+    @property
+    def _table(self) -> Table:
+        return Table(self.header, tuple(self.rows))
 
 
 def number(value: float | None, digits: int = 3) -> str:

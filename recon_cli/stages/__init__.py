@@ -56,7 +56,7 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),
-    Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 1, False,
+    Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 2, False,
           "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("sfm", "train"), ("prune",), ExportConfig, 2, False,
           "recon_cli.stages.export"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from recon_cli.bench.tables import Table
+from recon_cli.bench.tables import TitledTable
 from recon_cli.bench.training.arms import Arm
 from recon_cli.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.study.intervals import Difference, Spread
@@ -50,7 +50,7 @@ def head(result: Result) -> str:
             f"run on {' and '.join(result.machines)}")
 
 
-def scores(result: Result, comparison: str) -> Table:
+def scores(result: Result, comparison: str) -> TitledTable:
     """Returns the table of means and standard deviations."""
     header = ("scene, arm", *(name for label, _, _ in _COLUMNS for name in (label, "sd")), "steps",
               *(label for label, _, _ in _COSTS))
@@ -62,10 +62,10 @@ def scores(result: Result, comparison: str) -> Table:
             costs = [f"{result.spread(row, comparison, arm, figure).mean:,.{digits}f}"
                      for _, figure, digits in (("steps", "steps", 0), *_COSTS)]
             rows.append((f"{row}, {arm.label}", *(cell for pair in found for cell in pair), *costs))
-    return Table(f"Scores at {comparison}", header, rows)
+    return TitledTable(f"Scores at {comparison}", header, rows)
 
 
-def differences(result: Result, comparison: str) -> Table:
+def differences(result: Result, comparison: str) -> TitledTable:
     """Returns the table of paired differences with their intervals."""
     header = ("scene, arm - arm", *(
         name for label, _, _ in _COLUMNS for name in (label, "95% from", "to")))
@@ -75,7 +75,7 @@ def differences(result: Result, comparison: str) -> Table:
             cells = [cell for _, figure, digits in _COLUMNS for cell in _interval(
                 result.difference(row, comparison, ours, theirs, figure), digits)]
             rows.append((f"{row}, {ours.label} - {theirs.label}", *cells))
-    return Table(f"Differences at {comparison}", header, rows)
+    return TitledTable(f"Differences at {comparison}", header, rows)
 
 
 def words(result: Result, comparison: str) -> list[str]:
@@ -102,13 +102,13 @@ def _sentence(
            f"{ours.label} is {found.shown}."
 
 
-def beside_the_paper(result: Result) -> Table | None:
+def beside_the_paper(result: Result) -> TitledTable | None:
     """Returns the paper's figures beside ours, None where no scene has a name of theirs."""
     rows = list(_published_rows(result))
     header = ("scene", "paper: 3DGS dB", "SSIM", "theirs dB", "SSIM", "gain dB", "SSIM",
               "here: 3DGS dB", "SSIM", "paper's prune dB", "SSIM", "gain dB", "SSIM")
     title = f"The paper's Table I beside this study, {EQUAL_STEPS}"
-    return Table(title, header, rows) if rows else None
+    return TitledTable(title, header, rows) if rows else None
 
 
 def _published_rows(result: Result) -> Iterator[tuple[str, ...]]:

@@ -18,6 +18,7 @@ from recon_cli.errors import TrainingError
 from recon_cli.execute import Job
 from recon_cli.stages import stage
 from recon_cli.stages.context import StageInputs
+from recon_cli.tables import Table
 from recon_cli.workspace import disk_errors
 
 if TYPE_CHECKING:
@@ -105,8 +106,4 @@ def table(found: Sequence[Trial], score: str) -> str:
         share = "-" if one.removed is None else f"{one.ratio:.0%}"
         rows.append([name, share, f"{one.gaussians:,}", f"{one.steps}", f"{one.seconds:.1f}",
                      *removed, f"{one.recovered.psnr_db:.2f}", f"{one.recovered.ssim:.4f}"])
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(cell.rjust(width) if place else cell.ljust(width)
-                  for place, (cell, width) in enumerate(zip(row, widths, strict=True)))
-        for row in rows)
+    return Table(tuple(rows[0]), tuple(map(tuple, rows[1:]))).text()

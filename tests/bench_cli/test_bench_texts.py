@@ -26,7 +26,7 @@ from recon_cli.bench.result import (
     VariantResult,
     read_record,
 )
-from recon_cli.bench.tables import Table, number, percent
+from recon_cli.bench.tables import TitledTable, number, percent
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
 
 EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)
@@ -108,7 +108,7 @@ def test_numbers_keep_their_digits() -> None:
 
 
 def test_a_table_is_aligned_as_text_and_piped_as_markdown() -> None:
-    table = Table("Title", ("what", "n"), [("one", "1"), ("three", "3.5")])
+    table = TitledTable("Title", ("what", "n"), [("one", "1"), ("three", "3.5")])
     assert table.text() == "Title\nwhat     n\none      1\nthree  3.5"
     assert table.markdown() == (
         "### Title\n\n| what | n |\n| --- | ---: |\n| one | 1 |\n| three | 3.5 |")

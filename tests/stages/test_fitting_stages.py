@@ -24,7 +24,7 @@ from recon_cli.errors import (
 from recon_cli.io.images import read_image
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.metrics import psnr, ssim
-from recon_cli.stages import course, evaluate, export, fitting, prune, train
+from recon_cli.stages import course, evaluate, export, fitting, held_out, prune, train
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.train.state import save_state
 
@@ -193,10 +193,12 @@ def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):
             truth = read_image(out / "truth" / view["name"], 48, 36)
             original = inputs.folders["sfm"] / "undistorted" / "images" / view["name"]
             assert np.array_equal(truth, read_image(original, 48, 36))
-            # the saved render is rounded to 8 bits, the score is not
             image = (shown / 255.0).astype(np.float32)
+            assert view["psnr_8bit_db"] == pytest.approx(psnr(image, truth), abs=1e-5)
+            # the saved render is rounded to 8 bits, the other scores are not
             assert view["psnr_db"] == pytest.approx(psnr(image, truth), abs=0.15)
             assert view["ssim"] == pytest.approx(ssim(image, truth), abs=0.01)
+            assert view["ssim_padded"] == pytest.approx(ssim(image, truth, padded=True), abs=0.01)
         assert model["psnr_db"] == pytest.approx(
             np.mean([view["psnr_db"] for view in model["views"]]))
         assert model["bytes"] == (
@@ -206,7 +208,24 @@ def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):
     assert "3DGS" in table
     assert "ours (pruned)" in table
     assert "scikit-image" in table
+    assert "INRIA" in table
+    assert "LPIPS: not measured" in table  # no test has its weights
+    assert f"held out {metrics['models']['base']['psnr_db']:.2f} dB: a gap of" in table
+    gained = [pruned["psnr_db"] - base["psnr_db"] for base, pruned in zip(
+        *(metrics["models"][name]["views"] for name in ("base", "pruned")), strict=True)]
+    assert metrics["pruned_minus_base"]["psnr_db"]["mean"] == pytest.approx(np.mean(gained))
+    assert min(gained) <= metrics["pruned_minus_base"]["psnr_db"]["low"] <= np.mean(gained)
+    assert "data set & PSNR 3DGS & PSNR ours" in (out / "metrics.tex").read_text()
     assert len((out / "metrics.csv").read_text().splitlines()) == 1 + 2 * (VIEWS // 4 + 1)
+
+
+def test_views_that_training_saw_are_scored_beside_the_held_out_ones(inputs, tmp_path):
+    run(evaluate, EvaluateConfig(), without(inputs, "prune"), tmp_path / "out")
+    model = json.loads((tmp_path / "out" / "metrics.json").read_text())["models"]["base"]
+    log = (inputs.folders["train"] / "log.jsonl").read_text().splitlines()
+    assert model["seen_psnr_db"]["validation"] == pytest.approx(
+        json.loads(log[-1])["validation_psnr_db"], abs=1e-3)
+    assert model["seen_psnr_db"]["training"] > model["psnr_db"]
 
 
 def test_scores_are_against_the_original_pixels_also_where_training_saw_denoised_ones(
@@ -242,7 +261,7 @@ def test_a_held_out_frame_without_a_camera_is_named(inputs, tmp_path, caplog):
 
 
 def test_views_too_small_to_score_are_a_usage_error(inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate, "MIN_SIDE", 13)  # 16 pixels wide are 12 high here
+    monkeypatch.setattr(held_out, "MIN_SIDE", 13)  # 16 pixels wide are 12 high here
     with pytest.raises(ConfigError, match="16x12 pixels are too small") as caught:
         run(evaluate, EvaluateConfig(max_size=16), inputs, tmp_path / "out")
     assert "--max-size" in caught.value.hint

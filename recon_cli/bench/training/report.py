@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from recon_cli.bench.clock import timing_of
-from recon_cli.bench.tables import Table, number
+from recon_cli.bench.tables import TitledTable, number
 from recon_cli.bench.training.result import ArmResult, Result, SceneResult
 
 
@@ -15,7 +15,7 @@ def head(result: Result) -> str:
             "brackets; scored on validation views, scoring not timed")
 
 
-def tables(result: Result) -> list[Table]:
+def tables(result: Result) -> list[TitledTable]:
     """Returns one table a scene."""
     return [_scene(name, scene, result) for name, scene in result.scenes.items()]
 
@@ -30,13 +30,13 @@ def middle(values: Sequence[float | None], digits: int = 3) -> str:
     return shown if len(known) == len(values) else f"{shown}, {len(known)} of {len(values)}"
 
 
-def _scene(name: str, scene: SceneResult, result: Result) -> Table:
+def _scene(name: str, scene: SceneResult, result: Result) -> TitledTable:
     targets = result.targets_of(scene)
     header = ("recipe", *(f"{kind} to {db:g} dB" for db in targets for kind in ("s", "CPU s")),
               "PSNR dB", "SSIM", "Gaussians", "MB", "steps", "s", "CPU s")
     title = (f"{name}: {scene.views} validation views at {scene.width}x{scene.height}, "
              f"at most {result.base.max_gaussians:,} Gaussians")
-    return Table(title, header, [_row(one, targets) for one in scene.arms.values()])
+    return TitledTable(title, header, [_row(one, targets) for one in scene.arms.values()])
 
 
 def _row(one: ArmResult, targets: Sequence[float]) -> tuple[str, ...]:

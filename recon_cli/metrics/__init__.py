@@ -1,0 +1,40 @@
+"""Scores of rendered views, and the tables that show them."""
+
+from recon_cli.metrics.bootstrap import PairedDifference, paired_bootstrap
+from recon_cli.metrics.quality import (
+    MASK_CONVENTION,
+    MIN_PIXELS,
+    MIN_SIDE,
+    PSNR_8BIT_CONVENTION,
+    PSNR_CONVENTION,
+    SSIM_CONVENTION,
+    SSIM_PADDED_CONVENTION,
+    as_bytes,
+    leaves_enough,
+    psnr,
+    ssim,
+)
+from recon_cli.metrics.scores import ModelScore, ViewScore
+from recon_cli.metrics.tables import csv_table, model_table, paper_table, view_table
+
+__all__ = [
+    "MASK_CONVENTION",
+    "MIN_PIXELS",
+    "MIN_SIDE",
+    "PSNR_8BIT_CONVENTION",
+    "PSNR_CONVENTION",
+    "SSIM_CONVENTION",
+    "SSIM_PADDED_CONVENTION",
+    "ModelScore",
+    "PairedDifference",
+    "ViewScore",
+    "as_bytes",
+    "csv_table",
+    "leaves_enough",
+    "model_table",
+    "paired_bootstrap",
+    "paper_table",
+    "psnr",
+    "ssim",
+    "view_table",
+]
