@@ -11,7 +11,6 @@ from pathlib import Path
 import click
 
 from recon_cli import __version__, cleaning, comparing, console, doctor, options, pipeline, report
-from recon_cli import settings as layers
 from recon_cli.bench.command import bench
 from recon_cli.config import (
     ComputeConfig,
@@ -25,13 +24,13 @@ from recon_cli.config import (
 )
 from recon_cli.errors import ReconError
 from recon_cli.options import Call, pass_call
-from recon_cli.pipeline import Job, Outcome, Target
-from recon_cli.progress import TqdmProgress
-from recon_cli.settings import C, Settings
+from recon_cli.pipeline import Job
+from recon_cli.settings import Settings
 from recon_cli.stages import STAGES
 from recon_cli.study.command import study
 from recon_cli.sweep import command as sweeping
-from recon_cli.workspace import SETTINGS, Workspace
+from recon_cli.verbs import beside, explicit, perform
+from recon_cli.workspace import Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # what the paper does: prune while training goes on
@@ -84,67 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logger.removeHandler(handler)
 
 
-def _explicit(call: Call) -> Settings:
-    """Returns what recon.toml, --config and --set set, checked."""
-    inside = call.workspace / SETTINGS
-    found = [path for path in (inside if inside.exists() else None, call.config_file) if path]
-    explicit = layers.merged([*map(layers.read_settings, found), call.assigned])
-    layers.check(explicit)
-    return explicit
-
-
-def _perform(
-    call: Call,
-    verb: str,
-    stages: Sequence[str],
-    *,
-    sources: tuple[Path, ...] = (),
-    base: Settings | None = None,
-    forced: Settings | None = None,
-) -> None:
-    """Runs stages one after the other, or prints their options.
-
-    Args:
-        call: what was typed.
-        verb: what others who want the workspace are told.
-        stages: by name, in the order of the table.
-        sources: the user's files, for ingest.
-        base: defaults of the verb; recon.toml, --config and options win over them.
-        forced: what the verb itself means; it wins over everything.
-    """
-    explicit = _explicit(call)
-    values = layers.merged([base or {}, explicit, call.settings, forced or {}])
-    rows = [row for row in STAGES if row.name in stages]
-    configs = {row.name: layers.build(row.config, values) for row in rows}
-    compute = layers.build(ComputeConfig, values)
-    if call.print_config:
-        click.echo(layers.to_toml({**configs, "compute": compute}), nl=False)
-        return
-    job = Job(Workspace(call.workspace), explicit, compute, TqdmProgress(), _tell, STAGES)
-    targets = [
-        Target(row.name, configs[row.name], () if row.needs else sources) for row in rows]
-    pipeline.run(job, verb, targets, again=call.again)
-    if "evaluate" in stages:
-        click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
-
-
-def _beside(call: Call, kind: type[C]) -> tuple[Job, C]:
-    """Returns what a command needs that only looks at a stage, and the stage's options."""
-    explicit = _explicit(call)
-    values = layers.merged([explicit, call.settings])
-    compute = layers.build(ComputeConfig, values)
-    job = Job(Workspace(call.workspace), explicit, compute, TqdmProgress(), table=STAGES)
-    return job, layers.build(kind, values)
-
-
-def _tell(outcome: Outcome) -> None:
-    if outcome.ran:
-        run = outcome.manifest.run
-        click.echo(report.summary_line(outcome.stage, run.summary, run.seconds))
-    else:
-        click.echo(f"{outcome.stage} is up to date")
-
-
 _inputs = click.argument(
     "inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))
 
@@ -159,7 +97,7 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
     Each video and folder gets intrinsics of its own. A COLMAP model, transforms.json, Replica or
     ScanNet is told by its layout. Without INPUT, that of the last time is read again.
     """
-    _perform(call, "ingest", ["ingest"], sources=inputs)
+    perform(call, "ingest", ["ingest"], sources=inputs)
 
 
 @cli.command()
@@ -169,9 +107,9 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 def denoise(call: Call, compare: bool) -> None:
     """Filter noisy frames and pass the others through."""
     if compare:
-        click.echo(comparing.compare_filters(*_beside(call, DenoiseConfig)))
+        click.echo(comparing.compare_filters(*beside(call, DenoiseConfig)))
         return
-    _perform(call, "denoise", ["denoise"])
+    perform(call, "denoise", ["denoise"])
 
 
 @cli.command()
@@ -179,7 +117,7 @@ def denoise(call: Call, compare: bool) -> None:
 @pass_call
 def sfm(call: Call) -> None:
     """Find cameras and a sparse point cloud."""
-    _perform(call, "sfm", ["sfm"])
+    perform(call, "sfm", ["sfm"])
 
 
 @cli.command()
@@ -193,11 +131,11 @@ def sfm(call: Call) -> None:
 def train(call: Call, with_prune: bool) -> None:
     """Fit Gaussians; denoise and sfm run first where needed."""
     if with_prune:
-        _perform(call, "train --prune", ["train", "prune"], forced=MID)
+        perform(call, "train --prune", ["train", "prune"], forced=MID)
         return
     for name in call.settings.get("prune", {}):
         raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
-    _perform(call, "train", ["train"])
+    perform(call, "train", ["train"])
 
 
 @cli.command()
@@ -207,9 +145,9 @@ def train(call: Call, with_prune: bool) -> None:
 def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
     """Remove the least important Gaussians; the rest recovers."""
     if sweep:
-        click.echo(sweeping.sweep(*_beside(call, PruneConfig), ratios))
+        click.echo(sweeping.sweep(*beside(call, PruneConfig), ratios))
         return
-    _perform(call, "prune", ["prune"])
+    perform(call, "prune", ["prune"])
 
 
 @cli.command("eval")
@@ -217,7 +155,7 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 @pass_call
 def evaluate(call: Call) -> None:
     """Score every model on the held-out views."""
-    _perform(call, "eval", ["evaluate"])
+    perform(call, "eval", ["evaluate"])
 
 
 @cli.command()
@@ -225,7 +163,7 @@ def evaluate(call: Call) -> None:
 @pass_call
 def export(call: Call) -> None:
     """Write a .ply that other viewers open, and check it."""
-    _perform(call, "export", ["export"])
+    perform(call, "export", ["export"])
 
 
 @cli.command("run")
@@ -245,7 +183,7 @@ def run_all(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
     INPUT is what `recon ingest` takes. Without it, that of the last time is read again.
     """
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
-    _perform(call, "run", stages, sources=inputs, base=MID)
+    perform(call, "run", stages, sources=inputs, base=MID)
 
 
 @cli.command()
@@ -257,7 +195,7 @@ def run_all(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
 def demo(call: Call) -> None:
     """Do everything on the bundled room video."""
     stages = [row.name for row in STAGES]
-    _perform(call, "demo", stages, sources=(SAMPLE,), base=MID)
+    perform(call, "demo", stages, sources=(SAMPLE,), base=MID)
     click.echo(f"The scene is in {call.workspace / 'export' / 'splats.ply'}")
 
 
@@ -270,7 +208,7 @@ def demo(call: Call) -> None:
 @pass_call
 def status(call: Call, as_json: bool) -> None:
     """Show what is fresh, stale and why, partial, or missing."""
-    job = Job(Workspace(call.workspace), _explicit(call), table=STAGES)
+    job = Job(Workspace(call.workspace), explicit(call), table=STAGES)
     stages = pipeline.status(job)
     if as_json:
         click.echo(json.dumps({

@@ -60,13 +60,16 @@ ALLOWED: dict[str, set[str]] = {
     "study": BOTTOM | OPTIONS | {
         "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
         "execute", "bench"},
+    "verbs": OPTIONS | {
+        "settings", "options", "pipeline", "report", "progress", "stages", "workspace"},
     "cli": OPTIONS | {
+        "verbs",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study", "sweep"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "options", "bench", "study", "console"},
+    "click": {"cli", "verbs", "options", "bench", "study", "console"},
     "matplotlib": {"bench", "study", "sweep"},
     "numba": {"render"},
     "llvmlite": {"render"},

@@ -9,7 +9,7 @@ import fake_stages
 import pytest
 from fake_stages import NAMES
 
-from recon_cli import __version__, cli, pipeline
+from recon_cli import __version__, cli, pipeline, verbs
 from recon_cli.cli import main
 from recon_cli.pipeline import StageStatus
 
@@ -20,7 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 def _fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fake_stages.actions.clear()
     fake_stages.ran.clear()
-    monkeypatch.setattr(cli, "STAGES", fake_stages.TABLE)
+    for module in (cli, verbs):
+        monkeypatch.setattr(module, "STAGES", fake_stages.TABLE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("RECON_WORKSPACE", raising=False)
     (tmp_path / "room.mp4").write_text("a video")

@@ -1,0 +1,80 @@
+"""What verbs have in common: options from their layers, a job, and stages that are brought up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from recon_cli import pipeline, report
+from recon_cli import settings as layers
+from recon_cli.config import ComputeConfig
+from recon_cli.options import Call
+from recon_cli.pipeline import Job, Outcome, Target
+from recon_cli.progress import TqdmProgress
+from recon_cli.settings import C, Settings
+from recon_cli.stages import STAGES
+from recon_cli.workspace import SETTINGS, Workspace
+
+
+def explicit(call: Call) -> Settings:
+    """Returns what recon.toml, --config and --set set, checked."""
+    inside = call.workspace / SETTINGS
+    found = [path for path in (inside if inside.exists() else None, call.config_file) if path]
+    explicit = layers.merged([*map(layers.read_settings, found), call.assigned])
+    layers.check(explicit)
+    return explicit
+
+
+def perform(
+    call: Call,
+    verb: str,
+    stages: Sequence[str],
+    *,
+    sources: tuple[Path, ...] = (),
+    base: Settings | None = None,
+    forced: Settings | None = None,
+) -> None:
+    """Runs stages one after the other, or prints their options.
+
+    Args:
+        call: what was typed.
+        verb: what others who want the workspace are told.
+        stages: by name, in the order of the table.
+        sources: the user's files, for ingest.
+        base: defaults of the verb; recon.toml, --config and options win over them.
+        forced: what the verb itself means; it wins over everything.
+    """
+    given = explicit(call)
+    values = layers.merged([base or {}, given, call.settings, forced or {}])
+    rows = [row for row in STAGES if row.name in stages]
+    configs = {row.name: layers.build(row.config, values) for row in rows}
+    compute = layers.build(ComputeConfig, values)
+    if call.print_config:
+        click.echo(layers.to_toml({**configs, "compute": compute}), nl=False)
+        return
+    job = Job(Workspace(call.workspace), given, compute, TqdmProgress(), tell, STAGES)
+    targets = [
+        Target(row.name, configs[row.name], () if row.needs else sources) for row in rows]
+    pipeline.run(job, verb, targets, again=call.again)
+    if "evaluate" in stages:
+        click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
+
+
+def beside(call: Call, kind: type[C]) -> tuple[Job, C]:
+    """Returns what a command needs that only looks at a stage, and the stage's options."""
+    given = explicit(call)
+    values = layers.merged([given, call.settings])
+    compute = layers.build(ComputeConfig, values)
+    job = Job(Workspace(call.workspace), given, compute, TqdmProgress(), table=STAGES)
+    return job, layers.build(kind, values)
+
+
+def tell(outcome: Outcome) -> None:
+    """Says what became of a stage."""
+    if outcome.ran:
+        run = outcome.manifest.run
+        click.echo(report.summary_line(outcome.stage, run.summary, run.seconds))
+    else:
+        click.echo(f"{outcome.stage} is up to date")
