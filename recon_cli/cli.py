@@ -25,6 +25,7 @@ from recon_cli.config import (
 from recon_cli.errors import ReconError
 from recon_cli.options import Call, pass_call
 from recon_cli.pipeline import Job
+from recon_cli.scoreboard import command as scoreboard
 from recon_cli.settings import Settings
 from recon_cli.stages import STAGES
 from recon_cli.study.command import study
@@ -151,10 +152,21 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 
 
 @cli.command("eval")
+@click.argument("items", metavar="[ITEM]...", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--form", type=click.Choice(scoreboard.FORMS), default="text",
+    help="With ITEM: how the comparison is printed.  [default: text]")
 @options.stage(EvaluateConfig, renders=True)
 @pass_call
-def evaluate(call: Call) -> None:
-    """Score every model on the held-out views."""
+def evaluate(call: Call, items: tuple[Path, ...], form: str) -> None:
+    """Score every model on the held-out views.
+
+    With ITEM, workspaces and .ply files, their models in one table; files are scored on the views
+    of the workspace.
+    """
+    if items:
+        click.echo(scoreboard.compare(*beside(call, EvaluateConfig), items, form))
+        return
     perform(call, "eval", ["evaluate"])
 
 

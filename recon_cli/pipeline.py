@@ -155,6 +155,16 @@ def plan(look: Inspection, stage: str) -> tuple[Stage, ...]:
     return tuple(steps)
 
 
+def require_fresh(job: Job, stages: Sequence[str]) -> None:
+    """Raises StageError unless the results of these stages are there and fresh."""
+    look = job.inspect()
+    for check in map(look.check, stages):
+        if not check.fresh:
+            raise StageError(
+                f"The {check.row.name} of {job.workspace.root} is {check.described()}.",
+                hint=f"Run `{command(look, check)} -w {job.workspace.root}` first.")
+
+
 def command(look: Inspection, check: Check) -> str:
     """Returns what to type to bring a stage up to date with the options it had."""
     words = ["recon", check.row.verb]

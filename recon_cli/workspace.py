@@ -40,6 +40,11 @@ class Workspace:
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
 
+    @property
+    def holds_results(self) -> bool:
+        """Whether a capture was read in here."""
+        return (self.root / "ingest" / "manifest.json").is_file()
+
     def folder(self, stage: str) -> Path:
         """Returns where a stage's finished result lies or will lie."""
         return self.root / stage

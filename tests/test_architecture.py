@@ -57,13 +57,15 @@ ALLOWED: dict[str, set[str]] = {
         "settings", "options", "machine", "progress", "metrics", "tables", "scene", "render",
         "train", "io",
         "stages", "digests", "workspace", "execute", "pipeline"},
+    "scoreboard": BOTTOM | OPTIONS | {
+        "metrics", "tables", "scene", "io", "train", "stages", "workspace", "execute", "pipeline"},
     "study": BOTTOM | OPTIONS | {
         "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
         "execute", "bench"},
     "verbs": OPTIONS | {
         "settings", "options", "pipeline", "report", "progress", "stages", "workspace"},
     "cli": OPTIONS | {
-        "verbs",
+        "verbs", "scoreboard",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study", "sweep"},
     "__main__": {"cli"},

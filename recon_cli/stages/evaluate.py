@@ -45,9 +45,17 @@ from recon_cli.stages.fitting import (
     size_summary,
     sizes_of,
 )
-from recon_cli.stages.held_out import Scored, Truth, mean_psnr, scorable, scored, truths
+from recon_cli.stages.held_out import (
+    LABELS,
+    Scored,
+    Truth,
+    mean_psnr,
+    scorable,
+    scored,
+    truth_digest,
+    truths,
+)
 
-LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}
 _GAIN = 4  # of the difference images
 _EVER = 1 << 62  # an iteration beyond any
 _SEEN_VIEWS = 20  # training and validation views that are scored beside, at most
@@ -160,6 +168,7 @@ def _write(
         "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION,
         "lpips_convention": LPIPS_CONVENTION if measured else f"not measured: {lacking}",
         **({"mask_convention": MASK_CONVENTION} if masked else {}),
+        "truth_digest": truth_digest(held_out),
         **size_summary([truth.camera for truth in held_out]), **_counts(held_out, scene),
     })
     table = list(scores.values())

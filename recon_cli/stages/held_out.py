@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -22,6 +23,8 @@ from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext
 from recon_cli.stages.fitting import MASK_HINT, notice_hidden
 from recon_cli.train.trials import corrected_psnr
+
+LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}  # of the models of a workspace
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,22 @@ def truths(views: Sequence[View], max_size: int) -> list[Truth]:
         image, mask = read_masked_image(view.original, view.mask, camera.width, camera.height)
         found.append(Truth(view.name, camera, image, mask))
     return found
+
+
+def truth_digest(views: Sequence[Truth]) -> str:
+    """Returns a digest of all that models are held against: names, lenses, pixels, masks.
+
+    Scores of two models can be paired where theirs are equal.
+    """
+    found = hashlib.sha256()
+    for truth in views:
+        camera = truth.camera
+        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        found.update(repr((truth.name, lens, truth.mask is None)).encode())
+        for pixels in (truth.image, truth.mask):
+            if pixels is not None:
+                found.update(np.ascontiguousarray(pixels).tobytes())
+    return found.hexdigest()
 
 
 def scored(

@@ -10,7 +10,7 @@ from pathlib import Path
 from recon_cli import pipeline
 from recon_cli.config import ComputeConfig, IngestConfig, RunConfig, SfmConfig
 from recon_cli.digests import digest_file, sha256_json
-from recon_cli.errors import ConfigError, InputError, ReconstructionError, StageError
+from recon_cli.errors import ConfigError, InputError, ReconstructionError
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.pipeline import Job, Target
 from recon_cli.progress import Progress
@@ -71,26 +71,11 @@ def checked(paths: Sequence[Path]) -> dict[str, Path]:
                 f"{found[name]} and {path} are both called {name}.",
                 hint="Rename one of the folders: tables tell scenes by their names.")
         found[name] = path
-        if is_workspace(path):
-            _refuse_unmapped(path)
+        if Workspace(path).holds_results:
+            pipeline.require_fresh(Job(Workspace(path)), ("ingest", "sfm"))
         else:
             _refuse_unposed(path)
     return found
-
-
-def is_workspace(path: Path) -> bool:
-    """Tells whether a folder holds results of stages."""
-    return (path / "ingest" / "manifest.json").is_file()
-
-
-def _refuse_unmapped(path: Path) -> None:
-    look = Job(Workspace(path)).inspect()
-    for name in ("ingest", "sfm"):
-        check = look.check(name)
-        if not check.fresh:
-            raise StageError(
-                f"The {name} of {path} is {check.described()}.",
-                hint=f"Run `{pipeline.command(look, check)} -w {path}` first.")
 
 
 def _refuse_unposed(path: Path) -> None:
@@ -122,7 +107,7 @@ def opened(
         ReconError: whatever the stages raise.
     """
     root = path
-    if not is_workspace(path):
+    if not Workspace(path).holds_results:
         root = scratch / name
         values = merged([settings, {"sfm": {"poses": "keep"}}])
         stages = {part: values[part] for part in ("ingest", "denoise", "sfm")}

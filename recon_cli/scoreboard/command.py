@@ -1,0 +1,19 @@
+"""What `recon eval` calls for a comparison. Torch is imported only when it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from recon_cli.config import EvaluateConfig
+from recon_cli.execute import Job
+
+FORMS = ("text", "markdown", "csv", "latex", "json")
+
+
+def compare(job: Job, config: EvaluateConfig, items: Sequence[Path], form: str) -> str:
+    """Returns the scores of workspaces and files in one of FORMS."""
+    from recon_cli.scoreboard.compare import compared
+    from recon_cli.scoreboard.report import report
+
+    return report(compared(job, config, items), form)
