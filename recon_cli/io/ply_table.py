@@ -31,7 +31,7 @@ class Element:
     Attributes:
         name: as the header has it.
         count: how many rows the header promises.
-        row: the type of a row, float64 throughout in ASCII; None where a property is a list.
+        row: the type of a row; None where a property is a list.
     """
 
     name: str
@@ -98,7 +98,7 @@ def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
         raise FormatError(f"{path} has a {name} without properties.")
     if any(len(line) == 5 for line in properties):
         return Element(name, count, None)
-    types = ["f8" if kind == "ascii" else _ORDERS[kind] + _TYPES[line[1]] for line in properties]
+    types = [_ORDERS[kind] + _TYPES[line[1]] for line in properties]
     return Element(name, count, np.dtype(list(zip(names, types, strict=True))))
 
 
@@ -117,27 +117,52 @@ def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
             raise FormatError(
                 f"{header.path} holds other elements than vertices: {element.count} of "
                 f"{element.name}, which is {what}, not Gaussians.")
+    return _read(header, header.elements, exact=True)
+
+
+def read_first_table(header: Header) -> NDArray[np.void]:
+    """Returns the rows of the first element, whatever follows.
+
+    No memory is taken for rows that the file is too small to hold.
+
+    Raises:
+        FormatError: the file ends before, or the element holds lists.
+    """
+    first = header.elements[0]
+    if first.row is None:
+        raise FormatError(f"{header.path} has a list in {first.name}.")
+    return _read(header, (first,), exact=False)[first.name]
+
+
+def _read(
+    header: Header, elements: tuple[Element, ...], *, exact: bool
+) -> dict[str, NDArray[np.void]]:
+    """Returns the rows of the first elements; `exact` demands that nothing follows."""
+    rows = [(each.name, each.count, each.row) for each in elements if each.row is not None]
+    is_text = header.format == "ascii"
     try:
         with header.path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size - header.offset
-            _check_size(header, size)
+            if is_text:  # a number takes a digit and a space, which at the end may be missing
+                fits = sum(2 * count * len(row.names or ()) for _, count, row in rows) <= size + 1
+            else:
+                promised = sum(count * row.itemsize for _, count, row in rows)
+                fits = promised == size if exact else promised <= size
+            if not fits:
+                listed = ", ".join(
+                    f"{count} of {name} of {row.itemsize} bytes" for name, count, row in rows)
+                raise _wrong_size(header, listed, f"{size} bytes of data")
             file.seek(header.offset)
-            data = file.read(size)
+            data = file.read(size if is_text else promised)
     except OSError as error:
         raise FormatError(f"{header.path} cannot be read: {error}.") from error
-    return _text_tables(header, data) if header.format == "ascii" else _tables(header, data)
-
-
-def _check_size(header: Header, size: int) -> None:
-    rows = [(each.name, each.count, each.row.itemsize)
-            for each in header.elements if each.row is not None]
-    promised = sum(count * width for _, count, width in rows)
-    # A number of ASCII takes a digit and a space at least, and 8 bytes of its row here; the space
-    # at the end may be missing.
-    fits = promised // 4 <= size + 1 if header.format == "ascii" else promised == size
-    if not fits:
-        listed = ", ".join(f"{count} of {name} of {width} bytes" for name, count, width in rows)
-        raise _wrong_size(header, listed, f"{size} bytes of data")
+    if is_text:
+        return _text_tables(header, rows, data, exact=exact)
+    tables, start = {}, 0
+    for name, count, row in rows:
+        tables[name] = np.frombuffer(data[start:start + count * row.itemsize], row)
+        start += count * row.itemsize
+    return tables
 
 
 def _wrong_size(header: Header, promised: str, found: str) -> FormatError:
@@ -146,35 +171,38 @@ def _wrong_size(header: Header, promised: str, found: str) -> FormatError:
         hint="Write or copy the file again.")
 
 
-def _tables(header: Header, data: bytes) -> dict[str, NDArray[np.void]]:
-    tables, offset = {}, 0
-    for element in header.elements:
-        if element.row is not None:
-            rows = data[offset:offset + element.count * element.row.itemsize]
-            offset += len(rows)
-            tables[element.name] = np.frombuffer(rows, element.row)
-    return tables
-
-
-def _text_tables(header: Header, data: bytes) -> dict[str, NDArray[np.void]]:
+def _text_tables(
+    header: Header, rows: list[tuple[str, int, np.dtype[np.void]]], data: bytes, *, exact: bool
+) -> dict[str, NDArray[np.void]]:
     lines = [line for line in data.decode("ascii", "replace").splitlines() if line.strip()]
-    promised = sum(element.count for element in header.elements if element.row is not None)
-    if len(lines) != promised:
+    promised = sum(count for _, count, _ in rows)
+    if len(lines) < promised or (exact and len(lines) > promised):
         raise _wrong_size(header, f"{promised} rows", f"{len(lines)}")
     tables, start = {}, 0
-    for element in header.elements:
-        if element.row is None:
-            continue
-        if not element.count:
-            tables[element.name] = np.zeros(0, element.row)
-            continue
-        width = len(element.row.names or ())
+    for name, count, row in rows:
         try:
-            rows = np.loadtxt(lines[start:start + element.count], comments=None, ndmin=2)
-            tables[element.name] = rows.reshape(element.count, width).view(element.row)[:, 0]
+            tables[name] = _parsed(lines[start:start + count], row)
         except ValueError as error:
             raise FormatError(
-                f"{header.path} has rows of {element.name} that are not {width} numbers: {error}."
-            ) from error
-        start += element.count
+                f"{header.path} has rows of {name} that are not {len(row.names or ())} numbers: "
+                f"{error}.") from error
+        start += count
     return tables
+
+
+def _parsed(lines: list[str], row: np.dtype[np.void]) -> NDArray[np.void]:
+    """Returns rows of numbers, or raises ValueError."""
+    table = np.zeros(len(lines), row)
+    if not lines:
+        return table  # numpy warns of nothing to load
+    names = row.names or ()
+    columns = np.loadtxt(lines, comments=None, ndmin=2).reshape(len(lines), len(names)).T
+    for name, values in zip(names, columns, strict=True):
+        kind = row[name]
+        if kind.kind in "ui":
+            limits = np.iinfo(kind)
+            if not ((values >= limits.min) & (values <= limits.max)).all():  # NaN fails too
+                raise ValueError(f"{name} is no {kind.name}")
+        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+            table[name] = values
+    return table

@@ -30,7 +30,8 @@ from recon_cli.scene.splats import SH_C0, Splats
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _LEAST = np.finfo(np.float32).tiny  # stands for a scale of 0, which has no logarithm
 _LARGEST = 88.0  # of a log scale; the exponential of more is infinite in float32
-_OTHER_FORMATS = (b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b\x08", b"PK\x03\x04")
+# First bytes of .ply, SPZ, gzip and zip. As a position they would be 1e-32 and less, or 1e10.
+_OTHER_FORMATS = (b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b\x08\0", b"PK\x03\x04")
 
 
 def write_splat(path: Path, splats: Splats) -> None:

@@ -60,7 +60,8 @@ def as_splats(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
     Raises:
         FormatError: a value is not finite.
     """
-    plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
+    with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite, which is refused
+        plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
     refuse_not_finite(path, plain)
     colored = np.flatnonzero(plain["sh_rest"].any(axis=(1, 2)))
     plain["sh_rest"] = plain["sh_rest"][:colored[-1] + 1 if len(colored) else 0].copy()

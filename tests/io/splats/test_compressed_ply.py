@@ -159,10 +159,13 @@ def test_what_does_not_fit_is_refused_and_tiny_scales_are_clamped(tmp_path):
     (lambda data: data.replace(b"sh 9", b"sh 8")[:-9], "do not make a degree"),
     (lambda data: data.replace(b"uchar f_rest_8", b"char f_rest_8"), "do not make a degree"),
     (lambda data: data.replace(b"f_rest_8", b"f_rest_9"), "do not make a degree"),
-    (lambda data: data.replace(b"binary_little_endian", b"ascii"), "no compressed"),
+    (lambda data: data.replace(b"binary_little_endian", b"ascii"), "truncated or damaged"),
     (lambda data: data.replace(b"end_header\n", b"end_header\n" + b"\xff" * 4, 1)[:-4],
      "not finite in means"),
+    (lambda data: data.replace(b"end_header\n", b"end_header\n" + (
+        np.full(18, 3e38, "<f4").tobytes()), 1)[:-72], "not finite in sh_dc"),
 ])
+@pytest.mark.filterwarnings("error")
 def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message):
     path = tmp_path / "a.ply"
     write_compressed_ply(path, few())

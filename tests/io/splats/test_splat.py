@@ -88,7 +88,9 @@ def test_scales_beyond_float32_are_clamped_below_and_refused_above(tmp_path):
     (lambda data: data[:12] + np.float32(-1).tobytes() + data[16:], "negative scales"),
     (lambda data: data[:4] + np.float32(np.nan).tobytes() + data[8:], r"positions \(1\)"),
     (lambda data: data[:16] + np.float32(np.inf).tobytes() + data[20:], r"scales \(1\)"),
+    (lambda data: data[:16] + np.float32(np.nan).tobytes() + data[20:], r"scales \(1\)"),
 ])
+@pytest.mark.filterwarnings("error")
 def test_damaged_files_are_refused_with_the_reason(written, change, message):
     path, _ = written
     path.write_bytes(change(path.read_bytes()))
