@@ -1,0 +1,204 @@
+"""The compressed .ply of PlayCanvas and SuperSplat: 16 bytes a Gaussian, in chunks of 256.
+
+Each chunk has the least and greatest position, log scale and colour of its Gaussians, between which
+11, 10 and 11 bits say where a position or log scale lies, and 8 where a colour does. Opacity has 8
+bits after the sigmoid, a rotation 2 for which component is largest and 10 for each of the others.
+Harmonics, where the scene has any, are a third element of bytes between -4 and 4. Axes are those of
+the plain .ply. The layout is read off https://github.com/playcanvas/splat-transform.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.atomic import replacing
+from recon_cli.errors import FormatError
+from recon_cli.io.ply_table import Element, read_header, read_tables
+from recon_cli.io.splats.morton import morton_order
+from recon_cli.io.splats.values import (
+    Bytes,
+    Floats,
+    as_splats,
+    from_smallest_three,
+    logits_of_bytes,
+    opacity_bytes,
+    refuse_above,
+    smallest_three,
+    writable,
+)
+from recon_cli.scene.splats import SH_C0, TERMS, Splats
+
+_CHUNK = 256
+_AXES, _COLORS = ("x", "y", "z"), ("r", "g", "b")
+_PLACE = [f"{end}_{axis}" for end in ("min", "max") for axis in _AXES]
+_SCALE = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in _AXES]
+_COLOR = [f"{end}_{color}" for end in ("min", "max") for color in _COLORS]
+_BOUNDS = [*_PLACE, *_SCALE, *_COLOR]
+_PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+_BITS, _SHIFTS = (11, 10, 11), (21, 11, 0)
+_SCALE_RANGE = 20.0  # of log scales; one of -1000 would leave the others of its chunk no bits
+_STEP = 1 / 32  # of a coefficient: 256 steps from -4 to 4
+
+Words = NDArray[np.uint32]
+
+
+def write_compressed_ply(path: Path, splats: Splats) -> None:
+    """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
+
+    Log scales below -20 become -20, coefficients outside -4 to 4 are clipped, and no coefficient
+    stays 0.
+
+    Raises:
+        FormatError: there are no Gaussians, one is too large, or a parameter is not finite.
+    """
+    values = writable(path, splats)
+    order = morton_order(values.means.numpy())
+    means, log_scales, quats, logits, sh_dc, sh_rest = (
+        value.numpy()[order] for value in (
+            values.means, values.log_scales, values.quats, values.logit_opacities, values.sh_dc,
+            values.sh_rest))
+    refuse_above(path, log_scales, _SCALE_RANGE)
+    parts = [means, np.maximum(log_scales, -_SCALE_RANGE),
+             (SH_C0 * sh_dc.astype(np.float64) + 0.5).astype(np.float32)]
+    bounds, (place, scale, color) = zip(*[_bounded(part) for part in parts], strict=True)
+    alpha = opacity_bytes(logits).astype(np.uint32)
+    words = np.stack([
+        _joined(place, _BITS, _SHIFTS), _rotation_words(quats), _joined(scale, _BITS, _SHIFTS),
+        _joined(color, (8, 8, 8), (24, 16, 8)) | alpha], axis=1)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(_header(len(splats), sh_rest.shape[1]))
+        file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
+        file.write(words.astype("<u4").tobytes())
+        file.write(_harmonic_bytes(sh_rest).tobytes())
+
+
+def _header(n: int, terms: int) -> bytes:
+    rest = [f"property uchar f_rest_{i}" for i in range(3 * terms)]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-n // _CHUNK)}",
+             *(f"property float {name}" for name in _BOUNDS), f"element vertex {n}",
+             *(f"property uint {name}" for name in _PACKED),
+             *([f"element sh {n}", *rest] if terms else []), "end_header", ""]
+    return "\n".join(lines).encode("ascii")
+
+
+def _bounded(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
+    """Returns the bounds [chunks, 6] of values [N, 3], and where in them each lies, 0 to 1."""
+    starts = np.arange(0, len(values), _CHUNK)
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    rows = np.arange(len(values)) // _CHUNK
+    width = (high.astype(np.float64) - low)[rows]
+    share = (values - low[rows].astype(np.float64)) / np.where(width > 0, width, 1)
+    return np.concatenate([low, high], axis=1), share
+
+
+def _joined(
+    shares: NDArray[np.floating], bits: tuple[int, ...], shifts: tuple[int, ...]
+) -> Words:
+    """Returns words [N] of shares [N, 3] of the greatest number of that many bits."""
+    most = (1 << np.array(bits)) - 1
+    fields = np.clip(np.rint(shares * most), 0, most).astype(np.uint32)
+    return np.asarray(np.bitwise_or.reduce(fields << np.array(shifts, np.uint32), axis=1))
+
+
+def _rotation_words(quats: Floats) -> Words:
+    largest, others = smallest_three(quats)
+    shares = others / np.sqrt(2) + 0.5
+    index = largest.astype(np.uint32) << np.uint32(30)
+    return index | _joined(shares, (10, 10, 10), (20, 10, 0))
+
+
+def _harmonic_bytes(sh_rest: Floats) -> Bytes:
+    """Returns [N, 3 T] bytes, channel-major.
+
+    0 lies between two bytes, which stand for plus and minus 1/64. Neighbours take turns, else all
+    Gaussians without harmonics would lean the same way and tint the whole scene.
+    """
+    steps = np.floor(sh_rest / _STEP) + 128
+    turns = 127 + np.arange(len(sh_rest))[:, None, None] % 2
+    steps = np.where(sh_rest == 0, turns, steps)
+    flat = steps.transpose(0, 2, 1).reshape(len(sh_rest), -1)
+    return np.clip(flat, 0, 255).astype(np.uint8)
+
+
+def read_compressed_ply(path: Path) -> Splats:
+    """Returns the Gaussians of a compressed .ply in the file's order and degree.
+
+    Older files without bounds of colours are read too.
+
+    Raises:
+        FormatError: the file is missing, damaged, or another kind of .ply.
+    """
+    header = read_header(path)
+    kinds = {each.name: _kinds(each) for each in header.elements}
+    colored = not kinds.get("chunk", {}).keys().isdisjoint(_COLOR)
+    if not (_has(kinds.get("chunk", {}), _BOUNDS if colored else _PLACE + _SCALE, "f4")
+            and _has(kinds.get("vertex", {}), _PACKED, "u4")):
+        raise FormatError(f"{path} is no compressed .ply.")
+    tables = read_tables(header)
+    chunk, vertex = tables["chunk"], tables["vertex"]
+    n = len(vertex)
+    if not n or len(chunk) != -(-n // _CHUNK):
+        raise FormatError(f"{path} has {len(chunk)} chunks of {_CHUNK} for {n} Gaussians.")
+    place, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
+    shares = _shares(color, (8, 8, 8), (24, 16, 8))
+    colors = _between(chunk, _COLOR, shares) if colored else shares
+    return as_splats(path, {
+        "means": _between(chunk, _PLACE, _shares(place, _BITS, _SHIFTS)),
+        "quats": _rotations(rotation),
+        "log_scales": _between(chunk, _SCALE, _shares(scale, _BITS, _SHIFTS)),
+        "logit_opacities": logits_of_bytes((color & 255).astype(np.uint8)),
+        "sh_dc": (colors - 0.5) / SH_C0,
+        "sh_rest": _harmonics(path, tables, n),
+    })
+
+
+def _kinds(element: Element) -> dict[str, str]:
+    """Returns the types of an element's properties, such as f4, whatever their byte order."""
+    fields = element.row.fields if element.row is not None else None
+    return {name: field[0].str[1:] for name, field in (fields or {}).items()}
+
+
+def _has(kinds: dict[str, str], names: list[str], kind: str) -> bool:
+    return all(kinds.get(name) == kind for name in names)
+
+
+def _shares(
+    words: Words, bits: tuple[int, ...], shifts: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Returns [N, 3] shares of words [N]: the inverse of `_joined`."""
+    most = (1 << np.array(bits, np.uint32)) - 1
+    return (words[:, None] >> np.array(shifts, np.uint32) & most) / most
+
+
+def _between(
+    chunk: NDArray[np.void], names: list[str], shares: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns what shares [N, 3] of the chunks' bounds stand for."""
+    bounds = np.stack([chunk[name].astype(np.float64) for name in names], axis=1)
+    rows = np.arange(len(shares)) // _CHUNK
+    low, high = bounds[rows, :3], bounds[rows, 3:]
+    with np.errstate(invalid="ignore"):  # bounds that are not finite make NaN, which is refused
+        return np.asarray(low * (1 - shares) + high * shares)
+
+
+def _rotations(words: Words) -> Floats:
+    others = (_shares(words, (10, 10, 10), (20, 10, 0)) - 0.5) * np.sqrt(2)
+    return from_smallest_three((words >> 30).astype(np.int64), others.astype(np.float32))
+
+
+def _harmonics(path: Path, tables: dict[str, NDArray[np.void]], n: int) -> Floats:
+    if "sh" not in tables:
+        return np.zeros((n, 0, 3), np.float32)
+    table = tables["sh"]
+    kinds = dict(table.dtype.fields or {})
+    names = [f"f_rest_{i}" for i in range(len(kinds))]
+    if len(table) != n or set(names) != kinds.keys() or len(names) not in [
+            3 * terms for terms in TERMS[1:]] or any(kinds[name][0] != "u1" for name in names):
+        raise FormatError(f"{path} has harmonics that do not make a degree of its Gaussians.")
+    steps = np.stack([table[name] for name in names], axis=1).astype(np.float32)
+    steps[steps > 0] += 0.5  # a byte stands for the middle of its step, but 0 and 255 for the ends
+    steps[steps > 255] = 256
+    return ((steps - 128) * np.float32(_STEP)).reshape(n, 3, -1).transpose(0, 2, 1)

@@ -1,0 +1,146 @@
+"""What the formats have in common: which Gaussians they take, bytes of opacity, rotations, axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon_cli.errors import FormatError
+from recon_cli.scene.harmonics import basis_rest
+from recon_cli.scene.splats import Splats, with_rows
+
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+_SHORTEST = 1e-30  # a quaternion below it is zero
+
+
+def writable(path: Path, splats: Splats) -> Splats:
+    """Returns the Gaussians as a writer needs them: float32 on the CPU, none left out.
+
+    Rotations are unit quaternions, zeros became no rotation; every Gaussian has coefficients of the
+    scene's degree, or where none has any the degree is 0.
+
+    Raises:
+        FormatError: there are no Gaussians, or a parameter is not finite.
+    """
+    if not len(splats):
+        raise FormatError(f"There are no Gaussians to write to {path}.")
+    if not len(splats.sh_rest):
+        splats = splats.with_degree(0)
+    plain = splats.map(lambda value: value.detach().cpu().float())
+    refuse_not_finite(path, {name: value.numpy() for name, value in plain.parameters().items()})
+    quats = plain.quats.double()
+    quats = torch.where(quats.norm(dim=1, keepdim=True) < _SHORTEST, _identity(quats), quats)
+    quats = quats / quats.norm(dim=1, keepdim=True)
+    return replace(plain, quats=quats.float(), sh_rest=with_rows(plain.sh_rest, len(plain)))
+
+
+def _identity(quats: Tensor) -> Tensor:
+    return quats.new_tensor([1.0, 0, 0, 0])
+
+
+def as_splats(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
+    """Returns what was read from `path` as float32 tensors, in the file's order.
+
+    Those behind the last one that has a coefficient other than zero are of degree 0.
+
+    Args:
+        path: for the message.
+        values: the parameters by their names in `Splats`, with coefficients of all N Gaussians,
+            of any type.
+
+    Raises:
+        FormatError: a value is not finite.
+    """
+    with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite, which is refused
+        plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
+    refuse_not_finite(path, plain)
+    colored = np.flatnonzero(plain["sh_rest"].any(axis=(1, 2)))
+    plain["sh_rest"] = plain["sh_rest"][:colored[-1] + 1 if len(colored) else 0].copy()
+    return Splats(**{name: torch.from_numpy(value) for name, value in plain.items()})
+
+
+def refuse_not_finite(path: Path, columns: Mapping[str, Floats]) -> None:
+    """Raises FormatError that names each column with NaN or infinity, and how many it has."""
+    bad = {name: int(np.size(value) - np.isfinite(value).sum()) for name, value in columns.items()}
+    bad = {name: count for name, count in bad.items() if count}
+    if bad:
+        found = ", ".join(f"{name} ({count})" for name, count in bad.items())
+        raise FormatError(f"{path} holds values that are not finite in {found}.")
+
+
+def refuse_above(path: Path, log_scales: Floats, most: float) -> None:
+    """Raises FormatError where a Gaussian is greater than the format can say."""
+    count = int((log_scales.max(axis=1) > most).sum())
+    if count:
+        raise FormatError(
+            f"{count} Gaussians are too large for {path}: at most e^{most:g} units fit, the "
+            f"largest has e^{log_scales.max():.1f}.",
+            hint="Remove them, scale the scene down, or write a .ply.")
+
+
+def opacity_bytes(logits: Floats) -> Bytes:
+    """Returns opacities [N] in 255 steps."""
+    return nearest_bytes(255 / (1 + np.exp(-logits.astype(np.float64))))
+
+
+def logits_of_bytes(values: Bytes) -> NDArray[np.float64]:
+    """Returns logits [N] of opacities in 255 steps.
+
+    The first and the last step are half as wide as the others and stand for their middle, not for
+    0 and 1, whose logits are infinite.
+    """
+    share = np.clip(values.astype(np.float64), 0.25, 254.75) / 255
+    return np.asarray(np.log(share) - np.log1p(-share))
+
+
+def nearest_bytes(values: NDArray[Any]) -> Bytes:
+    """Returns values rounded to bytes; what lies outside becomes 0 or 255."""
+    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
+
+
+def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Returns of unit quaternions [N, 4] which component is largest [N], and the others [N, 3].
+
+    q and -q are one rotation: signs are such that the largest component is positive, so that it
+    follows from the others, none of which is above 1 / sqrt(2).
+    """
+    largest = np.abs(quats).argmax(axis=1)
+    value = np.take_along_axis(quats, largest[:, None], axis=1)
+    signed = np.where(value < 0, -quats, quats)
+    return largest, signed[_others(largest)].reshape(-1, 3)
+
+
+def from_smallest_three(largest: NDArray[np.int64], others: Floats) -> Floats:
+    """Returns quaternions [N, 4] from what `smallest_three` gave."""
+    quats = np.empty((len(others), 4), np.float32)
+    quats[_others(largest)] = others.ravel()
+    missing = np.sqrt(np.maximum(0, 1 - (others * others).sum(axis=1)))
+    np.put_along_axis(quats, largest[:, None], missing[:, None], axis=1)
+    return quats
+
+
+def _others(largest: NDArray[np.int64]) -> NDArray[np.bool_]:
+    return np.asarray(np.arange(4) != largest[:, None])
+
+
+def turned_about_x(splats: Splats) -> Splats:
+    """Returns the Gaussians with y and z negated, as between axes RDF and RUB; twice is nothing.
+
+    Only signs change, so that nothing is rounded.
+    """
+    signs = splats.means.new_tensor([1.0, -1, -1])
+    direction = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)  # where no function is 0
+    parity = (basis_rest(direction * signs, 3) / basis_rest(direction, 3)).round()
+    of_terms = parity[:splats.sh_rest.shape[1], None].to(splats.means)
+    return replace(
+        splats, means=splats.means * signs, sh_rest=splats.sh_rest * of_terms,
+        quats=torch.cat([splats.quats[:, :2], -splats.quats[:, 2:]], dim=1))
