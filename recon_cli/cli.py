@@ -31,7 +31,7 @@ from recon_cli.settings import C, Settings
 from recon_cli.stages import STAGES
 from recon_cli.study.command import study
 from recon_cli.sweep import command as sweeping
-from recon_cli.workspace import SETTINGS, Workspace
+from recon_cli.workspace import Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # what the paper does: prune while training goes on
@@ -84,15 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logger.removeHandler(handler)
 
 
-def _explicit(call: Call) -> Settings:
-    """Returns what recon.toml, --config and --set set, checked."""
-    inside = call.workspace / SETTINGS
-    found = [path for path in (inside if inside.exists() else None, call.config_file) if path]
-    explicit = layers.merged([*map(layers.read_settings, found), call.assigned])
-    layers.check(explicit)
-    return explicit
-
-
 def _perform(
     call: Call,
     verb: str,
@@ -112,7 +103,7 @@ def _perform(
         base: defaults of the verb; recon.toml, --config and options win over them.
         forced: what the verb itself means; it wins over everything.
     """
-    explicit = _explicit(call)
+    explicit = options.explicit(call)
     values = layers.merged([base or {}, explicit, call.settings, forced or {}])
     rows = [row for row in STAGES if row.name in stages]
     configs = {row.name: layers.build(row.config, values) for row in rows}
@@ -130,7 +121,7 @@ def _perform(
 
 def _beside(call: Call, kind: type[C]) -> tuple[Job, C]:
     """Returns what a command needs that only looks at a stage, and the stage's options."""
-    explicit = _explicit(call)
+    explicit = options.explicit(call)
     values = layers.merged([explicit, call.settings])
     compute = layers.build(ComputeConfig, values)
     job = Job(Workspace(call.workspace), explicit, compute, TqdmProgress(), table=STAGES)
@@ -270,7 +261,7 @@ def demo(call: Call) -> None:
 @pass_call
 def status(call: Call, as_json: bool) -> None:
     """Show what is fresh, stale and why, partial, or missing."""
-    job = Job(Workspace(call.workspace), _explicit(call), table=STAGES)
+    job = Job(Workspace(call.workspace), options.explicit(call), table=STAGES)
     stages = pipeline.status(job)
     if as_json:
         click.echo(json.dumps({
