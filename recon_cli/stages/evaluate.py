@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from recon_cli.atomic import write_bytes, write_json
 from recon_cli.config import EvaluateConfig
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.io.images import fitted_camera, read_masked_image, write_png
+from recon_cli.io.images import eight_bit, fitted_camera, read_masked_image, write_png
 from recon_cli.io.ply import read_ply
 from recon_cli.metrics import (
     MASK_CONVENTION,
@@ -147,7 +147,7 @@ def _score(
         views.append(_view_score(truth, image))
         corrected.append(corrected_psnr(image, truth.image, truth.mask))
         name = f"{Path(truth.name).stem}.png"
-        shown = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+        shown = eight_bit(image)
         _save(out / "renders" / model / name, shown)
         difference = np.abs(shown.astype(np.int16) - truth.image) * _GAIN
         if truth.mask is not None:
