@@ -58,6 +58,7 @@ ALLOWED: dict[str, set[str]] = {
     "study": BOTTOM | OPTIONS | {
         "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
         "execute", "bench"},
+    "shots": BOTTOM | {"scene", "io"},
     "cli": OPTIONS | {
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study", "sweep"},
