@@ -28,6 +28,7 @@ from recon_cli.options import Call, pass_call
 from recon_cli.pipeline import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress
 from recon_cli.settings import C, Settings
+from recon_cli.shots.command import render
 from recon_cli.stages import STAGES
 from recon_cli.study.command import study
 from recon_cli.sweep import command as sweeping
@@ -217,6 +218,9 @@ def evaluate(call: Call) -> None:
 def export(call: Call) -> None:
     """Write a .ply that other viewers open, and check it."""
     _perform(call, "export", ["export"])
+
+
+cli.add_command(render)
 
 
 @cli.command("run")

@@ -58,14 +58,16 @@ ALLOWED: dict[str, set[str]] = {
     "study": BOTTOM | OPTIONS | {
         "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
         "execute", "bench"},
-    "shots": BOTTOM | {"scene", "io"},
+    "shots": BOTTOM | {
+        "config", "settings", "options", "machine", "progress", "digests", "manifest", "lock",
+        "workspace", "scene", "render", "io", "stages", "freshness", "execute", "pipeline"},
     "cli": OPTIONS | {
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
-        "progress", "stages", "workspace", "bench", "study", "sweep"},
+        "progress", "stages", "workspace", "bench", "study", "sweep", "shots"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "options", "bench", "study", "console"},
+    "click": {"cli", "options", "bench", "study", "shots", "console"},
     "matplotlib": {"bench", "study", "sweep"},
     "numba": {"render"},
     "llvmlite": {"render"},
