@@ -27,10 +27,11 @@ from recon_cli.options import Call, pass_call
 from recon_cli.pipeline import Job
 from recon_cli.scoreboard import command as scoreboard
 from recon_cli.settings import Settings
+from recon_cli.shots.command import render
 from recon_cli.stages import STAGES
 from recon_cli.study.command import study
 from recon_cli.sweep import command as sweeping
-from recon_cli.verbs import beside, explicit, perform
+from recon_cli.verbs import beside, perform
 from recon_cli.workspace import Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
@@ -178,6 +179,9 @@ def export(call: Call) -> None:
     perform(call, "export", ["export"])
 
 
+cli.add_command(render)
+
+
 @cli.command("run")
 @_inputs
 @click.option(
@@ -220,7 +224,7 @@ def demo(call: Call) -> None:
 @pass_call
 def status(call: Call, as_json: bool) -> None:
     """Show what is fresh, stale and why, partial, or missing."""
-    job = Job(Workspace(call.workspace), explicit(call), table=STAGES)
+    job = Job(Workspace(call.workspace), options.explicit(call), table=STAGES)
     stages = pipeline.status(job)
     if as_json:
         click.echo(json.dumps({

@@ -16,7 +16,15 @@ import click
 
 from recon_cli.config import ComputeConfig
 from recon_cli.fields import OptionInfo, StageConfig, field_type, member_types, option_info
-from recon_cli.settings import SECTIONS, Settings, merged, parse_assignment
+from recon_cli.settings import (
+    FILE,
+    SECTIONS,
+    Settings,
+    check,
+    merged,
+    parse_assignment,
+    read_settings,
+)
 
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
@@ -48,6 +56,19 @@ class Call:
 
 
 pass_call = click.make_pass_decorator(Call, ensure=True)
+
+
+def explicit(call: Call) -> Settings:
+    """Returns what recon.toml, --config and --set set, checked.
+
+    Raises:
+        ConfigError: a file cannot be read, or a value cannot be used.
+    """
+    inside = call.workspace / FILE
+    found = [path for path in (inside if inside.exists() else None, call.config_file) if path]
+    together = merged([*map(read_settings, found), call.assigned])
+    check(together)
+    return together
 
 
 def _keep(name: str) -> Callable[[click.Context, click.Parameter, Any], None]:

@@ -35,6 +35,7 @@ SECTIONS: dict[str, type[StageConfig]] = {
     "compute": ComputeConfig,
 }
 
+FILE = "recon.toml"  # in the workspace
 Settings = dict[str, dict[str, Any]]  # section -> field -> value, only what was set
 C = TypeVar("C", bound=StageConfig)
 AUTOMATIC = "automatic"  # how None is written in --set

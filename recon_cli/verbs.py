@@ -1,4 +1,4 @@
-"""What verbs have in common: options from their layers, a job, and stages that are brought up."""
+"""What verbs have in common: a job from the options, and stages that are brought up."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from recon_cli import pipeline, report
+from recon_cli import options, pipeline, report
 from recon_cli import settings as layers
 from recon_cli.config import ComputeConfig
 from recon_cli.options import Call
@@ -15,16 +15,7 @@ from recon_cli.pipeline import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress
 from recon_cli.settings import C, Settings
 from recon_cli.stages import STAGES
-from recon_cli.workspace import SETTINGS, Workspace
-
-
-def explicit(call: Call) -> Settings:
-    """Returns what recon.toml, --config and --set set, checked."""
-    inside = call.workspace / SETTINGS
-    found = [path for path in (inside if inside.exists() else None, call.config_file) if path]
-    explicit = layers.merged([*map(layers.read_settings, found), call.assigned])
-    layers.check(explicit)
-    return explicit
+from recon_cli.workspace import Workspace
 
 
 def perform(
@@ -46,7 +37,7 @@ def perform(
         base: defaults of the verb; recon.toml, --config and options win over them.
         forced: what the verb itself means; it wins over everything.
     """
-    given = explicit(call)
+    given = options.explicit(call)
     values = layers.merged([base or {}, given, call.settings, forced or {}])
     rows = [row for row in STAGES if row.name in stages]
     configs = {row.name: layers.build(row.config, values) for row in rows}
@@ -64,7 +55,7 @@ def perform(
 
 def beside(call: Call, kind: type[C]) -> tuple[Job, C]:
     """Returns what a command needs that only looks at a stage, and the stage's options."""
-    given = explicit(call)
+    given = options.explicit(call)
     values = layers.merged([given, call.settings])
     compute = layers.build(ComputeConfig, values)
     job = Job(Workspace(call.workspace), given, compute, TqdmProgress(), table=STAGES)

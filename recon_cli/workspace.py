@@ -23,7 +23,6 @@ from recon_cli.digests import FileDigest, digest_file, sha256_json
 from recon_cli.errors import ManifestError, ReconError, WorkspaceError
 from recon_cli.manifest import Basis, Manifest, Unfinished
 
-SETTINGS = "recon.toml"
 LOG = "recon.log"
 _LEFTOVERS = ".*.tmp*"  # of files that atomic.replacing had not finished when it was killed
 

@@ -64,14 +64,18 @@ ALLOWED: dict[str, set[str]] = {
         "execute", "bench"},
     "verbs": OPTIONS | {
         "settings", "options", "pipeline", "report", "progress", "stages", "workspace"},
+    "shots": BOTTOM | {
+        "config", "settings", "options", "machine", "progress", "digests", "manifest", "lock",
+        "workspace", "scene", "render", "io", "stages", "freshness", "execute", "pipeline"},
     "cli": OPTIONS | {
         "verbs", "scoreboard",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
-        "progress", "stages", "workspace", "bench", "study", "sweep"},
+        "progress", "stages", "workspace", "bench", "study", "sweep", "shots"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "verbs", "options", "bench", "study", "console"},
+    "click": {"cli", "verbs", "options", "bench", "study", "shots", "console"},
+    "zstandard": {"io"},
     "matplotlib": {"bench", "study", "sweep"},
     "numba": {"render"},
     "llvmlite": {"render"},

@@ -9,10 +9,10 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
+from recon_cli.io.images import eight_bit
 from recon_cli.metrics import (
     ModelScore,
     ViewScore,
-    as_bytes,
     csv_table,
     leaves_enough,
     model_table,
@@ -132,7 +132,7 @@ def test_with_zeros_around_the_border_counts():
 def test_a_picture_of_8_bits_is_scored_as_the_file_holds_it():
     truth = np.full((16, 16, 3), 100, np.uint8)
     image = np.full((16, 16, 3), 100.4 / 255, np.float32)
-    assert psnr(as_bytes(image), truth) == 100.0
+    assert psnr(eight_bit(image), truth) == 100.0
     assert psnr(image, truth) == pytest.approx(-20 * np.log10(0.4 / 255), abs=1e-3)
 
 

@@ -91,9 +91,15 @@ def read_masked_image(
     return (image, None) if counts.all() else (painted(image, counts), counts)
 
 
-def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Writes [H, W, 3] RGB as PNG, whole or not at all."""
-    encoded, data = cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))
+def eight_bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Returns values in [0, 1] as whole steps of 1/255; what lies outside is clipped."""
+    return np.asarray(np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Writes [H, W, 3] RGB or [H, W] gray of 8 or 16 bits as PNG, whole or not at all."""
+    ordered = image[:, :, ::-1] if image.ndim == 3 else image
+    encoded, data = cv2.imencode(".png", np.ascontiguousarray(ordered))
     if not encoded:
         raise ValueError(f"OpenCV cannot encode an image of shape {image.shape}")
     write_bytes(path, data.tobytes())

@@ -26,11 +26,6 @@ def leaves_enough(mask: NDArray[np.bool_]) -> bool:
     return int(np.count_nonzero(_cropped(mask))) >= MIN_PIXELS
 
 
-def as_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Returns an image [H, W, 3], clamped to [0, 1], as a picture file holds it."""
-    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
 def psnr(
     image: NDArray[Any], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
 ) -> float:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.atomic import write_bytes, write_json
 from recon_cli.config import EvaluateConfig
-from recon_cli.io.images import write_png
+from recon_cli.io.images import eight_bit, write_png
 from recon_cli.io.ply import read_ply
 from recon_cli.metrics import (
     MASK_CONVENTION,
@@ -27,7 +27,6 @@ from recon_cli.metrics import (
     SSIM_CONVENTION,
     SSIM_PADDED_CONVENTION,
     ModelScore,
-    as_bytes,
     csv_table,
     model_table,
     paired_bootstrap,
@@ -140,7 +139,7 @@ def _save_pictures(
     out: Path, model: str, truth: Truth, image: NDArray[np.float32]
 ) -> None:
     """Saves the picture of a held-out view, and what it differs in from the truth."""
-    name, shown = f"{Path(truth.name).stem}.png", as_bytes(image)
+    name, shown = f"{Path(truth.name).stem}.png", eight_bit(image)
     _save(out / "renders" / model / name, shown)
     difference = np.abs(shown.astype(np.int16) - truth.image) * _GAIN
     if truth.mask is not None:

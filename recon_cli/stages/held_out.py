@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.io.images import fitted_camera, read_masked_image
-from recon_cli.metrics import MIN_SIDE, ViewScore, as_bytes, leaves_enough, psnr, ssim
+from recon_cli.io.images import eight_bit, fitted_camera, read_masked_image
+from recon_cli.metrics import MIN_SIDE, ViewScore, leaves_enough, psnr, ssim
 from recon_cli.metrics.perceptual import Perceptual
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
@@ -183,7 +183,7 @@ def view_score(
     if perceptual is not None and mask is None:
         distance = perceptual(image, truth.image)
     return ViewScore(
-        truth.name, psnr(image, truth.image, mask), psnr(as_bytes(image), truth.image, mask),
+        truth.name, psnr(image, truth.image, mask), psnr(eight_bit(image), truth.image, mask),
         ssim(image, truth.image, mask), ssim(image, truth.image, mask, padded=True), distance,
         None if mask is None else float(mask.mean()))
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from recon_cli.errors import FormatError
-from recon_cli.io.images import painted, read_mask, read_masked_image, write_png
+from recon_cli.io.images import eight_bit, painted, read_mask, read_masked_image, write_png
 
 
 def written(path, mask):
@@ -75,3 +75,16 @@ def test_a_file_that_is_no_mask_is_named(tmp_path):
     (tmp_path / "m.png").write_text("no picture")
     with pytest.raises(FormatError, match=r"m\.png cannot be read as a mask"):
         read_mask(tmp_path / "m.png", 4, 1)
+
+
+def test_gray_and_sixteen_bits_survive_a_png(tmp_path):
+    for image in (np.array([[0, 1, 256, 65_535]], np.uint16), np.array([[0, 7, 255]], np.uint8)):
+        write_png(tmp_path / "gray.png", image)
+        back = cv2.imread(str(tmp_path / "gray.png"), cv2.IMREAD_UNCHANGED)
+        assert back.dtype == image.dtype
+        np.testing.assert_array_equal(back, image)
+
+
+def test_eight_bits_round_to_the_nearest_step_and_clip():
+    values = np.array([-1, 0, 0.49 / 255, 0.51 / 255, 1, 7], np.float32)
+    np.testing.assert_array_equal(eight_bit(values), [0, 0, 0, 1, 255, 255])

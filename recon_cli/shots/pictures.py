@@ -1,0 +1,115 @@
+"""From what a rasterizer returns to pictures: colour, depth in whole steps, coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon_cli.io.images import eight_bit, write_png
+from recon_cli.render import RenderOutput
+from recon_cli.scene.scene import Scene
+from recon_cli.shots.orbit import depths_seen
+from recon_cli.shots.request import ALPHA, DEPTH, RGB
+
+DEPTH_COLOR = "depth_color"
+SHOWN = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA}  # the pictures that a video of it shows
+FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,)}
+FARTHEST = 65_535  # steps; what is farther has this depth too
+_MOST = 0.5  # of the light: where less meets a surface, there is none to have a depth
+# Depths that nearly all points lie between. Few points may cover much of a picture where a camera
+# comes close, so the colours begin at half of the first.
+_ENDS = (0.02, 0.98)
+_BLUE = 0.08  # of the colour map; what comes before is nearly as black as nothing
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """What depth pictures mean.
+
+    Attributes:
+        metres: a step is a millimetre; else it is a thousandth of the scene's extent.
+        step: of a 16-bit depth in world units.
+        near: depth in world units that is drawn red.
+        far: depth in world units that is drawn blue.
+    """
+
+    metres: bool
+    step: float
+    near: float
+    far: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns what a reader of the pictures must know."""
+        return {
+            "unit": "millimetre" if self.metres else "thousandth of the scene's extent",
+            "world_units_per_step": self.step, "nothing": 0, "this_or_farther": FARTHEST,
+            "colors": {"near_red_steps": self.near / self.step,
+                       "far_blue_steps": self.far / self.step},
+        }
+
+
+def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
+    """Returns the scale for a scene; colours span what its training cameras see.
+
+    The colours end where the scene does, not where a frame does, so that a video does not flicker.
+    """
+    seen = np.concatenate([depths_seen(view.camera, scene.points) for view in scene.train])
+    near, far = np.quantile(seen, _ENDS) if len(seen) else (0.0, scene.extent)
+    step = 1e-3 if metres else 1e-3 * scene.extent
+    return DepthScale(metres, step, float(near / 2), float(max(far, near + step)))
+
+
+def write_pictures(
+    folder: Path, name: str, shown: RenderOutput, outputs: Sequence[str], scale: DepthScale
+) -> None:
+    """Writes the pictures of one frame, each whole or not at all."""
+    file = f"{name}.png"
+    for output in outputs:
+        if output == RGB:
+            write_png(folder / RGB / file, eight_bit(_array(shown.rgb)))
+        elif output == ALPHA:
+            write_png(folder / ALPHA / file, eight_bit(_array(shown.alpha)))
+        else:
+            steps = depth_steps(_array(shown.depth), _array(shown.alpha), scale.step)
+            write_png(folder / DEPTH / file, steps)
+            write_png(folder / DEPTH_COLOR / file, depth_colors(steps, scale))
+
+
+def _array(tensor: Tensor) -> NDArray[np.float32]:
+    array: NDArray[np.float32] = tensor.cpu().numpy()
+    return array
+
+
+def depth_steps(
+    depth: NDArray[np.float32], alpha: NDArray[np.float32], step: float
+) -> NDArray[np.uint16]:
+    """Returns z-depth [H, W] in whole steps: the mean of what covers a pixel, by alpha T.
+
+    0 where less than half of the light meets a surface. What is nearer than half a step has 1, what
+    is beyond 16 bits has 65535.
+
+    Args:
+        depth: [H, W] sum of alpha T z in world units.
+        alpha: [H, W] coverage.
+        step: in world units.
+    """
+    there = alpha >= _MOST
+    mean = depth.astype(np.float64) / np.where(there, alpha, 1) / step
+    return np.where(there, np.clip(np.rint(mean), 1, FARTHEST), 0).astype(np.uint16)
+
+
+def depth_colors(steps: NDArray[np.uint16], scale: DepthScale) -> NDArray[np.uint8]:
+    """Returns RGB [H, W, 3]: red is near, blue is far, black is nothing."""
+    nearness = np.clip((scale.far - steps * scale.step) / (scale.far - scale.near), 0, 1)
+    place = (_BLUE + (1 - _BLUE) * nearness).astype(np.float32)
+    colors = cv2.applyColorMap(eight_bit(place), cv2.COLORMAP_TURBO)
+    rgb = np.asarray(colors[:, :, ::-1], np.uint8).copy()
+    rgb[steps == 0] = 0
+    return rgb

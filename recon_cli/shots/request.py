@@ -1,0 +1,147 @@
+"""What was asked of `recon render`, checked as far as that goes without a workspace."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon_cli.errors import ConfigError
+
+TRAINING, ORBIT = "training", "orbit"  # what --path takes beside a file
+RGB, DEPTH, ALPHA = OUTPUTS = ("rgb", "depth", "alpha")
+PNG, MP4 = FORMATS = ("png", "mp4")
+FPS, SECONDS = 30.0, 10.0  # where nothing else is said
+_CRF_LIMITS = {"h264": 51, "av1": 63}
+CODECS = tuple(_CRF_LIMITS)
+CRF = {"h264": 18, "av1": 28}  # hardly a difference to the eye
+MAX_FRAMES = 100_000
+
+
+@dataclass(frozen=True)
+class Request:
+    """The options of the verb.
+
+    Attributes:
+        path: "training", "orbit" or a .json with cameras.
+        views: test, train, validation or names of frames: single views in place of a path.
+        outputs: which of rgb, depth, alpha.
+        model: auto, base or pruned, as in `recon export`.
+        fps: frames a second; None takes that of the file, or 30.
+        seconds: length of a path that is made here; None stands for 10.
+        size: longest side in pixels.
+        width: in pixels.
+        height: in pixels; None of the three takes the size of training, or of the file.
+        background: RGB, 0 to 255.
+        form: png or mp4; None is mp4 where `out` is an .mp4.
+        codec: h264 or av1; None is h264.
+        crf: quality of the video, smaller is better.
+        out: folder, or a file that ends in .mp4 or .png; None is a folder in the workspace.
+    """
+
+    path: str = TRAINING
+    views: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = (RGB,)
+    model: str = "auto"
+    fps: float | None = None
+    seconds: float | None = None
+    size: int | None = None
+    width: int | None = None
+    height: int | None = None
+    background: tuple[int, int, int] = (0, 0, 0)
+    form: str | None = None
+    codec: str | None = None
+    crf: int | None = None
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.file is None and self.path not in (TRAINING, ORBIT):
+            raise ConfigError(
+                f"--path takes {TRAINING}, {ORBIT} or a FILE.json, but got {self.path!r}.")
+        self._check_numbers()
+        self._check_views()
+        self._check_video()
+        if self.out_file is not None and len(self.outputs) > 1:
+            raise ConfigError(
+                f"{self.out_file} is one file, but {len(self.outputs)} outputs are asked for.",
+                hint="Give a folder with --out, or one --output.")
+
+    @property
+    def file(self) -> Path | None:
+        """The camera path to read, if that is what --path names."""
+        return Path(self.path) if self.path.lower().endswith(".json") else None
+
+    @property
+    def out_file(self) -> Path | None:
+        """What --out names where it is no folder."""
+        single = self.out is not None and self.out.suffix.lower() in (".mp4", ".png")
+        return self.out if single else None
+
+    @property
+    def video(self) -> bool:
+        """Whether frames become a video."""
+        if self.form is None:
+            return self.out_file is not None and self.out_file.suffix.lower() == ".mp4"
+        return self.form == MP4
+
+    @property
+    def quality(self) -> tuple[str, int]:
+        """Codec and CRF of the video."""
+        codec = self.codec or CODECS[0]
+        return codec, CRF[codec] if self.crf is None else self.crf
+
+    def frames(self) -> int:
+        """Returns how many frames a path that is made here has."""
+        return max(1, round((self.fps or FPS) * (self.seconds or SECONDS)))
+
+    def _check_numbers(self) -> None:
+        for name, value, highest in (("fps", self.fps, 240), ("seconds", self.seconds, 86_400)):
+            if value is not None and not (math.isfinite(value) and 0 < value <= highest):
+                raise ConfigError(f"--{name} is {value:g}; needed is one above 0, up to {highest}.")
+        for name in ("size", "width", "height"):
+            pixels = getattr(self, name)
+            if pixels is not None and pixels < 1:
+                raise ConfigError(f"--{name} is {pixels}; needed is at least 1 pixel.")
+        if self.size is not None and (self.width or self.height):
+            raise ConfigError("--size and --width or --height exclude each other.")
+        if not all(0 <= value <= 255 for value in self.background):
+            raise ConfigError(f"--background is {self.background}; needed are 0 to 255.")
+        if self.frames() > MAX_FRAMES:
+            raise ConfigError(
+                f"{self.frames():,} frames are asked for; at most {MAX_FRAMES:,} are rendered.",
+                hint="Lower --fps or --seconds.")
+
+    def _check_views(self) -> None:
+        if self.file is not None and self.seconds is not None:
+            raise ConfigError("--seconds has no effect on a path from a file: it lists its frames.")
+        if not self.views:
+            return
+        for name in ("fps", "seconds"):
+            if getattr(self, name) is not None:
+                raise ConfigError(f"--{name} has no effect on single views.")
+        if self.video:
+            raise ConfigError(
+                "Single views make no video.", hint="Leave --views out, or the video.")
+        if self.width and self.height:
+            raise ConfigError(
+                "--width and --height together have no effect on single views, which keep their "
+                "shape.", hint="Give one of them, or --size.")
+
+    def _check_video(self) -> None:
+        codec = self.codec or CODECS[0]
+        if self.crf is not None and not 0 <= self.crf <= _CRF_LIMITS[codec]:
+            raise ConfigError(
+                f"--crf is {self.crf}; {codec} takes 0 to {_CRF_LIMITS[codec]}.")
+        if not self.video:
+            for name in ("codec", "crf"):
+                if getattr(self, name) is not None:
+                    raise ConfigError(f"--{name} has no effect without --format mp4.")
+        file = self.out_file
+        if file is not None and not self.video and DEPTH in self.outputs:
+            raise ConfigError(
+                f"{file} alone would not say what its depth means.",
+                hint="Give a folder with --out; render.json in it says that.")
+        if file is not None and (file.suffix.lower() == ".mp4") != self.video:
+            raise ConfigError(
+                f"--out names {file.name}, but the format is {'mp4' if self.video else 'png'}.",
+                hint="Give a folder, or a file that ends as the format does.")
