@@ -1,0 +1,1 @@
+"""Splat files of other programs: one module a format."""

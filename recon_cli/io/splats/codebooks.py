@@ -1,0 +1,93 @@
+"""Codebooks for numbers and palettes for vectors: k-means by scipy, seeded, in seconds."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
+
+BOOK = 256  # numbers that a byte tells apart
+_SAMPLE = 1 << 16  # numbers or rows that centres are fitted to; more move them no further
+_BOOK_ROUNDS = 20
+_ROUNDS = 10
+_Floats = NDArray[np.float32]
+_Float = TypeVar("_Float", np.float32, np.float64)
+
+
+def codebook(values: _Floats, rng: np.random.Generator) -> _Floats:
+    """Returns 256 ascending numbers near which `values` lie.
+
+    Lloyd's algorithm from 128 quantiles and 128 even steps: quantiles for the many, steps for the
+    tails, where quantiles leave gaps.
+
+    Args:
+        values: of any shape, at least one.
+        rng: draws the values that are looked at where they are many.
+    """
+    flat = values.ravel().astype(np.float64)  # squares of what is tiny or huge have to be numbers
+    ends = (float(flat.min()), float(flat.max()))
+    if flat.size > _SAMPLE:
+        flat = np.append(rng.choice(flat, _SAMPLE, replace=False), ends)
+    start = np.unique(np.concatenate([
+        np.quantile(flat, np.linspace(0, 1, BOOK // 2)), np.linspace(*ends, BOOK // 2)]))
+    centres = np.sort(_lloyd(flat[:, None], start[:, None], _BOOK_ROUNDS)[:, 0])
+    return np.pad(centres, (0, BOOK - len(centres)), mode="edge").astype(np.float32)
+
+
+def nearest(values: _Floats, book: _Floats) -> NDArray[np.uint8]:
+    """Returns the index of the nearest number of an ascending codebook for each value."""
+    wide = book.astype(np.float64)
+    return np.searchsorted((wide[1:] + wide[:-1]) / 2, values).astype(np.uint8)
+
+
+def palette(
+    rows: _Floats, size: int, rng: np.random.Generator
+) -> tuple[_Floats, NDArray[np.int64]]:
+    """Returns at most `size` representative rows [P, D] and which of them stands for each row [M].
+
+    Two levels of k-means: about sqrt(size) groups first, then each group by itself, with a share
+    of the palette like its share of the squared error. One level would compare every row with
+    every entry, which takes minutes for a million rows.
+
+    Args:
+        rows: [M, D], M at least 1.
+        size: entries wanted, at least 1.
+        rng: draws the rows that the search starts from.
+    """
+    peak = np.abs(rows).max()
+    if peak > 0:
+        rows = rows / peak  # so that no square overflows
+    count = min(len(rows), max(1, round(math.sqrt(size))))
+    sample = rows if len(rows) <= _SAMPLE else rows[
+        np.sort(rng.choice(len(rows), _SAMPLE, replace=False))]
+    start = sample[np.sort(rng.choice(len(sample), min(count, len(sample)), replace=False))]
+    groups, distances = vq(rows, _lloyd(sample, start, _ROUNDS))
+    errors = np.bincount(groups, distances.astype(np.float64) ** 2, minlength=count)
+    shares = errors / errors.sum() if errors.sum() > 0 else np.zeros(count)
+    entries: list[_Floats] = []
+    labels = np.zeros(len(rows), np.int64)
+    total = 0
+    for group, share in enumerate(shares):
+        members = np.flatnonzero(groups == group)
+        if not len(members):
+            continue
+        wanted = min(len(members), 1 + int(share * (size - count)))
+        start = rows[members[np.sort(rng.choice(len(members), wanted, replace=False))]]
+        centres = _lloyd(rows[members], start, _ROUNDS)
+        own, _ = vq(rows[members], centres)
+        used, own = np.unique(own, return_inverse=True)
+        entries.append(centres[used])
+        labels[members] = total + own
+        total += len(used)
+    return np.concatenate(entries) * peak, labels
+
+
+def _lloyd(rows: NDArray[_Float], start: NDArray[_Float], rounds: int) -> NDArray[_Float]:
+    with warnings.catch_warnings():  # a centre that no row is nearest to stays where it is
+        warnings.simplefilter("ignore", UserWarning)
+        centres, _ = kmeans2(rows, start, iter=rounds, minit="matrix", missing="warn")
+    return np.asarray(centres, rows.dtype)
