@@ -12,6 +12,7 @@ from scipy.cluster.vq import kmeans2, vq
 
 BOOK = 256  # numbers that a byte tells apart
 _SAMPLE = 1 << 16  # numbers or rows that centres are fitted to; more move them no further
+_PAIRS = 1 << 26  # of rows and centres that are compared at a time: 256 MB
 _BOOK_ROUNDS = 20
 _ROUNDS = 10
 _Floats = NDArray[np.float32]
@@ -54,20 +55,16 @@ def palette(
     every entry, which takes minutes for a million rows.
 
     Args:
-        rows: [M, D], M at least 1.
+        rows: [M, D], M at least 1. What is there often counts once.
         size: entries wanted, at least 1.
         rng: draws the rows that the search starts from.
     """
-    peak = np.abs(rows).max()
-    if peak > 0:
-        rows = rows / peak  # so that no square overflows
-    count = min(len(rows), max(1, round(math.sqrt(size))))
-    sample = rows if len(rows) <= _SAMPLE else rows[
-        np.sort(rng.choice(len(rows), _SAMPLE, replace=False))]
-    start = sample[np.sort(rng.choice(len(sample), min(count, len(sample)), replace=False))]
-    groups, distances = vq(rows, _lloyd(sample, start, _ROUNDS))
-    errors = np.bincount(groups, distances.astype(np.float64) ** 2, minlength=count)
-    shares = errors / errors.sum() if errors.sum() > 0 else np.zeros(count)
+    rows, copies = np.unique(rows, axis=0, return_inverse=True)
+    peak = max(float(np.abs(rows).max()), float(np.finfo(np.float32).tiny))
+    rows = rows / np.float32(peak)  # so that no square overflows
+    groups, errors = _grouped(rows, max(1, round(math.sqrt(size))), rng)
+    shares = errors / max(errors.sum(), np.finfo(np.float64).tiny)
+    spare = size - len(shares)
     entries: list[_Floats] = []
     labels = np.zeros(len(rows), np.int64)
     total = 0
@@ -75,15 +72,37 @@ def palette(
         members = np.flatnonzero(groups == group)
         if not len(members):
             continue
-        wanted = min(len(members), 1 + int(share * (size - count)))
-        start = rows[members[np.sort(rng.choice(len(members), wanted, replace=False))]]
-        centres = _lloyd(rows[members], start, _ROUNDS)
-        own, _ = vq(rows[members], centres)
-        used, own = np.unique(own, return_inverse=True)
+        wanted = min(1 + int(share * spare), max(1, _PAIRS // len(members)))
+        centres = _lloyd(rows[members], _starts(rows[members], wanted, rng), _ROUNDS)
+        used, own = np.unique(vq(rows[members], centres)[0], return_inverse=True)
         entries.append(centres[used])
         labels[members] = total + own
         total += len(used)
-    return np.concatenate(entries) * peak, labels
+    return np.concatenate(entries) * np.float32(peak), labels[copies.ravel()]
+
+
+def _grouped(
+    rows: _Floats, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Returns the group of each row [M] and the squared error of each group."""
+    sample = rows if len(rows) <= _SAMPLE else rows[
+        np.sort(rng.choice(len(rows), _SAMPLE, replace=False))]
+    centres = _lloyd(sample, _starts(sample, count, rng), _ROUNDS)
+    found = [vq(rows[at:at + _SAMPLE], centres) for at in range(0, len(rows), _SAMPLE)]
+    groups = np.concatenate([part[0] for part in found]).astype(np.int64)
+    squares = np.concatenate([part[1] for part in found]).astype(np.float64) ** 2
+    return groups, np.bincount(groups, squares, len(centres)).astype(np.float64)
+
+
+def _starts(rows: _Floats, count: int, rng: np.random.Generator) -> _Floats:
+    """Returns rows to start from: half of them anywhere, half by their distance from the middle.
+
+    Without the second half the few that lie far from the many would have no centre near them.
+    """
+    far = ((rows - rows.mean(axis=0)) ** 2).sum(axis=1, dtype=np.float64)
+    weights = far.mean() + far if far.any() else np.ones(len(far))
+    count = min(count, len(rows))
+    return rows[np.sort(rng.choice(len(rows), count, replace=False, p=weights / weights.sum()))]
 
 
 def _lloyd(rows: NDArray[_Float], start: NDArray[_Float], rounds: int) -> NDArray[_Float]:

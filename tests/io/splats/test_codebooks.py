@@ -77,3 +77,19 @@ def test_the_same_seed_gives_the_same_palette():
     one, other = (palette(rows, 200, np.random.default_rng(7)) for _ in range(2))
     np.testing.assert_array_equal(one[0], other[0])
     np.testing.assert_array_equal(one[1], other[1])
+
+
+def test_the_few_among_many_alike_have_entries_of_their_own(rng):
+    rows = rng.normal(0, 1e-3, (4000, 9)).astype(np.float32)
+    rows[::100] = rng.normal(size=(40, 9))
+    entries, labels = palette(rows, 250, rng)
+    error = np.abs(entries[labels] - rows).max(axis=1)
+    assert np.median(error[::100]) < 1e-6
+
+
+def test_zeros_among_others_are_one_entry(rng):
+    rows = np.zeros((20_000, 9), np.float32)
+    rows[::100] = rng.normal(size=(200, 9))
+    entries, labels = palette(rows, 1000, rng)
+    np.testing.assert_allclose(entries[labels], rows, atol=1e-6)
+    assert len(entries) == 201
