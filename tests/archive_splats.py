@@ -24,6 +24,7 @@ def room(n, *, seed=0, degree=3, materials=40):
     means[wall == 0, 0] = rng.choice([-2, 2], (wall == 0).sum())
     means[wall == 1, 1] = rng.choice([-1.5, 1.5], (wall == 1).sum())
     means[wall == 2, 2] = 5
+    means += rng.normal(0, 0.01, (n, 3))  # of one depth, the order of the file would show
     waves = np.sin(means @ rng.normal(size=(3, 3)) * 2)
     material = ((means @ rng.normal(size=3) * 3).astype(int) * 3 + wall) % materials
     strength = np.repeat([0.1, 0.05, 0.03], [3, 5, 7])[None, :, None]
