@@ -40,11 +40,13 @@ class Container:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            data = path.read_bytes()
+            with path.open("rb") as file:
+                head = file.read(_HEADER.size + _CHUNK.size)
+                if len(head) < _HEADER.size + _CHUNK.size or not head.startswith(_MAGIC):
+                    raise FormatError(f"{path} is no .glb.")
+                data = head + file.read()
         except OSError as error:
             raise FormatError(f"{path} cannot be read: {error}.") from error
-        if len(data) < _HEADER.size + _CHUNK.size or data[:4] != _MAGIC:
-            raise FormatError(f"{path} is no .glb.")
         _, version, length = _HEADER.unpack_from(data)
         if version != _VERSION:
             raise self.damaged(f"version {version} of the container; version 2 can be read")

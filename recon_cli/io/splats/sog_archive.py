@@ -23,6 +23,7 @@ from recon_cli.errors import FormatError
 META = "meta.json"
 _META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
 _SMALL = 1 << 20  # Gaussians or pixels that are taken without asking how: a few hundred MB
+_START, _ENTRY = b"PK\x03\x04", b"PK\x01\x02"  # of a zip, and of each entry of its directory
 _ENTRIES = 64  # a .sog has eight
 _HEADER = 1 << 16  # bytes of an image beside its pixels
 _HINT = "Write or copy the file again."
@@ -40,16 +41,20 @@ class Archive:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._data = path.read_bytes()
+            with path.open("rb") as file:
+                if file.read(len(_START)) != _START:
+                    raise FormatError(f"{path} is no .sog.")
+                self._data = _START + file.read()
+            if self._data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
+                raise self.damaged(f"more than {_ENTRIES} entries: no .sog")
             self._zip = zipfile.ZipFile(io.BytesIO(self._data))
         except OSError as error:
             raise FormatError(f"{path} cannot be read: {error}.") from error
         except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
             raise FormatError(f"{path} is no .sog: {error}.", hint=_HINT) from error
         self._entries = {entry.filename: entry for entry in self._zip.infolist()}
-        if len(self._zip.infolist()) > _ENTRIES or len(self._entries) < len(self._zip.infolist()):
-            raise self.damaged(
-                f"{len(self._zip.infolist())} entries, or two of one name: no .sog")
+        if len(self._entries) < len(self._zip.infolist()):
+            raise self.damaged("two entries of one name")
         for name in self._entries:
             if _leaves(name):
                 raise self.damaged(f"the entry {name!r:.80}, which leaves the archive")

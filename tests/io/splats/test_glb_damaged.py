@@ -3,6 +3,7 @@
 import contextlib
 import json
 import struct
+import warnings
 
 import archive_splats
 import damage
@@ -165,6 +166,15 @@ def test_a_value_that_is_none_is_refused(tmp_path, good, name, number, said):
     start = of(value, "bufferViews", name)["byteOffset"] + 8
     data = data[:start] + np.array([number], "<f4").tobytes() + data[start + 4:]
     refused(tmp_path, contained(value, data), said)
+
+
+def test_a_nan_that_signals_is_refused_without_a_warning(tmp_path, good):
+    value, data = good
+    start = of(value, "bufferViews", "POSITION")["byteOffset"]
+    data = data[:start] + (0x7FA00000).to_bytes(4, "little") + data[start + 4:]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        refused(tmp_path, contained(value, data), "not finite")
 
 
 def _survives(path, data):
