@@ -1,1 +1,1 @@
-"""Gaussians in the one-file formats of viewers, read and written; docs/formats.md compares them."""
+"""Gaussians in the formats of viewers, read and written; docs/formats.md compares them."""

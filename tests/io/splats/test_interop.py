@@ -1,10 +1,4 @@
-"""Files of other programs: all are read, and one scene in several formats is one scene.
-
-The files in data/ are those of MetalSplatter and of PlayCanvas' splat-transform, each under the
-licence beside it.
-"""
-
-from pathlib import Path
+"""Files of other programs: all are read, and one scene in several formats is one scene."""
 
 import numpy as np
 import pytest
@@ -17,16 +11,21 @@ from recon_cli.io.splats.splat import read_splat
 from recon_cli.io.splats.spz import read_spz
 from recon_cli.scene.splats import SH_C0
 
-DATA = Path(__file__).parent / "data"
-MINIMAL = DATA / "splat-transform"
+
+@pytest.fixture
+def points(shared_data):
+    """The same three Gaussians in several formats, by suffix."""
+    folder = shared_data / "interop" / "metalsplatter" / "SplatIO" / "TestData"
+    return lambda kind: folder / f"test-splat.3-points-from-train.{kind}"
 
 
-def points(kind: str) -> Path:
-    """The same three Gaussians in a format."""
-    return DATA / "metalsplatter" / f"test-splat.3-points-from-train.{kind}"
+@pytest.fixture
+def minimal(shared_data):
+    """Four Gaussians of degree 0 in several formats."""
+    return shared_data / "interop" / "splat-transform" / "test" / "fixtures" / "splat"
 
 
-def test_one_scene_as_ply_and_spz_agrees_within_the_steps_of_spz():
+def test_one_scene_as_ply_and_spz_agrees_within_the_steps_of_spz(points):
     ply, spz = read_ply(points("ply")), read_spz(points("spz"))
     assert greatest(ply.means, spz.means) <= 0.5 / 4096 + 1e-7
     assert greatest(ply.log_scales, spz.log_scales) <= 0.5 / 16 + 1e-6
@@ -40,7 +39,7 @@ def test_one_scene_as_ply_and_spz_agrees_within_the_steps_of_spz():
     assert greatest(ply.sh_rest[:, 3:], spz.sh_rest[:, 3:]) <= 8.5 / 128
 
 
-def test_one_scene_as_ply_and_splat_agrees_within_the_steps_of_splat():
+def test_one_scene_as_ply_and_splat_agrees_within_the_steps_of_splat(points):
     ply, splat = read_ply(points("ply")), read_splat(points("splat"))
     assert torch.equal(splat.means, ply.means)
     assert greatest(splat.log_scales, ply.log_scales) <= 1e-5
@@ -51,22 +50,22 @@ def test_one_scene_as_ply_and_splat_agrees_within_the_steps_of_splat():
     assert splat.sh_degree == 0
 
 
-def test_a_file_without_gzip_is_the_one_with_it():
-    packed, raw = read_spz(MINIMAL / "minimal-v2.spz"), read_spz(MINIMAL / "minimal-raw.spz")
+def test_a_file_without_gzip_is_the_one_with_it(minimal):
+    packed, raw = read_spz(minimal / "minimal-v2.spz"), read_spz(minimal / "minimal-raw.spz")
     for name, value in packed.parameters().items():
         assert torch.equal(value, getattr(raw, name)), name
 
 
-def test_four_points_on_a_square_are_one_scene_in_every_version():
-    splat = read_splat(MINIMAL / "minimal.splat")
+def test_four_points_on_a_square_are_one_scene_in_every_version(minimal):
+    splat = read_splat(minimal / "minimal.splat")
     assert splat.means.tolist() == [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]]
     for version in (3, 4):
-        spz = read_spz(MINIMAL / f"minimal-v{version}.spz")
+        spz = read_spz(minimal / f"minimal-v{version}.spz")
         assert torch.equal(spz.means, splat.means)
         assert spz.quats.tolist() == [[1, 0, 0, 0]] * 4
         assert greatest(spz.log_scales, splat.log_scales) <= 0.5 / 16
         assert torch.equal(spz.logit_opacities, splat.logit_opacities)
-    two = read_spz(MINIMAL / "minimal-v2.spz")  # made without turning the axes
+    two = read_spz(minimal / "minimal-v2.spz")  # made without turning the axes
     assert torch.equal(two.means * torch.tensor([1, -1, -1]), splat.means)
     assert rotation_error(two, spz) <= 0.5 / 127.5 + 1e-6
 

@@ -1,0 +1,112 @@
+"""Codebooks for numbers and palettes for vectors: k-means by scipy, seeded, in seconds."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
+
+BOOK = 256  # numbers that a byte tells apart
+_SAMPLE = 1 << 16  # numbers or rows that centres are fitted to; more move them no further
+_PAIRS = 1 << 26  # of rows and centres that are compared at a time: 256 MB
+_BOOK_ROUNDS = 20
+_ROUNDS = 10
+_Floats = NDArray[np.float32]
+_Float = TypeVar("_Float", np.float32, np.float64)
+
+
+def codebook(values: _Floats, rng: np.random.Generator) -> _Floats:
+    """Returns 256 ascending numbers near which `values` lie.
+
+    Lloyd's algorithm from 128 quantiles and 128 even steps: quantiles for the many, steps for the
+    tails, where quantiles leave gaps.
+
+    Args:
+        values: of any shape, at least one.
+        rng: draws the values that are looked at where they are many.
+    """
+    flat = values.ravel().astype(np.float64)  # squares of what is tiny or huge have to be numbers
+    ends = (float(flat.min()), float(flat.max()))
+    if flat.size > _SAMPLE:
+        flat = np.append(rng.choice(flat, _SAMPLE, replace=False), ends)
+    start = np.unique(np.concatenate([
+        np.quantile(flat, np.linspace(0, 1, BOOK // 2)), np.linspace(*ends, BOOK // 2)]))
+    centres = np.sort(_lloyd(flat[:, None], start[:, None], _BOOK_ROUNDS)[:, 0])
+    return np.pad(centres, (0, BOOK - len(centres)), mode="edge").astype(np.float32)
+
+
+def nearest(values: _Floats, book: _Floats) -> NDArray[np.uint8]:
+    """Returns the index of the nearest number of an ascending codebook for each value."""
+    wide = book.astype(np.float64)
+    return np.searchsorted((wide[1:] + wide[:-1]) / 2, values).astype(np.uint8)
+
+
+def palette(
+    rows: _Floats, size: int, rng: np.random.Generator
+) -> tuple[_Floats, NDArray[np.int64]]:
+    """Returns at most `size` representative rows [P, D] and which of them stands for each row [M].
+
+    Two levels of k-means: about sqrt(size) groups first, then each group by itself, with a share
+    of the palette like its share of the squared error. One level would compare every row with
+    every entry, which takes minutes for a million rows.
+
+    Args:
+        rows: [M, D], M at least 1. What is there often counts once.
+        size: entries wanted, at least 1.
+        rng: draws the rows that the search starts from.
+    """
+    rows, copies = np.unique(rows, axis=0, return_inverse=True)
+    peak = max(float(np.abs(rows).max()), float(np.finfo(np.float32).tiny))
+    rows = rows / np.float32(peak)  # so that no square overflows
+    groups, errors = _grouped(rows, max(1, round(math.sqrt(size))), rng)
+    shares = errors / max(errors.sum(), np.finfo(np.float64).tiny)
+    spare = size - len(shares)
+    entries: list[_Floats] = []
+    labels = np.zeros(len(rows), np.int64)
+    total = 0
+    for group, share in enumerate(shares):
+        members = np.flatnonzero(groups == group)
+        if not len(members):
+            continue
+        wanted = min(1 + int(share * spare), max(1, _PAIRS // len(members)))
+        centres = _lloyd(rows[members], _starts(rows[members], wanted, rng), _ROUNDS)
+        used, own = np.unique(vq(rows[members], centres)[0], return_inverse=True)
+        entries.append(centres[used])
+        labels[members] = total + own
+        total += len(used)
+    return np.concatenate(entries) * np.float32(peak), labels[copies.ravel()]
+
+
+def _grouped(
+    rows: _Floats, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Returns the group of each row [M] and the squared error of each group."""
+    sample = rows if len(rows) <= _SAMPLE else rows[
+        np.sort(rng.choice(len(rows), _SAMPLE, replace=False))]
+    centres = _lloyd(sample, _starts(sample, count, rng), _ROUNDS)
+    found = [vq(rows[at:at + _SAMPLE], centres) for at in range(0, len(rows), _SAMPLE)]
+    groups = np.concatenate([part[0] for part in found]).astype(np.int64)
+    squares = np.concatenate([part[1] for part in found]).astype(np.float64) ** 2
+    return groups, np.bincount(groups, squares, len(centres)).astype(np.float64)
+
+
+def _starts(rows: _Floats, count: int, rng: np.random.Generator) -> _Floats:
+    """Returns rows to start from: half of them anywhere, half by their distance from the middle.
+
+    Without the second half the few that lie far from the many would have no centre near them.
+    """
+    far = ((rows - rows.mean(axis=0)) ** 2).sum(axis=1, dtype=np.float64)
+    weights = far.mean() + far if far.any() else np.ones(len(far))
+    count = min(count, len(rows))
+    return rows[np.sort(rng.choice(len(rows), count, replace=False, p=weights / weights.sum()))]
+
+
+def _lloyd(rows: NDArray[_Float], start: NDArray[_Float], rounds: int) -> NDArray[_Float]:
+    with warnings.catch_warnings():  # a centre that no row is nearest to stays where it is
+        warnings.simplefilter("ignore", UserWarning)
+        centres, _ = kmeans2(rows, start, iter=rounds, minit="matrix", missing="warn")
+    return np.asarray(centres, rows.dtype)
