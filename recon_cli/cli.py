@@ -162,8 +162,8 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 def evaluate(call: Call, items: tuple[Path, ...], form: str) -> None:
     """Score every model on the held-out views.
 
-    With ITEM, workspaces and .ply files, their models in one table; files are scored on the views
-    of the workspace.
+    With ITEM, workspaces and files of Gaussians (.ply, .spz, .sog, .splat, .glb): their models in
+    one table. Files are scored on the views of the workspace.
     """
     if items:
         click.echo(scoreboard.compare(*beside(call, EvaluateConfig), items, form))

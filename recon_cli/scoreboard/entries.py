@@ -9,7 +9,7 @@ from typing import Any
 
 from recon_cli.atomic import read_json
 from recon_cli.errors import ConfigError, FormatError, InputError
-from recon_cli.io.ply import read_ply
+from recon_cli.io.splats.registry import read_splats
 from recon_cli.metrics import ModelScore, ViewScore
 from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs
@@ -45,7 +45,7 @@ def checked(items: Sequence[Path]) -> None:
         if path.is_dir() and not Workspace(path).holds_results:
             raise InputError(
                 f"{path} is neither a workspace nor a file of Gaussians.",
-                hint="Give folders that `recon train` was run in, or .ply files.")
+                hint="Give folders that `recon train` was run in, or files of Gaussians.")
         if path.resolve() in seen:
             raise ConfigError(f"{path} is there twice.", hint="Leave one out.")
         seen.add(path.resolve())
@@ -120,7 +120,7 @@ def of_file(path: Path, against: Benchmark) -> Entry:
     Raises:
         FormatError: it holds no Gaussians that can be read.
     """
-    splats: Splats = read_ply(path).map(lambda tensor: tensor.to(against.ctx.device))
+    splats: Splats = read_splats(path).map(lambda tensor: tensor.to(against.ctx.device))
     found = scored(splats, against.views, splats.sh_degree, against.ctx)
     score = ModelScore(
         path.name, found.views, len(splats), path.stat().st_size, found.render_ms, None)

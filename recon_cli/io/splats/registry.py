@@ -1,0 +1,64 @@
+"""The formats of Gaussians by name, and which one a file is in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon_cli.errors import FormatError
+from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.io.splats.compressed_ply import read_compressed_ply, write_compressed_ply
+from recon_cli.io.splats.glb import read_glb, write_glb
+from recon_cli.io.splats.sog import read_sog, write_sog
+from recon_cli.io.splats.splat import read_splat, write_splat
+from recon_cli.io.splats.spz import read_spz, write_spz
+from recon_cli.scene.splats import Splats
+
+
+@dataclass(frozen=True)
+class SplatFormat:
+    """One format.
+
+    Attributes:
+        name: and, after a dot, the end of its files' names.
+        read: returns the Gaussians of a file; raises FormatError.
+        write: writes a file, whole or not at all; raises InputError for what does not fit.
+    """
+
+    name: str
+    read: Callable[[Path], Splats]
+    write: Callable[[Path, Splats], None]
+
+
+FORMATS: dict[str, SplatFormat] = {one.name: one for one in (
+    SplatFormat("compressed.ply", read_compressed_ply, write_compressed_ply),  # before "ply"
+    SplatFormat("ply", read_ply, write_ply),
+    SplatFormat("splat", read_splat, write_splat),
+    SplatFormat("spz", read_spz, write_spz),
+    SplatFormat("sog", read_sog, write_sog),
+    SplatFormat("glb", read_glb, write_glb),
+)}
+
+
+def format_of(path: Path) -> SplatFormat:
+    """Returns the format that the end of a file's name stands for.
+
+    Raises:
+        FormatError: it stands for none.
+    """
+    for name, found in FORMATS.items():
+        if path.name.lower().endswith(f".{name}"):
+            return found
+    raise FormatError(
+        f"{path} is of no known format of Gaussians.",
+        hint="Known are " + ", ".join(f".{name}" for name in FORMATS) + ".")
+
+
+def read_splats(path: Path) -> Splats:
+    """Returns the Gaussians of a file in any of FORMATS, on the CPU.
+
+    Raises:
+        FormatError: its format is not known, or the file is damaged.
+    """
+    return format_of(path).read(path)
