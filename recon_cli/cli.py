@@ -172,10 +172,10 @@ def evaluate(call: Call, items: tuple[Path, ...], form: str) -> None:
 
 
 @cli.command()
-@options.stage(ExportConfig)
+@options.stage(ExportConfig, renders=True)
 @pass_call
 def export(call: Call) -> None:
-    """Write a .ply that other viewers open, and check it."""
+    """Write a .ply that other viewers open, and other formats; check each."""
     perform(call, "export", ["export"])
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from recon_cli.errors import ConfigError
 from recon_cli.fields import StageConfig, option
+from recon_cli.holdout_option import parse_holdout
 from recon_cli.measure_option import SCALE_BETWEEN, check_scale_between
 
 
@@ -37,30 +38,6 @@ class IngestConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         parse_holdout(self.holdout)
-
-
-def parse_holdout(text: str) -> tuple[str, float, float]:
-    """Returns (kind, a, b) of --holdout: ("every", N, 0), ("segment", A, B) or ("none", 0, 0).
-
-    Raises:
-        ConfigError: the text is none of the three forms.
-    """
-    kind, *numbers = text.split(":")
-    try:
-        values = [float(number) for number in numbers]
-    except ValueError:
-        values = []
-    if kind == "none" and not numbers:
-        return kind, 0.0, 0.0
-    if kind == "every" and len(values) == 1 and values[0] >= 2 and values[0].is_integer():
-        return kind, values[0], 0.0
-    if kind == "segment" and len(values) == 2 and 0 <= values[0] < values[1] <= 1:
-        return kind, values[0], values[1]
-    raise ConfigError(
-        f"holdout is {text!r}, but it must be every:N (N >= 2), segment:A:B (0 <= A < B <= 1) "
-        "or none.",
-        hint="Try --holdout every:8.",
-    )
 
 
 @dataclass(frozen=True)
@@ -282,6 +259,10 @@ class EvaluateConfig(StageConfig):
         automatic="the size that was trained on")
 
 
+EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "points.ply", "colmap",
+                  "transforms.json")
+
+
 @dataclass(frozen=True)
 class ExportConfig(StageConfig):
     """Which model is handed out."""
@@ -291,10 +272,24 @@ class ExportConfig(StageConfig):
         choices=("auto", "base", "pruned"))
     scale_between: tuple[str, str, float] | None = option(
         None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale of the training stays")
+    format: str = option(
+        "ply", "Formats to write beside the .ply, with commas between: "
+        f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...")
+    max_loss: float | None = option(
+        None, "Most PSNR that a format may lose on the validation views.", unit="dB", minimum=0.0,
+        automatic="0.3, and 3 for .splat, which drops harmonics")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_scale_between(self.scale_between)
+        for name in self.formats:
+            if name not in EXPORT_FORMATS:
+                raise self._refused("format", name, "one of " + ", ".join(EXPORT_FORMATS))
+
+    @property
+    def formats(self) -> tuple[str, ...]:
+        """The names in `format`, each once."""
+        return tuple(dict.fromkeys(name.strip() for name in self.format.split(",")))
 
 
 @dataclass(frozen=True)

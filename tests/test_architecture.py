@@ -27,7 +27,8 @@ ALLOWED: dict[str, set[str]] = {
     "fields": {"errors"},
     "atomic": {"errors"},
     "measure_option": {"errors"},
-    "config": {"errors", "fields", "measure_option"},
+    "holdout_option": {"errors"},
+    "config": {"errors", "fields", "measure_option", "holdout_option"},
     "settings": OPTIONS,
     "digests": BOTTOM,
     "manifest": BOTTOM | {"digests"},
@@ -40,7 +41,8 @@ ALLOWED: dict[str, set[str]] = {
     "mapping": BOTTOM | OPTIONS | {"progress", "io", "scene"},
     "train": BOTTOM | OPTIONS | {"progress", "scene", "render"},
     "stages": BOTTOM | OPTIONS | {
-        "progress", "metrics", "machine", "capture", "mapping", "scene", "io", "train", "render"},
+        "holdout_option", "progress", "metrics", "machine", "capture", "mapping", "scene", "io",
+        "train", "render"},
     "freshness": OPTIONS | RECORDS | {"settings", "stages"},
     "execute": OPTIONS | RECORDS | {
         "settings", "stages", "freshness", "machine", "progress", "render"},

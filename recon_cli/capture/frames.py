@@ -114,7 +114,7 @@ def held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozens
 
     Args:
         names: of all frames.
-        holdout: (kind, a, b) as `config.parse_holdout` gives it: each a-th by name from the
+        holdout: (kind, a, b) as `holdout_option.parse_holdout` gives it: each a-th by name from the
             first on, the share a to b of the names in order, or none.
     """
     ordered = sorted(names)

@@ -14,8 +14,9 @@ from recon_cli.capture import from_data_set, from_photos, from_video
 from recon_cli.capture.frames import FrameList
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.taken import Taken, joined
-from recon_cli.config import IngestConfig, parse_holdout
+from recon_cli.config import IngestConfig
 from recon_cli.errors import InputError
+from recon_cli.holdout_option import parse_holdout
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 

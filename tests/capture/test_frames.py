@@ -14,8 +14,8 @@ from recon_cli.capture.frames import (
     read_png,
     write_png,
 )
-from recon_cli.config import parse_holdout
 from recon_cli.errors import FormatError
+from recon_cli.holdout_option import parse_holdout
 from recon_cli.scene.lens import Lens
 
 NAMES = [f"{index:06d}.png" for index in range(20)]

@@ -35,6 +35,8 @@ from recon_cli.scene.transformed import transformed
 # [3, 3] from the scene's axes to those of glTF; numbers that are whole keep positions exact.
 Z_UP: NDArray[np.float64] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 Y_DOWN: NDArray[np.float64] = np.diag([1.0, -1, -1])
+_AXES = {"z up": Z_UP, "y down": Y_DOWN}  # as `asset.extras` tells which of them a scene had
+_SAID = "scene_axes"
 
 _NAME = "KHR_gaussian_splatting"
 _PLAIN = (_NAME, "KHR_mesh_quantization")  # what can be read of extensions that a file demands
@@ -78,7 +80,11 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
     }
     degree = TERMS.index(table["sh_rest"].shape[1])
     columns |= {name: table["sh_rest"][:, at] for at, name in enumerate(_coefficients(degree))}
-    write_bytes(path, contained(_described(columns), b"".join(
+    described = _described(columns)
+    for name, known in _AXES.items():
+        if np.array_equal(axes, known):
+            described["asset"]["extras"] = {_SAID: name}
+    write_bytes(path, contained(described, b"".join(
         np.ascontiguousarray(column).tobytes() for column in columns.values())))
 
 
@@ -113,7 +119,7 @@ def _described(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     }
 
 
-def read_glb(path: Path, *, axes: NDArray[np.float64] = Z_UP) -> Splats:
+def read_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> Splats:
     """Returns the Gaussians of a .glb as float32 tensors; other points and meshes are left out.
 
     The order is the file's; where several primitives hold Gaussians, those with coefficients come
@@ -121,7 +127,8 @@ def read_glb(path: Path, *, axes: NDArray[np.float64] = Z_UP) -> Splats:
 
     Args:
         path: of the .glb.
-        axes: [3, 3] rotation from the axes that are wanted to those of glTF, as in `write_glb`.
+        axes: [3, 3] rotation from the axes that are wanted to those of glTF, as in `write_glb`;
+            None for those that the file says the scene had, or else `Z_UP`.
 
     Raises:
         FormatError: the file is missing or damaged, holds no Gaussians, or asks for more than is
@@ -146,7 +153,17 @@ def read_glb(path: Path, *, axes: NDArray[np.float64] = Z_UP) -> Splats:
         [part.with_degree(degree) for part in parts])[0]
     if not all(torch.isfinite(value).all() for value in splats.parameters().values()):
         raise container.damaged("values beyond any number")
+    if axes is None:
+        axes = _AXES.get(_said_axes(container.json), Z_UP)
     return transformed(splats, Similarity(rotation=axes.T))
+
+
+def _said_axes(value: Mapping[str, Any]) -> str:
+    """Returns which axes a file says the scene had; empty where it says nothing."""
+    inner: Any = value
+    for key in ("asset", "extras", _SAID):
+        inner = inner.get(key) if isinstance(inner, Mapping) else None
+    return inner if isinstance(inner, str) else ""
 
 
 def _primitives(

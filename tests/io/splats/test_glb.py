@@ -222,3 +222,19 @@ def test_a_file_without_gaussians_is_refused(tmp_path):
         "extensions"))
     with pytest.raises(FormatError, match="no Gaussians"):
         read_glb(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("axes", [Z_UP, Y_DOWN])
+def test_a_file_says_which_axes_the_scene_had(axes, tmp_path):
+    splats = archive_splats.room(40)
+    write_glb(tmp_path / "x.glb", splats, axes=axes)
+    back = read_glb(tmp_path / "x.glb")
+    assert torch.allclose(back.means, splats.means, atol=1e-5)
+
+
+def test_axes_that_a_file_cannot_name_are_asked_for(tmp_path):
+    turned = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    splats = archive_splats.room(40)
+    write_glb(tmp_path / "x.glb", splats, axes=turned)
+    assert torch.allclose(read_glb(tmp_path / "x.glb", axes=turned).means, splats.means, atol=1e-5)
+    assert not torch.allclose(read_glb(tmp_path / "x.glb").means, splats.means, atol=0.1)

@@ -1,0 +1,117 @@
+"""export into other formats: what is written, what each loses, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from tiny_scene import make_inputs
+
+from recon_cli.config import EXPORT_FORMATS, ExportConfig, RunConfig
+from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.io.colmap import read_images
+from recon_cli.io.ply import read_ply
+from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
+from recon_cli.stages import export, train
+from recon_cli.stages.context import StageContext, StageInputs
+
+CONTEXT = StageContext()
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A short training of the tiny scene."""
+    folder = tmp_path_factory.mktemp("tiny")
+    given = make_inputs(folder)
+    (folder / "train").mkdir()
+    train.run(RunConfig(iterations=120, max_gaussians=120, sh_rate=0.05), given,
+              folder / "train", CONTEXT)
+    return StageInputs({**given.folders, "train": folder / "train"})
+
+
+@pytest.fixture(scope="module")
+def exported(inputs, tmp_path_factory):
+    """All formats at once: the folder and the summary."""
+    out = tmp_path_factory.mktemp("export")
+    return out, export.run(ExportConfig(format=",".join(EXPORT_FORMATS)), inputs, out, CONTEXT)
+
+
+def test_every_format_of_gaussians_can_be_asked_for():
+    assert set(FORMATS) <= set(EXPORT_FORMATS)
+
+
+def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported):
+    out, summary = exported
+    assert set(summary["files"]) == set(EXPORT_FORMATS) - {"ply"}
+    ply = out / "splats.ply"
+    for name in FORMATS.keys() - {"ply"}:
+        told = summary["files"][name]
+        path = out / told["file"]
+        assert len(read_splats(path)) == len(read_ply(ply))
+        assert told["bytes"] == path.stat().st_size
+        assert told["smaller"] == pytest.approx(
+            ply.stat().st_size / path.stat().st_size, abs=1e-3)
+        assert -export.MOST_LOSS_DB.get(name, 0.3) <= told["psnr_change_db"] < 0.3, name
+    assert abs(summary["files"]["glb"]["psnr_change_db"]) < 1e-3  # it keeps every value
+
+
+def test_cameras_are_those_of_the_scene(exported, inputs):
+    out, _ = exported
+    found = {name: viewmat for name, _, viewmat in read_images(out / "colmap" / "images.bin")}
+    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    for name, _, viewmat in read_images(sparse / "images.bin"):
+        assert np.allclose(found[name], viewmat, atol=1e-12)
+    transforms = json.loads((out / "transforms.json").read_text())
+    assert len(transforms["frames"]) == len(found)
+    held_out = {frame["name"] for frame in json.loads(
+        (inputs.folders["ingest"] / "frames.json").read_text())["frames"] if frame["held_out"]}
+    assert {name.removeprefix("images/") for name in transforms["test_filenames"]} == held_out
+
+
+def test_what_each_format_loses_is_said(inputs, tmp_path, caplog):
+    caplog.set_level(logging.INFO, "recon")
+    export.run(ExportConfig(format="spz"), inputs, tmp_path, CONTEXT)
+    assert any("spz: " in line and "x smaller, " in line and " dB" in line
+               for line in caplog.messages)
+
+
+def test_a_format_that_loses_more_than_it_may_is_refused(inputs, tmp_path, monkeypatch):
+    real = FORMATS["spz"]
+
+    def darker(path):
+        splats = real.read(path)
+        splats.sh_dc -= 1.0
+        return splats
+
+    monkeypatch.setitem(FORMATS, "spz", SplatFormat("spz", darker, real.write))
+    with pytest.raises(ReconstructionError, match=r"may lose 0\.3 dB") as caught:
+        export.run(ExportConfig(format="spz"), inputs, tmp_path, CONTEXT)
+    assert "--max-loss" in caught.value.hint
+    export.run(ExportConfig(format="spz", max_loss=100.0), inputs, tmp_path, CONTEXT)
+
+
+def test_a_scene_that_is_measured_is_scored_in_its_new_world(inputs, tmp_path):
+    config = ExportConfig(format="glb", scale_between=("000000.png", "000006.png", 7.0))
+    summary = export.run(config, inputs, tmp_path, CONTEXT)
+    assert abs(summary["files"]["glb"]["psnr_change_db"]) < 1e-3
+    before = read_ply(inputs.folders["train"] / "splats.ply")
+    after = FORMATS["glb"].read(tmp_path / "splats.glb")
+    assert after.means.norm(dim=1).median() == pytest.approx(
+        float(summary["transform"]["scale"] * before.means.norm(dim=1).median()), rel=1e-4)
+
+
+@pytest.mark.parametrize("text", ["", "ksplat", "spz,usdz"])
+def test_an_unknown_format_is_refused_with_those_that_are_known(text):
+    with pytest.raises(ConfigError, match=r"compressed\.ply"):
+        ExportConfig(format=text)
+
+
+def test_without_other_formats_nothing_else_is_written(inputs, tmp_path):
+    summary = export.run(ExportConfig(), inputs, tmp_path, CONTEXT)
+    assert "files" not in summary
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["splats.ply", "transform.json"]
+    assert torch.equal(read_ply(tmp_path / "splats.ply").means,
+                       read_ply(inputs.folders["train"] / "splats.ply").means)
