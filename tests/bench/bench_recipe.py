@@ -62,7 +62,11 @@ def planned(task: Task, changes: dict[str, Any], seed: int) -> Task:
         changes["levels"] = ((changes.pop("half"), 2),)
     config = dataclasses.replace(task.schedule.config, seed=seed, **{
         name: value for name, value in changes.items() if name not in FIELDS})
-    recipe = dataclasses.replace(RECIPES[config.densify], **{
+    own = RECIPES[config.densify]
+    config = dataclasses.replace(config, **{  # the optimizer multiplies them by the recipe's own
+        name: getattr(config, name) * changes.pop(name) / getattr(own, name)
+        for name in ("scales_rate", "sh_rate") if name in changes})
+    recipe = dataclasses.replace(own, **{
         name: value for name, value in changes.items() if name in FIELDS})
     return dataclasses.replace(task, schedule=Schedule(config, recipe))
 
