@@ -22,9 +22,9 @@ from recon_cli.io.splats.values import (
     nearest_bytes,
     opacity_bytes,
     refuse_above,
-    refuse_not_finite,
     writable,
 )
+from recon_cli.io.splats.writable import refuse_not_finite
 from recon_cli.scene.splats import SH_C0, Splats
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])

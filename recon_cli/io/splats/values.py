@@ -10,41 +10,24 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon_cli.errors import FormatError
+from recon_cli.io.splats.writable import arrays, colored_rows, refuse_not_finite, sigmoid
 from recon_cli.scene.harmonics import basis_rest
-from recon_cli.scene.splats import Splats, with_rows
+from recon_cli.scene.splats import Splats
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-_SHORTEST = 1e-30  # a quaternion below it is zero
-
 
 def writable(path: Path, splats: Splats) -> Splats:
-    """Returns the Gaussians as a writer needs them: float32 on the CPU, none left out.
-
-    Rotations are unit quaternions, zeros became no rotation; every Gaussian has coefficients of the
-    scene's degree, or where none has any the degree is 0.
+    """Returns the Gaussians as a writer needs them: those of `arrays` as tensors.
 
     Raises:
         FormatError: there are no Gaussians, or a parameter is not finite.
     """
-    if not len(splats):
-        raise FormatError(f"There are no Gaussians to write to {path}.")
-    if not len(splats.sh_rest):
-        splats = splats.with_degree(0)
-    plain = splats.map(lambda value: value.detach().cpu().float())
-    refuse_not_finite(path, {name: value.numpy() for name, value in plain.parameters().items()})
-    quats = plain.quats.double()
-    quats = torch.where(quats.norm(dim=1, keepdim=True) < _SHORTEST, _identity(quats), quats)
-    quats = quats / quats.norm(dim=1, keepdim=True)
-    return replace(plain, quats=quats.float(), sh_rest=with_rows(plain.sh_rest, len(plain)))
-
-
-def _identity(quats: Tensor) -> Tensor:
-    return quats.new_tensor([1.0, 0, 0, 0])
+    return Splats(**{
+        name: torch.from_numpy(value) for name, value in arrays(splats, path.name).items()})
 
 
 def as_splats(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
@@ -63,18 +46,8 @@ def as_splats(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
     with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite, which is refused
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
     refuse_not_finite(path, plain)
-    colored = np.flatnonzero(plain["sh_rest"].any(axis=(1, 2)))
-    plain["sh_rest"] = plain["sh_rest"][:colored[-1] + 1 if len(colored) else 0].copy()
+    plain["sh_rest"] = colored_rows(plain["sh_rest"]).copy()
     return Splats(**{name: torch.from_numpy(value) for name, value in plain.items()})
-
-
-def refuse_not_finite(path: Path, columns: Mapping[str, Floats]) -> None:
-    """Raises FormatError that names each column with NaN or infinity, and how many it has."""
-    bad = {name: int(np.size(value) - np.isfinite(value).sum()) for name, value in columns.items()}
-    bad = {name: count for name, count in bad.items() if count}
-    if bad:
-        found = ", ".join(f"{name} ({count})" for name, count in bad.items())
-        raise FormatError(f"{path} holds values that are not finite in {found}.")
 
 
 def refuse_above(path: Path, log_scales: Floats, most: float) -> None:
@@ -89,7 +62,7 @@ def refuse_above(path: Path, log_scales: Floats, most: float) -> None:
 
 def opacity_bytes(logits: Floats) -> Bytes:
     """Returns opacities [N] in 255 steps."""
-    return nearest_bytes(255 / (1 + np.exp(-logits.astype(np.float64))))
+    return nearest_bytes(255 * sigmoid(logits))
 
 
 def logits_of_bytes(values: Bytes) -> NDArray[np.float64]:

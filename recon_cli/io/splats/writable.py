@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import InputError
+from recon_cli.errors import FormatError
 from recon_cli.scene.splats import Splats, with_rows
 
 _Float = TypeVar("_Float", bound=np.floating[Any])
@@ -24,22 +25,27 @@ def arrays(splats: Splats, kind: str) -> dict[str, NDArray[np.float32]]:
         kind: what a message calls the file, such as ".sog".
 
     Raises:
-        InputError: there are no Gaussians, or a value is not finite.
+        FormatError: there are no Gaussians, or a value is not finite.
     """
     if not len(splats):
-        raise InputError(f"The scene has no Gaussians; a {kind} needs at least one.")
+        raise FormatError(f"There are no Gaussians to write; a {kind} needs at least one.")
     if not len(splats.sh_rest):
         splats = splats.with_degree(0)
     values = {name: value.detach().cpu().float() for name, value in splats.parameters().items()}
     values["sh_rest"] = with_rows(values["sh_rest"], len(splats))
     table = {name: value.numpy() for name, value in values.items()}
-    bad = [name for name, value in table.items() if not np.isfinite(value).all()]
-    if bad:
-        raise InputError(
-            f"The scene holds values that are not finite in {', '.join(bad)}.",
-            hint="Train it again; a .ply of it is damaged.")
+    refuse_not_finite(f"The scene for a {kind}", table)
     table["quats"] = unit_quats(table["quats"])
     return table
+
+
+def refuse_not_finite(what: object, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Raises FormatError that names each column with NaN or infinity, and how many it has."""
+    bad = {name: int(np.size(value) - np.isfinite(value).sum()) for name, value in columns.items()}
+    bad = {name: count for name, count in bad.items() if count}
+    if bad:
+        found = ", ".join(f"{name} ({count})" for name, count in bad.items())
+        raise FormatError(f"{what} holds values that are not finite in {found}.")
 
 
 def unit_quats(quats: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
