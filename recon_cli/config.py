@@ -272,6 +272,15 @@ class ExportConfig(StageConfig):
         choices=("auto", "base", "pruned"))
     scale_between: tuple[str, str, float] | None = option(
         None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale of the training stays")
+    crop: tuple[float, float, float, float, float, float] | None = option(
+        None, "Keep what lies in the box between two corners, in units of the exported scene.",
+        metavar="X Y Z X Y Z", automatic="everything")
+    sh_degree: int | None = option(
+        None, "Highest degree of the colours.", minimum=0, maximum=3,
+        automatic="that of the scene")
+    max_mb: float | None = option(
+        None, "Largest file, of the first format that is named: by the degree and the count that "
+        "look best on the validation views.", unit="MB", minimum=0.0, automatic="no limit")
     format: str = option(
         "ply", "Formats to write beside the .ply, with commas between: "
         f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...")
@@ -282,6 +291,8 @@ class ExportConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_scale_between(self.scale_between)
+        if self.crop and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
+            raise self._refused("crop", list(self.crop), "a lowest and a highest corner")
         for name in self.formats:
             if name not in EXPORT_FORMATS:
                 raise self._refused("format", name, "one of " + ", ".join(EXPORT_FORMATS))

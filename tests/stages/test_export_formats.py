@@ -15,7 +15,7 @@ from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.io.colmap import read_images
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
-from recon_cli.stages import export, train
+from recon_cli.stages import export, handing_out, train
 from recon_cli.stages.context import StageContext, StageInputs
 
 CONTEXT = StageContext()
@@ -54,7 +54,7 @@ def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported):
         assert told["bytes"] == path.stat().st_size
         assert told["smaller"] == pytest.approx(
             ply.stat().st_size / path.stat().st_size, abs=1e-3)
-        assert -export.MOST_LOSS_DB.get(name, 0.3) <= told["psnr_change_db"] < 0.3, name
+        assert -handing_out.MOST_LOSS_DB.get(name, 0.3) <= told["psnr_change_db"] < 0.3, name
     assert abs(summary["files"]["glb"]["psnr_change_db"]) < 1e-3  # it keeps every value
 
 

@@ -1,0 +1,196 @@
+"""A scene on its way out: what options take from it, the formats it is written in, their checks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import tempfile
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from recon_cli.config import ExportConfig, RunConfig
+from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.io.colmap_writer import write_colmap
+from recon_cli.io.splats.glb import Y_DOWN, Z_UP, write_glb
+from recon_cli.io.splats.points import write_points
+from recon_cli.io.splats.registry import FORMATS
+from recon_cli.io.transforms_writer import write_transforms
+from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.splats import Splats
+from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.stages.fidelity import Fidelity, fidelity
+from recon_cli.stages.fitting import load_scene, load_views, read_config
+from recon_cli.stages.lighter import Change, changed, cropped, of_size
+from recon_cli.train.importance import Importance, add_views
+
+# dB on the validation views, where --max-loss says nothing; .splat has no harmonics
+MOST_LOSS_DB = {"splat": 3.0}
+_MOST_LOSS_DB = 0.3
+_SCORE = "loo"  # by which Gaussians go where a size is asked for; docs/pruning.md
+
+logger = logging.getLogger("recon")
+
+
+class Hand:
+    """Hands a scene out. Views are read only where something has to be shown on them.
+
+    Args:
+        config: what is wanted.
+        inputs: finished folders.
+        out: where files go.
+        similarity: from the world of the training to that of the files.
+        ctx: backend and device.
+    """
+
+    def __init__(
+        self, config: ExportConfig, inputs: StageInputs, out: Path, similarity: Similarity,
+        ctx: StageContext,
+    ) -> None:
+        self._config, self._inputs, self._out, self._ctx = config, inputs, out, ctx
+        self._similarity = similarity
+        self._last: tuple[Splats, float] | None = None
+
+    def lightened(self, splats: Splats) -> tuple[Splats, list[Change]]:
+        """Returns the scene after --crop, --sh-degree and --max-mb, in this order, and what went.
+
+        Raises:
+            ConfigError: nothing would be left.
+        """
+        config, changes = self._config, []
+
+        def step(option: str, after: Splats) -> Splats:
+            changes.append(changed(option, splats, after, self._psnr_db))
+            return after
+
+        if config.crop is not None:
+            splats = step("crop", cropped(splats, config.crop))
+        if config.sh_degree is not None and config.sh_degree < splats.sh_degree:
+            splats = step("sh_degree", splats.with_degree(config.sh_degree))
+        if config.max_mb is not None:
+            splats = step("max_mb", of_size(
+                splats, int(1e6 * config.max_mb), size_of=self._size_of(config.formats[0]),
+                score_of=self._score, psnr_db=self._psnr_db))
+        return splats, changes
+
+    def out_as(self, name: str, splats: Splats) -> Summary:
+        """Writes the scene, whose .ply is there already, in one more format.
+
+        Returns:
+            Its file, and of Gaussians its size and what became of the PSNR.
+
+        Raises:
+            ReconstructionError: it loses more than it may.
+        """
+        others: dict[str, Callable[[Splats], Path]] = {
+            "points.ply": self._points, "colmap": self._colmap, "transforms.json": self._cameras}
+        if name in others:
+            return {"file": others[name](splats).name}
+        path = self._out / f"splats.{name}"
+        self._write(name, path, splats)
+        return self._told(name, path, splats, FORMATS[name].read(path))
+
+    def _told(self, name: str, path: Path, splats: Splats, back: Splats) -> Summary:
+        """Returns size and loss of a file that was read back, and says them."""
+        gain = self._psnr_db(back) - self._before_db(splats)
+        size, whole = path.stat().st_size, (self._out / "splats.ply").stat().st_size
+        text = f"{name}: {whole / size:.1f}x smaller, {gain:+.2f} dB"
+        most = self._config.max_loss
+        if most is None:
+            most = MOST_LOSS_DB.get(name, _MOST_LOSS_DB)
+        if not gain >= -most:  # a NaN fails too
+            raise ReconstructionError(
+                f"{text} on {len(self._views.views)} views, but it may lose {most:g} dB at most.",
+                hint="Leave this format out, or allow more with --max-loss.")
+        logger.info("%s", text)
+        return {"file": path.name, "bytes": size, "smaller": round(whole / size, 3),
+                "psnr_change_db": round(gain, 4)}
+
+    def _write(self, name: str, path: Path, splats: Splats) -> None:
+        if name == "glb":
+            write_glb(path, splats, axes=Z_UP if self._up_found else Y_DOWN)
+        else:
+            FORMATS[name].write(path, splats)
+
+    def _size_of(self, name: str) -> Callable[[Splats], int]:
+        """Returns the function that tells how large a file of a format would be."""
+        if name not in FORMATS:
+            raise ConfigError(
+                f"--max-mb is about the first format, but {name} holds no Gaussians.",
+                hint="Name ply, spz or another one of Gaussians first in --format.")
+
+        def size_of(splats: Splats) -> int:
+            with tempfile.TemporaryDirectory(prefix="recon-size-") as folder:
+                path = Path(folder) / f"splats.{name}"
+                self._write(name, path, splats)
+                return path.stat().st_size
+
+        return size_of
+
+    def _psnr_db(self, splats: Splats) -> float:
+        """Returns the PSNR of a scene on the views that it is held against."""
+        return self._views.psnr_db(splats)
+
+    def _before_db(self, splats: Splats) -> float:
+        """Returns the same of the scene that all files are made of, rendered once."""
+        if self._last is None or self._last[0] is not splats:
+            self._last = splats, self._psnr_db(splats)
+        return self._last[1]
+
+    def _score(self, splats: Splats) -> Tensor:
+        """Returns how much each Gaussian matters to the training views, [N]."""
+        there = splats.map(lambda tensor: tensor.to(self._ctx.device))
+        found = Importance.of_score(_SCORE, len(there), there.means.device)
+        views = load_views(self._scene.train, self._train, self._ctx)
+        add_views(found, there, [
+            dataclasses.replace(view, camera=self._similarity.camera(view.camera))
+            for view in views], sh_degree=there.sh_degree, backend=self._ctx.backend)
+        return found.score(_SCORE, there, beta=0.0, generator=torch.Generator()).cpu()
+
+    def _points(self, splats: Splats) -> Path:
+        path = self._out / "points.ply"
+        write_points(path, splats)
+        return path
+
+    def _colmap(self, _: Splats) -> Path:
+        path, scene = self._out / "colmap", self._scene
+        views = [(view.name, self._similarity.camera(view.camera)) for view in _all(scene)]
+        write_colmap(path, views, self._similarity.points(scene.points), scene.colors)
+        return path
+
+    def _cameras(self, _: Splats) -> Path:
+        path, scene = self._out / "transforms.json", self._scene
+        views = [(f"images/{view.name}", self._similarity.camera(view.camera))
+                 for view in _all(scene)]
+        write_transforms(path, views, held_out={f"images/{view.name}" for view in scene.test})
+        return path
+
+    @cached_property
+    def _train(self) -> RunConfig:
+        return read_config(self._inputs.folders["train"])
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return load_scene(self._inputs, validation=self._train.validation)
+
+    @cached_property
+    def _views(self) -> Fidelity:
+        return fidelity(self._scene, self._similarity, self._train.max_size, self._ctx)
+
+    @property
+    def _up_found(self) -> bool:
+        """Whether z is up in the world of the mapping."""
+        world = self._inputs.folders["sfm"] / "world.json"
+        if not world.exists():
+            return False
+        found = json.loads(world.read_text(encoding="utf-8")).get("evidence") or {}
+        return bool(found.get("up_found"))
+
+
+def _all(scene: Scene) -> list[View]:
+    return sorted((*scene.train, *scene.validation, *scene.test), key=lambda view: view.name)
