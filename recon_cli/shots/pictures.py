@@ -15,6 +15,7 @@ from torch import Tensor
 from recon_cli.io.images import eight_bit, write_png
 from recon_cli.render import RenderOutput
 from recon_cli.scene.scene import Scene
+from recon_cli.scene.splats import Splats
 from recon_cli.shots.orbit import depths_seen
 from recon_cli.shots.request import ALPHA, DEPTH, RGB
 
@@ -22,6 +23,7 @@ DEPTH_COLOR = "depth_color"
 SHOWN = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA}  # the pictures that a video of it shows
 FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,)}
 FARTHEST = 65_535  # steps; what is farther has this depth too
+_REACH = 20.0  # extents; a room reaches some, what lies outside its windows is put at 100
 _MOST = 0.5  # of the light: where less meets a surface, there is none to have a depth
 # Depths that nearly all points lie between. Few points may cover much of a picture where a camera
 # comes close, so the colours begin at half of the first.
@@ -38,12 +40,16 @@ class DepthScale:
         step: of a 16-bit depth in world units.
         near: depth in world units that is drawn red.
         far: depth in world units that is drawn blue.
+        center: [3] of the training cameras, world units.
+        reach: Gaussians farther than this from `center` are no surface, in world units.
     """
 
     metres: bool
     step: float
     near: float
     far: float
+    center: tuple[float, float, float]
+    reach: float
 
     def to_json(self) -> dict[str, Any]:
         """Returns what a reader of the pictures must know."""
@@ -52,7 +58,17 @@ class DepthScale:
             "world_units_per_step": self.step, "nothing": 0, "this_or_farther": FARTHEST,
             "colors": {"near_red_steps": self.near / self.step,
                        "far_blue_steps": self.far / self.step},
+            "surfaces_within": {"center": list(self.center), "world_units": self.reach},
         }
+
+    def surfaces(self, splats: Splats) -> Splats:
+        """Returns the Gaussians whose depth means something: those of the room, not of its views.
+
+        What lies outside windows is a hundred extents away; a hundredth of its light that shines
+        through a wall would move the wall's mean depth by an extent.
+        """
+        apart = (splats.means - splats.means.new_tensor(self.center)).norm(dim=1)
+        return splats if bool((apart <= self.reach).all()) else splats.select(apart <= self.reach)
 
 
 def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
@@ -63,13 +79,17 @@ def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
     seen = np.concatenate([depths_seen(view.camera, scene.points) for view in scene.train])
     near, far = np.quantile(seen, _ENDS) if len(seen) else (0.0, scene.extent)
     step = 1e-3 if metres else 1e-3 * scene.extent
-    return DepthScale(metres, step, float(near / 2), float(max(far, near + step)))
+    center = np.mean([view.camera.center for view in scene.train], axis=0)
+    return DepthScale(
+        metres, step, float(near / 2), float(max(far, near + step)),
+        (float(center[0]), float(center[1]), float(center[2])), _REACH * scene.extent)
 
 
 def write_pictures(
-    folder: Path, name: str, shown: RenderOutput, outputs: Sequence[str], scale: DepthScale
+    folder: Path, name: str, shown: RenderOutput, surfaces: RenderOutput, outputs: Sequence[str],
+    scale: DepthScale,
 ) -> None:
-    """Writes the pictures of one frame, each whole or not at all."""
+    """Writes the pictures of one frame, each whole or not at all; depth is that of `surfaces`."""
     file = f"{name}.png"
     for output in outputs:
         if output == RGB:
@@ -77,7 +97,8 @@ def write_pictures(
         elif output == ALPHA:
             write_png(folder / ALPHA / file, eight_bit(_array(shown.alpha)))
         else:
-            steps = depth_steps(_array(shown.depth), _array(shown.alpha), scale.step)
+            steps = depth_steps(
+                _array(surfaces.depth), _array(surfaces.alpha), scale.step)
             write_png(folder / DEPTH / file, steps)
             write_png(folder / DEPTH_COLOR / file, depth_colors(steps, scale))
 

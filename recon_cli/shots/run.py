@@ -14,7 +14,9 @@ from recon_cli.atomic import write_bytes
 from recon_cli.digests import sha256_json
 from recon_cli.errors import ConfigError, WorkspaceError
 from recon_cli.execute import Job, rendering
-from recon_cli.render import render
+from recon_cli.render import RenderOutput, render
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 from recon_cli.shots.camera_path import write_camera_path
 from recon_cli.shots.frames import PATH, Frames, refuse_foreign
 from recon_cli.shots.pictures import SHOWN, DepthScale, depth_scale, write_pictures
@@ -124,13 +126,17 @@ def _render(
 ) -> None:
     splats = source.splats.map(lambda tensor: tensor.to(ctx.device))
     background = torch.tensor(request.background, device=ctx.device) / 255
+    near = scale.surfaces(splats) if DEPTH in request.outputs else splats
     total = len(frames.names)
     with torch.no_grad(), ctx.progress.bar(
             "render", total, unit="frame", done=total - len(missing)) as bar:
         for name in missing:
-            shown = render(
-                splats, asked.cameras[name], background, source.sh_degree, backend=ctx.backend)
-            write_pictures(frames.root, name, shown, request.outputs, scale)
+            def rendered(what: Splats, camera: Camera = asked.cameras[name]) -> RenderOutput:
+                return render(what, camera, background, source.sh_degree, backend=ctx.backend)
+
+            shown = rendered(splats)
+            surfaces = shown if near is splats else rendered(near)
+            write_pictures(frames.root, name, shown, surfaces, request.outputs, scale)
             bar.advance()
 
 

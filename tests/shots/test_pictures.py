@@ -8,9 +8,10 @@ from made import wall
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.splats import joined
 from recon_cli.shots.pictures import DepthScale, depth_colors, depth_scale, depth_steps
 
-SCALE = DepthScale(True, 1e-3, 1.0, 3.0)
+SCALE = DepthScale(True, 1e-3, 1.0, 3.0, (0.0, 0.0, 0.0), 50.0)
 
 
 def steps(depth, alpha, step=1e-3):
@@ -36,6 +37,20 @@ def test_a_plane_of_gaussians_has_the_depth_that_it_has(backend):
     shown = render(wall(3.217, spacing=0.1, half=3.0), camera, torch.zeros(3), 0, backend=backend)
     found = depth_steps(shown.depth.numpy(), shown.alpha.numpy(), 1e-3)
     assert (found == 3217).all()
+
+
+def test_what_lies_outside_the_windows_moves_no_depth():
+    camera = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))
+    near, far = wall(3.217, spacing=0.1, half=3.0), wall(300.0, spacing=10.0, half=300.0)
+    near.logit_opacities -= 7.0  # some light shines through
+    both = joined([near, far])[0]
+    kept = SCALE.surfaces(both)
+    assert len(kept) == len(near)
+    assert SCALE.surfaces(near) is near
+    shown = render(both, camera, torch.zeros(3), 0, backend="torch")
+    surfaces = render(kept, camera, torch.zeros(3), 0, backend="torch")
+    assert (depth_steps(surfaces.depth.numpy(), surfaces.alpha.numpy(), 1e-3) == 3217).all()
+    assert (depth_steps(shown.depth.numpy(), shown.alpha.numpy(), 1e-3) > 3300).any()
 
 
 def test_colours_go_from_red_to_blue_and_nothing_is_black():
