@@ -166,7 +166,9 @@ def evaluate(call: Call, items: tuple[Path, ...], form: str) -> None:
     one table. Files are scored on the views of the workspace.
     """
     if items:
-        click.echo(scoreboard.compare(*beside(call, EvaluateConfig), items, form))
+        click.echo(scoreboard.compare(
+            lambda path: beside(dataclasses.replace(call, workspace=path), EvaluateConfig),
+            call.workspace, items, form))
         return
     perform(call, "eval", ["evaluate"])
 

@@ -80,6 +80,29 @@ def test_a_file_scores_what_the_workspace_it_came_from_scores(room, tmp_path, ca
     assert file["truth_digest"] == pruned["truth_digest"]
 
 
+def test_paths_of_one_name_are_told_apart_in_every_table(room, tmp_path, capsys):
+    twin = tmp_path / "a"
+    shutil.copytree(room / "b", twin)
+    found = as_json(compared(capsys, room / "a", twin, "--form", "json"))
+    labels = [one["label"] for one in found["models"]]
+    assert labels == [f"{room / 'a'}, 3DGS", f"{room / 'a'}, ours (pruned)", f"{twin}, 3DGS"]
+    means = [line for line in compared(capsys, room / "a", twin, "--form", "csv").splitlines()
+             if ",mean," in line]
+    assert len(means) == 3
+
+
+def test_each_workspace_keeps_to_its_own_settings(room, tmp_path, capsys, monkeypatch):
+    (tmp_path / "workspace").mkdir()
+    (tmp_path / "workspace" / "recon.toml").write_text("[train]\niterations = 7\n")
+    monkeypatch.chdir(tmp_path)  # where -w is not given, it is ./workspace
+    assert as_json(compared(capsys, room / "a", "--form", "json"))["models"]
+    shutil.copytree(room / "b", tmp_path / "small")
+    (tmp_path / "small" / "recon.toml").write_text("[evaluate]\nmax_size = 20\n")
+    compared(capsys, tmp_path / "small", "--form", "json")
+    metrics = json.loads((tmp_path / "small" / "evaluate" / "metrics.json").read_text())
+    assert metrics["width"] == 20
+
+
 def test_every_form_holds_the_figures(room, capsys):
     found = as_json(compared(capsys, room / "a", "--form", "json"))
     shown = f"{found['models'][0]['psnr_db']:.2f}"

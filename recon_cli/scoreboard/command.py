@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from recon_cli.config import EvaluateConfig
@@ -11,9 +11,12 @@ from recon_cli.execute import Job
 FORMS = ("text", "markdown", "csv", "latex", "json")
 
 
-def compare(job: Job, config: EvaluateConfig, items: Sequence[Path], form: str) -> str:
-    """Returns the scores of workspaces and files in one of FORMS."""
+def compare(
+    opened: Callable[[Path], tuple[Job, EvaluateConfig]], workspace: Path, items: Sequence[Path],
+    form: str,
+) -> str:
+    """Returns the scores of workspaces and files in one of FORMS; see `compare.compared`."""
     from recon_cli.scoreboard.compare import compared
     from recon_cli.scoreboard.report import report
 
-    return report(compared(job, config, items), form)
+    return report(compared(opened, workspace, items), form)

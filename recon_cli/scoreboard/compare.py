@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from recon_cli import execute, pipeline
@@ -22,15 +22,17 @@ from recon_cli.stages import stage
 from recon_cli.stages.context import StageInputs
 from recon_cli.workspace import Workspace
 
+Open = Callable[[Path], tuple[Job, EvaluateConfig]]
 
-def compared(job: Job, config: EvaluateConfig, items: Sequence[Path]) -> list[Entry]:
+
+def compared(opened: Open, workspace: Path, items: Sequence[Path]) -> list[Entry]:
     """Returns the scores of several workspaces and files, in their order.
 
-    Files are scored on the held-out views of the job's workspace, in whose world they must lie.
+    Files are scored on the held-out views of one workspace, in whose world they must lie.
 
     Args:
-        job: its workspace is the one of -w; others are worked on in the same terms.
-        config: how views are scored.
+        opened: returns the job and the options of a workspace, its own recon.toml among them.
+        workspace: that of -w.
         items: workspaces and files, at least one.
 
     Raises:
@@ -38,17 +40,25 @@ def compared(job: Job, config: EvaluateConfig, items: Sequence[Path]) -> list[En
         StageError: a workspace has no fresh model, or the one of -w no fresh cameras.
     """
     checked(items)
+    names = _names(items)
     entries: list[Entry] = []
     views: Benchmark | None = None
     for path in items:
         if Workspace(path).holds_results:
-            own = dataclasses.replace(job, workspace=Workspace(path))
-            pipeline.run(own, "eval", [Target("evaluate", config)])
-            entries += of_workspace(_name(path), own.workspace.folder("evaluate"))
+            job, config = opened(path)
+            pipeline.run(job, "eval", [Target("evaluate", config)])
+            entries += of_workspace(names[path], job.workspace.folder("evaluate"))
         else:
-            views = views or _views(job, config)
-            entries.append(of_file(path, views))
+            views = views or _views(*opened(workspace))
+            entries.append(of_file(path, names[path], views))
     return entries
+
+
+def _names(items: Sequence[Path]) -> dict[Path, str]:
+    """Returns what tables call each path: its last part, or where two share that, all of it."""
+    short = {path: path.resolve().name for path in items}
+    shared = Counter(short.values())
+    return {path: name if shared[name] == 1 else str(path) for path, name in short.items()}
 
 
 def _views(job: Job, config: EvaluateConfig) -> Benchmark:
@@ -60,8 +70,4 @@ def _views(job: Job, config: EvaluateConfig) -> Benchmark:
         folders["train"] = job.workspace.folder("train")
     context = execute.context_for(job, row, lambda _done, _total: None)
     return benchmark_of(
-        _name(job.workspace.root), StageInputs(folders), config.max_size, context)
-
-
-def _name(path: Path) -> str:
-    return path.resolve().name
+        job.workspace.root.name, StageInputs(folders), config.max_size, context)

@@ -114,8 +114,13 @@ def benchmark_of(
     return Benchmark(name, scorable(load_scene(inputs, validation=0.0), max_size, ctx), ctx)
 
 
-def of_file(path: Path, against: Benchmark) -> Entry:
+def of_file(path: Path, name: str, against: Benchmark) -> Entry:
     """Returns a file of Gaussians, scored on the views of a workspace, in whose world it must lie.
+
+    Args:
+        path: of the file.
+        name: for the tables.
+        against: the views.
 
     Raises:
         FormatError: it holds no Gaussians that can be read.
@@ -123,5 +128,5 @@ def of_file(path: Path, against: Benchmark) -> Entry:
     splats: Splats = read_splats(path).map(lambda tensor: tensor.to(against.ctx.device))
     found = scored(splats, against.views, splats.sh_degree, against.ctx)
     score = ModelScore(
-        path.name, found.views, len(splats), path.stat().st_size, found.render_ms, None)
-    return Entry(against.name, path.name, score, truth_digest(against.views))
+        name, found.views, len(splats), path.stat().st_size, found.render_ms, None)
+    return Entry(against.name, name, score, truth_digest(against.views))
