@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 
+_REACH = 20.0  # extents; a room reaches some
 _LEAST_EXTENT = 0.05  # of the median distance of the points; a step aside in a room
 _SAMPLES = 2000  # points looked at
 
@@ -69,6 +70,19 @@ class Scene:
         path = 1.1 * np.linalg.norm(centers - middle, axis=1).max()
         reach = np.median(np.linalg.norm(self.points - middle, axis=1)) if len(self.points) else 0
         return float(max(path, _LEAST_EXTENT * reach))
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Mean of the training cameras, [3] in world units."""
+        return np.asarray(np.mean([view.camera.center for view in self.train], axis=0))
+
+    @property
+    def reach(self) -> float:
+        """Distance from `center` within which the room lies, world units.
+
+        What is seen through windows is modelled a hundred extents away.
+        """
+        return _REACH * self.extent
 
     @property
     def nearness(self) -> float:

@@ -83,6 +83,11 @@ class Splats:
                  for name, value in self.parameters().items()}
         return Splats(**taken)
 
+    def within(self, center: Sequence[float], distance: float) -> Tensor:
+        """Returns which centres lie within `distance` of `center` [3], [N] bool."""
+        apart: Tensor = (self.means.detach() - self.means.new_tensor(center)).norm(dim=1)
+        return apart <= distance
+
     def with_degree(self, degree: int) -> Splats:
         """Returns the splats with the coefficients of this degree: cut, or filled up with zeros.
 

@@ -23,7 +23,6 @@ DEPTH_COLOR = "depth_color"
 SHOWN = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA}  # the pictures that a video of it shows
 FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,)}
 FARTHEST = 65_535  # steps; what is farther has this depth too
-_REACH = 20.0  # extents; a room reaches some, what lies outside its windows is put at 100
 _MOST = 0.5  # of the light: where less meets a surface, there is none to have a depth
 # Depths that nearly all points lie between. Few points may cover much of a picture where a camera
 # comes close, so the colours begin at half of the first.
@@ -67,8 +66,8 @@ class DepthScale:
         What lies outside windows is a hundred extents away; a hundredth of its light that shines
         through a wall would move the wall's mean depth by an extent.
         """
-        apart = (splats.means - splats.means.new_tensor(self.center)).norm(dim=1)
-        return splats if bool((apart <= self.reach).all()) else splats.select(apart <= self.reach)
+        inside = splats.within(self.center, self.reach)
+        return splats if bool(inside.all()) else splats.select(inside)
 
 
 def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
@@ -79,10 +78,9 @@ def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
     seen = np.concatenate([depths_seen(view.camera, scene.points) for view in scene.train])
     near, far = np.quantile(seen, _ENDS) if len(seen) else (0.0, scene.extent)
     step = 1e-3 if metres else 1e-3 * scene.extent
-    center = np.mean([view.camera.center for view in scene.train], axis=0)
+    x, y, z = map(float, scene.center)
     return DepthScale(
-        metres, step, float(near / 2), float(max(far, near + step)),
-        (float(center[0]), float(center[1]), float(center[2])), _REACH * scene.extent)
+        metres, step, float(near / 2), float(max(far, near + step)), (x, y, z), scene.reach)
 
 
 def write_pictures(

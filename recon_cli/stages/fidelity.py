@@ -6,10 +6,12 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from recon_cli.errors import ReconstructionError
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext
+from recon_cli.stages.fitting import MASK_HINT
 from recon_cli.stages.held_out import Truth, mean_psnr, truths
 
 _VIEWS = 8  # rendered for each file, at most
@@ -44,9 +46,16 @@ def fidelity(
         similarity: from there to the world of the files.
         max_size: longest side of the pictures in pixels.
         ctx: backend and device.
+
+    Raises:
+        ReconstructionError: masks leave nothing of any of them.
     """
     chosen = scene.validation or scene.train
     some = truths(chosen[::max(1, -(-len(chosen) // _VIEWS))], max_size)
-    return Fidelity([
-        dataclasses.replace(truth, camera=similarity.camera(truth.camera))
-        for truth in some if truth.enough], ctx)
+    views = [dataclasses.replace(truth, camera=similarity.camera(truth.camera))
+             for truth in some if truth.enough]
+    if not views:
+        raise ReconstructionError(
+            f"The masks leave nothing of {len(some)} views to check the export on.",
+            hint=MASK_HINT)
+    return Fidelity(views, ctx)

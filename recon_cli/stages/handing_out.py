@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import shutil
 import tempfile
 from collections.abc import Callable
 from functools import cached_property
@@ -32,6 +33,7 @@ from recon_cli.train.importance import Importance, add_views
 # dB on the validation views, where --max-loss says nothing; .splat has no harmonics
 MOST_LOSS_DB = {"splat": 3.0}
 _MOST_LOSS_DB = 0.3
+_IMAGES = "images"
 _SCORE = "loo"  # by which Gaussians go where a size is asked for; docs/pruning.md
 
 logger = logging.getLogger("recon")
@@ -153,22 +155,37 @@ class Hand:
         return found.score(_SCORE, there, beta=0.0, generator=torch.Generator()).cpu()
 
     def _points(self, splats: Splats) -> Path:
-        path = self._out / "points.ply"
-        write_points(path, splats)
+        """Writes the points of the room; those seen through its windows would dwarf it."""
+        path, scene, similarity = self._out / "points.ply", self._scene, self._similarity
+        center = similarity.points(scene.center)
+        write_points(path, splats.select(
+            splats.within(center.tolist(), similarity.scale * scene.reach)))
         return path
 
     def _colmap(self, _: Splats) -> Path:
         path, scene = self._out / "colmap", self._scene
-        views = [(view.name, self._similarity.camera(view.camera)) for view in _all(scene)]
-        write_colmap(path, views, self._similarity.points(scene.points), scene.colors)
+        shutil.rmtree(path, ignore_errors=True)  # of a run that was killed
+        write_colmap(
+            path, [(view.name, self._similarity.camera(view.camera)) for view in _all(scene)],
+            self._similarity.points(scene.points), scene.colors)
+        self._images()
         return path
 
     def _cameras(self, _: Splats) -> Path:
         path, scene = self._out / "transforms.json", self._scene
-        views = [(f"images/{view.name}", self._similarity.camera(view.camera))
-                 for view in _all(scene)]
-        write_transforms(path, views, held_out={f"images/{view.name}" for view in scene.test})
+        write_transforms(
+            path, [(f"{_IMAGES}/{view.name}", self._similarity.camera(view.camera))
+                   for view in _all(scene)],
+            held_out={f"{_IMAGES}/{view.name}" for view in scene.test})
+        self._images()
         return path
+
+    def _images(self) -> None:
+        """Copies the undistorted images, without which cameras are of no use elsewhere."""
+        for view in _all(self._scene):
+            target = self._out / _IMAGES / view.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(view.original, target)
 
     @cached_property
     def _train(self) -> RunConfig:

@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 
 import numpy as np
 import pytest
 import torch
-from tiny_scene import make_inputs
+from tiny_stages import CONTEXT, LEARNT, trained
 
-from recon_cli.config import EXPORT_FORMATS, ExportConfig, RunConfig
+from recon_cli.config import EXPORT_FORMATS, ExportConfig
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.io.colmap import read_images
-from recon_cli.io.ply import read_ply
+from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.io.ply_points import read_ply_points
 from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
-from recon_cli.stages import export, handing_out, train
-from recon_cli.stages.context import StageContext, StageInputs
-
-CONTEXT = StageContext()
+from recon_cli.stages import export, handing_out
+from recon_cli.stages.context import StageInputs
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     """A short training of the tiny scene."""
-    folder = tmp_path_factory.mktemp("tiny")
-    given = make_inputs(folder)
-    (folder / "train").mkdir()
-    train.run(RunConfig(iterations=120, max_gaussians=120, sh_rate=0.05), given,
-              folder / "train", CONTEXT)
-    return StageInputs({**given.folders, "train": folder / "train"})
+    return trained(tmp_path_factory.mktemp("tiny"), LEARNT)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +64,41 @@ def test_cameras_are_those_of_the_scene(exported, inputs):
     held_out = {frame["name"] for frame in json.loads(
         (inputs.folders["ingest"] / "frames.json").read_text())["frames"] if frame["held_out"]}
     assert {name.removeprefix("images/") for name in transforms["test_filenames"]} == held_out
+
+
+def test_the_images_of_the_cameras_lie_beside_them(exported, inputs):
+    out, _ = exported
+    transforms = json.loads((out / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        image = out / frame["file_path"]
+        original = inputs.folders["sfm"] / "undistorted" / "images" / image.name
+        assert image.read_bytes() == original.read_bytes()
+
+
+def test_an_export_that_was_killed_goes_on_over_what_it_left(inputs, tmp_path):
+    config = ExportConfig(format=",".join(EXPORT_FORMATS))
+    export.run(config, inputs, tmp_path, CONTEXT)
+    before = {path.relative_to(tmp_path): path.read_bytes()
+              for path in tmp_path.rglob("*") if path.is_file()}
+    (tmp_path / "transforms.json").unlink()
+    (tmp_path / "colmap" / "images.bin").unlink()
+    export.run(config, inputs, tmp_path, CONTEXT)
+    assert before == {path.relative_to(tmp_path): path.read_bytes()
+                      for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_points_are_those_of_the_room_not_of_what_its_windows_show(inputs, tmp_path):
+    folder = tmp_path / "train"
+    shutil.copytree(inputs.folders["train"], folder)
+    splats = read_ply(folder / "splats.ply")
+    splats.logit_opacities[:] = 3.0
+    splats.means[-5:] *= 1e4
+    write_ply(folder / "splats.ply", splats)
+    (tmp_path / "out").mkdir()
+    export.run(ExportConfig(format="points.ply"),
+               StageInputs({**inputs.folders, "train": folder}), tmp_path / "out", CONTEXT)
+    points, _ = read_ply_points(tmp_path / "out" / "points.ply")
+    assert len(points) == len(splats) - 5
 
 
 def test_what_each_format_loses_is_said(inputs, tmp_path, caplog):

@@ -6,28 +6,20 @@ import logging
 
 import pytest
 import torch
-from tiny_scene import make_inputs
+from tiny_stages import CONTEXT, LEARNT, trained
 
-from recon_cli.config import ExportConfig, RunConfig
+from recon_cli.config import ExportConfig
 from recon_cli.errors import ConfigError
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import FORMATS
-from recon_cli.stages import export, train
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages import export
 from recon_cli.stages.lighter import of_size
-
-CONTEXT = StageContext()
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     """A short training of the tiny scene, with harmonics."""
-    folder = tmp_path_factory.mktemp("tiny")
-    given = make_inputs(folder)
-    (folder / "train").mkdir()
-    train.run(RunConfig(iterations=120, max_gaussians=120, sh_rate=0.05), given,
-              folder / "train", CONTEXT)
-    return StageInputs({**given.folders, "train": folder / "train"})
+    return trained(tmp_path_factory.mktemp("tiny"), LEARNT)
 
 
 @pytest.fixture

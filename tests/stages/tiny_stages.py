@@ -1,0 +1,65 @@
+"""Finished stages of the tiny scene, for tests of what follows them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+from tiny_scene import make_inputs
+
+from recon_cli.config import PruneConfig, RunConfig
+from recon_cli.io.images import read_image
+from recon_cli.metrics import psnr
+from recon_cli.stages import prune, train
+from recon_cli.stages.context import StageContext, StageInputs
+
+CONFIG = RunConfig(
+    iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
+    checkpoint_every=7)
+PRUNE = PruneConfig(ratio=0.5, at="mid")
+LEARNT = RunConfig(iterations=120, max_gaussians=120, sh_rate=0.05)  # harmonics that show
+CONTEXT = StageContext()
+
+
+def trained(folder, config=CONFIG):
+    """ingest, sfm, and a finished train."""
+    given = make_inputs(folder)
+    (folder / "train").mkdir()
+    train.run(config, given, folder / "train", CONTEXT)
+    return StageInputs({**given.folders, "train": folder / "train"})
+
+
+def pruned(folder):
+    """ingest, sfm, and a finished train and prune."""
+    inputs = trained(folder)
+    (folder / "prune").mkdir()
+    prune.run(PRUNE, inputs, folder / "prune", CONTEXT)
+    return StageInputs({**inputs.folders, "prune": folder / "prune"})
+
+
+def run(stage, config, inputs, out, ctx=CONTEXT):
+    out.mkdir(exist_ok=True)
+    return stage.run(config, inputs, out, ctx)
+
+
+def without(inputs, *names):
+    return StageInputs({k: v for k, v in inputs.folders.items() if k not in names})
+
+
+def holding_out(inputs, tmp_path, *, held_out):
+    """The same inputs with every view held out, or none."""
+    folder = tmp_path / "ingest"
+    shutil.copytree(inputs.folders["ingest"], folder)
+    frames = json.loads((folder / "frames.json").read_text())
+    for frame in frames["frames"]:
+        frame["held_out"] = held_out
+    (folder / "frames.json").write_text(json.dumps(frames))
+    return StageInputs({**inputs.folders, "ingest": folder})
+
+
+def mean_colour_psnr(inputs):
+    """PSNR of painting a view in its own mean colour: what knowing nothing of its shape gives."""
+    image = read_image(inputs.folders["sfm"] / "undistorted" / "images" / "000006.png", 48, 36)
+    mean = np.broadcast_to(image.mean((0, 1)) / 255, image.shape).astype(np.float32)
+    return psnr(mean, image)
