@@ -82,9 +82,10 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
     scene = load_scene(inputs, validation=train_config.validation)
     size = config.max_size or train_config.max_size
     held_out = scorable(scene, size, ctx)
+    # where training refined its cameras, their images are no longer what these cameras show
+    trained = scene.train if train_config.poses != "on" else ()
     seen = {name: views for name, views in (
-        ("training", _seen(scene.train, size)), ("validation", _seen(scene.validation, size)))
-        if views}
+        ("training", _seen(trained, size)), ("validation", _seen(scene.validation, size))) if views}
     stages = {"base": "train", "pruned": "prune"}
     folders = {model: inputs.folders[stage] for model, stage in stages.items()
                if stage in inputs.folders}
@@ -232,8 +233,8 @@ def _in_words(paired: Summary) -> str:
 def _gap(model: _Model, *, gains: bool) -> str:
     """Returns how much better the views are that training saw."""
     held_out = model.corrected_db if gains else model.score.psnr_db
-    seen = ", ".join(f"{name} {value:.2f}" for name, value in model.seen_db.items())
-    text = f"PSNR of {seen}, held out {held_out:.2f} dB"
+    shown = {**model.seen_db, "held out": held_out}
+    text = f"PSNR of {', '.join(f'{name} {value:.2f}' for name, value in shown.items())} dB"
     if "training" not in model.seen_db:
         return text
     return f"{text}: a gap of {model.seen_db['training'] - held_out:.2f} dB to the training views"

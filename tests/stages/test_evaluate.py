@@ -1,0 +1,132 @@
+"""evaluate on a tiny scene: what is scored against what, and what the tables say."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_scene import VIEWS
+from tiny_stages import holding_out, mean_colour_psnr, pruned, run, without
+
+from recon_cli.config import EvaluateConfig
+from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.io.images import read_image
+from recon_cli.metrics import psnr, ssim
+from recon_cli.stages import evaluate, held_out
+from recon_cli.stages.context import StageInputs
+from recon_cli.stages.fitting import read_config, write_config
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """ingest, sfm, and a finished train and prune."""
+    return pruned(tmp_path_factory.mktemp("tiny"))
+
+
+def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):
+    out = tmp_path / "out"
+    run(evaluate, EvaluateConfig(), inputs, out)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert set(metrics["models"]) == {"base", "pruned"}
+    for name, model in metrics["models"].items():
+        assert set(model) >= {"psnr_db", "ssim", "gaussians", "bytes", "render_ms",
+                              "train_seconds", "views"}
+        assert [view["name"] for view in model["views"]] == [
+            f"{i:06d}.png" for i in range(0, VIEWS, 4)]
+        for view in model["views"]:
+            shown = read_image(out / "renders" / name / view["name"], 48, 36)
+            truth = read_image(out / "truth" / view["name"], 48, 36)
+            original = inputs.folders["sfm"] / "undistorted" / "images" / view["name"]
+            assert np.array_equal(truth, read_image(original, 48, 36))
+            image = (shown / 255.0).astype(np.float32)
+            assert view["psnr_8bit_db"] == pytest.approx(psnr(image, truth), abs=1e-5)
+            # the saved render is rounded to 8 bits, the other scores are not
+            assert view["psnr_db"] == pytest.approx(psnr(image, truth), abs=0.15)
+            assert view["ssim"] == pytest.approx(ssim(image, truth), abs=0.01)
+            assert view["ssim_padded"] == pytest.approx(ssim(image, truth, padded=True), abs=0.01)
+        assert model["psnr_db"] == pytest.approx(
+            np.mean([view["psnr_db"] for view in model["views"]]))
+        assert model["bytes"] == (
+            inputs.folders["train" if name == "base" else "prune"] / "splats.ply").stat().st_size
+    assert metrics["models"]["base"]["psnr_db"] > mean_colour_psnr(inputs) + 2
+    table = (out / "table.txt").read_text()
+    assert "3DGS" in table
+    assert "ours (pruned)" in table
+    assert "scikit-image" in table
+    assert "INRIA" in table
+    assert "LPIPS: not measured" in table  # no test has its weights
+    assert f"held out {metrics['models']['base']['psnr_db']:.2f} dB: a gap of" in table
+    gained = [pruned["psnr_db"] - base["psnr_db"] for base, pruned in zip(
+        *(metrics["models"][name]["views"] for name in ("base", "pruned")), strict=True)]
+    assert metrics["pruned_minus_base"]["psnr_db"]["mean"] == pytest.approx(np.mean(gained))
+    assert min(gained) <= metrics["pruned_minus_base"]["psnr_db"]["low"] <= np.mean(gained)
+    assert "data set & PSNR 3DGS & PSNR ours" in (out / "metrics.tex").read_text()
+    assert len((out / "metrics.csv").read_text().splitlines()) == 1 + 2 * (VIEWS // 4 + 1)
+
+
+def test_views_that_training_saw_are_scored_beside_the_held_out_ones(inputs, tmp_path):
+    run(evaluate, EvaluateConfig(), without(inputs, "prune"), tmp_path / "out")
+    model = json.loads((tmp_path / "out" / "metrics.json").read_text())["models"]["base"]
+    log = (inputs.folders["train"] / "log.jsonl").read_text().splitlines()
+    assert model["seen_psnr_db"]["validation"] == pytest.approx(
+        json.loads(log[-1])["validation_psnr_db"], abs=1e-3)
+    assert model["seen_psnr_db"]["training"] > model["psnr_db"]
+
+
+def test_training_views_whose_cameras_were_refined_are_not_scored(inputs, tmp_path):
+    folder = tmp_path / "train"
+    shutil.copytree(inputs.folders["train"], folder)
+    write_config(folder, replace(read_config(folder), poses="on"))
+    changed = without(StageInputs({**inputs.folders, "train": folder}), "prune")
+    run(evaluate, EvaluateConfig(), changed, tmp_path / "out")
+    model = json.loads((tmp_path / "out" / "metrics.json").read_text())["models"]["base"]
+    assert set(model["seen_psnr_db"]) == {"validation"}
+    assert "a gap of" not in (tmp_path / "out" / "table.txt").read_text()
+
+
+def test_scores_are_against_the_original_pixels_also_where_training_saw_denoised_ones(
+    inputs, tmp_path
+):
+    folder = tmp_path / "sfm"
+    shutil.copytree(inputs.folders["sfm"], folder)
+    for path in (folder / "undistorted" / "denoised").iterdir():
+        path.write_bytes((folder / "undistorted" / "denoised" / "000001.png").read_bytes())
+    changed = StageInputs({**inputs.folders, "sfm": folder})
+    run(evaluate, EvaluateConfig(), inputs, tmp_path / "a")
+    run(evaluate, EvaluateConfig(), changed, tmp_path / "b")
+    first, second = (json.loads((tmp_path / name / "metrics.json").read_text())["models"]["base"]
+                     for name in "ab")
+    assert first["psnr_db"] == second["psnr_db"]
+
+
+def test_without_pruning_there_is_one_model(inputs, tmp_path):
+    run(evaluate, EvaluateConfig(), without(inputs, "prune"), tmp_path / "out")
+    assert set(json.loads((tmp_path / "out" / "metrics.json").read_text())["models"]) == {"base"}
+
+
+def test_a_held_out_frame_without_a_camera_is_named(inputs, tmp_path, caplog):
+    folder = tmp_path / "ingest"
+    shutil.copytree(inputs.folders["ingest"], folder)
+    frames = json.loads((folder / "frames.json").read_text())
+    frames["frames"].append({**frames["frames"][0], "name": "999999.png"})
+    (folder / "frames.json").write_text(json.dumps(frames))
+    summary = run(evaluate, EvaluateConfig(), StageInputs({**inputs.folders, "ingest": folder}),
+                  tmp_path / "out")
+    assert summary["unregistered_test"] == ["999999.png"]
+    assert "999999.png" in caplog.text
+
+
+def test_views_too_small_to_score_are_a_usage_error(inputs, tmp_path, monkeypatch):
+    monkeypatch.setattr(held_out, "MIN_SIDE", 13)  # 16 pixels wide are 12 high here
+    with pytest.raises(ConfigError, match="16x12 pixels are too small") as caught:
+        run(evaluate, EvaluateConfig(max_size=16), inputs, tmp_path / "out")
+    assert "--max-size" in caught.value.hint
+
+
+def test_nothing_to_score_on_is_an_error(inputs, tmp_path):
+    with pytest.raises(ReconstructionError, match="No held-out view"):
+        run(evaluate, EvaluateConfig(), holding_out(inputs, tmp_path, held_out=False),
+            tmp_path / "out")
