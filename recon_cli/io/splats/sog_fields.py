@@ -16,8 +16,8 @@ _STEPS = 65535  # of a position along an axis
 _TAG = 252  # of a quaternion whose greatest component is w
 _ROOT2 = math.sqrt(2)  # no but the greatest component of a unit quaternion exceeds 1 / sqrt(2)
 _MOST_ENTRIES = 65535  # of a palette, and one of zeros
-# Gaussians an entry. In a made room with 8 the file grows by 15% and coefficients come out 8%
-# nearer; with 32 it shrinks by 8% and they come out 5% farther.
+# Gaussians an entry. A scene of photos with 60,000 (fox, degree 3) loses .15, .19, .25 and .33 dB
+# with 4, 8, 16 and 32, and takes 23.7, 18.7, 16.1 and 14.7 bytes each.
 _SHARE = 16
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
