@@ -2,9 +2,12 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from browser import Watched, browser, watched
+from playwright.sync_api import Browser
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels are kept from one run of the tests to the next, but not among the user's own.
@@ -26,3 +29,17 @@ def shared_data() -> Path:
 def sample_video() -> Path:
     """The room video that comes with the package."""
     return ROOT / "recon_cli" / "samples" / "room.mp4"
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Browser]:
+    """Headless Chromium, started once for all tests."""
+    with browser() as started:
+        yield started
+
+
+@pytest.fixture
+def page(chromium: Browser) -> Iterator[Watched]:
+    """A fresh page that remembers what its console said."""
+    with watched(chromium) as kept:
+        yield kept
