@@ -182,7 +182,11 @@ def differences(old: Basis, new: Basis) -> list[str]:
         reasons.append(f"stage version {old.version} -> {new.version}")
     for name in [*new.config, *(name for name in old.config if name not in new.config)]:
         before, after = old.config.get(name), new.config.get(name)
-        if before != after or (name in old.config) != (name in new.config):
+        if name not in old.config:
+            reasons.append(f"{new.stage}.{name} is new")
+        elif name not in new.config:
+            reasons.append(f"{new.stage}.{name} is no more")
+        elif before != after:
             reasons.append(f"{new.stage}.{name} changed: {_shown(before)} -> {_shown(after)}")
     reasons += _source_changes(old.sources, new.sources)
     for name in {**new.upstream, **old.upstream}:

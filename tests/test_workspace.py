@@ -106,6 +106,13 @@ def test_a_renamed_photo_is_named_among_the_reasons(tmp_path: Path) -> None:
         "the input p/a.jpg is gone", "the input p/b.jpg changed", "the input p/c.jpg is new"]
 
 
+def test_options_that_another_version_knew_or_did_not_know_are_named() -> None:
+    before = Basis("export", 1, {"gone": None, "kept": 1.5}, (), {})
+    after = Basis("export", 1, {"kept": 2.0, "crop": None}, (), {})
+    assert differences(before, after) == [
+        "export.kept changed: 1.5 -> 2", "export.crop is new", "export.gone is no more"]
+
+
 def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> None:
     with workspace.writing("train"):
         manifest = finish(workspace, "one")
