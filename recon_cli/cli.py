@@ -155,16 +155,25 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 @cli.command("eval")
 @click.argument("items", metavar="[ITEM]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
+    "--seeds", type=click.IntRange(min=1), metavar="N",
+    help="Train the models N - 1 times more, each with another seed, and print mean and deviation. "
+         " [default: off]")
+@click.option(
     "--form", type=click.Choice(scoreboard.FORMS), default="text",
-    help="With ITEM: how the comparison is printed.  [default: text]")
+    help="With ITEM or --seeds: how the table is printed.  [default: text]")
 @options.stage(EvaluateConfig, renders=True)
 @pass_call
-def evaluate(call: Call, items: tuple[Path, ...], form: str) -> None:
+def evaluate(call: Call, items: tuple[Path, ...], seeds: int | None, form: str) -> None:
     """Score every model on the held-out views.
 
     With ITEM, workspaces and files of Gaussians (.ply, .spz, .sog, .splat, .glb): their models in
     one table. Files are scored on the views of the workspace.
     """
+    if items and seeds:
+        raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
+    if seeds:
+        click.echo(scoreboard.over_seeds(*beside(call, EvaluateConfig), seeds, form))
+        return
     if items:
         click.echo(scoreboard.compare(
             lambda path: beside(dataclasses.replace(call, workspace=path), EvaluateConfig),

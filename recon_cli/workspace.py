@@ -24,6 +24,7 @@ from recon_cli.errors import ManifestError, ReconError, WorkspaceError
 from recon_cli.manifest import Basis, Manifest, Unfinished
 
 LOG = "recon.log"
+SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
 _LEFTOVERS = ".*.tmp*"  # of files that atomic.replacing had not finished when it was killed
 
 logger = logging.getLogger("recon")
@@ -182,8 +183,8 @@ class Workspace:
             remove(old)
 
     def scraps(self) -> list[Path]:
-        """Returns what serves no finished result: unfinished work and old results."""
-        return [path for parent in (".partial", ".old")
+        """Returns what serves no finished result: unfinished work, old results, other seeds."""
+        return [path for parent in (".partial", ".old", SEEDS)
                 for path in sorted(self.root.glob(f"{parent}/*"))]
 
     def _refuse_foreign(self, stage: str) -> None:

@@ -60,7 +60,8 @@ ALLOWED: dict[str, set[str]] = {
         "train", "io",
         "stages", "digests", "workspace", "execute", "pipeline"},
     "scoreboard": BOTTOM | OPTIONS | {
-        "metrics", "tables", "scene", "io", "train", "stages", "workspace", "execute", "pipeline"},
+        "settings", "metrics", "tables", "scene", "io", "train", "stages", "workspace", "execute",
+        "pipeline"},
     "study": BOTTOM | OPTIONS | {
         "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
         "execute", "bench"},

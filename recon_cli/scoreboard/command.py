@@ -20,3 +20,10 @@ def compare(
     from recon_cli.scoreboard.report import report
 
     return report(compared(opened, workspace, items), form)
+
+
+def over_seeds(job: Job, config: EvaluateConfig, count: int, form: str) -> str:
+    """Returns the scores of a workspace over seeds in one of FORMS; see `seeds.over_seeds`."""
+    from recon_cli.scoreboard import seeds
+
+    return seeds.over_seeds(job, config, count).text(form)
