@@ -61,4 +61,10 @@ def read_splats(path: Path) -> Splats:
     Raises:
         FormatError: its format is not known, or the file is damaged.
     """
-    return format_of(path).read(path)
+    found = format_of(path)
+    try:
+        return found.read(path)
+    except FormatError as error:
+        error.hint = error.hint or (
+            f"Copy or export it again; if it is no .{found.name}, rename it to what it is.")
+        raise

@@ -27,8 +27,9 @@ def test_a_file_under_the_name_of_another_format_is_refused(name, tmp_path):
     for other in FORMATS.keys() - {name, "splat"}:
         renamed = tmp_path / f"x.{other}"
         renamed.write_bytes(path.read_bytes())
-        with pytest.raises(FormatError):
+        with pytest.raises(FormatError) as caught:
             read_splats(renamed)
+        assert caught.value.hint
 
 
 def test_an_unknown_ending_is_refused_with_those_that_are_known(tmp_path):
