@@ -177,10 +177,10 @@ def _between(
     chunk: NDArray[np.void], names: list[str], shares: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Returns what shares [N, 3] of the chunks' bounds stand for."""
-    bounds = np.stack([chunk[name].astype(np.float64) for name in names], axis=1)
-    rows = np.arange(len(shares)) // _CHUNK
-    low, high = bounds[rows, :3], bounds[rows, 3:]
     with np.errstate(invalid="ignore"):  # bounds that are not finite make NaN, which is refused
+        bounds = np.stack([chunk[name].astype(np.float64) for name in names], axis=1)
+        rows = np.arange(len(shares)) // _CHUNK
+        low, high = bounds[rows, :3], bounds[rows, 3:]
         return np.asarray(low * (1 - shares) + high * shares)
 
 

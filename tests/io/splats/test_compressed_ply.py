@@ -162,6 +162,9 @@ def test_what_does_not_fit_is_refused_and_tiny_scales_are_clamped(tmp_path):
     (lambda data: data.replace(b"binary_little_endian", b"ascii"), "truncated or damaged"),
     (lambda data: data.replace(b"end_header\n", b"end_header\n" + b"\xff" * 4, 1)[:-4],
      "not finite in means"),
+    # a signalling NaN, of which a cast complains
+    (lambda data: data.replace(b"end_header\n", b"end_header\n" + b"\1\0\xa0\x7f", 1)[:-4],
+     "not finite in means"),
     (lambda data: data.replace(b"end_header\n", b"end_header\n" + (
         np.full(18, 3e38, "<f4").tobytes()), 1)[:-72], "not finite in sh_dc"),
 ])
