@@ -312,6 +312,6 @@ class ComputeConfig(StageConfig):
         choices=("auto", "cpu", "cuda"), hashed=False)
     backend: str = option(
         "auto", "Rasterizer; auto takes the fastest that runs on the device.",
-        choices=("auto", "numba", "torch"), hashed=False)
+        choices=("auto", "triton", "numba", "torch"), hashed=False)
     threads: int | None = option(
         None, "CPU threads.", unit="threads", minimum=1, hashed=False, automatic="all cores")

@@ -6,12 +6,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from browser import Watched, browser, watched
 from playwright.sync_api import Browser
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels are kept from one run of the tests to the next, but not among the user's own.
 os.environ.setdefault("RECON_CACHE_DIR", str(ROOT / ".pytest_cache" / "recon"))
+# The triton backend is tested without a GPU too, by its interpreter; kernels ask at their import.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 # A shell lets what it runs in the background ignore Ctrl-C, and every process below inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -83,6 +83,7 @@ AT_HOME = {  # packages that only some parts may import
     "numba": {"render"},
     "llvmlite": {"render"},
     "tqdm": {"progress"},
+    "triton": {"render"},
     "pycolmap": {"mapping", "io"},
 }
 

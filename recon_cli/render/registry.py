@@ -15,6 +15,8 @@ from recon_cli.render.contract import Renderer, RenderOutput, check_inputs
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
+_OLDEST_GPU = (7, 5)  # compute capability, of Turing: what triton's kernels are compiled for
+
 logger = logging.getLogger("recon")
 
 
@@ -37,7 +39,21 @@ def available_backends() -> tuple[BackendStatus, ...]:
     """Returns every known backend, fastest first, each with the reason if it cannot run."""
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
     missing = "" if importlib.util.find_spec("numba") else "the package numba is not installed"
-    return (BackendStatus("numba", ("cpu",), missing), BackendStatus("torch", devices))
+    return (BackendStatus("triton", ("cuda",), _lacking_for_triton()),
+            BackendStatus("numba", ("cpu",), missing), BackendStatus("torch", devices))
+
+
+def _lacking_for_triton() -> str:
+    """Returns why triton's kernels cannot run here; empty where they can."""
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device"
+    if not importlib.util.find_spec("triton"):
+        return "the package triton is not installed (it comes with torch for CUDA, on Linux)"
+    found = torch.cuda.get_device_capability()
+    if found < _OLDEST_GPU:
+        return (f"the GPU has compute capability {'.'.join(map(str, found))}, needed "
+                f"{'.'.join(map(str, _OLDEST_GPU))}")
+    return ""
 
 
 def resolve(backend: str, device: str) -> tuple[str, str]:
@@ -55,8 +71,11 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
         chosen_device = "cuda" if torch.cuda.is_available() else "cpu"
     known = {status.name: status for status in available_backends()}
     if backend == "auto":
-        backend = next(s.name for s in known.values()
-                       if chosen_device in s.devices and not s.missing)
+        able = [one for one in known.values() if chosen_device in one.devices]
+        backend = next(one.name for one in able if not one.missing)
+        for one in able[:[other.name for other in able].index(backend)]:
+            logger.warning(
+                "%s is used in place of %s: %s", backend, one.name, one.missing)
         logger.info("rasterizer: %s on %s (chosen automatically)", backend, chosen_device)
     if backend not in known:
         raise BackendError(
@@ -112,6 +131,10 @@ def renderer(backend: str) -> Renderer:
         from recon_cli.render.numba.backend import render as numba_render
 
         return numba_render
+    if backend == "triton":
+        from recon_cli.render.triton.backend import render as triton_render
+
+        return triton_render
     raise BackendError(f"There is no backend {backend!r}.", hint="See recon doctor.")
 
 

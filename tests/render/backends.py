@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -40,6 +43,11 @@ class Case:
     def __str__(self) -> str:
         return f"{self.backend}-{self.device}-{str(self.dtype).removeprefix('torch.')}"
 
+    @property
+    def interpreted(self) -> bool:
+        """Whether Python runs the kernels step by step."""
+        return (self.backend, self.device) == ("triton", "cpu")
+
     def rounded(self, splats: Splats) -> Splats:
         """The same in float64, with values that the precision holds: the input's rounding is
         no error of the backend."""
@@ -70,14 +78,25 @@ def _cases() -> list[Case]:
         if status.missing:
             continue
         for device in status.devices:
-            # the numba backend is float32 alone; the torch backend takes both
-            dtypes = [torch.float32] if status.name == "numba" else [torch.float32, torch.float64]
+            # the torch backend alone takes both
+            dtypes = [torch.float32, torch.float64] if status.name == "torch" else [torch.float32]
             found += [Case(status.name, device, dtype) for dtype in dtypes]
+    if not torch.cuda.is_available() and importlib.util.find_spec("triton"):
+        found.append(Case("triton", "cpu", torch.float32))  # by its interpreter
     return found
 
 
 CASES = _cases()
 every_backend = pytest.mark.parametrize("case", CASES, ids=str)
+
+
+def at_size(cases: Sequence[Case]) -> list[Any]:
+    """The cases for a test whose scene takes an interpreter minutes: there it is marked slow."""
+    return [pytest.param(case, marks=pytest.mark.slow if case.interpreted else ())
+            for case in cases]
+
+
+every_backend_at_size = pytest.mark.parametrize("case", at_size(CASES), ids=str)
 
 
 @dataclass(frozen=True)

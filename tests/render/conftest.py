@@ -4,6 +4,9 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from interpreter import quicken
+
+quicken()
 
 
 @pytest.fixture(autouse=True)

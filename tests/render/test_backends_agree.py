@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import pytest
 import torch
-from backends import CASES, GREENISH, Case
+from backends import CASES, GREENISH, Case, at_size
 from scenes import camera_at, random_splats, with_harmonics
 
 from recon_cli.render import Statistics
@@ -48,7 +48,7 @@ def everything(case: Case, splats: Splats, degree: int) -> dict[str, torch.Tenso
     return {name: value.detach().double().cpu() for name, value in found.items()}
 
 
-@pytest.mark.parametrize("case", OTHERS, ids=str)
+@pytest.mark.parametrize("case", at_size(OTHERS), ids=str)
 @pytest.mark.parametrize(("seed", "degree", "stored", "colored"), [
     (0, 0, 3, 2000), (1, 2, 3, 2000), (2, 3, 3, 2000), (3, 3, 3, 701), (4, 2, 2, 1500),
     (5, 3, 1, 1999), (6, 3, 0, 0)])

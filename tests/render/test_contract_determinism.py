@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import pytest
 import torch
-from backends import BLACK, CASES, GREENISH, every_backend
+from backends import BLACK, CASES, GREENISH, at_size, every_backend_at_size
 from scenes import camera_at, random_splats
 
 from recon_cli.render import Statistics
@@ -38,7 +38,7 @@ def threads():
     torch.set_num_threads(before)
 
 
-@every_backend
+@every_backend_at_size
 def test_the_same_input_gives_the_same_bits(case):
     splats, camera = random_splats(400, seed=2), camera_at(90, 70)
     first, second = (everything(case, splats, camera) for _ in range(2))
@@ -46,7 +46,7 @@ def test_the_same_input_gives_the_same_bits(case):
         assert torch.equal(value, second[name]), name
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.device == "cpu"], ids=str)
+@pytest.mark.parametrize("case", at_size([c for c in CASES if c.device == "cpu"]), ids=str)
 def test_the_number_of_threads_changes_nothing(case, threads):
     splats, camera = random_splats(3000, seed=2), camera_at(90, 70)
     found = {}
@@ -63,7 +63,7 @@ def test_the_number_of_threads_changes_nothing(case, threads):
                 assert error <= THREADS_TOLERANCE[case.dtype], f"{name} with {count} threads"
 
 
-@every_backend
+@every_backend_at_size
 def test_the_order_of_the_gaussians_does_not_matter(case):
     splats, camera = random_splats(200, seed=3), camera_at()
     order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
@@ -76,7 +76,7 @@ def test_the_order_of_the_gaussians_does_not_matter(case):
         assert error <= ORDER_TOLERANCE[case.dtype] * scale, name
 
 
-@every_backend
+@every_backend_at_size
 def test_a_picture_does_not_remember_the_one_before_it(case):
     splats, small = random_splats(100, seed=4), camera_at(20, 20)
     alone = everything(case, splats, small)
@@ -86,7 +86,7 @@ def test_a_picture_does_not_remember_the_one_before_it(case):
         assert torch.equal(value, again[name]), name
 
 
-@every_backend
+@every_backend_at_size
 def test_two_pictures_may_wait_for_their_backward_passes(case):
     splats, camera, other = random_splats(100, seed=4), camera_at(), camera_at(31, 23)
     alone = everything(case, splats, camera)

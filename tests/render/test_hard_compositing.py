@@ -185,7 +185,9 @@ def _covering(count: int) -> Splats:
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("case", [c for c in CASES if c.dtype == torch.float32], ids=str)
 def test_up_to_ten_million_instances_fit_into_memory_and_into_integers(case):
-    count = 20_000 if case.backend == "numba" else 2_000  # the torch backend takes its time
+    if case.interpreted:
+        pytest.skip("a million instances take an interpreter hours")
+    count = 2_000 if case.backend == "torch" else 20_000  # the torch backend takes its time
     camera = camera_at(480, 270, focal=300.0)
     tracked = case.leaves(_covering(count))
     out = case.render(tracked, camera, BLACK, scores=True)

@@ -15,7 +15,7 @@ from backends import (
     IMAGE_TOLERANCE,
     ORACLE_SH_TOLERANCE,
     compared,
-    every_backend,
+    every_backend_at_size,
 )
 from scenes import camera_at, joined, one_splat, random_splats, with_harmonics
 
@@ -34,7 +34,7 @@ def ones(colored: int, degree: int, *, seed: int = 5):
     return with_harmonics(random_splats(N, seed=seed), degree, colored)
 
 
-@every_backend
+@every_backend_at_size
 @every_degree
 @every_share
 def test_images_and_gradients_agree_with_the_brute_force(case, degree, colored):
@@ -46,7 +46,7 @@ def test_images_and_gradients_agree_with_the_brute_force(case, degree, colored):
         assert error <= max(GRADIENT_TOLERANCE[case.dtype], loose), f"{name}: {error:.1e}"
 
 
-@every_backend
+@every_backend_at_size
 @pytest.mark.parametrize(("used", "stored"), [(1, 2), (1, 3), (2, 3)])
 def test_a_lower_degree_in_use_agrees_with_the_brute_force(case, used, stored):
     found = compared(case, ones(33, stored), camera_at(), GREENISH, used)
@@ -55,7 +55,7 @@ def test_a_lower_degree_in_use_agrees_with_the_brute_force(case, used, stored):
     assert found.gradient <= limit
 
 
-@every_backend
+@every_backend_at_size
 @every_degree
 def test_a_gaussian_without_coefficients_has_exactly_its_base_colour(case, degree):
     plain = one_splat((0.5, 0.1, 3.0), scale=0.1, opacity=0.6, color=(0.9, 0.5, 0.1))
@@ -75,7 +75,7 @@ def test_a_gaussian_without_coefficients_has_exactly_its_base_colour(case, degre
         [0.9 * alpha, 0.5 * alpha, 0.1 * alpha], abs=2e-7)
 
 
-@every_backend
+@every_backend_at_size
 @every_degree
 @every_share
 def test_no_coefficients_and_coefficients_of_zero_are_the_same_picture(case, degree, colored):
@@ -95,7 +95,7 @@ def test_no_coefficients_and_coefficients_of_zero_are_the_same_picture(case, deg
             assert torch.equal(value.grad, theirs[: len(value)]), name
 
 
-@every_backend
+@every_backend_at_size
 def test_only_coefficients_that_exist_and_are_in_use_can_be_broken(case):
     splats = ones(60, 2)
     splats.means[:, :2] *= 0.2

@@ -1,0 +1,1 @@
+"""The triton backend: kernels for GPUs that come with torch and need no CUDA toolkit."""

@@ -1,0 +1,151 @@
+"""Gradients of compositing, back to front.
+
+With g the gradient of the loss at a pixel, c the colour of a Gaussian and R the loss's slope along
+what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
+
+    R <- g . background at the last fragment,  R <- R + alpha (g . c - R) after each,
+    dL/dc = alpha T g,  s = alpha dL/dalpha = alpha T (g . c - R),  T <- T / (1 - alpha).
+
+s is zero where alpha was clamped. Every instance has a slot of its own for its sums over the tile,
+slots of a Gaussian lie side by side, and `gather` adds them in order: no atomics, and the same bits
+every time.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from recon_cli.render.triton.fragments import (
+    AREA,
+    FLOATS,
+    LOG2_ALPHA_MAX,
+    LOG2_ALPHA_MIN,
+    SIDE,
+    SLOT,
+    alpha_of,
+    log2_alpha,
+)
+
+
+@triton.jit
+def decompose(order, first, members, offsets, records, background, width, height, tiles_x,
+              final, last, grad_rgb, grad_alpha, grad_depth, slots, counting, sums,
+              SCORES: tl.constexpr, MASKED: tl.constexpr):
+    """Sums the gradients of every instance of a tile over its pixels.
+
+    Args:
+        order: [tiles] int32, as in the forward pass; so are the next eight and the last ones.
+        first: [tiles + 1] int32.
+        members: [E] int32.
+        offsets: [E, 2].
+        records: [M, FLOATS].
+        background: [3].
+        width: of the image in pixels.
+        height: of the image in pixels.
+        tiles_x: tiles in a row.
+        final: [tiles, AREA] transmittance behind the last fragment.
+        last: [tiles, AREA] int32, number of the last fragment.
+        grad_rgb: [H, W, 3] dL/drgb.
+        grad_alpha: [H, W] dL/dalpha.
+        grad_depth: [H, W] dL/ddepth.
+        slots: [E] int32.
+        counting: [H, W] uint8.
+        sums: [E, SLOT] out by slot: dL/d(red, green, blue, depth), then the sums of s times 1, u,
+            v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back, without its
+            factor), of s^2, the fragments, and what leaving the instance out would change.
+        SCORES: also the last of these.
+        MASKED: that one of the pixels in `counting` alone.
+    """
+    tile = tl.load(order + tl.program_id(0))
+    begin, end = tl.load(first + tile), tl.load(first + tile + 1)
+    pixel = tl.arange(0, AREA)
+    x, y = tile % tiles_x * SIDE + pixel % SIDE, tile // tiles_x * SIDE + pixel // SIDE
+    column, row = (pixel % SIDE).to(tl.float32), (pixel // SIDE).to(tl.float32)
+    inside = (x < width) & (y < height)
+    at = y * width + x
+    T = tl.load(final + tile * AREA + pixel)
+    latest = tl.load(last + tile * AREA + pixel)
+    g_red = tl.load(grad_rgb + 3 * at, mask=inside, other=0.0)
+    g_green = tl.load(grad_rgb + 3 * at + 1, mask=inside, other=0.0)
+    g_blue = tl.load(grad_rgb + 3 * at + 2, mask=inside, other=0.0)
+    g_depth = tl.load(grad_depth + at, mask=inside, other=0.0)
+    behind_red, behind_green = T * 0.0 + tl.load(background), T * 0.0 + tl.load(background + 1)
+    behind_blue = T * 0.0 + tl.load(background + 2)
+    # coverage is 1 - T at the end: a colour of -1 behind everything
+    R = (g_red * behind_red + g_green * behind_green + g_blue * behind_blue
+         - tl.load(grad_alpha + at, mask=inside, other=0.0))
+    counts = inside
+    if MASKED:
+        counts = inside & (tl.load(counting + at, mask=inside, other=0) != 0)
+    e = begin + tl.max(latest)
+    drawn = e
+    while e > begin:
+        e -= 1
+        record = records + tl.load(members + e).to(tl.int64) * FLOATS
+        u, v, power = log2_alpha(record, offsets + 2 * e.to(tl.int64), column, row)
+        part = (power >= LOG2_ALPHA_MIN) & (latest > e - begin)
+        a = tl.where(part, alpha_of(power), 0.0)
+        T = T / (1.0 - a)
+        weight = a * T
+        red, green, blue = tl.load(record + 4), tl.load(record + 5), tl.load(record + 6)
+        shade = tl.fma(g_red, red, tl.fma(g_green, green, tl.fma(
+            g_blue, blue, g_depth * tl.load(record + 7))))
+        slope = shade - R
+        R = tl.fma(a, slope, R)
+        s = tl.where(power <= LOG2_ALPHA_MAX, weight * slope, 0.0)
+        su, sv = s * u, s * v
+        to = sums + tl.load(slots + e).to(tl.int64) * SLOT
+        tl.store(to, tl.sum(weight * g_red))
+        tl.store(to + 1, tl.sum(weight * g_green))
+        tl.store(to + 2, tl.sum(weight * g_blue))
+        tl.store(to + 3, tl.sum(weight * g_depth))
+        tl.store(to + 4, tl.sum(s))
+        tl.store(to + 5, tl.sum(su))
+        tl.store(to + 6, tl.sum(sv))
+        tl.store(to + 7, tl.sum(su * u))
+        tl.store(to + 8, tl.sum(su * v))
+        tl.store(to + 9, tl.sum(sv * v))
+        u_x, u_y, v_y = tl.load(record), tl.load(record + 1), tl.load(record + 2)
+        tl.store(to + 10, tl.sum(tl.abs(su)) * u_x)
+        tl.store(to + 11, tl.sum(tl.abs(tl.fma(su, u_y, sv * v_y))))
+        tl.store(to + 12, tl.sum(s * s))
+        tl.store(to + 13, tl.sum(part.to(tl.float32)))
+        if SCORES:
+            away_red, away_green, away_blue = (
+                red - behind_red, green - behind_green, blue - behind_blue)
+            behind_red = tl.fma(a, away_red, behind_red)
+            behind_green = tl.fma(a, away_green, behind_green)
+            behind_blue = tl.fma(a, away_blue, behind_blue)
+            error = away_red * away_red + away_green * away_green + away_blue * away_blue
+            tl.store(to + 14, tl.sum(tl.where(counts, weight * weight * error, 0.0)))
+    nothing = tl.arange(0, SLOT).to(tl.float32) * 0.0
+    while drawn < end:  # what no pixel reached
+        to = sums + tl.load(slots + drawn).to(tl.int64) * SLOT
+        tl.store(to + tl.arange(0, SLOT), nothing)
+        drawn += 1
+
+
+@triton.jit
+def gather(starts, sums, count, totals, USED: tl.constexpr, BLOCK: tl.constexpr):
+    """Adds the sums of the slots of each Gaussian, in order.
+
+    Args:
+        starts: [M + 1] int32, first slot of each Gaussian.
+        sums: [E, SLOT].
+        count: M.
+        totals: [M, SLOT] out.
+        USED: columns that `decompose` wrote; the others become 0.
+        BLOCK: Gaussians a program.
+    """
+    j = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here, lane = j < count, tl.arange(0, SLOT)
+    used = lane[None, :] < USED
+    slot, end = tl.load(starts + j, mask=here, other=0), tl.load(starts + j + 1, mask=here, other=0)
+    total = (j[:, None] * lane[None, :]).to(tl.float32) * 0.0
+    while tl.max(end - slot) > 0:
+        more = (slot < end)[:, None] & used
+        total += tl.load(
+            sums + slot[:, None].to(tl.int64) * SLOT + lane[None, :], mask=more, other=0.0)
+        slot += 1
+    tl.store(totals + j[:, None].to(tl.int64) * SLOT + lane[None, :], total, mask=here[:, None])

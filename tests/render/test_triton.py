@@ -1,0 +1,57 @@
+"""What is the triton backend's alone: its kernels compile for GPUs that are not here."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from backends import BLACK, GREENISH, Case
+from scenes import camera_at, random_splats
+
+from recon_cli.render import render
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("triton") is None, reason="the package triton is not installed")
+
+
+def test_every_kernel_compiles_for_gpus_old_and_new_without_spilling(tmp_path):
+    script = Path(__file__).with_name("triton_targets.py")
+    environment = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path), "TRITON_INTERPRET": "0"}
+    done = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("registers, 0 bytes spilled") == 12
+
+
+def pictures(splats, case):
+    tracked = case.leaves(splats)
+    out = case.render(tracked, camera_at(33, 20), GREENISH, 3, scores=True)
+    (out.rgb.square().sum() + out.depth.sum() + out.alpha.square().sum()).backward()
+    return [out.rgb, out.depth, tracked.means.grad, tracked.sh_rest.grad, out.statistics.loo]
+
+
+def test_the_same_small_scene_gives_the_same_bits_in_any_order_of_its_gaussians():
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    case, splats = Case("triton", device, torch.float32), random_splats(40, seed=2)
+    first, again = pictures(splats, case), pictures(splats, case)
+    assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    turned = pictures(splats.select(order), case)
+    assert torch.equal(first[0], turned[0])
+    assert torch.equal(first[2][order.to(device)], turned[2])
+
+
+def test_float64_is_refused():
+    with pytest.raises(ValueError, match="takes float32"):
+        render(random_splats(3), camera_at(), BLACK, 0, backend="triton")
+
+
+def test_a_scene_of_no_gaussians_in_view_launches_kernels_over_nothing():
+    splats = random_splats(3).map(torch.Tensor.float)
+    splats.means[:, 2] = -5
+    out = render(splats, camera_at(40, 20), BLACK.float(), 0, backend="triton", scores=True)
+    assert out.alpha.abs().max() == 0
+    assert out.statistics.hits.sum() == 0

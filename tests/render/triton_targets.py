@@ -1,0 +1,77 @@
+"""Compiles every kernel for GPUs that need not be here: `python tests/render/triton_targets.py`.
+
+Prints registers and spilled bytes as ptxas, which comes with triton, tells them. Fails where one
+spills: a warp would then wait for its own memory.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from recon_cli.render.triton import raster_backward, raster_forward
+
+TARGETS = (75, 90)  # Turing, the oldest that triton compiles for, and Hopper
+TYPES = {
+    "order": "*i32", "first": "*i32", "members": "*i32", "offsets": "*fp32", "records": "*fp32",
+    "background": "*fp32", "width": "i32", "height": "i32", "tiles_x": "i32", "rgb": "*fp32",
+    "alpha": "*fp32", "depth": "*fp32", "final": "*fp32", "last": "*i32", "slots": "*i32",
+    "counting": "*u8", "hits": "*i32", "weights": "*fp32", "peaks": "*fp32", "grad_rgb": "*fp32",
+    "grad_alpha": "*fp32", "grad_depth": "*fp32", "sums": "*fp32", "starts": "*i32",
+    "count": "i32", "totals": "*fp32", "total_hits": "*i64", "blend_sum": "*fp32",
+    "blend_max": "*fp32",
+}  # fmt: skip
+# what is compiled, with the constants and the warps that the backend starts it with
+KERNELS = (
+    (raster_forward.composite, {"SCORES": False, "MASKED": False, "CHUNK": 16}, 1),
+    (raster_forward.composite, {"SCORES": True, "MASKED": True, "CHUNK": 16}, 1),
+    (raster_forward.tally, {"BLOCK": 128}, 4),
+    (raster_backward.decompose, {"SCORES": False, "MASKED": False}, 1),
+    (raster_backward.decompose, {"SCORES": True, "MASKED": True}, 1),
+    (raster_backward.gather, {"USED": 15, "BLOCK": 128}, 4),
+)
+
+
+def compiled(kernel, constants, warps, target):
+    """Returns registers a thread and spilled bytes of a kernel."""
+    names = kernel.arg_names
+    source = ASTSource(
+        fn=kernel, signature={
+            name: "constexpr" if name in constants else TYPES[name] for name in names},
+        constexprs={(names.index(name),): value for name, value in constants.items()})
+    made = triton.compile(
+        source, target=GPUTarget("cuda", target, 32), options={"num_warps": warps})
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "kernel.ptx"
+        path.write_text(made.asm["ptx"])
+        assembler = next((Path(triton.__file__).parent / "backends/nvidia/bin").glob("ptxas*"))
+        architecture = re.search(r"\.target (\w+)", made.asm["ptx"]).group(1)
+        said = subprocess.run(
+            [assembler, "-v", f"--gpu-name={architecture}", path, "-o", path.with_suffix(".o")],
+            check=True, capture_output=True, text=True).stderr
+    registers = int(re.search(r"Used (\d+) registers", said).group(1))
+    spilled = sum(map(int, re.findall(r"(\d+) bytes spill", said)))
+    return registers, spilled
+
+
+def main():
+    worst = 0
+    for target in TARGETS:
+        for kernel, constants, warps in KERNELS:
+            registers, spilled = compiled(kernel, constants, warps, target)
+            worst = max(worst, spilled)
+            shown = ", ".join(f"{name}={value}" for name, value in constants.items())
+            sys.stdout.write(f"sm_{target} {kernel.__name__}({shown}): {registers} registers, "
+                             f"{spilled} bytes spilled\n")
+    sys.exit(worst > 0)
+
+
+if __name__ == "__main__":
+    main()
