@@ -1,7 +1,7 @@
 """Triton's interpreter without what it does over and over.
 
 It patches triton's language anew for each function that a kernel calls, which takes longer than the
-function. Where the language is patched already, that is left out here, if this version of triton works so.
+function. Where the language is patched already, that is left out here, if this version works so.
 """
 
 from __future__ import annotations
