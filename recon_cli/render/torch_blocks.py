@@ -93,7 +93,9 @@ def build_table(
     channels: Tensor,  # [M, 4]
 ) -> Table:
     """Returns the table of M projected Gaussians with its empty last row."""
-    whitening = whitening_factors(cov2d, det)
+    _, b, c = cov2d.double().unbind(-1)
+    det = det.double()
+    whitening = torch.stack([(c / det).sqrt(), -b / (c * det).sqrt(), c.rsqrt()], dim=-1)
     one = torch.ones_like(log_o)[:, None]
     return Table(
         torch.nn.functional.pad(means2d.double(), (0, 0, 0, 1)),
@@ -101,13 +103,6 @@ def build_table(
         torch.nn.functional.pad(log_o, (0, 1), value=-torch.inf),
         torch.nn.functional.pad(torch.cat([channels, one], dim=-1), (0, 0, 0, 1)),
     )
-
-
-def whitening_factors(cov2d: Tensor, det: Tensor) -> Tensor:
-    """Returns float64 (l11, l12, l22) [M, 3] of the inverses of covariances [M, 3]."""
-    _, b, c = cov2d.double().unbind(-1)
-    det = det.double()
-    return torch.stack([(c / det).sqrt(), -b / (c * det).sqrt(), c.rsqrt()], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)

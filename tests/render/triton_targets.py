@@ -16,16 +16,27 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from recon_cli.render.triton import raster_backward, raster_forward
+from recon_cli.render.triton import (
+    projection,
+    projection_gradient,
+    raster_backward,
+    raster_forward,
+)
 
 TARGETS = (75, 90)  # Turing, the oldest that triton compiles for, and Hopper
 TYPES = {
     "order": "*i32", "first": "*i32", "members": "*i32", "offsets": "*fp32", "records": "*fp32",
+    "means": "*fp32", "quats": "*fp32", "log_scales": "*fp32", "logits": "*fp32",
+    "sh_dc": "*fp32", "sh_rest": "*fp32", "view": "*fp64", "colored": "i32", "shapes": "*fp32",
+    "centers": "*fp64", "depths": "*fp32", "touched": "*i32", "radii": "*fp32", "broken": "*i32",
+    "keys": "*i64", "owners": "*i32", "g_means": "*fp32", "g_quats": "*fp32",
+    "g_log_scales": "*fp32", "g_logits": "*fp32", "g_sh_dc": "*fp32", "g_sh_rest": "*fp32",
+    "means2d_grad": "*fp32", "absolute_grad": "*fp32", "variance": "*fp32", "loo": "*fp32",
     "background": "*fp32", "width": "i32", "height": "i32", "tiles_x": "i32", "rgb": "*fp32",
-    "alpha": "*fp32", "depth": "*fp32", "final": "*fp32", "last": "*i32", "slots": "*i32",
+    "alpha": "*fp32", "depth": "*fp32", "final": "*fp32", "last": "*i32", "slots": "*i64",
     "counting": "*u8", "hits": "*i32", "weights": "*fp32", "peaks": "*fp32", "grad_rgb": "*fp32",
     "grad_alpha": "*fp32", "grad_depth": "*fp32", "sums": "*fp32", "starts": "*i32",
-    "count": "i32", "totals": "*fp32", "total_hits": "*i64", "blend_sum": "*fp32",
+    "count": "i32", "total_hits": "*i64", "blend_sum": "*fp32",
     "blend_max": "*fp32",
 }  # fmt: skip
 # what is compiled, with the constants and the warps that the backend starts it with
@@ -35,7 +46,10 @@ KERNELS = (
     (raster_forward.tally, {"BLOCK": 128}, 4),
     (raster_backward.decompose, {"SCORES": False, "MASKED": False}, 1),
     (raster_backward.decompose, {"SCORES": True, "MASKED": True}, 1),
-    (raster_backward.gather, {"USED": 15, "BLOCK": 128}, 4),
+    (projection.project, {"STRIDE": 45, "TERMS": 15, "BLOCK": 128}, 4),
+    (projection.list_tiles, {"BLOCK": 128}, 4),
+    (projection.place, {"BLOCK": 128}, 4),
+    (projection_gradient.unproject, {"STRIDE": 45, "TERMS": 15, "SCORES": True, "BLOCK": 128}, 4),
 )
 
 

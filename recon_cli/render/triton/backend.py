@@ -1,12 +1,7 @@
-"""The triton backend behind the contract: float32, differentiable by autograd.
-
-Projection and binning are the torch backend's, which run wholly on the device. The kernels take
-what grows with the pixels: compositing, its gradients, and the sums over each Gaussian's tiles.
-"""
+"""The triton backend behind the contract: float32, differentiable by autograd."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,19 +9,18 @@ import torch
 import triton
 from torch import Tensor
 
-from recon_cli.render.binning import Instances, bin_to_tiles
-from recon_cli.render.contract import TILE, RenderOutput, Statistics
-from recon_cli.render.projection import Projection, project
-from recon_cli.render.torch_blocks import gradients_of, whitening_factors
-from recon_cli.render.triton.fragments import LOG2_E, PIXELS, RECORD, SUMS
-from recon_cli.render.triton.raster_backward import decompose, gather
+from recon_cli.render.contract import RenderOutput, Statistics
+from recon_cli.render.triton import projection as kernels
+from recon_cli.render.triton.fragments import PIXELS, RECORD, SIDE, SUMS
+from recon_cli.render.triton.projection_gradient import unproject
+from recon_cli.render.triton.raster_backward import decompose
 from recon_cli.render.triton.raster_forward import CHUNK, composite, tally
+from recon_cli.render.triton.view import view_numbers
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import TERMS, Splats
 
-_UNIT = math.sqrt(LOG2_E / 2)  # what the whitening factors are multiplied by: alpha as a power of 2
-_BLOCK = 128  # Gaussians a program where sums are gathered
 _WARPS = 1  # a tile is one warp: no barrier in its sums
+_LOWER = 1 << 32  # a key is a tile times this, and the bits of a depth
 
 
 def render(
@@ -42,145 +36,149 @@ def render(
         raise ValueError(
             f"the triton backend takes float32, not {splats.means.dtype}; the torch backend takes "
             "both")
-    projection = project(splats, camera, sh_degree)
-    with torch.no_grad():
-        lists = Lists.of(projection, bin_to_tiles(projection, camera.width, camera.height))
-        statistics = Statistics.zeros(splats.means)
-        statistics.broken = projection.broken
-        a, b, c = projection.cov2d.unbind(-1)
-        longest = (a + c) / 2 + (((a - c) / 2) ** 2 + b * b).sqrt()
-        statistics.radii[projection.ids] = 3 * longest.sqrt()
-    # log sigmoid keeps its gradient where the sigmoid has rounded to 1
-    log_opacities = torch.nn.functional.logsigmoid(splats.logit_opacities[projection.ids])
-    channels = torch.cat([projection.colors, projection.depths[:, None]], dim=-1)
-    rgb, alpha, depth = _Rasterize.apply(
-        projection.means2d, projection.directions, projection.log_scales, log_opacities, channels,
-        background, projection.ids, lists, (camera.height, camera.width), statistics, scores, mask)
+    statistics = Statistics.zeros(splats.means)
+    tensors = list(splats.parameters().values())
+    if min(sh_degree, splats.sh_degree) == 0:
+        tensors[5] = tensors[5].detach()  # no part of the picture
+    rgb, alpha, depth = _Render.apply(
+        *tensors, background, camera, sh_degree, scores, mask, statistics)
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """What the kernels read of the instances, E of M Gaussians.
+    """Gaussians as a view sees them, and E instances of them, each in a tile.
 
     Attributes:
         tiles_x: tiles in a row.
+        records: [N, RECORD], see `fragments`.
+        starts: [N + 1] int32, first slot of each Gaussian.
         order: [tiles] int32, longest list first.
         first: [tiles + 1] int32, where the instances of each tile begin.
         members: [E] int32, Gaussian of each instance, by tile and depth.
-        slots: [E] int32, its place in the order by Gaussian.
-        starts: [M + 1] int32, first slot of each Gaussian.
-        whitening: [M, 3] float64 factors (U_X, U_Y, V_Y).
+        slots: [E] int64, its place in the order by Gaussian.
         offsets: [E, 2] u and v at the first pixel of the tile.
+        radii: [N], see `Statistics`.
+        broken: how many Gaussians hold or become what is not finite.
     """
 
     tiles_x: int
+    records: Tensor
+    starts: Tensor
     order: Tensor
     first: Tensor
     members: Tensor
     slots: Tensor
-    starts: Tensor
-    whitening: Tensor
     offsets: Tensor
-
-    @staticmethod
-    def of(projection: Projection, instances: Instances) -> Lists:
-        """Returns the lists of the instances of a view."""
-        counts, members = instances.counts, instances.gaussians
-        tile = torch.repeat_interleave(counts, output_size=len(members))
-        whitening = _UNIT * whitening_factors(projection.cov2d, projection.det)
-        corner = torch.stack([tile % instances.tiles_x, tile // instances.tiles_x], dim=-1)
-        dx, dy = (TILE * corner + 0.5 - projection.means2d.double()[members]).unbind(-1)
-        u_x, u_y, v_y = whitening[members].unbind(-1)
-        return Lists(
-            instances.tiles_x, torch.argsort(counts, descending=True, stable=True).int(),
-            _begins(counts), members.int(), instances.slots.int(), _begins(instances.per_gaussian),
-            whitening, torch.stack([u_x * dx + u_y * dy, v_y * dy], dim=-1).float())
+    radii: Tensor
+    broken: int
 
 
-def _begins(counts: Tensor) -> Tensor:
-    """Returns [n + 1] int32 where runs of these lengths begin, and where the last one ends."""
-    return torch.nn.functional.pad(torch.cumsum(counts, 0), (1, 0)).int()
+def project(splats: Splats, camera: Camera, view: Tensor, terms: int) -> Lists:
+    """Returns the lists of a view.
+
+    Args:
+        splats: contiguous.
+        camera: whose size is taken.
+        view: its numbers, see `view.view_numbers`.
+        terms: coefficients a channel that are in use.
+    """
+    n, like = len(splats), splats.means
+    tiles_x, tiles_y = triton.cdiv(camera.width, SIDE.value), triton.cdiv(camera.height, SIDE.value)
+    records, shapes = like.new_empty(n, RECORD), like.new_empty(n, kernels.SHAPES)
+    centers, depths = like.new_empty(n, 2, dtype=torch.float64), like.new_empty(n)
+    touched, radii = like.new_empty(n, dtype=torch.int32), like.new_empty(n)
+    programs = triton.cdiv(n, kernels.BLOCK)
+    broken = like.new_zeros(programs, dtype=torch.int32)
+    if n:
+        kernels.project[(programs,)](
+            *splats.parameters().values(), view, n, len(splats.sh_rest), records, shapes, centers,
+            depths, touched, radii, broken, STRIDE=3 * TERMS[splats.sh_degree], TERMS=terms,
+            BLOCK=kernels.BLOCK)
+    starts = torch.nn.functional.pad(torch.cumsum(touched, 0), (1, 0))
+    # the one wait for the device: how much memory the instances take
+    instances, unsound = torch.stack([starts[-1], broken.sum()]).tolist()
+    starts = starts.int()
+    keys = torch.empty(instances, dtype=torch.int64, device=like.device)
+    owners = torch.empty(instances, dtype=torch.int32, device=like.device)
+    members, offsets = torch.empty_like(owners), like.new_empty(instances, 2)
+    if instances:
+        kernels.list_tiles[(programs,)](
+            shapes, centers, depths, touched, starts, view, n, tiles_x, keys, owners,
+            BLOCK=kernels.BLOCK)
+    # slots ascend with the Gaussians, so that a stable sort leaves ties in order of index
+    keys, slots = torch.sort(keys, stable=True)
+    if instances:
+        kernels.place[(triton.cdiv(instances, kernels.BLOCK),)](
+            keys, slots, owners, centers, records, instances, tiles_x, members, offsets,
+            BLOCK=kernels.BLOCK)
+    tiles = torch.arange(tiles_x * tiles_y + 1, device=like.device)
+    first = torch.searchsorted(keys, tiles * _LOWER).int()
+    order = torch.argsort(first[1:] - first[:-1], descending=True, stable=True).int()
+    return Lists(tiles_x, records, starts, order, first, members, slots, offsets, radii, unsound)
 
 
-class _Rasterize(torch.autograd.Function):
-    """Composites instances and carries gradients back to the projected Gaussians."""
+class _Render(torch.autograd.Function):
+    """All kernels of a view as one differentiable operation."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor, directions: Tensor, log_scales: Tensor, log_opacities: Tensor,
-        channels: Tensor, background: Tensor, ids: Tensor, lists: Lists, size: tuple[int, int],
-        statistics: Statistics, scores: bool, mask: Tensor | None,
+        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor,
+        sh_dc: Tensor, sh_rest: Tensor, background: Tensor, camera: Camera, sh_degree: int,
+        scores: bool, mask: Tensor | None, statistics: Statistics,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        height, width = size
-        tiles, instances = len(lists.order), len(lists.members)
-        records = torch.cat([
-            lists.whitening.float(), log_opacities[:, None] * LOG2_E, channels], dim=-1)
-        assert records.shape[1] == RECORD
-        rgb, alpha, depth = (means2d.new_empty(height, width, 3), means2d.new_empty(size),
-                             means2d.new_empty(size))
-        final = means2d.new_empty(tiles, PIXELS)
-        last = torch.empty(tiles, PIXELS, dtype=torch.int32, device=means2d.device)
-        # what leaves a tile early is never counted
-        tallied = [torch.zeros(instances * scores, dtype=kind, device=means2d.device)
+        splats = Splats(*(tensor.contiguous() for tensor in (
+            means, quats, log_scales, logit_opacities, sh_dc, sh_rest)))
+        terms = TERMS[min(sh_degree, splats.sh_degree)]
+        view = view_numbers(camera, means.device)
+        lists = project(splats, camera, view, terms)
+        statistics.radii, statistics.broken = lists.radii, lists.broken
+        height, width = camera.height, camera.width
+        rgb, alpha, depth = (means.new_empty(height, width, 3), means.new_empty(height, width),
+                             means.new_empty(height, width))
+        final = means.new_empty(len(lists.order), PIXELS)
+        last = torch.empty(len(lists.order), PIXELS, dtype=torch.int32, device=means.device)
+        # zeros: an instance that a tile leaves out is never counted
+        tallied = [means.new_zeros(len(lists.members) * scores, dtype=kind)
                    for kind in (torch.int32, torch.float32, torch.float32)]
         counting = None if mask is None else mask.contiguous().to(torch.uint8)
-        composite[(tiles,)](
-            lists.order, lists.first, lists.members, lists.offsets, records,
-            background.contiguous(), width, height, lists.tiles_x, rgb, alpha, depth, final, last,
-            lists.slots, counting, *tallied, SCORES=scores, MASKED=counting is not None,
-            CHUNK=CHUNK, num_warps=_WARPS)
-        if scores and len(ids):
-            _tally(ids, lists, tallied, statistics)
-        ctx.save_for_backward(directions, log_scales, records, background, final, last, alpha)
-        ctx.rest = ids, lists, statistics, scores, counting
+        background = background.contiguous()
+        composite[(len(lists.order),)](
+            lists.order, lists.first, lists.members, lists.offsets, lists.records, background,
+            width, height, lists.tiles_x, rgb, alpha, depth, final, last, lists.slots, counting,
+            *tallied, SCORES=scores, MASKED=counting is not None, CHUNK=CHUNK, num_warps=_WARPS)
+        if scores and len(splats):
+            tally[(triton.cdiv(len(splats), kernels.BLOCK),)](
+                lists.starts, *tallied, len(splats), statistics.hits, statistics.blend_sum,
+                statistics.blend_max, BLOCK=kernels.BLOCK)
+        # the output itself would hold its own graph, and with it everything here, for ever
+        ctx.save_for_backward(
+            *splats.parameters().values(), view, background, final, last, alpha.detach())
+        ctx.rest = lists, statistics, terms, scores, counting
         return rgb, alpha, depth
 
     @staticmethod
     def backward(
         ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor, grad_depth: Tensor
     ) -> tuple[Tensor | None, ...]:
-        directions, log_scales, records, background, final, last, alpha = ctx.saved_tensors
-        ids, lists, statistics, scores, counting = ctx.rest
+        *tensors, view, background, final, last, alpha = ctx.saved_tensors
+        lists, statistics, terms, scores, counting = ctx.rest
+        splats = Splats(*tensors)
         height, width = alpha.shape
-        sums = records.new_empty(len(lists.members), SUMS)
+        sums = alpha.new_empty(len(lists.members), SUMS)
         grad_rgb = grad_rgb.contiguous()
         decompose[(len(lists.order),)](
-            lists.order, lists.first, lists.members, lists.offsets, records,
-            background.contiguous(), width, height, lists.tiles_x, final, last, grad_rgb,
-            grad_alpha.contiguous(), grad_depth.contiguous(), lists.slots, counting, sums,
-            SCORES=scores, MASKED=counting is not None, num_warps=_WARPS)
-        totals = records.new_empty(len(ids), SUMS)
-        if len(ids):
-            gather[(triton.cdiv(len(ids), _BLOCK),)](
-                lists.starts, sums, len(ids), totals, USED=14 + scores, BLOCK=_BLOCK)
+            lists.order, lists.first, lists.members, lists.offsets, lists.records, background,
+            width, height, lists.tiles_x, final, last, grad_rgb, grad_alpha.contiguous(),
+            grad_depth.contiguous(), lists.slots, counting, sums, SCORES=scores,
+            MASKED=counting is not None, num_warps=_WARPS)
+        gradients = [torch.empty_like(tensor) for tensor in tensors]
+        if len(splats):
+            unproject[(triton.cdiv(len(splats), kernels.BLOCK),)](
+                splats.means, splats.quats, splats.log_scales, splats.logit_opacities,
+                splats.sh_rest, view, len(splats), len(splats.sh_rest), lists.records,
+                lists.starts, sums, *gradients, statistics.means2d_grad, statistics.absolute_grad,
+                statistics.variance, statistics.loo, STRIDE=3 * TERMS[splats.sh_degree],
+                TERMS=terms, SCORES=scores, BLOCK=kernels.BLOCK)
         grad_background = (grad_rgb * (1 - alpha)[..., None]).sum((0, 1))
-        factors = totals.new_tensor([_UNIT, _UNIT, _UNIT**2, _UNIT**2, _UNIT**2])
-        shape = [gradient.to(totals.dtype) for gradient in gradients_of(
-            totals[:, 5:10] / factors, lists.whitening / _UNIT, directions, log_scales)]
-        _write_statistics(ids, shape[0], totals, statistics, scores=scores)
-        return (*shape, totals[:, 4], totals[:, :4], grad_background,
-                None, None, None, None, None, None)
-
-
-def _tally(ids: Tensor, lists: Lists, tallied: list[Tensor], statistics: Statistics) -> None:
-    """Writes hits and blend weights of the Gaussians `ids`, [M]."""
-    found = [values.new_empty(len(ids)) for values in (
-        statistics.hits, statistics.blend_sum, statistics.blend_max)]
-    tally[(triton.cdiv(len(ids), _BLOCK),)](
-        lists.starts, *tallied, len(ids), *found, BLOCK=_BLOCK)
-    statistics.hits[ids], statistics.blend_sum[ids], statistics.blend_max[ids] = found
-
-
-def _write_statistics(
-    ids: Tensor, means2d_grad: Tensor, totals: Tensor, statistics: Statistics, *, scores: bool
-) -> None:
-    """Writes what the backward pass gathers, from the sums [M, SUMS] of `decompose`."""
-    statistics.means2d_grad[ids] = means2d_grad
-    statistics.absolute_grad[ids] = totals[:, 10:12] / _UNIT**2
-    squares, count = totals[:, 12].double(), totals[:, 13].double().clamp_min(1)
-    variance = squares - totals[:, 4].double().square() / count
-    statistics.variance[ids] = variance.clamp_min(0).to(totals.dtype)
-    if scores:
-        statistics.loo[ids] = totals[:, 14]
+        return (*gradients, grad_background, None, None, None, None, None)

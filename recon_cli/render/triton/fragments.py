@@ -30,6 +30,8 @@ FLOATS = tl.constexpr(RECORD)
 SLOT = tl.constexpr(SUMS)
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(ALPHA_MIN))
 LOG2_ALPHA_MAX = tl.constexpr(math.log2(ALPHA_MAX))
+LOG2E = tl.constexpr(LOG2_E)
+UNIT = tl.constexpr(math.sqrt(LOG2_E / 2))
 T_MIN = tl.constexpr(TRANSMITTANCE_MIN)
 
 

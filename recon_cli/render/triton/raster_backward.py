@@ -7,8 +7,8 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
     dL/dc = alpha T g,  s = alpha dL/dalpha = alpha T (g . c - R),  T <- T / (1 - alpha).
 
 s is zero where alpha was clamped. Every instance has a slot of its own for its sums over the tile,
-slots of a Gaussian lie side by side, and `gather` adds them in order: no atomics, and the same bits
-every time.
+slots of a Gaussian lie side by side, and are added in order: no atomics, and the same bits every
+time.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def decompose(order, first, members, offsets, records, background, width, height
         grad_rgb: [H, W, 3] dL/drgb.
         grad_alpha: [H, W] dL/dalpha.
         grad_depth: [H, W] dL/ddepth.
-        slots: [E] int32.
+        slots: [E] int64.
         counting: [H, W] uint8.
         sums: [E, SLOT] out by slot: dL/d(red, green, blue, depth), then the sums of s times 1, u,
             v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back, without its
@@ -124,28 +124,3 @@ def decompose(order, first, members, offsets, records, background, width, height
         to = sums + tl.load(slots + drawn).to(tl.int64) * SLOT
         tl.store(to + tl.arange(0, SLOT), nothing)
         drawn += 1
-
-
-@triton.jit
-def gather(starts, sums, count, totals, USED: tl.constexpr, BLOCK: tl.constexpr):
-    """Adds the sums of the slots of each Gaussian, in order.
-
-    Args:
-        starts: [M + 1] int32, first slot of each Gaussian.
-        sums: [E, SLOT].
-        count: M.
-        totals: [M, SLOT] out.
-        USED: columns that `decompose` wrote; the others become 0.
-        BLOCK: Gaussians a program.
-    """
-    j = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here, lane = j < count, tl.arange(0, SLOT)
-    used = lane[None, :] < USED
-    slot, end = tl.load(starts + j, mask=here, other=0), tl.load(starts + j + 1, mask=here, other=0)
-    total = (j[:, None] * lane[None, :]).to(tl.float32) * 0.0
-    while tl.max(end - slot) > 0:
-        more = (slot < end)[:, None] & used
-        total += tl.load(
-            sums + slot[:, None].to(tl.int64) * SLOT + lane[None, :], mask=more, other=0.0)
-        slot += 1
-    tl.store(totals + j[:, None].to(tl.int64) * SLOT + lane[None, :], total, mask=here[:, None])

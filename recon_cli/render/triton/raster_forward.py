@@ -42,7 +42,7 @@ def composite(order, first, members, offsets, records, background, width, height
         depth: [H, W] out.
         final: [tiles, AREA] out, transmittance behind the last fragment.
         last: [tiles, AREA] int32 out, number in the tile of the last fragment, from 1.
-        slots: [E] int32, where the scores of an instance go.
+        slots: [E] int64, where the scores of an instance go.
         counting: [H, W] uint8, pixels that count in the scores.
         hits: [E] int32 out.
         weights: [E] out, sum of alpha T.
