@@ -154,8 +154,7 @@ class _AutogradStep:
         if gain is not None:
             log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
             rgb = rgb * log_gain.exp()
-        loss = photometric_loss(
-            rgb, view.pixels(device), ssim_weight, mask=counting)
+        loss = self._loss(rgb, view, ssim_weight, counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None
@@ -164,3 +163,14 @@ class _AutogradStep:
             if log_gain is not None and log_gain.grad is not None:
                 self.log_gain_gradient = log_gain.grad.cpu().double().numpy()
         return value, output.statistics
+
+    def _loss(
+        self, rgb: Tensor, view: TrainView, ssim_weight: float, counting: Tensor | None
+    ) -> Tensor:
+        """Returns the loss, by kernels of the backend where it has them."""
+        if self._backend != "triton":
+            return photometric_loss(rgb, view.pixels(rgb.device), ssim_weight, mask=counting)
+        from recon_cli.render.triton.loss import photometric_loss as by_kernels
+
+        truth = torch.from_numpy(view.image).to(rgb.device)
+        return by_kernels(rgb, truth, ssim_weight, mask=counting)

@@ -17,6 +17,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from recon_cli.render.triton import (
+    loss,
     projection,
     projection_gradient,
     raster_backward,
@@ -26,6 +27,8 @@ from recon_cli.render.triton import (
 TARGETS = (75, 90)  # Turing, the oldest that triton compiles for, and Hopper
 TYPES = {
     "order": "*i32", "first": "*i32", "members": "*i32", "offsets": "*fp32", "records": "*fp32",
+    "image": "*fp32", "truth": "*u8", "mask": "*u8", "maps": "*fp32", "slopes": "*fp32",
+    "parts": "*fp32", "gradient": "*fp32", "by_error": "fp32", "by_ssim": "fp32",
     "means": "*fp32", "quats": "*fp32", "log_scales": "*fp32", "logits": "*fp32",
     "sh_dc": "*fp32", "sh_rest": "*fp32", "view": "*fp64", "colored": "i32", "shapes": "*fp32",
     "centers": "*fp64", "depths": "*fp32", "touched": "*i32", "radii": "*fp32", "broken": "*i32",
@@ -50,6 +53,10 @@ KERNELS = (
     (projection.list_tiles, {"BLOCK": 128}, 4),
     (projection.place, {"BLOCK": 128}, 4),
     (projection_gradient.unproject, {"STRIDE": 45, "TERMS": 15, "SCORES": True, "BLOCK": 128}, 4),
+    (loss.blur_products, {"MASKED": True, "BLOCK": 256}, 4),
+    (loss.similarity, {"BLOCK": 256}, 4),
+    (loss.blur_slopes, {"BLOCK": 256}, 4),
+    (loss.gradient_of, {"MASKED": True, "SSIM": True, "BLOCK": 256}, 4),
 )
 
 

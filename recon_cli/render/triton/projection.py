@@ -108,8 +108,8 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     red, green, blue = colors(
         sh_dc, sh_rest, i, here, here & (i < colored), to_x, to_y, to_z, STRIDE, TERMS)
     lit = tl.abs(red) + tl.abs(green) + tl.abs(blue) < INFINITE
-    bad = here & ((not finite) | (not lit) | (seen & (not sound)))
-    tl.store(broken + tl.program_id(0), tl.sum(bad.to(tl.int32)))
+    whole = tl.where(seen, finite & lit & sound, finite & lit)
+    tl.store(broken + tl.program_id(0), tl.sum(tl.where(here & (whole == 0), 1, 0)))
     seen = seen & sound & lit
     center_x, center_y = tl.where(seen, center_x, 0.0), tl.where(seen, center_y, 0.0)
 

@@ -1,0 +1,231 @@
+"""(1 - w) L1 + w (1 - SSIM) and its gradient in four kernels (Kerbl et al. 2023, eq. 7).
+
+SSIM as in `train.losses`: 11 taps, sigma 1.5, zeros beyond the border, mean over pixels and
+channels (Wang et al. 2004, eq. 13). The window is separable: two kernels go along rows, two down
+columns. The truth is read as bytes. Each program sums its own part, and torch adds the parts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+_SIGMA, _RADIUS = 1.5, 5
+_WINDOW = [math.exp(-0.5 * (shift / _SIGMA) ** 2) for shift in range(_RADIUS + 1)]
+_TOTAL = _WINDOW[0] + 2 * sum(_WINDOW[1:])
+_BLOCK = 256  # numbers a program
+
+RADIUS = tl.constexpr(_RADIUS)
+W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight / _TOTAL) for weight in _WINDOW)
+C1, C2 = tl.constexpr(0.01**2), tl.constexpr(0.03**2)  # for images in [0, 1]
+
+
+@triton.jit
+def tap(d: tl.constexpr):
+    """Returns the weight of the window at a distance."""
+    if d == 0:
+        return W0
+    elif d == 1 or d == -1:
+        return W1
+    elif d == 2 or d == -2:
+        return W2
+    elif d == 3 or d == -3:
+        return W3
+    elif d == 4 or d == -4:
+        return W4
+    else:
+        return W5
+
+
+@triton.jit
+def pair(image, truth, mask, at, here, MASKED: tl.constexpr):
+    """Returns rendered and true values; the true ones twice where a pixel does not count."""
+    y = tl.load(truth + at, mask=here, other=0).to(tl.float32) / 255.0
+    x = tl.load(image + at, mask=here, other=0.0)
+    if MASKED:
+        x = tl.where(tl.load(mask + at // 3, mask=here, other=0) != 0, x, y)
+    return x, y
+
+
+@triton.jit
+def blur_products(image, truth, mask, width, count, maps, MASKED: tl.constexpr,
+                  BLOCK: tl.constexpr):
+    """Blurs x, y, xx, yy and xy along rows.
+
+    Args:
+        image: [H, W, 3] rendered.
+        truth: [H, W, 3] uint8.
+        mask: [H, W] uint8, pixels that count.
+        width: W.
+        count: 3 H W.
+        maps: [5, H, W, 3] out.
+        MASKED: there is a mask.
+        BLOCK: numbers a program.
+    """
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here, column = at < count, at // 3 % width
+    zero = at.to(tl.float32) * 0.0
+    m_x, m_y, xx, yy, xy = zero, zero, zero, zero, zero
+    for d in tl.static_range(-RADIUS, RADIUS + 1):
+        inside = here & (column + d >= 0) & (column + d < width)
+        x, y = pair(image, truth, mask, at + 3 * d, inside, MASKED)
+        wx, wy = x * tap(d), y * tap(d)
+        m_x += wx
+        m_y += wy
+        xx += wx * x
+        yy += wy * y
+        xy += wx * y
+    tl.store(maps + at, m_x, mask=here)
+    tl.store(maps + count + at, m_y, mask=here)
+    tl.store(maps + 2 * count + at, xx, mask=here)
+    tl.store(maps + 3 * count + at, yy, mask=here)
+    tl.store(maps + 4 * count + at, xy, mask=here)
+
+
+@triton.jit
+def similarity(maps, width, count, slopes, parts, BLOCK: tl.constexpr):
+    """Blurs down columns; SSIM, and its slopes by blurred x, xx and xy.
+
+    Args:
+        maps: [5, H, W, 3].
+        width: W.
+        count: 3 H W.
+        slopes: [3, H, W, 3] out.
+        parts: [programs] out, sums of SSIM.
+        BLOCK: numbers a program.
+    """
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = at < count
+    zero = at.to(tl.float32) * 0.0
+    m_x, m_y, xx, yy, xy = zero, zero, zero, zero, zero
+    for d in tl.static_range(-RADIUS, RADIUS + 1):
+        to = at + 3 * d * width
+        inside = here & (to >= 0) & (to < count)
+        m_x += tl.load(maps + to, mask=inside, other=0.0) * tap(d)
+        m_y += tl.load(maps + count + to, mask=inside, other=0.0) * tap(d)
+        xx += tl.load(maps + 2 * count + to, mask=inside, other=0.0) * tap(d)
+        yy += tl.load(maps + 3 * count + to, mask=inside, other=0.0) * tap(d)
+        xy += tl.load(maps + 4 * count + to, mask=inside, other=0.0) * tap(d)
+    a1, a2 = 2.0 * m_x * m_y + C1, 2.0 * (xy - m_x * m_y) + C2
+    b1, b2 = m_x * m_x + m_y * m_y + C1, (xx - m_x * m_x) + (yy - m_y * m_y) + C2
+    ssim = a1 * a2 / (b1 * b2)
+    by_variance, by_covariance = -ssim / b2, 2.0 * a1 / (b1 * b2)
+    by_mean = (2.0 * m_y * a2 / (b1 * b2) - 2.0 * m_x * ssim / b1
+               - 2.0 * m_x * by_variance - m_y * by_covariance)
+    tl.store(slopes + at, by_mean, mask=here)
+    tl.store(slopes + count + at, by_variance, mask=here)
+    tl.store(slopes + 2 * count + at, by_covariance, mask=here)
+    tl.store(parts + tl.program_id(0), tl.sum(tl.where(here, ssim, 0.0)))
+
+
+@triton.jit
+def blur_slopes(slopes, width, count, maps, BLOCK: tl.constexpr):
+    """Blurs three maps along rows: [3, H, W, 3] to [3, H, W, 3]."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here, column = at < count, at // 3 % width
+    zero = at.to(tl.float32) * 0.0
+    mean, variance, covariance = zero, zero, zero
+    for d in tl.static_range(-RADIUS, RADIUS + 1):
+        inside = here & (column + d >= 0) & (column + d < width)
+        mean += tl.load(slopes + at + 3 * d, mask=inside, other=0.0) * tap(d)
+        variance += tl.load(slopes + count + at + 3 * d, mask=inside, other=0.0) * tap(d)
+        covariance += tl.load(slopes + 2 * count + at + 3 * d, mask=inside, other=0.0) * tap(d)
+    tl.store(maps + at, mean, mask=here)
+    tl.store(maps + count + at, variance, mask=here)
+    tl.store(maps + 2 * count + at, covariance, mask=here)
+
+
+@triton.jit
+def gradient_of(image, truth, mask, maps, width, count, by_error, by_ssim, gradient, parts,
+                MASKED: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr):
+    """Blurs down columns and joins both terms.
+
+    Args:
+        image: [H, W, 3] rendered.
+        truth: [H, W, 3] uint8.
+        mask: [H, W] uint8, pixels that count.
+        maps: [3, H, W, 3] of `blur_slopes`.
+        width: W.
+        count: 3 H W.
+        by_error: slope of the loss by the sum of absolute errors.
+        by_ssim: slope of the loss by the sum of SSIM.
+        gradient: [H, W, 3] out.
+        parts: [programs] out, sums of absolute errors.
+        MASKED: there is a mask.
+        SSIM: it is part of the loss.
+        BLOCK: numbers a program.
+    """
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = at < count
+    x, y = pair(image, truth, mask, at, here, MASKED)
+    error = x - y
+    slope = tl.where(error > 0.0, by_error, tl.where(error < 0.0, -by_error, 0.0))
+    if SSIM:
+        mean, variance, covariance = x * 0.0, x * 0.0, x * 0.0
+        for d in tl.static_range(-RADIUS, RADIUS + 1):
+            to = at + 3 * d * width
+            inside = here & (to >= 0) & (to < count)
+            mean += tl.load(maps + to, mask=inside, other=0.0) * tap(d)
+            variance += tl.load(maps + count + to, mask=inside, other=0.0) * tap(d)
+            covariance += tl.load(maps + 2 * count + to, mask=inside, other=0.0) * tap(d)
+        slope += by_ssim * (mean + 2.0 * x * variance + y * covariance)
+    if MASKED:
+        slope = tl.where(tl.load(mask + at // 3, mask=here, other=0) != 0, slope, 0.0)
+    tl.store(gradient + at, slope, mask=here)
+    tl.store(parts + tl.program_id(0), tl.sum(tl.where(here, tl.abs(error), 0.0)))
+
+
+def photometric_loss(
+    image: Tensor, truth: Tensor, ssim_weight: float, *, mask: Tensor | None = None
+) -> Tensor:
+    """Returns the loss as `train.losses.photometric_loss` does, for a truth in bytes.
+
+    Args:
+        image: [H, W, 3] float32, gradients flow here.
+        truth: [H, W, 3] uint8.
+        ssim_weight: w in [0, 1].
+        mask: [H, W] bool, True where a pixel counts; None where all do.
+    """
+    loss: Tensor = _Photometric.apply(image, truth, ssim_weight, mask)
+    return loss
+
+
+class _Photometric(torch.autograd.Function):
+    """The gradient is taken with the value: training asks for both."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, image: Tensor, truth: Tensor, ssim_weight: float, mask: Tensor | None
+    ) -> Tensor:
+        image, truth = image.contiguous(), truth.contiguous()
+        bytes_of_mask = None if mask is None else mask.contiguous().to(torch.uint8)
+        count, width = image.numel(), image.shape[1]
+        grid = (triton.cdiv(count, _BLOCK),)
+        maps, slopes = image.new_empty(5 * count), image.new_empty(3 * count)
+        similar, wrong = image.new_zeros(grid), image.new_empty(grid)
+        gradient, masked = torch.empty_like(image), mask is not None
+        if ssim_weight > 0:
+            blur_products[grid](
+                image, truth, bytes_of_mask, width, count, maps, MASKED=masked, BLOCK=_BLOCK)
+            similarity[grid](maps, width, count, slopes, similar, BLOCK=_BLOCK)
+            blur_slopes[grid](slopes, width, count, maps, BLOCK=_BLOCK)
+        gradient_of[grid](
+            image, truth, bytes_of_mask, maps, width, count, (1 - ssim_weight) / count,
+            -ssim_weight / count, gradient, wrong, MASKED=masked, SSIM=ssim_weight > 0,
+            BLOCK=_BLOCK)
+        ctx.save_for_backward(gradient)
+        error = wrong.double().sum() / count
+        if ssim_weight == 0:
+            return error.float()
+        similarity_mean = similar.double().sum() / count
+        return ((1 - ssim_weight) * error + ssim_weight * (1 - similarity_mean)).float()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        gradient, = ctx.saved_tensors
+        return gradient * grad, None, None, None
