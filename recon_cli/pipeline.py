@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -28,7 +29,7 @@ from recon_cli.execute import (
     refuse_missing_backend,
     run_stage,
 )
-from recon_cli.fields import StageConfig, option_info
+from recon_cli.fields import OptionInfo, StageConfig, option_info
 from recon_cli.freshness import Check, Inspection
 from recon_cli.manifest import Manifest
 from recon_cli.stages import Stage
@@ -173,14 +174,20 @@ def command(look: Inspection, check: Check) -> str:
         return " ".join(words if check.row.needs else [*words, "VIDEO"])
     had, plain = look.config(check.row, latest.basis), look.config(check.row, None)
     for item in dataclasses.fields(check.row.config):
-        value = getattr(had, item.name)
-        if value not in (None, getattr(plain, item.name)) and option_info(item).hashed:
-            flag = item.name.replace("_", "-")
-            if isinstance(value, bool):
-                words.append(f"--{flag}" if value else f"--no-{flag}")
-            else:
-                words += [f"--{flag}", str(value)]
-    return " ".join(words)
+        value, info = getattr(had, item.name), option_info(item)
+        if value not in (None, getattr(plain, item.name)) and info.hashed:
+            words += _typed(item.name, value, info)
+    return shlex.join(words)
+
+
+def _typed(name: str, value: Any, info: OptionInfo) -> list[str]:
+    """Returns the words that give an option a value."""
+    flag = name.replace("_", "-")
+    if isinstance(value, bool):
+        return [f"--{flag}" if value else f"--no-{flag}"]
+    if info.flags:  # the choices are options themselves: --force
+        return [f"--{value}"]
+    return [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
 
 
 def _reach(job: Job, target: Target, *, again: bool) -> Iterator[Outcome]:
