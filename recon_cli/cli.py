@@ -24,6 +24,7 @@ from recon_cli.config import (
 )
 from recon_cli.errors import ReconError
 from recon_cli.options import Call, pass_call
+from recon_cli.page.command import report as write_report
 from recon_cli.pipeline import Job
 from recon_cli.scoreboard import command as scoreboard
 from recon_cli.settings import Settings
@@ -191,6 +192,7 @@ def export(call: Call) -> None:
 
 
 cli.add_command(render)
+cli.add_command(write_report)
 
 
 @cli.command("run")

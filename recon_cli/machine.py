@@ -23,6 +23,7 @@ _PACKAGES = {
     "rawpy": "rawpy",
     "scikit-image": "scikit-image",
 }
+_CPUINFO = Path("/proc/cpuinfo")
 _SAMPLE_SECONDS = 0.5  # a look at all children takes about 5 ms
 
 
@@ -61,6 +62,16 @@ def free_memory_bytes(limits: Sequence[tuple[str, str]] = _LIMITS) -> int:
             continue
         free = min(free, max(0, left))
     return free
+
+
+def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
+    """Returns the model name that Linux tells, or what Python knows elsewhere."""
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
 
 
 class Meter:

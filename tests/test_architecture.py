@@ -70,15 +70,20 @@ ALLOWED: dict[str, set[str]] = {
     "shots": BOTTOM | {
         "config", "settings", "options", "machine", "progress", "digests", "manifest", "lock",
         "workspace", "scene", "render", "io", "stages", "freshness", "execute", "pipeline"},
+    "page": BOTTOM | OPTIONS | {
+        "settings", "options", "machine", "tables", "digests", "manifest", "workspace", "scene",
+        "capture", "io", "stages", "freshness", "execute", "pipeline", "report"},
     "cli": OPTIONS | {
-        "verbs", "scoreboard",
+        "verbs", "scoreboard", "page",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study", "sweep", "shots"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "verbs", "options", "bench", "study", "shots", "console"},
+    "click": {"cli", "verbs", "options", "bench", "study", "shots", "page", "console"},
     "zstandard": {"io"},
+    "jinja2": {"page"},
+    "markupsafe": {"page"},
     "matplotlib": {"bench", "study", "sweep"},
     "numba": {"render"},
     "llvmlite": {"render"},

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
 from recon_cli import machine
 from recon_cli.bench.peak import measured_peak
 from recon_cli.render.numba.lanes import LANES
-
-_CPUINFO = Path("/proc/cpuinfo")
 
 
 @dataclass(frozen=True)
@@ -52,15 +48,5 @@ def examine(threads: int, device: str) -> Host:
     """Returns this machine with its measured peak."""
     name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
     return Host(
-        cpu_model(_CPUINFO), machine.usable_threads(), threads, LANES, measured_peak(), name,
+        machine.cpu_model(), machine.usable_threads(), threads, LANES, measured_peak(), name,
         machine.versions())
-
-
-def cpu_model(cpuinfo: Path) -> str:
-    """Returns the model name that Linux tells, or what Python knows elsewhere."""
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
-            key, _, value = line.partition(":")
-            if key.strip() == "model name":
-                return value.strip()
-    return platform.processor() or platform.machine()

@@ -64,7 +64,9 @@ def sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
             for trial in measure.sweep(course, ratios):
                 found.append(trial)
                 bar.advance()
+        of_train = job.workspace.manifest("train")
         atomic.write_json(root / RESULT, {
+            "of_train": of_train.digest if of_train else None,
             "validation_views": len(course.task.validation), "at": config.at,
             "rounds": course.rounds, "recovery_steps": course.until - course.first,
             "equal_seconds_of": config.score, "before": dataclasses.asdict(start),

@@ -12,7 +12,7 @@ from recon_cli.bench import page, picture
 from recon_cli.bench.accuracy import Accuracy
 from recon_cli.bench.clock import Timing, alternate, timing_of
 from recon_cli.bench.compare import check_comparable, compared, other_machine, ratio
-from recon_cli.bench.host import Host, cpu_model
+from recon_cli.bench.host import Host
 from recon_cli.bench.peak import FLOPS_BACKWARD, FLOPS_FORWARD, counted, peak_fraction, rate
 from recon_cli.bench.report import head, tables
 from recon_cli.bench.request import Request, pixels
@@ -28,6 +28,7 @@ from recon_cli.bench.result import (
 )
 from recon_cli.bench.tables import TitledTable, number, percent
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
+from recon_cli.machine import cpu_model
 
 EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)
 ROUGH = Accuracy(0.1, 0.01, 0.5, 0.2, "quats", 0.9)
