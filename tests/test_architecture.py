@@ -71,8 +71,8 @@ ALLOWED: dict[str, set[str]] = {
         "config", "settings", "options", "machine", "progress", "digests", "manifest", "lock",
         "workspace", "scene", "render", "io", "stages", "freshness", "execute", "pipeline"},
     "page": BOTTOM | OPTIONS | {
-        "settings", "options", "machine", "tables", "digests", "manifest", "workspace", "scene",
-        "capture", "io", "stages", "freshness", "execute", "pipeline", "report"},
+        "settings", "options", "machine", "progress", "tables", "digests", "manifest", "workspace",
+        "scene", "capture", "io", "stages", "freshness", "execute", "pipeline", "report"},
     "cli": OPTIONS | {
         "verbs", "scoreboard", "page",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",

@@ -54,6 +54,11 @@ def test_the_counts_are_those_of_the_ratios_and_nothing_goes_in_the_controls(swe
         assert (one["removed"] is None) == (one["score"] == NONE)
 
 
+def test_a_sweep_says_which_training_it_is_of(workspace, swept):
+    manifest = json.loads((workspace / "train" / "manifest.json").read_text())
+    assert swept[2]["of_train"] == manifest["digest"]
+
+
 def test_scores_are_of_the_views_that_were_kept_out_of_training(swept):
     assert swept[2]["validation_views"] >= 1
     for one in swept[2]["trials"]:

@@ -9,6 +9,7 @@ import click
 from recon_cli import options
 from recon_cli.options import Call, pass_call
 from recon_cli.pipeline import Job
+from recon_cli.progress import TqdmProgress
 from recon_cli.workspace import Workspace
 
 
@@ -26,4 +27,5 @@ def report(call: Call, out: Path | None) -> None:
     """
     from recon_cli.page.write import write
 
-    click.echo(write(Job(Workspace(call.workspace), options.explicit(call)), out))
+    job = Job(Workspace(call.workspace), options.explicit(call), progress=TqdmProgress())
+    click.echo(write(job, out))

@@ -51,7 +51,7 @@ def compose(job: Job) -> str:
     # the text is rendered once without pictures, to know exactly how much room it leaves
     text = len(_rendered(values, _EMPTY).encode()) + _EACH_VIEW * views
     return _rendered(values, gallery(
-        stages["evaluate"].folder, metrics, MAX_FILE_BYTES - text))
+        stages["evaluate"].folder, metrics, MAX_FILE_BYTES - text, job.progress))
 
 
 def _metrics(evaluate: Standing) -> tuple[Metrics | None, str]:

@@ -14,6 +14,7 @@ from recon_cli.capture.frames import read_png
 from recon_cli.errors import FormatError
 from recon_cli.page.pictures import RUNGS, Rung, data_uri, error_of, reduced
 from recon_cli.page.records import Metrics, ViewRow
+from recon_cli.progress import NullProgress, Progress
 
 _SAMPLE = 3  # views whose size is taken for that of all
 _SAFE = 0.92  # of the budget that an estimate may fill
@@ -85,13 +86,16 @@ class _Pixels:
 _Scores = Mapping[str, ViewRow]
 
 
-def gallery(folder: Path, metrics: Metrics, budget: int) -> Gallery:
+def gallery(
+    folder: Path, metrics: Metrics, budget: int, progress: Progress | None = None
+) -> Gallery:
     """Returns the held-out views as large as the budget allows, at the last resort fewer of them.
 
     Args:
         folder: of evaluate.
         metrics: its scores.
         budget: bytes of the file that pictures of views may take.
+        progress: shows a bar; None for none.
     """
     order = _worst_first(metrics)
     sample = [pixels for _, pixels in _readable(folder, order[:: max(1, len(order) // _SAMPLE)])]
@@ -100,25 +104,29 @@ def gallery(folder: Path, metrics: Metrics, budget: int) -> Gallery:
         expected = sum(_stored("", {}, pixels, rung).size for pixels in sample)
         if not last and expected * len(order) > _SAFE * budget * max(1, len(sample)):
             continue
-        found = _at(folder, order, rung, budget)
+        found = _at(folder, order, rung, budget, progress or NullProgress())
         if last or not found.left_out:
             break
     return found
 
 
-def _at(folder: Path, order: Sequence[_Scores], rung: Rung, budget: int) -> Gallery:
+def _at(
+    folder: Path, order: Sequence[_Scores], rung: Rung, budget: int, progress: Progress
+) -> Gallery:
     """Returns as many views as fit, stored in one way."""
     views: list[Shown] = []
     damaged: list[str] = []
     full, used = (0, 0), 0
-    for scores, pixels in _readable(folder, order, damaged):
-        height, width = pixels.truth.shape[:2]
-        full = max(full, (width, height), key=max)
-        one = _stored(next(iter(scores.values())).name, scores, pixels, rung)
-        used += one.size
-        if used > budget:
-            break
-        views.append(one)
+    with progress.bar("pictures", len(order), unit="view") as bar:
+        for scores, pixels in _readable(folder, order, damaged):
+            height, width = pixels.truth.shape[:2]
+            full = max(full, (width, height), key=max)
+            one = _stored(next(iter(scores.values())).name, scores, pixels, rung)
+            used += one.size
+            if used > budget:
+                break
+            views.append(one)
+            bar.advance()
     left_out = len(order) - len(views) - len(damaged) if used > budget else 0
     return Gallery(tuple(views), full, rung if views else None, left_out, tuple(damaged))
 
