@@ -34,8 +34,8 @@ _EACH_VIEW = 1_000  # bytes of text around a view's pictures, at most
 _EMPTY = Gallery((), (0, 0), None, 0, ())
 
 
-def compose(job: Job) -> str:
-    """Returns the page of a workspace, at most MAX_FILE_BYTES long.
+def compose(job: Job) -> bytes:
+    """Returns the page of a workspace in UTF-8, at most MAX_FILE_BYTES long.
 
     Raises:
         StageError: nothing was read in yet.
@@ -49,7 +49,7 @@ def compose(job: Job) -> str:
     if not views or metrics is None:
         return _rendered(values, _EMPTY)
     # the text is rendered once without pictures, to know exactly how much room it leaves
-    text = len(_rendered(values, _EMPTY).encode()) + _EACH_VIEW * views
+    text = len(_rendered(values, _EMPTY)) + _EACH_VIEW * views
     return _rendered(values, gallery(
         stages["evaluate"].folder, metrics, MAX_FILE_BYTES - text, job.progress))
 
@@ -96,7 +96,7 @@ def _decisions(train: Standing) -> tuple[Mapping[str, Any], ...]:
         return ()  # volatile: a log of what was tried, which nothing depends on
 
 
-def _rendered(values: Mapping[str, Any], views: Gallery) -> str:
+def _rendered(values: Mapping[str, Any], views: Gallery) -> bytes:
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True)
@@ -104,10 +104,11 @@ def _rendered(values: Mapping[str, Any], views: Gallery) -> str:
         duration=duration, megabytes=megabytes,
         facts=facts)
     script = (_HERE / "script.js").read_text(encoding="utf-8")
-    return environment.get_template("report.html.j2").render(
+    page = environment.get_template("report.html.j2").render(
         **values, gallery=views, data=[_for_script(one) for one in views.views],
         style=Markup((_HERE / "style.css").read_text(encoding="utf-8")),
         script=Markup(script), script_hash=_hash(script))
+    return page.encode(errors="backslashreplace")  # file names need not be UTF-8
 
 
 def _for_script(view: Shown) -> dict[str, Any]:

@@ -12,6 +12,9 @@ function tabs() {
     }
     if (focus) button.focus();
     button.scrollIntoView({ block: "nearest", inline: "nearest" });
+    // a section begins at its top, wherever the one before was left
+    const main = document.querySelector("main");
+    if (main.getBoundingClientRect().top < 0) window.scrollTo(0, main.offsetTop - button.offsetHeight - 4);
   };
   const named = () => buttons.find((one) => "#" + one.getAttribute("aria-controls") === location.hash);
   buttons.forEach((button, at) => {

@@ -56,11 +56,13 @@ def curves(stages: Mapping[str, Standing], metrics: Metrics | None) -> Curves:
             for name, rows in logs.items()]
 
     decibels = Axis("PSNR, dB")
+    over_time = [*series(lambda row: row.psnr_db, over="seconds"),
+                 *_held_out(metrics, stages["evaluate"])]
     figures = (
-        chart("Speed against error: PSNR on validation views over wall time", Axis("seconds", True),
-              decibels, [*series(lambda row: row.psnr_db, over="seconds"), *_held_out(metrics)]),
+        chart("Speed against error: PSNR on validation views over wall time",
+              Axis("seconds", log=True), decibels, over_time),
         chart("PSNR on validation views", STEP, decibels, series(lambda row: row.psnr_db)),
-        chart("Loss of a step, which sees one view", STEP, Axis("loss", True),
+        chart("Loss of a step, which sees one view", STEP, Axis("loss", log=True),
               series(lambda row: row.loss)),
         chart("Number of Gaussians", STEP, Axis("Gaussians"), series(lambda row: row.gaussians)),
         chart("Wall time", STEP, Axis("seconds"), series(lambda row: row.seconds)),
@@ -68,12 +70,13 @@ def curves(stages: Mapping[str, Standing], metrics: Metrics | None) -> Curves:
     return Curves(figures, tuple(_jumps(logs)), tuple(damaged))
 
 
-def _held_out(metrics: Metrics | None) -> list[Series]:
+def _held_out(metrics: Metrics | None, evaluate: Standing) -> list[Series]:
     """Returns where the finished models lie, by their seconds and the held-out views."""
     if metrics is None:
         return []
     names = {BASE: ("held out, base", 0, "diamond"), PRUNED: ("held out, pruned", 1, "triangle")}
-    return [Series(label, ((model.train_seconds, model.psnr_db),), color, mark, line=False,
+    old = "" if evaluate.fresh else " (stale)"
+    return [Series(label + old, ((model.train_seconds, model.psnr_db),), color, mark, line=False,
                    big=True)
             for key, (label, color, mark) in names.items()
             if (model := metrics.models.get(key)) and model.train_seconds]

@@ -31,7 +31,7 @@ def write(job: Job, out: Path | None) -> str:
     path = (job.workspace.root / FILE if out is None else out).absolute()
     _check(job, path)
     with disk_errors(job.workspace.root, "reading the workspace"):
-        page = compose(job).encode()
+        page = compose(job)
     try:
         with disk_errors(path.parent, "writing the report"):
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -69,6 +69,14 @@ def test_tabs_are_reached_by_keys_and_by_address(workspace, page):
         assert page.page.evaluate("document.activeElement.id") == f"tab-{name}"
 
 
+def test_a_section_begins_at_its_top_wherever_the_last_one_was_left(shown):
+    shown.page.click("#tab-settings")
+    shown.page.evaluate("window.scrollTo(0, 5000)")
+    shown.page.click("#tab-scores")
+    box = shown.page.locator("#scores h2").bounding_box()
+    assert 0 < box["y"] < 120
+
+
 def test_without_a_script_every_section_is_shown(workspace, chromium: Browser):
     assert report(workspace) == 0
     context = chromium.new_context(java_script_enabled=False)

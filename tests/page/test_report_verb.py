@@ -108,6 +108,7 @@ def test_scores_that_were_changed_by_hand_are_stale_and_may_hold_anything(worksp
     change(metrics, lambda value: value["models"]["base"].update(psnr_db=99.0))
     scores = section(page_of(workspace), "scores")
     assert "99.00" in scores
+    assert "held out, base (stale)" in section(page_of(workspace), "training")
     assert "metrics.json was changed by hand" in scores
     for content in ("{", "[]", '{"models": {"base": {"views": 3}}}',
                     '{"models": {"base": {"psnr_db": NaN}}}'):
@@ -191,6 +192,14 @@ def test_a_page_among_the_inputs_would_be_one_of_them(workspace, tmp_path, capsy
     assert report(workspace, "-o", tmp_path / "photos" / "report.html") == 2
     assert "would count as a new input" in capsys.readouterr().err
     assert list((tmp_path / "photos").iterdir()) == []
+
+
+def test_a_file_name_that_is_no_utf8_is_shown_as_it_can_be(workspace):
+    manifest = Manifest.read(workspace / "ingest")
+    source = dataclasses.replace(manifest.basis.sources[0], path="/gone/b\udcff.mp4")
+    dataclasses.replace(manifest, basis=dataclasses.replace(
+        manifest.basis, sources=(source,))).write(workspace / "ingest")
+    assert "b\\udcff.mp4" in page_of(workspace)
 
 
 @pytest.mark.parametrize("name", ["room.mp4", "report", "folder.html"])
