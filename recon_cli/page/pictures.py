@@ -79,7 +79,9 @@ def error_of(
         hidden: [H, W], True where a mask ignores the pixel.
         longest: longest side of the picture.
     """
-    error = np.abs(truth.astype(np.float32) - render.astype(np.float32)).mean(axis=2)
+    apart = cv2.absdiff(truth, render)
+    # channel by channel: a mean over the last axis takes six times as long
+    error = (apart[..., 0].astype(np.float32) + apart[..., 1] + apart[..., 2]) / 3
     size = fitted_size(error.shape[1], error.shape[0], longest)
     if size != error.shape[::-1]:
         error = cv2.resize(error, size, interpolation=cv2.INTER_AREA)

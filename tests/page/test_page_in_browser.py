@@ -173,6 +173,17 @@ def test_views_are_turned_by_keys_buttons_and_clicks(shown, workspace):
     shown.assert_silent()
 
 
+def test_a_contact_sheet_grows_to_its_full_size(workspace, page):
+    write_png(workspace / "ingest" / "contact.png", np.full((900, 1900, 3), 9, np.uint8))
+    opened(workspace, page, at="#capture")
+    sheet = page.page.locator(".sheet img")
+    assert sheet.bounding_box()["width"] < 1200
+    page.page.click(".sheet")
+    assert sheet.bounding_box()["width"] == 1900
+    page.page.click(".sheet")
+    assert sheet.bounding_box()["width"] < 1200
+
+
 HARM = "<img src=x onerror=hacked=1>"
 SCRIPT = "<script>hacked=1<!--"
 

@@ -1,5 +1,6 @@
 """Differences in closed form, and pictures within a budget whatever is in them."""
 
+import base64
 import json
 
 import cv2
@@ -108,3 +109,17 @@ def test_a_view_larger_than_a_screen_is_scaled_down(tmp_path):
     assert (found.views[0].width, found.views[0].height) == (1600, 900)
     assert found.scaled
     assert found.full == (1920, 1080)
+
+
+def test_what_evaluate_did_not_score_is_gray_in_the_difference(noisy):
+    (noisy / "difference" / "base").mkdir(parents=True)
+    told = np.full((220, 300, 3), 40, np.uint8)
+    told[:, :150] = 0  # masked: the pixels differ, and the difference says nothing
+    write_png(noisy / "difference" / "base" / "05.png", told)
+    found = {view.name: view for view in gallery(noisy, read_metrics(noisy), 50_000_000).views}
+    assert found["05.png"].masked
+    assert not found["04.png"].masked
+    data = base64.b64decode(found["05.png"].differences["base"].split(",")[1])
+    shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(shown[:, :140].astype(int) - 96).max() < 12
+    assert shown[:, 160:].astype(int).std() > 20

@@ -47,7 +47,10 @@ def test_the_page_shows_what_the_stages_say(workspace):
     assert f"{low:+.2f} to " in section(page, "scores")
     assert "The mapping can be trusted: 12 of 12 frames have a camera." in page
     assert "splats.spz" in section(page, "exports")
-    assert "--iterations 60" in section(page, "settings")
+    settings = section(page, "settings")
+    assert f"room.mp4 -w {workspace}\n" in settings
+    assert "recon train --iterations 60 " in settings
+    assert "Seeds: sfm 0, train 0." in settings
     assert "Weakest link: 88%." in section(page, "overview")
     for lacking in ("is stale", "is missing", "is not shown", "are not shown"):
         assert lacking not in page
@@ -166,6 +169,16 @@ def test_a_damaged_model_leaves_out_the_plan_alone(workspace):
     assert "<figcaption>000000.png</figcaption>" in capture  # thumbnails: there is no sheet
 
 
+def test_contact_sheets_take_the_place_of_thumbnails_and_many_are_counted(workspace):
+    for number in range(6):
+        write_png(workspace / "ingest" / f"{number:02d}_contact.png",
+                  np.full((30, 40, 3), 9, np.uint8))
+    capture = section(page_of(workspace), "capture")
+    assert capture.count('alt="Contact sheet of the capture"') == 4
+    assert "2 more contact sheets lie in ingest/" in capture
+    assert "Some of the frames" not in capture
+
+
 def test_frames_without_a_camera_are_lost_in_the_legend(workspace):
     def edit(value):
         value["frames"].append({**value["frames"][-1], "name": "000099.png"})
@@ -199,7 +212,9 @@ def test_a_file_name_that_is_no_utf8_is_shown_as_it_can_be(workspace):
     source = dataclasses.replace(manifest.basis.sources[0], path="/gone/b\udcff.mp4")
     dataclasses.replace(manifest, basis=dataclasses.replace(
         manifest.basis, sources=(source,))).write(workspace / "ingest")
-    assert "b\\udcff.mp4" in page_of(workspace)
+    page = page_of(workspace)
+    assert "The input /gone/b\\udcff.mp4 is gone." in section(page, "overview")
+    assert "from a video: b\\udcff.mp4" in page
 
 
 @pytest.mark.parametrize("name", ["room.mp4", "report", "folder.html"])
