@@ -114,8 +114,7 @@ def _tiles(stages: Mapping[str, Standing], metrics: Metrics | None) -> list[Tile
     return [
         Tile("frames", _count(ingest.summary, "frames"), size, not ingest.fresh),
         _of(sfm, "registered", _count(sfm.summary, "registered"), _share(sfm.summary)),
-        _of(train, "Gaussians", _count(train.summary, "gaussians"), _pruned(
-            prune, _count(prune.summary, "gaussians"))),
+        _of(train, "Gaussians", _count(train.summary, "gaussians"), _pruned(train, prune)),
         *_scores(stages["evaluate"], metrics),
         _training(train)]
 
@@ -128,11 +127,12 @@ def _training(train: Standing) -> Tile:
                f"peak {megabytes(run.peak_memory_bytes)}")
 
 
-def _pruned(prune: Standing, figure: str) -> str:
-    """Returns the pruned model's figure beside that of the base; empty where there is none."""
+def _pruned(train: Standing, prune: Standing) -> str:
+    """Returns the pruned count beside that of the base; empty where there is none."""
     if not prune.there:
         return ""
-    return f"pruned {figure}{'' if prune.fresh else ' (stale)'}"
+    stale = train.fresh and not prune.fresh  # else the figure of the base is called stale already
+    return f"pruned {_count(prune.summary, 'gaussians')}{' (stale)' if stale else ''}"
 
 
 def _of(stage: Standing, label: str, value: str, detail: str) -> Tile:

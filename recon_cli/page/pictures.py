@@ -15,8 +15,8 @@ from recon_cli.io.images import fitted_size
 
 MAX_FILE_BYTES = 15_000_000
 _PREFIX = "data:image/webp;base64,"
-MOST_ERROR = 64  # mean error in 1/255 at which the colours of a difference end
-GAIN = 255 / MOST_ERROR
+GAIN = 4  # of a difference, as in evaluate/difference
+MOST_ERROR = 64  # mean error in 1/255 from which on colours no longer change: 255 / GAIN
 _HIDDEN = (96, 96, 96)  # what a mask ignores, in a difference: no colour of the map
 
 
