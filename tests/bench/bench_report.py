@@ -3,10 +3,14 @@
 Printed per workspace: seconds to write the page, its size, and the time until headless Chromium has
 fired the load event of the file, as the median and range of several openings. Chromium is started
 before; its caches know nothing of the file's content.
+
+With --views N also what becomes of a large capture: N held-out views of two models as large as the
+frames of the first workspace, some of which are taken for the truth and, blurred, for the renders.
 """
 
 from __future__ import annotations
 
+import json
 import statistics
 import sys
 import tempfile
@@ -14,8 +18,13 @@ import time
 from pathlib import Path
 
 import click
+import cv2
 
+from recon_cli.capture.frames import FOLDER, read_png, write_png
 from recon_cli.execute import Job
+from recon_cli.page.pictures import MAX_FILE_BYTES
+from recon_cli.page.records import MODELS, read_metrics
+from recon_cli.page.views import gallery
 from recon_cli.page.write import write
 from recon_cli.tables import Table
 from recon_cli.workspace import Workspace
@@ -23,13 +32,16 @@ from recon_cli.workspace import Workspace
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from browser import browser, watched
 
+DISTINCT = 10  # frames that the views of a large capture are made of
+RESERVED = 500_000  # bytes for the rest of the page
 _LOAD = "() => { const t = performance.getEntriesByType('navigation')[0]; return t.loadEventEnd; }"
 
 
 @click.command()
 @click.argument("workspaces", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--times", default=7, show_default=True, help="Openings of each page.")
-def main(workspaces: tuple[Path, ...], times: int) -> None:
+@click.option("--views", default=0, help="Held-out views of a large capture.  [default: none]")
+def main(workspaces: tuple[Path, ...], times: int, views: int) -> None:
     """Writes the report of each workspace to a temporary folder and opens it."""
     rows = []
     with tempfile.TemporaryDirectory() as folder, browser() as started:
@@ -49,6 +61,36 @@ def main(workspaces: tuple[Path, ...], times: int) -> None:
                          f"{min(opened):.0f} to {max(opened):.0f}"))
     click.echo(Table(
         ("workspace", "write s", "MB", "load ms", "range"), tuple(rows)).text(rule=True))
+    if views:
+        click.echo(large(workspaces[0], views))
+
+
+def large(workspace: Path, views: int) -> str:
+    """Returns in words how many views are shown, how large, and the CPU seconds that it took."""
+    frames = sorted((workspace / "ingest" / FOLDER).iterdir())[:DISTINCT]
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        for place in ("truth", *(f"renders/{model}" for model in MODELS)):
+            (root / place).mkdir(parents=True)
+            for index, path in enumerate(frames):
+                image = read_png(path)
+                write_png(root / place / f"{index}.png",
+                          image if place == "truth" else cv2.GaussianBlur(image, (0, 0), 2))
+            for index in range(len(frames), views):
+                (root / place / f"{index}.png").symlink_to(
+                    root / place / f"{index % len(frames)}.png")
+        model = {
+            **dict.fromkeys(("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "render_ms"), 1.0),
+            "gaussians": 1, "bytes": 1, "train_seconds": None, "seen_psnr_db": {},
+            "views": [{"name": f"{i}.png", "psnr_db": i, "ssim": 1.0} for i in range(views)]}
+        (root / "metrics.json").write_text(json.dumps({"models": dict.fromkeys(MODELS, model)}))
+        begin = time.process_time()
+        found = gallery(root, read_metrics(root), MAX_FILE_BYTES - RESERVED)
+        seconds = time.process_time() - begin
+    size = sum(view.size for view in found.views) / 1e6
+    width, height = found.full
+    return (f"{len(found.views)} of {views} views of {width}x{height}: {found.rung}, "
+            f"{size:.1f} MB, {seconds / views:.2f} CPU s a view")
 
 
 if __name__ == "__main__":
