@@ -24,13 +24,11 @@ class Curve:
 
     Attributes:
         figure: the chart; None where no sweep was kept.
-        sweep: its figures; None where no sweep was kept.
         stale: why it is not of the training that is there; empty where it is.
         damaged: why a sweep that is there is not shown; empty otherwise.
     """
 
     figure: Markup | None
-    sweep: Sweep | None
     stale: str
     damaged: str
 
@@ -44,18 +42,18 @@ def curve(root: Path, stages: Mapping[str, Standing]) -> Curve:
     """
     path = root / SWEEP
     if not path.is_file():
-        return Curve(None, None, "", "")
+        return Curve(None, "", "")
     try:
         sweep = read_sweep(path)
     except FormatError as error:
-        return Curve(None, None, "", f"The sweep is not shown: {error.message}")
+        return Curve(None, "", f"The sweep is not shown: {error.message}")
     found = [*_scores(sweep), *_models(stages), *_controls(sweep)]
     each = _bytes_each(stages)
     figure = chart(
         f"PSNR on {sweep.views} validation views after {sweep.steps} steps of recovery",
         Axis("Gaussians that are left"), Axis("PSNR, dB"), found,
         above=("megabytes of the .ply", each / 1e6) if each else None)
-    return Curve(figure, sweep, _stale(path, sweep, stages["train"]), "")
+    return Curve(figure, _stale(path, sweep, stages["train"]), "")
 
 
 def rounds(stage: Standing) -> Markup | None:
@@ -86,7 +84,7 @@ def _scores(sweep: Sweep) -> list[Series]:
         name, tuple((float(one.gaussians), one.psnr_db) for one in sorted(
             sweep.trials, key=lambda one: one.gaussians) if one.score == name),
         color=1 if name == sweep.score else 2 + number % 6, mark=MARKS[number % 4],
-        dashed=name == "random", big=False) for number, name in enumerate(ordered)]
+        dashed=name == "random") for number, name in enumerate(ordered)]
 
 
 def _controls(sweep: Sweep) -> list[Series]:

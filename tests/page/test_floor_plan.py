@@ -103,7 +103,9 @@ def test_without_a_known_up_the_cameras_say_where_it_is():
     up = np.cross(*frame.axes)
     assert up == pytest.approx([0, -1, 0], abs=0.05)
     svg = draw(made, frame, metres=False)
-    assert drawn(svg, "n.png")[1][1] < -10 or drawn(svg, "n.png")[1][1] > 10
+    (ex, ey), (nx, ny), (sx, sy) = (drawn(svg, f"{name}.png")[1] for name in "ens")
+    assert (sx, sy) == pytest.approx((-nx, -ny), abs=0.2)
+    assert ex * ny - ey * nx < -100  # north lies to the left of east: from above, not mirrored
 
 
 def test_one_camera_and_no_spread_still_make_a_plan():
