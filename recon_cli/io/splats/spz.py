@@ -21,6 +21,7 @@ from recon_cli.io.splats.values import (
     Bytes,
     Floats,
     as_splats,
+    contents,
     from_smallest_three,
     logits_of_bytes,
     nearest_bytes,
@@ -42,36 +43,51 @@ _MAGNITUDE = 511  # of a component of a rotation; 9 bits and a sign
 _WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
 
 
+VERSIONS = (2, 3, 4)  # that are read and written
+
+
 def write_spz(path: Path, splats: Splats, *, version: int = 3) -> None:
-    """Writes `splats` to `path`, whole or not at all.
+    """Writes `splats` to `path`, whole or not at all; see `spz_bytes`.
+
+    Raises:
+        FormatError: there are no Gaussians, one is too large or too far away, or a parameter is
+            not finite.
+    """
+    write_bytes(path, spz_bytes(path, splats, version=version))
+
+
+def spz_bytes(path: Path, splats: Splats, *, version: int = 3) -> bytes:
+    """Returns `splats` as an SPZ file.
 
     Log scales below -10 become -10, coefficients outside -1 to 127/128 and dc outside -3.33 to 3.33
     are clipped. Positions get the 12 fractional bits of Niantic's program, fewer in a scene that
     is wider than 2048 units, and never fewer than 8. Harmonics are written in all 8 bits.
 
     Args:
-        path: of the file.
+        path: of the file that they are for, for messages.
         splats: of any degree.
-        version: 3, which all readers of today know, or 4.
+        version: 3, which all readers of today know; 2, for older ones, with coarser rotations;
+            or 4.
 
     Raises:
         FormatError: there are no Gaussians, one is too large or too far away, or a parameter is
             not finite.
     """
-    if version not in (3, 4):
-        raise ValueError(f"version {version} of SPZ is not written, 3 and 4 are")
+    if version not in VERSIONS:
+        raise ValueError(f"version {version} of SPZ is not written, {VERSIONS} are")
     values = turned_about_x(writable(path, splats))
-    means, log_scales = values.means.numpy(), values.log_scales.numpy()
+    means, quats, log_scales = (
+        value.numpy() for value in (values.means, values.quats, values.log_scales))
     refuse_above(path, log_scales, _LARGEST_SCALE)
     bits = _fractional_bits(path, means)
-    write_bytes(path, pack(SpzHeader(version, len(splats), values.sh_degree, bits), [
+    return pack(SpzHeader(version, len(splats), values.sh_degree, bits), [
         _position_bytes(means, bits),
         opacity_bytes(values.logit_opacities.numpy()),
         nearest_bytes(255 * (_COLOR * values.sh_dc.numpy() + 0.5)),
         nearest_bytes(_SCALE_STEPS * (log_scales + _SCALE_OFFSET)),
-        _rotation_bytes(values.quats.numpy()),
+        _vector_bytes(quats) if version < 3 else _rotation_bytes(quats),
         nearest_bytes(_HARMONIC * values.sh_rest.numpy() + _HARMONIC),
-    ]))
+    ])
 
 
 def read_spz(path: Path) -> Splats:
@@ -81,7 +97,12 @@ def read_spz(path: Path) -> Splats:
         FormatError: the file is missing, damaged, of another format or version, or promises more
             than it holds.
     """
-    header, (places, opacities, colors, scales, rotations, harmonics) = unpack(path)
+    return spz_splats(path, contents(path))
+
+
+def spz_splats(path: Path, data: bytes) -> Splats:
+    """Returns the Gaussians of an SPZ file whose bytes are there already; see `read_spz`."""
+    header, (places, opacities, colors, scales, rotations, harmonics) = unpack(path, data)
     n = header.count
     shape = (n, TERMS[header.sh_degree], 3)
     return turned_about_x(as_splats(path, {
@@ -129,6 +150,11 @@ def _rotation_bytes(quats: Floats) -> Bytes:
     fields = np.minimum(magnitude, _MAGNITUDE) | np.uint32(512) * (others < 0)
     words = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
     return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(-1, 4)
+
+
+def _vector_bytes(quats: Floats) -> Bytes:
+    """Returns [N, 3] bytes of x, y and z, where w is at least 0."""
+    return nearest_bytes(np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] * 127.5 + 127.5)
 
 
 def _rotations(data: Bytes) -> Floats:

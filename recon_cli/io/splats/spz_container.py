@@ -11,7 +11,6 @@ An unpacked array is as long as the header's count says, and no byte more is eve
 from __future__ import annotations
 
 import gzip
-import os
 import struct
 import zlib
 from dataclasses import dataclass
@@ -77,18 +76,17 @@ def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
     return b"".join([head, *sizes, *packed])
 
 
-def unpack(path: Path) -> tuple[SpzHeader, list[Bytes]]:
+def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
     """Returns the header and the six arrays of a file.
 
+    Args:
+        path: for messages.
+        data: what lies in it.
+
     Raises:
-        FormatError: the file is missing, damaged, of another format or version, promises more than
-            a file of its size can hold, or holds less or more than it promises.
+        FormatError: the data is damaged, of another format or version, promises more than a file
+            of its size can hold, or holds less or more than it promises.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(os.fstat(file.fileno()).st_size)  # a device has no end
-    except OSError as error:
-        raise FormatError(f"{path} cannot be read: {error}.") from error
     try:
         if data.startswith(b"\x1f\x8b"):
             header, body = _unpack_gzip(path, data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,19 @@ from recon_cli.scene.splats import Splats
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
+
+
+def contents(path: Path) -> bytes:
+    """Returns the bytes of a file.
+
+    Raises:
+        FormatError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(os.fstat(file.fileno()).st_size)  # a device has no end
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read: {error}.") from error
 
 
 def writable(path: Path, splats: Splats) -> Splats:

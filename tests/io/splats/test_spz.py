@@ -10,7 +10,15 @@ import torch
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splat_cases import N, damaged, edge_splats, greatest, read_or_refused, rotation_error
+from splat_cases import (
+    N,
+    damaged,
+    edge_splats,
+    greatest,
+    read_or_refused,
+    rotation_error,
+    unit,
+)
 
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.spz import read_spz, write_spz
@@ -97,6 +105,24 @@ def test_the_file_has_y_up_and_z_back(tmp_path):
     assert np.allclose(sizes, np.array([0.1, 0.3, 0.5]) / length, atol=1e-3)
 
 
+def test_version_2_is_version_3_with_bytes_of_rotations(tmp_path):
+    splats = edge_splats()
+    for version in (2, 3):
+        write_spz(tmp_path / f"{version}.spz", splats, version=version)
+    two, three = read_spz(tmp_path / "2.spz"), read_spz(tmp_path / "3.spz")
+    assert plain(tmp_path / "2.spz")[4] == 2
+    for name, value in three.parameters().items():
+        if name != "quats":
+            assert torch.equal(getattr(two, name), value), name
+    # With d = sqrt(3) / 255 the most by which (x, y, z) is off, w^2 is off by 2 d + d^2 at most,
+    # and so w by the root of that, or by 1.05 d / w where w is not small.
+    apart = torch.minimum(*(
+        (unit(two.quats) - sign * unit(splats.quats)).norm(dim=1) for sign in (1, -1)))
+    d, w = np.sqrt(3) / 255, unit(splats.quats)[:, 0].abs()
+    assert apart.max() <= np.sqrt(2 * d + 2 * d**2)
+    assert apart[w > 0.3].max() <= d * np.sqrt(1 + (1.05 / 0.3)**2)
+
+
 def test_rotations_of_version_2_are_bytes_of_x_y_z(tmp_path):
     splats = few(3, 0)
     write_spz(tmp_path / "a.spz", splats)
@@ -134,8 +160,8 @@ def test_what_does_not_fit_is_refused_and_nothing_written(tmp_path):
         write_spz(path, splats)
     with pytest.raises(FormatError, match="no Gaussians"):
         write_spz(path, splats.select(torch.arange(0)))
-    with pytest.raises(ValueError, match="version 2"):
-        write_spz(path, few(), version=2)
+    with pytest.raises(ValueError, match="version 1"):
+        write_spz(path, few(), version=1)
     assert list(tmp_path.iterdir()) == []
 
 
