@@ -28,6 +28,27 @@ class Axes:
     walls: Walls
 
 
+def turn_onto(
+    one: NDArray[np.float64],  # [3]
+    other: NDArray[np.float64],  # [3]
+) -> NDArray[np.float64]:
+    """Returns the smallest rotation [3, 3] that takes one unit vector to another.
+
+    Rodrigues' formula. Between opposite vectors it is the half turn about the axis of coordinates
+    that is most at right angles to them, so that x stays where it is for y and z.
+    """
+    cosine = float(one @ other)
+    if cosine < -1 + 1e-9:
+        axis = np.zeros(3)
+        axis[np.argmin(np.abs(one))] = 1
+        axis -= (axis @ one) * one
+        axis /= np.linalg.norm(axis)
+        return np.asarray(2 * np.outer(axis, axis) - np.eye(3))
+    x, y, z = np.cross(one, other)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))
+
+
 def upright_axes(
     gravity: Gravity, points: NDArray[np.float64], viewmats: NDArray[np.float64]
 ) -> Axes:

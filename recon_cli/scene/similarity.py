@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 
+_ROUNDING = 1e-4  # of a matrix in float32 or in decimals that somebody wrote
 _ORTHOGONAL = 1e-6  # what is off by more is no rotation; a product of ten rotations is off by 1e-15
 
 
@@ -94,6 +95,30 @@ class Similarity:
     def camera(self, camera: Camera) -> Camera:
         """Returns the same camera in the new world."""
         return replace(camera, viewmat=self.viewmat(camera.viewmat))
+
+    @classmethod
+    def from_matrix(cls, matrix: NDArray[np.float64]) -> Similarity:
+        """Returns the similarity that a matrix [4, 4] stands for; what rounding left is made good.
+
+        Raises:
+            ValueError: it stretches, shears or mirrors, is not finite, or its last row is not
+                0 0 0 1.
+        """
+        if not np.isfinite(matrix).all():
+            raise ValueError("its numbers are not finite")
+        if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+            raise ValueError("its last row is not 0 0 0 1")
+        with np.errstate(over="ignore", invalid="ignore"):
+            scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        if scale < 0:
+            raise ValueError("it mirrors")
+        rotation = matrix[:3, :3] / scale if 0 < scale < np.inf else np.zeros((3, 3))
+        if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROUNDING:
+            raise ValueError("it stretches or shears")
+        if not np.array_equal(rotation, np.round(rotation)):
+            left, _, right = np.linalg.svd(rotation)
+            rotation = left @ right
+        return cls(scale, rotation, matrix[:3, 3])
 
     def to_json(self) -> dict[str, Any]:
         """Returns scale, rotation (rows) and translation as JSON values, without loss."""

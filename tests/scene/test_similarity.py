@@ -82,3 +82,22 @@ def test_json_keeps_every_bit():
 def test_what_is_no_similarity_is_refused(wrong):
     with pytest.raises(ValueError, match=r"similarity|rotation"):
         Similarity(**wrong)
+
+
+def test_a_matrix_gives_back_the_similarity_that_it_was_made_of():
+    turn = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
+    wanted = Similarity(0.3, turn, np.array([1.0, -2, 5]))
+    found = Similarity.from_matrix(wanted.matrix)
+    assert np.allclose(found.matrix, wanted.matrix, atol=1e-15)
+    assert Similarity.from_matrix(np.diag([2.0, 2, 2, 1])).scale == pytest.approx(2)
+    assert np.array_equal(
+        Similarity.from_matrix(np.diag([1.0, -1, -1, 1])).rotation, np.diag([1, -1, -1]))
+
+
+@pytest.mark.parametrize(("matrix", "reason"), [
+    (np.diag([1.0, 1, -1, 1]), "mirrors"), (np.diag([1.0, 1, 1.001, 1]), "stretches"),
+    (np.diag([0.0, 0, 0, 1]), "stretches"), (np.diag([1e200, 1e200, 1e200, 1]), "stretches"),
+    (np.diag([np.nan, 1, 1, 1]), "finite"), (np.eye(4) * 2, "last row")])
+def test_a_matrix_that_is_no_similarity_is_refused_with_the_reason(matrix, reason):
+    with pytest.raises(ValueError, match=reason):
+        Similarity.from_matrix(matrix)

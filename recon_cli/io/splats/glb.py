@@ -7,7 +7,7 @@ extension had logarithms in SCALE; a file that has numbers below 0 there is refu
 
 The world of glTF is right-handed with +Y up. A scene is turned into it when it is written, with its
 coefficients, and turned back when it is read: by `Z_UP` for a scene whose z is up, by `Y_DOWN` for
-one with the axes of a camera (x right, y down, z forward).
+one with the axes of a camera (x right, y down, z forward); one with y up stays.
 
 The extension is https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/
 KHR_gaussian_splatting.
@@ -35,7 +35,9 @@ from recon_cli.scene.transformed import transformed
 # [3, 3] from the scene's axes to those of glTF; numbers that are whole keep positions exact.
 Z_UP: NDArray[np.float64] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 Y_DOWN: NDArray[np.float64] = np.diag([1.0, -1, -1])
-_AXES = {"z up": Z_UP, "y down": Y_DOWN}  # as `asset.extras` tells which of them a scene had
+Y_UP: NDArray[np.float64] = np.eye(3)
+# As `asset.extras` tells which of them a scene had.
+_AXES = {"z up": Z_UP, "y down": Y_DOWN, "y up": Y_UP}
 _SAID = "scene_axes"
 
 _NAME = "KHR_gaussian_splatting"
@@ -86,6 +88,11 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
             described["asset"]["extras"] = {_SAID: name}
     write_bytes(path, contained(described, b"".join(
         np.ascontiguousarray(column).tobytes() for column in columns.values())))
+
+
+def nearest_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the one of the known axes whose up is nearest to a unit vector [3]."""
+    return max(_AXES.values(), key=lambda axes: float(axes[1] @ up))
 
 
 def _coefficients(degree: int) -> list[str]:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from recon_cli.io.splats.glb_container import Container
 from recon_cli.scene.similarity import Similarity
 
-_ROUNDING = 1e-4  # of a rotation stored as float32, through a few nodes
-
 
 def placed_meshes(container: Container) -> Iterator[tuple[dict[str, Any], Similarity]]:
     """Yields the meshes of the scene that is shown first, each with what leads it to the world.
@@ -73,13 +71,8 @@ def _numbers(
 
 
 def _similarity(container: Container, matrix: NDArray[np.float64]) -> Similarity:
-    with np.errstate(over="ignore", invalid="ignore"):
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    rotation = matrix[:3, :3] / scale if 0 < scale < np.inf else np.zeros((3, 3))
-    if not (np.isfinite(matrix).all() and np.array_equal(matrix[3], [0, 0, 0, 1])
-            and np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROUNDING):
-        raise container.damaged("a node that stretches, shears or mirrors its Gaussians")
-    if not np.array_equal(rotation, np.round(rotation)):  # what rounding left is made good
-        left, _, right = np.linalg.svd(rotation)
-        rotation = left @ right
-    return Similarity(scale, rotation, matrix[:3, 3])
+    try:
+        return Similarity.from_matrix(matrix)
+    except ValueError as error:
+        raise container.damaged(
+            "a node that stretches, shears or mirrors its Gaussians") from error

@@ -11,7 +11,14 @@ import torch
 from scenes import camera_at, with_harmonics
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.splats.glb import Y_DOWN, Z_UP, read_glb, write_glb
+from recon_cli.io.splats.glb import (
+    Y_DOWN,
+    Y_UP,
+    Z_UP,
+    nearest_axes,
+    read_glb,
+    write_glb,
+)
 from recon_cli.io.splats.glb_container import contained
 from recon_cli.render.registry import render
 from recon_cli.scene.similarity import Similarity
@@ -224,7 +231,14 @@ def test_a_file_without_gaussians_is_refused(tmp_path):
         read_glb(tmp_path / "a.glb")
 
 
-@pytest.mark.parametrize("axes", [Z_UP, Y_DOWN])
+@pytest.mark.parametrize(("up", "axes"), [
+    ([0, 0, 1], Z_UP), ([0, 1, 0], Y_UP), ([0, -1, 0], Y_DOWN), ([0.1, -0.2, 0.97], Z_UP),
+    ([0.05, -0.99, 0.1], Y_DOWN)])
+def test_axes_go_by_where_up_is(up, axes):
+    assert nearest_axes(np.array(up)) is axes
+
+
+@pytest.mark.parametrize("axes", [Z_UP, Y_DOWN, Y_UP])
 def test_a_file_says_which_axes_the_scene_had(axes, tmp_path):
     splats = archive_splats.room(40)
     write_glb(tmp_path / "x.glb", splats, axes=axes)
