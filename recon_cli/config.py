@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from recon_cli.errors import ConfigError
+from recon_cli.export_config import EXPORT_FORMATS as EXPORT_FORMATS
+from recon_cli.export_config import ExportConfig as ExportConfig
 from recon_cli.fields import StageConfig, option
 from recon_cli.holdout_option import parse_holdout
 from recon_cli.measure_option import SCALE_BETWEEN, check_scale_between
@@ -257,50 +259,6 @@ class EvaluateConfig(StageConfig):
     max_size: int | None = option(
         None, "Longest side at which views are rendered and scored.", unit="pixels", minimum=16,
         automatic="the size that was trained on")
-
-
-EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "points.ply", "colmap",
-                  "transforms.json")
-
-
-@dataclass(frozen=True)
-class ExportConfig(StageConfig):
-    """Which model is handed out."""
-
-    model: str = option(
-        "auto", "auto takes the pruned model where there is a fresh one.",
-        choices=("auto", "base", "pruned"))
-    scale_between: tuple[str, str, float] | None = option(
-        None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale of the training stays")
-    crop: tuple[float, float, float, float, float, float] | None = option(
-        None, "Keep what lies in the box between two corners, in units of the exported scene.",
-        metavar="X Y Z X Y Z", automatic="everything")
-    sh_degree: int | None = option(
-        None, "Highest degree of the colours.", minimum=0, maximum=3,
-        automatic="that of the scene")
-    max_mb: float | None = option(
-        None, "Largest file, of the first format that is named: by the degree and the count that "
-        "look best on the validation views.", unit="MB", minimum=0.0, automatic="no limit")
-    format: str = option(
-        "ply", "Formats to write beside the .ply, with commas between: "
-        f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...")
-    max_loss: float | None = option(
-        None, "Most PSNR that a format may lose on the validation views.", unit="dB", minimum=0.0,
-        automatic="0.3, and 3 for .splat, which drops harmonics")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_scale_between(self.scale_between)
-        if self.crop and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
-            raise self._refused("crop", list(self.crop), "a lowest and a highest corner")
-        for name in self.formats:
-            if name not in EXPORT_FORMATS:
-                raise self._refused("format", name, "one of " + ", ".join(EXPORT_FORMATS))
-
-    @property
-    def formats(self) -> tuple[str, ...]:
-        """The names in `format`, each once."""
-        return tuple(dict.fromkeys(name.strip() for name in self.format.split(",")))
 
 
 @dataclass(frozen=True)

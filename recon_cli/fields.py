@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -28,6 +29,7 @@ class OptionInfo:
     flags: bool = False  # each choice other than the default gets a flag of its own: --force
     automatic: str = ""  # what None means
     metavar: str = ""  # how --help names the values of a tuple
+    read: Callable[[str], Any] | None = None  # makes the value of the one word that is typed
 
 
 def option(default: Any, help: str, **info: Any) -> Any:

@@ -228,7 +228,8 @@ def _field(
 
     def keep(ctx: click.Context, _parameter: click.Parameter, value: Any) -> None:
         if value is not None:
-            ctx.ensure_object(Call).settings.setdefault(section, {})[name] = value
+            ctx.ensure_object(Call).settings.setdefault(section, {})[name] = (
+                info.read(value) if info.read else value)
 
     return click.option(
         f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}",
@@ -240,6 +241,8 @@ def _field(
 def _click_type(kind: type, info: OptionInfo) -> click.ParamType[Any]:
     if info.choices:
         return click.Choice(info.choices)
+    if info.read:
+        return click.STRING
     if member_types(kind):
         return click.Tuple(list(member_types(kind)))
     if kind is int:

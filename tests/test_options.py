@@ -1,6 +1,7 @@
 """Every option explains itself, and reaches the settings with its type."""
 
 import dataclasses
+from pathlib import Path
 
 import click
 import pytest
@@ -112,6 +113,18 @@ def test_a_field_of_several_values_is_one_option() -> None:
         parsed(ExportConfig, "--scale-between", "a.png", "b.png", "far")
     with pytest.raises(click.UsageError):
         parsed(ExportConfig, "--scale-between", "a.png", "b.png")
+
+
+def test_a_matrix_is_read_from_its_file_when_it_is_typed(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("[[2, 0, 0, 0.5], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]")
+    numbers = [2, 0, 0, 0.5, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
+    assert parsed(ExportConfig, "--transform", str(path)) == {"transform": numbers}
+    assert ExportConfig(transform=numbers).hashed()["transform"] == numbers  # not the file's name
+
+
+def test_an_axis_may_begin_with_a_dash() -> None:
+    assert parsed(ExportConfig, "--up", "-y") == {"up": "-y"}
 
 
 def test_some_fields_can_be_left_out() -> None:

@@ -58,7 +58,7 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 2, False,
           "recon_cli.stages.evaluate", renders=True),
-    Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig, 3, False,
+    Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig, 4, False,
           "recon_cli.stages.export", renders=True),
 )
 

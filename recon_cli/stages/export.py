@@ -14,13 +14,11 @@ import torch
 from recon_cli.atomic import write_json
 from recon_cli.config import ExportConfig
 from recon_cli.errors import StageError, WorkspaceError
-from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.mapping.measure import Measurement, ScaleBetween, measure
-from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, with_rows
 from recon_cli.scene.transformed import transformed
 from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.stages.frame import Frame, frame_of
 from recon_cli.stages.handing_out import Hand
 
 TRANSFORM = "transform.json"
@@ -33,12 +31,11 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
             "The pruned model was asked for, but there is none that is fresh.",
             hint="Run `recon prune` first, or export with --model base.")
     pruned = "prune" in inputs.folders and config.model != "base"
-    measured = _measured(config, inputs)
-    similarity = Similarity(scale=measured.scale) if measured else Similarity()
+    frame = frame_of(config, inputs)
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
-    if not similarity.is_identity:
-        splats = transformed(splats, similarity)
-    hand = Hand(config, inputs, out, similarity, ctx)
+    if not frame.similarity.is_identity:
+        splats = transformed(splats, frame.similarity)
+    hand = Hand(config, inputs, out, frame, ctx)
     splats, changes = hand.lightened(splats)
     path = out / "splats.ply"
     others = [name for name in config.formats if name != "ply"]
@@ -51,33 +48,21 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         for name in others:
             files[name] = hand.out_as(name, splats)
             bar.advance()
-    _write_transform(out / TRANSFORM, similarity, measured)
+    _write_transform(out / TRANSFORM, frame)
     return {
         "model": "pruned" if pruned else "base", "file": "splats.ply", "gaussians": len(splats),
-        "bytes": path.stat().st_size, "transform": similarity.to_json(),
+        "bytes": path.stat().st_size, "transform": frame.similarity.to_json(),
         **({"changes": [change.record() for change in changes]} if changes else {}),
         **({"files": files} if files else {}),
     }
 
 
-def _measured(config: ExportConfig, inputs: StageInputs) -> Measurement | None:
-    """Returns how long a metre is in the scene that was trained, where the user says so."""
-    if config.scale_between is None:
-        return None
-    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
-    points, _ = read_points(sparse / "points3D.bin")
-    viewmats = {name: viewmat for name, _, viewmat in read_images(sparse / "images.bin")}
-    return measure(ScaleBetween(*config.scale_between), points, viewmats, read_pinholes(sparse))
-
-
-def _write_transform(
-    path: Path, similarity: Similarity, measured: Measurement | None
-) -> None:
+def _write_transform(path: Path, frame: Frame) -> None:
     write_json(path, {
         "from": "the world of sfm, in which the scene was trained",
         "to": "splats.ply beside this file",
-        "similarity": similarity.to_json(),
-        "measurement": measured.to_json() if measured else None,
+        "similarity": frame.similarity.to_json(),
+        "measurement": frame.measured.to_json() if frame.measured else None,
     })
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import shutil
 import tempfile
@@ -14,19 +13,23 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from recon_cli.atomic import read_json
 from recon_cli.config import ExportConfig, RunConfig
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.io.colmap_writer import write_colmap
-from recon_cli.io.splats.glb import Y_DOWN, Z_UP, write_glb
+from recon_cli.io.splats.glb import nearest_axes, write_glb
+from recon_cli.io.splats.html import write_html
 from recon_cli.io.splats.points import write_points
 from recon_cli.io.splats.registry import FORMATS
+from recon_cli.io.splats.spz import write_spz
 from recon_cli.io.transforms_writer import write_transforms
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
-from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.fidelity import Fidelity, fidelity
 from recon_cli.stages.fitting import load_scene, load_views, read_config
+from recon_cli.stages.frame import Frame
 from recon_cli.stages.lighter import Change, changed, cropped, of_size
 from recon_cli.train.importance import Importance, add_views
 
@@ -46,16 +49,15 @@ class Hand:
         config: what is wanted.
         inputs: finished folders.
         out: where files go.
-        similarity: from the world of the training to that of the files.
+        frame: of the files.
         ctx: backend and device.
     """
 
     def __init__(
-        self, config: ExportConfig, inputs: StageInputs, out: Path, similarity: Similarity,
-        ctx: StageContext,
+        self, config: ExportConfig, inputs: StageInputs, out: Path, frame: Frame, ctx: StageContext,
     ) -> None:
         self._config, self._inputs, self._out, self._ctx = config, inputs, out, ctx
-        self._similarity = similarity
+        self._similarity, self._up = frame.similarity, frame.up
         self._last: tuple[Splats, float] | None = None
 
     def lightened(self, splats: Splats) -> tuple[Splats, list[Change]]:
@@ -115,7 +117,11 @@ class Hand:
 
     def _write(self, name: str, path: Path, splats: Splats) -> None:
         if name == "glb":
-            write_glb(path, splats, axes=Z_UP if self._up_found else Y_DOWN)
+            write_glb(path, splats, axes=nearest_axes(self._up))
+        elif name == "spz":
+            write_spz(path, splats, version=self._config.spz_version)
+        elif name == "html":
+            write_html(path, splats, title=self._name, up=self._up, views=self._seen)
         else:
             FORMATS[name].write(path, splats)
 
@@ -200,13 +206,16 @@ class Hand:
         return fidelity(self._scene, self._similarity, self._train.max_size, self._ctx)
 
     @property
-    def _up_found(self) -> bool:
-        """Whether z is up in the world of the mapping."""
-        world = self._inputs.folders["sfm"] / "world.json"
-        if not world.exists():
-            return False
-        found = json.loads(world.read_text(encoding="utf-8")).get("evidence") or {}
-        return bool(found.get("up_found"))
+    def _name(self) -> str:
+        """What was captured: the name of its first video or folder."""
+        frames = read_json(self._inputs.folders["ingest"] / "frames.json")
+        return str(frames["groups"][0]["name"])
+
+    @property
+    def _seen(self) -> list[tuple[str, Camera]]:
+        """The cameras that the scene was trained on."""
+        return [(view.name, self._similarity.camera(view.camera))
+                for view in sorted(self._scene.train, key=lambda view: view.name)]
 
 
 def _all(scene: Scene) -> list[View]:

@@ -10,6 +10,7 @@ from recon_cli.errors import FormatError
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.io.splats.compressed_ply import read_compressed_ply, write_compressed_ply
 from recon_cli.io.splats.glb import read_glb, write_glb
+from recon_cli.io.splats.html import read_html, write_html
 from recon_cli.io.splats.sog import read_sog, write_sog
 from recon_cli.io.splats.splat import read_splat, write_splat
 from recon_cli.io.splats.spz import read_spz, write_spz
@@ -38,6 +39,7 @@ FORMATS: dict[str, SplatFormat] = {one.name: one for one in (
     SplatFormat("spz", read_spz, write_spz),
     SplatFormat("sog", read_sog, write_sog),
     SplatFormat("glb", read_glb, write_glb),
+    SplatFormat("html", read_html, write_html),
 )}
 
 
