@@ -158,6 +158,18 @@ def test_a_drag_and_a_key_move_the_camera_and_reset_takes_it_back(page, tmp_path
     page.assert_silent()
 
 
+def test_what_the_wheel_did_in_orbit_is_not_done_again_in_flight(page, tmp_path):
+    opened(page, made(tmp_path / "a.html", 0))
+    before = picture(page)
+    page.page.mouse.move(120, 80)
+    page.page.mouse.wheel(0, -300)
+    assert psnr_db(before, picture(page)) < 30
+    page.page.keyboard.press("r")
+    page.page.keyboard.press("f")
+    page.page.wait_for_timeout(200)
+    assert psnr_db(before, picture(page)) > 45
+
+
 def test_the_orbit_keeps_the_middle_of_the_scene_in_the_middle(page, tmp_path):
     """A bright Gaussian alone: however one turns about it, it stays where it is."""
     splats = room(1, degree=0)

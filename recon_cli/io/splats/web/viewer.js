@@ -27,7 +27,7 @@ const spark = new SparkRenderer({
   preBlurAmount: DILATION, // the scene was trained without compensation of its opacities
   blurAmount: 0,
   sortRadial: false, // by depth, as it was trained
-  accumExtSplats: true, // 32 bits for positions and colours; 16 lose 3 dB
+  accumExtSplats: true, // positions of 32 bits; those of 16 can be seen
   maxStdDev: Math.sqrt(CUTOFF),
   minAlpha: 1 / 255,
   maxPixelRadius: 4096,
@@ -53,7 +53,8 @@ let loaded = false;
 let shown = 1; // number of the view that was asked for last
 let lens = null; // { fx, fy, cx, cy, width, height } of that view
 let distance = SIZE; // to what the orbit turns about
-let waiting = [];
+let drawn = 0; // frames
+const waiting = [];
 
 // Takes the place and the lens of a view: `pose` is camera to world, 12 numbers in rows, in the
 // scene's axes with x right, y down, z forward; `distance` is to what the orbit turns about.
@@ -61,6 +62,7 @@ function look(view, given) {
   const turned = new THREE.Matrix4().set(...view.pose, 0, 0, 0, 1)
     .multiply(new THREE.Matrix4().makeScale(1, -1, -1)).premultiply(world.matrixWorld);
   turned.decompose(camera.position, camera.quaternion, new THREE.Vector3());
+  for (const glide of [fly.rotateVelocity, fly.moveVelocity]) glide.set(0, 0, 0);
   lens = given;
   distance = view.distance * unit;
   aim();
@@ -105,6 +107,7 @@ function setFlying(value) {
   flying = value;
   orbit.enabled = !flying;
   fly.enable = flying;
+  fly.scroll.set(0, 0, 0); // it counts the wheel while it is switched off, too
   if (!flying) aim();
   button("mode").textContent = flying ? "orbit" : "fly";
   button("mode").setAttribute("aria-pressed", String(flying));
@@ -145,6 +148,7 @@ function tick(now) {
   if (moved || turned || needed) {
     needed = false;
     renderer.render(root, camera);
+    drawn++;
   }
   const still = loaded && !needed && !spark.dirty && !spark.sorting && !spark.sortDirty;
   if (still) {
@@ -154,11 +158,12 @@ function tick(now) {
   requestAnimationFrame(tick);
 }
 
-// For scripts: recon.show(3) is the third view, and recon.settled() a promise that is kept when
-// the frame shows all Gaussians in the right order.
+// For scripts: recon.show(3) is the third view, recon.settled() a promise that is kept when the
+// frame shows all Gaussians in the right order, recon.drawn() how many frames there were.
 window.recon = {
   views: scene.views.map((view) => view.name),
   show,
+  drawn: () => drawn,
   settled: () => new Promise((done) => { needed = true; waiting.push(done); }),
 };
 document.body.classList.toggle("posed", scene.views.length > 1);
