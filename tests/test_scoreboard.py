@@ -80,6 +80,18 @@ def test_a_file_scores_what_the_workspace_it_came_from_scores(room, tmp_path, ca
     assert file["truth_digest"] == pruned["truth_digest"]
 
 
+def test_a_file_that_was_handed_out_in_another_frame_scores_the_same(room, tmp_path, capsys):
+    out = shutil.copytree(room / "a", tmp_path / "turned")
+    assert main(["export", "-w", str(out), "--up", "y"]) == 0
+    found = as_json(compared(
+        capsys, room / "a", out / "export" / "splats.ply", "-w", room / "a", "--form", "json"))
+    _, pruned, file = found["models"]
+    assert file["psnr_db"] == pytest.approx(pruned["psnr_db"], abs=1e-4)
+    (out / "export" / "transform.json").write_text("{}")
+    assert main(["eval", str(out / "export" / "splats.ply"), "-w", str(room / "a")]) == 3
+    assert "transform.json" in capsys.readouterr().err
+
+
 def test_paths_of_one_name_are_told_apart_in_every_table(room, tmp_path, capsys):
     twin = tmp_path / "a"
     shutil.copytree(room / "b", twin)

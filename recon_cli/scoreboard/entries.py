@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +12,18 @@ from recon_cli.atomic import read_json
 from recon_cli.errors import ConfigError, FormatError, InputError
 from recon_cli.io.splats.registry import read_splats
 from recon_cli.metrics import ModelScore, ViewScore
+from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.transformed import transformed
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.stages.fitting import load_scene, read_config
 from recon_cli.stages.held_out import LABELS, Truth, scorable, scored, truth_digest
 from recon_cli.train.plan import QUALITIES
 from recon_cli.workspace import Workspace
+
+_TRANSFORM = "transform.json"  # of an export, see stages.export
+
+logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,8 @@ def benchmark_of(
 def of_file(path: Path, name: str, against: Benchmark) -> Entry:
     """Returns a file of Gaussians, scored on the views of a workspace, in whose world it must lie.
 
+    A file beside which an export left transform.json is brought back into that world.
+
     Args:
         path: of the file.
         name: for the tables.
@@ -125,8 +134,30 @@ def of_file(path: Path, name: str, against: Benchmark) -> Entry:
     Raises:
         FormatError: it holds no Gaussians that can be read.
     """
-    splats: Splats = read_splats(path).map(lambda tensor: tensor.to(against.ctx.device))
+    splats = _brought_back(read_splats(path), path.with_name(_TRANSFORM))
+    splats = splats.map(lambda tensor: tensor.to(against.ctx.device))
     found = scored(splats, against.views, splats.sh_degree, against.ctx)
     score = ModelScore(
         name, found.views, len(splats), path.stat().st_size, found.render_ms, None)
     return Entry(against.name, name, score, truth_digest(against.views))
+
+
+def _brought_back(splats: Splats, record: Path) -> Splats:
+    """Returns the Gaussians in the world that an export took them from, where it says so.
+
+    Raises:
+        FormatError: what it says cannot be read.
+    """
+    if not record.is_file():
+        return splats
+    try:
+        similarity = Similarity.from_json(read_json(record)["similarity"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"{record} does not hold the frame of an export: {error!r}.",
+            hint="Run `recon export --again`, or score a copy of the file in another folder.",
+        ) from error
+    if similarity.is_identity:
+        return splats
+    logger.info("%s: brought back into the world of the training", record)
+    return transformed(splats, similarity.inverse())
