@@ -7,11 +7,14 @@ to 23 at degree 2, up to 8 at degree 1, none at degree 0. Gaussians of degree 0 
 another have zeros there.
 
 Reading takes ASCII and both byte orders, float and double, the properties in any order, and ignores
-those that it does not know.
+those that it does not know. Two infinities that other programs write have a meaning and become
+finite: the logit of an opacity of exactly 0 or 1, and the logarithm of a scale of 0.
 """
 
 from __future__ import annotations
 
+import logging
+import math
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +38,14 @@ _GROUPS = {
     "log_scales": [f"scale_{i}" for i in range(3)],
     "quats": [f"rot_{i}" for i in range(4)],
 }
+# An opacity of exactly 1 or 0, as PlayCanvas' splat-transform makes of the bytes 255 and 0: the
+# middle of such a step, as `values.logits_of_bytes` reads those bytes.
+_MOST_LOGIT = math.log(254.75 / 0.25)
+# The logarithm of a flat Gaussian's third scale: SuperSplat fills it in for 2D Gaussian Splatting,
+# whose files have no scale_2. A thousandth of a millimetre in metres.
+_FLAT = math.log(1e-6)
+
+logger = logging.getLogger("recon")
 
 
 def write_ply(path: Path, splats: Splats) -> None:
@@ -85,10 +96,12 @@ def read_ply(path: Path) -> Splats:
 
     Those behind the last one that has a coefficient other than zero are of degree 0. ASCII and big
     endian are read as well, numbers of any type, and elements besides the vertices passed over.
+    Infinite logits of opacities, scales of 0 and a third scale that is not there become finite, and
+    a warning counts them.
 
     Raises:
-        FormatError: the file is missing, truncated, of another kind of .ply, or holds values that
-            are not finite.
+        FormatError: the file is missing, truncated, of another kind of .ply, or holds other values
+            that are not finite.
     """
     table = _vertices(read_header(path))
     names = table.dtype.names or ()
@@ -99,11 +112,14 @@ def read_ply(path: Path) -> Splats:
             "degree.")
     groups = {name: _GROUPS[name] for name in _GROUPS if name != "normals"} | {"sh_rest": rest}
     missing = [name for group in groups.values() for name in group if name not in names]
-    if missing:
+    if missing and missing != ["scale_2"]:
         raise FormatError(f"{path} lacks the properties {', '.join(missing)}: no Gaussians.")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, which is refused
         columns = {name: table[name].astype(np.float32)
-                   for group in groups.values() for name in group}
+                   for group in groups.values() for name in group if name not in missing}
+    if missing:
+        columns["scale_2"] = np.full(len(table), -np.inf, np.float32)
+    _make_finite(path, columns)
     refuse_not_finite(path, columns)
     values = {key: np.stack([columns[name] for name in group], axis=1) if group
               else np.zeros((len(table), 0), np.float32) for key, group in groups.items()}
@@ -111,6 +127,24 @@ def read_ply(path: Path) -> Splats:
     return as_splats(path, values | {
         "logit_opacities": values["logit_opacities"][:, 0],
         "sh_rest": by_channel.transpose(0, 2, 1)})
+
+
+def _make_finite(path: Path, columns: dict[str, NDArray[np.float32]]) -> None:
+    """Replaces the infinities that stand for opaque, invisible and flat, and says how many."""
+    logits = columns["opacity"]
+    certain = np.isinf(logits)
+    logits[certain] = np.copysign(np.float32(_MOST_LOGIT), logits[certain])
+    if certain.any():
+        logger.warning("%s: %s opacities of exactly 0 or 1 are read as %.3f and %.3f", path.name,
+                       f"{certain.sum():,}", 0.25 / 255, 254.75 / 255)
+    flat = 0
+    for name in _GROUPS["log_scales"]:
+        none = np.isneginf(columns[name])
+        columns[name][none] = _FLAT
+        flat += int(none.sum())
+    if flat:
+        logger.warning("%s: %s scales of 0 are read as %g units", path.name, f"{flat:,}",
+                       math.exp(_FLAT))
 
 
 def _vertices(header: Header) -> NDArray[np.void]:
