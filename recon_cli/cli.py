@@ -23,6 +23,7 @@ from recon_cli.config import (
     TrainConfig,
 )
 from recon_cli.errors import ReconError
+from recon_cli.importing.command import import_scene
 from recon_cli.options import Call, pass_call
 from recon_cli.page.command import report as write_report
 from recon_cli.pipeline import Job
@@ -139,6 +140,9 @@ def train(call: Call, with_prune: bool) -> None:
     for name in call.settings.get("prune", {}):
         raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
     perform(call, "train", ["train"])
+
+
+cli.add_command(import_scene)
 
 
 @cli.command()

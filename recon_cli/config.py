@@ -262,6 +262,25 @@ class EvaluateConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class ImportConfig(StageConfig):
+    """How a scene from elsewhere comes into a workspace."""
+
+    frame: str = option(
+        "auto", "The world that the file lies in: that of the capture's own cameras (source), that "
+        "of this workspace, or whichever shows some training views better.",
+        choices=("auto", "source", "workspace"))
+    axes: str | None = option(
+        None, "Where up is in the file; only matters without views.",
+        choices=("y-down", "z-up"), automatic="z-up for .glb, else y-down, as viewers take it")
+    max_size: int = option(
+        600, "Longest side at which the scene is rendered, scored and pruned.", unit="pixels",
+        minimum=16)
+    validation: float = option(
+        0.05, "Share of the training views kept out of pruning to watch it.", unit="share",
+        minimum=0.0, maximum=0.5)
+
+
+@dataclass(frozen=True)
 class ComputeConfig(StageConfig):
     """Where the numerical work runs. Recorded in the manifest, never part of a fingerprint."""
 

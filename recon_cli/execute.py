@@ -157,7 +157,8 @@ def _remembered(job: Job, row: Stage) -> tuple[Source, ...]:
     if not sources:
         raise ConfigError(
             f"{row.verb} needs an input: none was given and {job.workspace.root} remembers none.",
-            hint=f"Type `recon {row.verb} VIDEO`, or a folder of photos in place of VIDEO.")
+            hint=f"Type `recon {row.verb} {row.takes}`"
+            f"{', or a folder of photos in place of VIDEO' * (row.takes == 'VIDEO')}.")
     return tuple(
         read_source(Path(source.path), known=source, without=job.workspace.root)
         for source in sources)

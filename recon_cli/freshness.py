@@ -11,16 +11,17 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from recon_cli import settings as layers
 from recon_cli.digests import Source, read_source
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, ManifestError
 from recon_cli.fields import StageConfig
 from recon_cli.manifest import Basis, Manifest, Unfinished, differences
 from recon_cli.settings import Settings
-from recon_cli.stages import Stage
+from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace import Workspace, changed_outputs
 
 
@@ -63,6 +64,11 @@ class Check:
         return f"{self.state}: {'; '.join(self.reasons)}" if self.reasons else self.state
 
 
+def is_imported(basis: Basis) -> bool:
+    """Tells whether a result is a scene that was imported: training reads no file of the user's."""
+    return basis.stage == IMPORT.name and bool(basis.sources)
+
+
 class Inspection:
     """One look at a workspace. Every stage is checked at most once, and nothing is changed.
 
@@ -82,8 +88,21 @@ class Inspection:
         self._checks: dict[str, Check] = {}
 
     def row(self, name: str) -> Stage:
-        """Returns the row of a stage."""
-        return self._rows[name]
+        """Returns the row of a stage; what an imported scene spares it is not needed."""
+        row = self._rows[name]
+        if not row.spares or not self._imported:
+            return row
+        needs = tuple(need for need in row.needs if need not in row.spares)
+        return dataclasses.replace(row, needs=needs, uses=(*row.spares, *row.uses))
+
+    @cached_property
+    def _imported(self) -> bool:
+        """Whether the scene was imported; one whose manifest is damaged counts as trained."""
+        try:
+            manifest = self._workspace.manifest(IMPORT.name)
+        except ManifestError:
+            return False
+        return manifest is not None and is_imported(manifest.basis)
 
     def check(self, name: str) -> Check:
         """Returns how a stage's result stands, held against the options it was made with.
@@ -93,7 +112,9 @@ class Inspection:
             ConfigError: the settings hold a value that cannot be used.
         """
         if name not in self._checks:
-            row, manifest = self._rows[name], self._workspace.manifest(name)
+            row, manifest = self.row(name), self._workspace.manifest(name)
+            if manifest and is_imported(manifest.basis):
+                row = IMPORT
             self._checks[name] = self._compared(
                 row, manifest, self.config(row, manifest.basis if manifest else None))
         return self._checks[name]
@@ -102,7 +123,7 @@ class Inspection:
         self, name: str, config: StageConfig, sources: tuple[Source, ...] | None
     ) -> Check:
         """Returns how a stage's result stands, held against `config` and, if given, `sources`."""
-        row = self._rows[name]
+        row = self.row(name)
         return self._compared(row, self._workspace.manifest(name), config, sources)
 
     def config(self, row: Stage, recorded: Basis | None) -> StageConfig:
@@ -112,7 +133,8 @@ class Inspection:
         if recorded:
             before = {key: value for key, value in recorded.config.items() if key in known}
         try:
-            return layers.build(row.config, layers.merged([{row.name: before}, self._settings]))
+            return layers.build(row.config, layers.merged(
+                [{layers.section_of(row.config): before}, self._settings]))
         except ConfigError:
             # A newer recon may refuse what an older one took; what is set now must be right.
             return layers.build(row.config, self._settings)

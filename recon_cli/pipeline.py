@@ -30,9 +30,9 @@ from recon_cli.execute import (
     run_stage,
 )
 from recon_cli.fields import OptionInfo, StageConfig, option_info
-from recon_cli.freshness import Check, Inspection
+from recon_cli.freshness import Check, Inspection, is_imported
 from recon_cli.manifest import Manifest
-from recon_cli.stages import Stage
+from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace import LOG, disk_errors
 
 __all__ = ["Job", "Outcome", "StageStatus", "Target", "plan", "run", "run_stage", "status"]
@@ -47,7 +47,7 @@ class Target:
     Attributes:
         stage: its name.
         config: its options.
-        sources: the user's files, for ingest; empty means those of the last time.
+        sources: the user's files, for what takes some; empty means those of the last time.
     """
 
     stage: str
@@ -100,7 +100,8 @@ def _status(check: Check) -> StageStatus:
         unfinished.total if unfinished else 0,
         run.seconds if run else None,
         dict(run.summary) if run else {},
-        tuple(f"the input {path} is gone" for path in check.gone),
+        (*(run.summary.get("notices", ()) if run else ()),
+         *(f"the input {path} is gone" for path in check.gone)),
     )
 
 
@@ -116,7 +117,8 @@ def run(
         again: run the targets even if they are fresh.
 
     Raises:
-        StageError: something that a target needs is missing or stale and is not made implicitly.
+        StageError: something that a target needs is missing or stale and is not made implicitly, or
+            a scene would be lost that another verb left.
         WorkspaceError: the workspace is in use, full, or not writable.
         ReconError: whatever the stages raise.
     """
@@ -124,11 +126,34 @@ def run(
     root = job.workspace.root
     with disk_errors(root, f"running {verb}"), job.workspace.writing(verb), _logged(root / LOG):
         refuse_missing_backend(job, [target.stage for target in targets])
+        if not again:
+            _refuse_to_replace(job, verb, [target.stage for target in targets])
         for target in targets:
             for outcome in _reach(job, target, again=again):
                 job.report(outcome)
                 outcomes.append(outcome)
     return tuple(outcomes)
+
+
+def _refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
+    """Raises StageError where training would take the place of an imported scene, or otherwise.
+
+    A training takes long, and of an imported scene there may be no other copy.
+    """
+    rows = [row for row in job.table if row.name == IMPORT.name and row.name in stages]
+    for row in rows:
+        finished, begun = job.workspace.manifest(row.name), job.workspace.unfinished(row.name)
+        importing = row.verb == IMPORT.verb
+        if finished and is_imported(finished.basis) is not importing:
+            name = Path(finished.basis.sources[0].path).name if finished.basis.sources else ""
+            what = f"the scene imported from {name}" if name else "a scene that was trained"
+        elif importing and begun and begun.done and not is_imported(begun.basis):
+            what = f"a training that was interrupted at {begun.done} of {begun.total}"
+        else:
+            continue
+        raise StageError(
+            f"{job.workspace.root} holds {what}, which `recon {verb}` would replace.",
+            hint=f"Give another workspace with -w, or replace it by `recon {verb} --again`.")
 
 
 def plan(look: Inspection, stage: str) -> tuple[Stage, ...]:
@@ -171,7 +196,7 @@ def command(look: Inspection, check: Check) -> str:
     words = ["recon", check.row.verb]
     latest = check.unfinished or check.manifest
     if latest is None:
-        return " ".join(words if check.row.needs else [*words, "VIDEO"])
+        return " ".join([*words, check.row.takes] if check.row.takes else words)
     had, plain = look.config(check.row, latest.basis), look.config(check.row, None)
     for item in dataclasses.fields(check.row.config):
         value, info = getattr(had, item.name), option_info(item)

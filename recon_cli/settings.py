@@ -16,6 +16,7 @@ from recon_cli.config import (
     DenoiseConfig,
     EvaluateConfig,
     ExportConfig,
+    ImportConfig,
     IngestConfig,
     PruneConfig,
     SfmConfig,
@@ -32,6 +33,7 @@ SECTIONS: dict[str, type[StageConfig]] = {
     "prune": PruneConfig,
     "evaluate": EvaluateConfig,
     "export": ExportConfig,
+    "import": ImportConfig,
     "compute": ComputeConfig,
 }
 
@@ -138,8 +140,12 @@ def merged(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
 
 def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
     """Returns the frozen instance of one config class that `settings` describe."""
-    section = next(name for name, kind in SECTIONS.items() if kind is config)
-    return config(**settings.get(section, {}))
+    return config(**settings.get(section_of(config), {}))
+
+
+def section_of(config: type[StageConfig]) -> str:
+    """Returns the section that sets the fields of a config class."""
+    return next(name for name, kind in SECTIONS.items() if kind is config)
 
 
 def check(settings: Mapping[str, Mapping[str, Any]]) -> None:

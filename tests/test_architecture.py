@@ -43,8 +43,8 @@ ALLOWED: dict[str, set[str]] = {
     "mapping": BOTTOM | OPTIONS | {"progress", "io", "scene"},
     "train": BOTTOM | OPTIONS | {"progress", "scene", "render"},
     "stages": BOTTOM | OPTIONS | {
-        "holdout_option", "progress", "metrics", "machine", "capture", "mapping", "scene", "io",
-        "train", "render"},
+        "digests", "holdout_option", "progress", "metrics", "machine", "capture", "mapping",
+        "scene", "io", "train", "render"},
     "freshness": OPTIONS | RECORDS | {"settings", "stages"},
     "execute": OPTIONS | RECORDS | {
         "settings", "stages", "freshness", "machine", "progress", "render"},
@@ -75,14 +75,17 @@ ALLOWED: dict[str, set[str]] = {
     "page": BOTTOM | OPTIONS | {
         "settings", "options", "machine", "progress", "tables", "digests", "manifest", "workspace",
         "scene", "capture", "io", "stages", "freshness", "execute", "pipeline", "report"},
+    "importing": OPTIONS | {
+        "settings", "options", "pipeline", "progress", "stages", "verbs", "workspace"},
     "cli": OPTIONS | {
-        "verbs", "scoreboard", "page",
+        "verbs", "scoreboard", "page", "importing",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study", "sweep", "shots"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
-    "click": {"cli", "verbs", "options", "bench", "study", "shots", "page", "console"},
+    "click": {"cli", "verbs", "options", "bench", "study", "shots", "page", "console",
+              "importing"},
     "zstandard": {"io"},
     "jinja2": {"page"},
     "markupsafe": {"page"},

@@ -48,3 +48,19 @@ class Camera:
             self, width=width, height=height,
             fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy,
         )
+
+
+def looking_at(
+    eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns [4, 4] world to camera at `eye` with `target` in the middle and the horizon level.
+
+    The line of sight may not be parallel to `up`.
+    """
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return viewmat

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import Camera, looking_at
 
 _SAMPLES = 20_000  # points looked at
 _MIDDLE = 0.5  # of the picture's sides: what a camera looks at lies in this part
@@ -42,22 +42,6 @@ def orbit_path(
     eyes = target + np.median(heights) * up + radius * (
         np.cos(angles) * start + np.sin(angles) * across)
     return np.stack([looking_at(eye, target, up) for eye in eyes])
-
-
-def looking_at(
-    eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Returns [4, 4] world to camera at `eye` with `target` in the middle and the horizon level.
-
-    The line of sight may not be parallel to `up`.
-    """
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return viewmat
 
 
 def _level(up: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, StageError
 from recon_cli.io.images import fitted_camera, fitted_size
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.shots.camera_path import CameraPath, read_camera_path
 from recon_cli.shots.orbit import middle_of_sight, orbit_path
-from recon_cli.shots.request import FPS, TRAINING, Request
+from recon_cli.shots.request import FPS, ORBIT, TRAINING, Request
 from recon_cli.shots.size import frame_size
 from recon_cli.shots.smooth import smooth_path
 from recon_cli.shots.source import Source
+from recon_cli.stages.made_up import AROUND
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +42,12 @@ def plan(request: Request, source: Source) -> Plan:
     """Returns the cameras that are asked for.
 
     Raises:
+        StageError: views are asked for, and there are none.
         ConfigError: a size or a view's name cannot be used.
         FormatError: the file of a path cannot be used.
     """
+    if not source.has_views and request.file is None:
+        _refuse_without_views(request)
     if request.views:
         views = _views(request.views, source.scene)
         cameras = {
@@ -59,10 +63,20 @@ def plan(request: Request, source: Source) -> Plan:
     return Plan(name, {f"{at:05d}": camera for at, camera in enumerate(path.cameras())}, path)
 
 
+def _refuse_without_views(request: Request) -> None:
+    """Raises StageError where cameras of views are asked for, and there are none."""
+    if request.views or request.path == TRAINING:
+        raise StageError(
+            "The scene was imported without views, so there are no cameras of its own to render.",
+            hint=f"Give --path {ORBIT}, or --path FILE.json with cameras.")
+
+
 def _made_path(request: Request, source: Source) -> CameraPath:
     """Returns the path through or around the training cameras, as they see and at their size."""
     scene, count = source.scene, request.frames()
     cameras = [view.camera for view in scene.train]
+    if not source.has_views:  # the others stand in the middle
+        cameras = cameras[:AROUND]
     viewmats = np.stack([camera.viewmat for camera in cameras])
     if request.path == TRAINING:
         viewmats = smooth_path(viewmats, count)

@@ -20,6 +20,9 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageInputs
 from recon_cli.stages.fitting import load_scene, read_config
+from recon_cli.stages.made_up import made_up_scene
+from recon_cli.stages.origin import Origin
+from recon_cli.stages.viewless import HINT
 
 _NEEDS = ("ingest", "train", "sfm")  # training runs sfm first where that is missing too
 
@@ -39,6 +42,7 @@ class Source:
         scene: views and points.
         z_up: the world's z axis is known to be up.
         metres: one world unit is a metre.
+        has_views: False where an imported scene came without; those of `scene` are made up then.
     """
 
     model: str
@@ -49,11 +53,14 @@ class Source:
     scene: Scene
     z_up: bool
     metres: bool
+    has_views: bool = True
 
     def up(self) -> NDArray[np.float64]:
         """Returns the unit vector [3] that is up, at worst that of the cameras, with a warning."""
         if self.z_up:
             return np.array([0.0, 0.0, 1.0])
+        if not self.has_views:
+            return np.array([0.0, -1.0, 0.0])
         viewmats = np.stack([view.camera.viewmat for view in self.scene.train])
         found = find_gravity(self.scene.points, viewmats)
         if found.up is not None:
@@ -74,6 +81,10 @@ def open_source(job: Job, model: str) -> Source:
         FormatError: a file of the workspace is damaged.
     """
     look = job.inspect()
+    origin = Origin.of(job.workspace.folder("train"))
+    if origin and not origin.views:
+        _fresh(look, "train")
+        return _viewless(job, model, origin)
     manifests = {name: _fresh(look, name) for name in _NEEDS}
     pruned = _take_pruned(look, model)
     folders = {name: job.workspace.folder(name) for name in _NEEDS}
@@ -84,6 +95,20 @@ def open_source(job: Job, model: str) -> Source:
         "pruned" if pruned else "base", splats, _digest(splats), config.sh_degree, config.max_size,
         load_scene(StageInputs(folders), validation=config.validation),
         bool(evidence.get("up_found")), bool(evidence.get("metres")))
+
+
+def _viewless(job: Job, model: str, origin: Origin) -> Source:
+    """Returns an imported scene with made-up cameras."""
+    if model == "pruned":
+        raise StageError(
+            "The pruned model was asked for, but a scene without views cannot be pruned.",
+            hint=HINT)
+    folder = job.workspace.folder("train")
+    config, splats = read_config(folder), read_ply(folder / "splats.ply")
+    return Source(
+        "base", splats, _digest(splats), config.sh_degree, config.max_size,
+        made_up_scene(splats, z_up=origin.z_up, max_size=config.max_size), origin.z_up, False,
+        has_views=False)
 
 
 def _fresh(look: Inspection, name: str) -> Manifest:

@@ -1,4 +1,8 @@
-"""The table of stages. A stage's module holds one `run(config, inputs, out, ctx) -> summary`."""
+"""The table of stages. A stage's module holds one `run(config, inputs, out, ctx) -> summary`.
+
+An imported scene takes the place of a trained one, in the same folder: IMPORT is the row of such a
+result. It is told by its inputs, for training reads no file of the user's.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from recon_cli.config import (
     DenoiseConfig,
     EvaluateConfig,
     ExportConfig,
+    ImportConfig,
     IngestConfig,
     PruneConfig,
     SfmConfig,
@@ -32,6 +37,8 @@ class Stage:
         volatile: patterns of outputs that hold times or logs, or are kept only to resume, and so
             take no part in the fingerprints of later stages.
         renders: it needs a rasterizer, and so torch and a device.
+        takes: what the user hands in, as usage shows it; empty for stages that read others alone.
+        spares: of `needs`, what an imported scene does without: then they are among `uses`.
     """
 
     name: str
@@ -44,10 +51,13 @@ class Stage:
     module: str
     volatile: tuple[str, ...] = ()
     renders: bool = False
+    takes: str = ""
+    spares: tuple[str, ...] = ()
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, 3, False, "recon_cli.stages.ingest"),
+    Stage("ingest", "ingest", (), (), IngestConfig, 3, False, "recon_cli.stages.ingest",
+          takes="VIDEO"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 3, True, "recon_cli.stages.sfm",
@@ -59,8 +69,11 @@ STAGES: tuple[Stage, ...] = (
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 2, False,
           "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig, 4, False,
-          "recon_cli.stages.export", renders=True),
+          "recon_cli.stages.export", renders=True, spares=("ingest", "sfm")),
 )
+
+IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, 1, False,
+               "recon_cli.stages.imported", renders=True, takes="FILE")
 
 
 def stage(name: str) -> Stage:

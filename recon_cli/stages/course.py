@@ -19,6 +19,8 @@ from torch import Tensor
 
 from recon_cli.atomic import read_json, write_bytes
 from recon_cli.config import PruneConfig, RunConfig
+from recon_cli.errors import ConfigError
+from recon_cli.io.ply import read_ply
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.stages.fitting import (
     LOG,
@@ -29,10 +31,11 @@ from recon_cli.stages.fitting import (
     run_fit,
     seconds_at,
 )
+from recon_cli.stages.origin import Origin
 from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.pruning import Recovery, remove, rounds_within, scored, survivors
-from recon_cli.train.start import saved_state
+from recon_cli.train.start import finished_state, saved_state
 from recon_cli.train.state import TrainState, save_state
 
 logger = logging.getLogger("recon")
@@ -176,8 +179,19 @@ class Course:
 
 
 def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Course:
-    """Returns what the rounds need: the state to be pruned, the views, and the steps there are."""
+    """Returns what the rounds need: the state to be pruned, the views, and the steps there are.
+
+    Raises:
+        ConfigError: the middle of a run is asked for that took place elsewhere.
+    """
     train = inputs.folders["train"]
+    origin = Origin.of(train)
+    if origin and config.at == "mid":
+        raise ConfigError(
+            f"at is mid, but the scene was imported from {origin.file}: the middle of its training "
+            "is not known.", hint="Prune it with --at end.")
+    if origin and origin.doubt:
+        ctx.notice(origin.doubt)
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
@@ -187,12 +201,16 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
     def load(path: Path) -> TrainState:
         return saved_state(path, task)
 
-    start = load(source)
+    def begin() -> TrainState:
+        return finished_state(read_ply(train / "splats.ply"), task) if origin else load(source)
+
+    start = begin()
     steps = config.recovery
     if steps is None:
-        steps = _recovery(config, train_config, len(task.train), load(final).steps - start.steps)
+        rest = load(final).steps - start.steps if config.at == "mid" else 0
+        steps = _recovery(config, train_config, len(task.train), rest)
     return Course(
-        config, task, lambda: load(source), load, out, ctx, start.iteration,
+        config, task, begin, load, out, ctx, start.iteration,
         start.iteration + steps, seconds_at(train / LOG, start.iteration))
 
 

@@ -54,6 +54,7 @@ from recon_cli.stages.held_out import (
     truth_digest,
     truths,
 )
+from recon_cli.stages.origin import Origin
 
 _GAIN = 4  # of the difference images
 _EVER = 1 << 62  # an iteration beyond any
@@ -79,6 +80,7 @@ class _Model:
 def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Renders and scores the held-out views and returns the means of each model."""
     train_config = read_config(inputs.folders["train"])
+    origin = Origin.of(inputs.folders["train"])
     scene = load_scene(inputs, validation=train_config.validation)
     size = config.max_size or train_config.max_size
     held_out = scorable(scene, size, ctx)
@@ -109,11 +111,15 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
             seen_db = {name: mean_psnr(
                 splats, views, degree, ctx, corrected=gains, on_view=bar.advance)
                 for name, views in seen.items()}
+            seconds = None if origin else seconds_at(folder / LOG, _EVER)
             models[model] = _Model(
-                _model_score(model, folder, found, len(splats)), found.corrected_db, seen_db)
+                _model_score(model, folder, found, len(splats), seconds), found.corrected_db,
+                seen_db)
     if scene.unregistered_test:
         ctx.notice(f"{len(scene.unregistered_test)} held-out views have no camera and are not "
                    f"scored: {', '.join(scene.unregistered_test)}")
+    for text in origin.warnings() if origin else ():
+        ctx.notice(text)
     _write(out, inputs, models, held_out, scene, gains=gains, lacking=lacking)
     return {
         **_counts(held_out, scene),
@@ -130,10 +136,12 @@ def _seen(views: Sequence[View], max_size: int) -> list[Truth]:
     return [truth for truth in truths(some, max_size) if truth.enough]
 
 
-def _model_score(model: str, folder: Path, found: Scored, gaussians: int) -> ModelScore:
+def _model_score(
+    model: str, folder: Path, found: Scored, gaussians: int, train_seconds: float | None
+) -> ModelScore:
     return ModelScore(
         LABELS[model], found.views, gaussians, (folder / "splats.ply").stat().st_size,
-        found.render_ms, seconds_at(folder / LOG, _EVER))
+        found.render_ms, train_seconds)
 
 
 def _save_pictures(
@@ -161,6 +169,7 @@ def _write(
     scores = {name: model.score for name, model in models.items()}
     measured = next(iter(scores.values())).lpips is not None
     masked = sum(truth.mask is not None for truth in held_out)
+    origin = Origin.of(inputs.folders["train"])
     write_json(out / "metrics.json", {
         "models": {name: _record(model, gains=gains) for name, model in models.items()},
         **({"pruned_minus_base": _paired(scores)} if len(scores) == 2 else {}),
@@ -170,9 +179,11 @@ def _write(
         **({"mask_convention": MASK_CONVENTION} if masked else {}),
         "truth_digest": truth_digest(held_out),
         **size_summary([truth.camera for truth in held_out]), **_counts(held_out, scene),
+        **({"imported_from": origin.file} if origin else {}),
     })
     table = list(scores.values())
     note = _note(held_out, scene, masked, lacking=None if measured else lacking)
+    note += "".join(f"{text}\n" for text in origin.warnings()) if origin else ""
     for name, model in models.items():
         if gains:
             note += (f"{LABELS[name]}, after the best gain per channel of each view: "

@@ -20,6 +20,7 @@ from recon_cli.scene.transformed import transformed
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.frame import Frame, frame_of
 from recon_cli.stages.handing_out import Hand
+from recon_cli.stages.viewless import refuse_without_views
 
 TRANSFORM = "transform.json"
 
@@ -30,6 +31,7 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         raise StageError(
             "The pruned model was asked for, but there is none that is fresh.",
             hint="Run `recon prune` first, or export with --model base.")
+    refuse_without_views(config, inputs)
     pruned = "prune" in inputs.folders and config.model != "base"
     frame = frame_of(config, inputs)
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
@@ -59,7 +61,8 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
 
 def _write_transform(path: Path, frame: Frame) -> None:
     write_json(path, {
-        "from": "the world of sfm, in which the scene was trained",
+        "from": "the world of sfm, in which the scene was trained; without views, that of the file "
+        "that was imported",
         "to": "splats.ply beside this file",
         "similarity": frame.similarity.to_json(),
         "measurement": frame.measured.to_json() if frame.measured else None,

@@ -29,6 +29,10 @@ class Fidelity:
     views: Sequence[Truth]
     ctx: StageContext
 
+    def described(self) -> str:
+        """Returns what is looked at, as part of a sentence."""
+        return f"{len(self.views)} views"
+
     def psnr_db(self, splats: Splats) -> float:
         """Returns the mean PSNR of a scene over the views in dB."""
         there = splats.map(lambda tensor: tensor.to(self.ctx.device))

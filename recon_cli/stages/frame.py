@@ -17,6 +17,8 @@ from recon_cli.scene.axes import turn_onto
 from recon_cli.scene.gravity import camera_up
 from recon_cli.scene.similarity import Similarity
 from recon_cli.stages.context import StageInputs
+from recon_cli.stages.origin import Origin
+from recon_cli.stages.viewless import has_views
 
 _UP = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 
@@ -76,6 +78,9 @@ def _measured(config: ExportConfig, inputs: StageInputs) -> Measurement | None:
 
 def _up(inputs: StageInputs, *, asked: bool) -> NDArray[np.float64]:
     """Returns up in the world of the training; with a warning where it counts and is a guess."""
+    origin = Origin.of(inputs.folders["train"])
+    if origin and not has_views(inputs):
+        return np.array(_UP["z" if origin.z_up else "-y"])
     world = inputs.folders["sfm"] / "world.json"
     evidence = json.loads(world.read_text(encoding="utf-8")).get("evidence") if (
         world.exists()) else None

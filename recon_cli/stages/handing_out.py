@@ -26,11 +26,15 @@ from recon_cli.io.transforms_writer import write_transforms
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.transformed import transformed
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.fidelity import Fidelity, fidelity
 from recon_cli.stages.fitting import load_scene, load_views, read_config
 from recon_cli.stages.frame import Frame
 from recon_cli.stages.lighter import Change, changed, cropped, of_size
+from recon_cli.stages.made_up import Likeness
+from recon_cli.stages.origin import Origin
+from recon_cli.stages.viewless import has_views, viewless_scene
 from recon_cli.train.importance import Importance, add_views
 
 # dB on the validation views, where --max-loss says nothing; .splat has no harmonics
@@ -59,6 +63,7 @@ class Hand:
         self._config, self._inputs, self._out, self._ctx = config, inputs, out, ctx
         self._similarity, self._up = frame.similarity, frame.up
         self._last: tuple[Splats, float] | None = None
+        self._whole: Splats | None = None
 
     def lightened(self, splats: Splats) -> tuple[Splats, list[Change]]:
         """Returns the scene after --crop, --sh-degree and --max-mb, in this order, and what went.
@@ -67,6 +72,7 @@ class Hand:
             ConfigError: nothing would be left.
         """
         config, changes = self._config, []
+        self._whole = splats
 
         def step(option: str, after: Splats) -> Splats:
             changes.append(changed(option, splats, after, self._psnr_db))
@@ -109,7 +115,7 @@ class Hand:
             most = MOST_LOSS_DB.get(name, _MOST_LOSS_DB)
         if not gain >= -most:  # a NaN fails too
             raise ReconstructionError(
-                f"{text} on {len(self._views.views)} views, but it may lose {most:g} dB at most.",
+                f"{text} on {self._views.described()}, but it may lose {most:g} dB at most.",
                 hint="Leave this format out, or allow more with --max-loss.")
         logger.info("%s", text)
         return {"file": path.name, "bytes": size, "smaller": round(whole / size, 3),
@@ -199,15 +205,31 @@ class Hand:
 
     @cached_property
     def _scene(self) -> Scene:
-        return load_scene(self._inputs, validation=self._train.validation)
+        if has_views(self._inputs):
+            return load_scene(self._inputs, validation=self._train.validation)
+        assert self._whole is not None
+        there = transformed(self._whole, self._similarity.inverse())
+        return viewless_scene(there, self._inputs, self._train.max_size)
 
     @cached_property
-    def _views(self) -> Fidelity:
-        return fidelity(self._scene, self._similarity, self._train.max_size, self._ctx)
+    def _views(self) -> Fidelity | Likeness:
+        if has_views(self._inputs):
+            return fidelity(self._scene, self._similarity, self._train.max_size, self._ctx)
+        assert self._whole is not None
+        moved = tuple(
+            dataclasses.replace(view, camera=self._similarity.camera(view.camera))
+            for view in self._scene.train)
+        found = Likeness.of(
+            self._whole, dataclasses.replace(self._scene, train=moved), self._ctx)
+        self._ctx.notice(f"no views: checked on {found.described()}")
+        return found
 
     @property
     def _name(self) -> str:
-        """What was captured: the name of its first video or folder."""
+        """What was captured: the name of its first video or folder, or of the imported file."""
+        origin = Origin.of(self._inputs.folders["train"])
+        if origin and not has_views(self._inputs):
+            return origin.file
         frames = read_json(self._inputs.folders["ingest"] / "frames.json")
         return str(frames["groups"][0]["name"])
 

@@ -62,6 +62,19 @@ def saved_state(path: Path, task: Task) -> TrainState:
         exposure=exposure, poses=poses)
 
 
+def finished_state(splats: Splats, task: Task) -> TrainState:
+    """Returns the state of a run that ended with these Gaussians, none of whose steps were taken.
+
+    For scenes that were trained elsewhere: all that a run does early on lies behind it.
+    """
+    state = new_state(
+        splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.extent,
+        fused=fuses(task.backend))
+    state.iteration = task.schedule.config.iterations
+    state.jump = 0, state.iteration
+    return state
+
+
 def _parts(
     task: Task, log_gains: NDArray[np.float64] | None
 ) -> tuple[Exposure | None, Poses | None]:
