@@ -34,6 +34,12 @@ class ExportConfig(StageConfig):
     crop: tuple[float, float, float, float, float, float] | None = option(
         None, "Keep what lies in the box between two corners, in units of the exported scene.",
         metavar="X Y Z X Y Z", automatic="everything")
+    drop_floaters: bool = option(
+        False, "Leave out what hangs in the air: what no training view shows, what hangs in front "
+        "of the two at most that do, and what makes them worse.")
+    drop_islands: bool = option(
+        False, "Leave out small groups of Gaussians far from all others, but for what is seen "
+        "through windows.")
     sh_degree: int | None = option(
         None, "Highest degree of the colours.", minimum=0, maximum=3,
         automatic="that of the scene")

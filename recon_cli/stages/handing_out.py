@@ -34,8 +34,10 @@ from recon_cli.stages.frame import Frame
 from recon_cli.stages.lighter import Change, changed, cropped, of_size
 from recon_cli.stages.made_up import Likeness
 from recon_cli.stages.origin import Origin
+from recon_cli.stages.tidying import without_floaters, without_islands
 from recon_cli.stages.viewless import has_views, viewless_scene
 from recon_cli.train.importance import Importance, add_views
+from recon_cli.train.step import TrainView
 
 # dB on the validation views, where --max-loss says nothing; .splat has no harmonics
 MOST_LOSS_DB = {"splat": 3.0}
@@ -66,7 +68,9 @@ class Hand:
         self._whole: Splats | None = None
 
     def lightened(self, splats: Splats) -> tuple[Splats, list[Change]]:
-        """Returns the scene after --crop, --sh-degree and --max-mb, in this order, and what went.
+        """Returns the scene after what options take from it, in their order, and what went.
+
+        Floaters and islands come before --crop: it takes away what views show behind the rest.
 
         Raises:
             ConfigError: nothing would be left.
@@ -78,6 +82,13 @@ class Hand:
             changes.append(changed(option, splats, after, self._psnr_db))
             return after
 
+        if config.drop_floaters:
+            splats = step("drop_floaters", without_floaters(
+                splats, self._training_views(), self._ctx))
+        if config.drop_islands:
+            views = self._training_views() if has_views(self._inputs) else None
+            splats = step("drop_islands", without_islands(
+                splats, self._scene, self._similarity, views, self._ctx))
         if config.crop is not None:
             splats = step("crop", cropped(splats, config.crop))
         if config.sh_degree is not None and config.sh_degree < splats.sh_degree:
@@ -160,11 +171,14 @@ class Hand:
         """Returns how much each Gaussian matters to the training views, [N]."""
         there = splats.map(lambda tensor: tensor.to(self._ctx.device))
         found = Importance.of_score(_SCORE, len(there), there.means.device)
-        views = load_views(self._scene.train, self._train, self._ctx)
-        add_views(found, there, [
-            dataclasses.replace(view, camera=self._similarity.camera(view.camera))
-            for view in views], sh_degree=there.sh_degree, backend=self._ctx.backend)
+        add_views(found, there, self._training_views(), sh_degree=there.sh_degree,
+                  backend=self._ctx.backend)
         return found.score(_SCORE, there, beta=0.0, generator=torch.Generator()).cpu()
+
+    def _training_views(self) -> list[TrainView]:
+        """Returns the training views with their cameras in the world of the files."""
+        return [dataclasses.replace(view, camera=self._similarity.camera(view.camera))
+                for view in load_views(self._scene.train, self._train, self._ctx)]
 
     def _points(self, splats: Splats) -> Path:
         """Writes the points of the room; those seen through its windows would dwarf it."""

@@ -29,9 +29,16 @@ def viewless_scene(splats: Splats, inputs: StageInputs, max_size: int) -> Scene:
 
 def refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
     """Raises StageError where an export asks for what only views can tell, and there are none."""
+    origin = Origin.of(inputs.folders["train"])
+    if origin and origin.doubt and config.drop_floaters:
+        raise StageError(
+            f"--drop-floaters goes by the views, but {origin.doubt}.",
+            hint="Run `recon import` with another --frame, or from a file in the right one.")
     if has_views(inputs):
         return
     asked = [f"--format {name}" for name in config.formats if name in _OF_VIEWS]
+    if config.drop_floaters:
+        asked.append("--drop-floaters")
     if config.max_mb is not None:  # which Gaussians matter
         asked.append("--max-mb")
     if config.scale_between is not None:  # points and frames

@@ -1,0 +1,119 @@
+"""What --drop-floaters and --drop-islands take from trained scenes, and from spoilt ones.
+
+`python tests/bench/bench_cleanup.py WORKSPACE...`, each with a fresh training. Printed are the
+Gaussians that go, by kind, and the PSNR on the validation views; then the same of the scene with 60
+floaters planted on lines of sight of training views, at 15 to 60% of the way to the surface, and
+with an island of 60 Gaussians planted where there is most space.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from recon_cli.io.ply import read_ply
+from recon_cli.render import render
+from recon_cli.render.registry import resolve
+from recon_cli.scene.scene import Scene
+from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.splats import SH_C0, Splats, joined
+from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages.fidelity import fidelity
+from recon_cli.stages.fitting import load_scene, load_views, read_config
+from recon_cli.train.floaters import floaters, sightings
+from recon_cli.train.islands import islands
+from recon_cli.train.step import TrainView
+
+PLANTED = 60
+
+
+def added(
+    splats: Splats, places: NDArray[np.float64], sizes: NDArray[np.float64],
+    draw: np.random.Generator,
+) -> tuple[Splats, torch.Tensor]:
+    """Returns the scene with round Gaussians of any colour added, and which those are [N]."""
+    n = len(places)
+    more = Splats(
+        torch.tensor(places).float(), torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        torch.tensor(np.log(sizes)).float()[:, None].repeat(1, 3),
+        torch.logit(torch.tensor(draw.uniform(0.1, 0.9, n)).float()),
+        torch.tensor((draw.random((n, 3)) - 0.5) / SH_C0).float(),
+        splats.sh_rest.new_zeros(0, *splats.sh_rest.shape[1:]))
+    both, order = joined([splats, more])
+    return both, order >= len(splats)
+
+
+def before_views(
+    splats: Splats, views: list[TrainView], ctx: StageContext, draw: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns places on lines of sight and sizes that cover two to six degrees."""
+    places, sizes = [], []
+    for _ in range(PLANTED):
+        camera = views[draw.integers(len(views))].camera
+        with torch.no_grad():
+            shown = render(splats, camera, torch.zeros(3), splats.sh_degree, backend=ctx.backend)
+        line, column = draw.integers(camera.height), draw.integers(camera.width)
+        depth = float(shown.depth[line, column] / shown.alpha[line, column].clamp_min(1e-3))
+        z = depth * draw.uniform(0.15, 0.6)
+        ray = np.array([
+            (column - camera.cx) / camera.fx * z, (line - camera.cy) / camera.fy * z, z])
+        places.append(camera.viewmat[:3, :3].T @ (ray - camera.viewmat[:3, 3]))
+        sizes.append(z * draw.uniform(0.02, 0.06))
+    return np.array(places), np.array(sizes)
+
+
+def emptiest(splats: Splats, scene: Scene, draw: np.random.Generator) -> NDArray[np.float64]:
+    """Returns the place near the cameras that is farthest from all Gaussians."""
+    places = scene.center + 0.8 * scene.extent * draw.uniform(-1, 1, (500, 3))
+    return np.asarray(places[cKDTree(splats.means.numpy()).query(places)[0].argmax()])
+
+
+@click.command()
+@click.argument("workspaces", nargs=-1, required=True, type=click.Path(path_type=Path))
+def main(workspaces: tuple[Path, ...]) -> None:
+    """Prints some lines for each workspace."""
+    backend, device = resolve("auto", "cpu")
+    ctx = StageContext(backend=backend, device=device)
+    for root in workspaces:
+        config, draw = read_config(root / "train"), np.random.default_rng(0)
+        scene = load_scene(StageInputs({name: root / name for name in ("ingest", "sfm")}),
+                           validation=config.validation)
+        views, held = load_views(scene.train, config, ctx), fidelity(
+            scene, Similarity(), config.max_size, ctx)
+        splats = read_ply(root / "train" / "splats.ply")
+        clean = held.psnr_db(splats)
+        spoilt = added(splats, *before_views(splats, views, ctx, draw), draw)
+        for name, (whole, planted) in (
+                ("as trained", (splats, torch.zeros(len(splats), dtype=torch.bool))),
+                (f"{PLANTED} floaters", spoilt)):
+            begin = time.perf_counter()
+            found = floaters(whole, views, backend=backend)
+            seconds, gone = time.perf_counter() - begin, found.all
+            click.echo(
+                f"{root.name}, {name}: unseen {int(found.unseen.sum())}, in front "
+                f"{int(found.in_front.sum())}, harmful {int(found.harmful.sum())}; planted "
+                f"{int((gone & planted).sum())} of {int(planted.sum())}; "
+                f"{held.psnr_db(whole):.3f} -> {held.psnr_db(whole.select(~gone)):.3f} dB "
+                f"(without any planted {clean:.3f}), {seconds:.0f} s")
+        island = emptiest(splats, scene, draw) + draw.normal(0, 0.02 * scene.extent, (PLANTED, 3))
+        spoilt = added(splats, island, np.full(PLANTED, 0.01 * scene.extent), draw)
+        for name, (whole, planted) in (
+                ("as trained", (splats, torch.zeros(len(splats), dtype=torch.bool))),
+                ("an island", spoilt)):
+            near = whole.within(scene.center.tolist(), scene.reach)
+            gone = islands(whole, near, sightings(whole, views, backend=backend) > 0)
+            click.echo(
+                f"{root.name}, {name}: {int(gone.sum())} in islands, planted "
+                f"{int((gone & planted).sum())} of {int(planted.sum())}; "
+                f"{held.psnr_db(whole):.3f} -> {held.psnr_db(whole.select(~gone)):.3f} dB; "
+                f"{int((~near).sum())} far away are left alone")
+
+
+if __name__ == "__main__":
+    main()
