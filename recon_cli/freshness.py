@@ -163,7 +163,8 @@ class Inspection:
         before = [self.check(need) for need in row.needs]
         reasons = [f"{one.row.name} is stale" for one in before if one.manifest and not one.fresh]
         expected = self._expected(row, config, manifest.basis, sources)
-        reasons += differences(manifest.basis, expected)
+        reasons += differences(
+            manifest.basis, expected, section=layers.section_of(row.config))
         reasons += changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)
         return Check(row, manifest, tuple(reasons), gone, self._unfinished(row))
 

@@ -175,19 +175,25 @@ class Unfinished:
             return None
 
 
-def differences(old: Basis, new: Basis) -> list[str]:
-    """Returns in words what `new` has that `old` was not made from; empty where they agree."""
+def differences(old: Basis, new: Basis, *, section: str) -> list[str]:
+    """Returns in words what `new` has that `old` was not made from; empty where they agree.
+
+    Args:
+        old: of a result.
+        new: that a run would have now.
+        section: of recon.toml, which sets the options.
+    """
     reasons = []
     if old.version != new.version:
         reasons.append(f"stage version {old.version} -> {new.version}")
     for name in [*new.config, *(name for name in old.config if name not in new.config)]:
         before, after = old.config.get(name), new.config.get(name)
         if name not in old.config:
-            reasons.append(f"{new.stage}.{name} is new")
+            reasons.append(f"{section}.{name} is new")
         elif name not in new.config:
-            reasons.append(f"{new.stage}.{name} is no more")
+            reasons.append(f"{section}.{name} is no more")
         elif before != after:
-            reasons.append(f"{new.stage}.{name} changed: {_shown(before)} -> {_shown(after)}")
+            reasons.append(f"{section}.{name} changed: {_shown(before)} -> {_shown(after)}")
     reasons += _source_changes(old.sources, new.sources)
     for name in {**new.upstream, **old.upstream}:
         had, has = old.upstream.get(name), new.upstream.get(name)

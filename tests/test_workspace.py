@@ -102,14 +102,14 @@ def test_a_renamed_photo_is_named_among_the_reasons(tmp_path: Path) -> None:
     (tmp_path / "p" / "a.jpg").rename(tmp_path / "p" / "c.jpg")
     (tmp_path / "p" / "b.jpg").write_text("changed")
     after = Basis("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
-    assert differences(before, after) == [
+    assert differences(before, after, section="ingest") == [
         "the input p/a.jpg is gone", "the input p/b.jpg changed", "the input p/c.jpg is new"]
 
 
 def test_options_that_another_version_knew_or_did_not_know_are_named() -> None:
     before = Basis("export", 1, {"gone": None, "kept": 1.5}, (), {})
     after = Basis("export", 1, {"kept": 2.0, "crop": None}, (), {})
-    assert differences(before, after) == [
+    assert differences(before, after, section="export") == [
         "export.kept changed: 1.5 -> 2", "export.crop is new", "export.gone is no more"]
 
 

@@ -21,6 +21,9 @@ from recon_cli.stages.fitting import load_scene, write_config
 from recon_cli.stages.matching import Match, match, world_of
 from recon_cli.stages.origin import Origin
 
+_MIP = b"SplatRenderMode: mip"  # a comment of Brush and others
+_HEAD_BYTES = 1 << 16
+
 
 def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Writes the scene of the one source into `out` and returns what it holds.
@@ -47,12 +50,13 @@ def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     write_ply(out / "splats.ply", splats)
     write_config(out, _run_config(config, splats))
     origin.write(out)
-    if origin.doubt:
-        ctx.notice(origin.doubt)
+    notices = [*([origin.doubt] if origin.doubt else []), *_antialiased(path)]
+    for text in notices:
+        ctx.notice(text)
     return {
         "imported_from": origin.file, "format": origin.format, "gaussians": len(splats),
         "sh_degree": splats.sh_degree, "sha256": origin.sha256[:12], **_told(found),
-        **({"notices": [origin.doubt]} if origin.doubt else {}),
+        **({"notices": notices} if notices else {}),
     }
 
 
@@ -73,6 +77,16 @@ def _run_config(config: ImportConfig, splats: Splats) -> RunConfig:
         max_size=config.max_size, validation=config.validation, sh_degree=splats.sh_degree,
         max_gaussians=max(MIN_GAUSSIANS, len(splats)), images="original", far="off",
         exposure="off", poses="off")
+
+
+def _antialiased(path: Path) -> list[str]:
+    """Returns a sentence where a .ply says that it is to be drawn as by Mip-Splatting."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES).partition(b"end_header")[0]
+    if not head.startswith(b"ply") or _MIP not in head:
+        return []
+    return [f"{path.name} was trained to be drawn with antialiasing ({_MIP.decode()}), which is "
+            "not done here: what is smaller than a pixel looks too thick"]
 
 
 def _told(found: Match | None) -> Summary:

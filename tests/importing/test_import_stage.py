@@ -155,3 +155,11 @@ def test_a_score_says_that_the_views_may_have_been_trained_on(inputs, tmp_path):
     assert metrics["models"]["base"]["train_seconds"] is None
     table = (tmp_path / "evaluate" / "table.txt").read_text()
     assert "may have trained on the held-out views" in table
+
+
+def test_a_scene_that_wants_antialiasing_is_said_to(tmp_path):
+    path = written(tmp_path / "a.ply", truth())
+    path.write_bytes(path.read_bytes().replace(
+        b"element", b"comment SplatRenderMode: mip\nelement", 1))
+    (notice,) = brought_in(path, None, tmp_path / "train")["notices"]
+    assert "drawn with antialiasing" in notice

@@ -11,6 +11,7 @@ from recon_cli.digests import digest_file
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.io.splats.spz import write_spz
 from recon_cli.pipeline import Job, status
+from recon_cli.settings import read_settings
 from recon_cli.workspace import Workspace
 
 
@@ -76,7 +77,8 @@ def test_without_views_files_are_written_and_checked(alone, capsys):
 
 
 @pytest.mark.parametrize("words", [
-    ("--max-mb", "1"), ("--format", "colmap"), ("--format", "transforms.json"),
+    ("--max-mb", "1"), ("--drop-floaters",), ("--format", "colmap"),
+    ("--format", "transforms.json"),
     ("--scale-between", "a.png", "b.png", "1")])
 def test_what_only_views_can_tell_is_refused_without_them(alone, words, capsys):
     assert recon("export", alone, *words) == 4
@@ -167,3 +169,10 @@ def test_the_options_are_printed_as_toml(tmp_path, capsys):
     assert recon("import", tmp_path / "ws", "--print-config", "--axes", "z-up") == 0
     assert 'axes = "z-up"' in capsys.readouterr().out
     assert not (tmp_path / "ws").exists()
+
+
+def test_the_reason_names_the_section_that_sets_the_option(alone):
+    (alone / "recon.toml").write_text("[import]\nmax_size = 80\n[train]\niterations = 7\n")
+    settings = read_settings(alone / "recon.toml")
+    (found,) = [one for one in status(Job(Workspace(alone), settings)) if one.name == "train"]
+    assert found.reasons == ("import.max_size changed: 96 -> 80",)
