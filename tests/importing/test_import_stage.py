@@ -23,7 +23,7 @@ from recon_cli.stages.fitting import read_config
 
 TURN = np.array([[0.0, -1, 0], [0.6, 0, 0.8], [-0.8, 0, 0.6]])
 WORLD = Similarity(2.5, TURN, np.array([3.0, -1, 2]))  # from the source's frame to the workspace's
-CONTEXT = StageContext()
+CONTEXT = StageContext(backend="numba")
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.stages.context import StageContext
 from recon_cli.stages.made_up import ASSUMED_DB, Likeness, made_up_scene
 
-CONTEXT = StageContext()
+CONTEXT = StageContext(backend="numba")
 
 
 def gaussians(places, *, scale=0.1, opacity=0.95, gray=0.5):
