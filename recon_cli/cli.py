@@ -34,6 +34,7 @@ from recon_cli.stages import STAGES
 from recon_cli.study.command import study
 from recon_cli.sweep import command as sweeping
 from recon_cli.verbs import beside, perform
+from recon_cli.viewer.command import view
 from recon_cli.workspace import Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
@@ -196,6 +197,7 @@ def export(call: Call) -> None:
 
 
 cli.add_command(render)
+cli.add_command(view)
 cli.add_command(write_report)
 
 

@@ -77,18 +77,22 @@ ALLOWED: dict[str, set[str]] = {
         "scene", "capture", "io", "stages", "freshness", "execute", "pipeline", "report"},
     "importing": OPTIONS | {
         "settings", "options", "pipeline", "progress", "stages", "verbs", "workspace"},
+    "viewer": BOTTOM | {
+        "config", "settings", "options", "progress", "workspace", "metrics", "scene", "render",
+        "io", "stages", "execute", "pipeline", "shots"},
     "cli": OPTIONS | {
-        "verbs", "scoreboard", "page", "importing",
+        "verbs", "scoreboard", "page", "importing", "viewer",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study", "sweep", "shots"},
     "__main__": {"cli"},
 }
 AT_HOME = {  # packages that only some parts may import
     "click": {"cli", "verbs", "options", "bench", "study", "shots", "page", "console",
-              "importing"},
+              "importing", "viewer"},
     "zstandard": {"io"},
     "jinja2": {"page"},
     "markupsafe": {"page"},
+    "viser": {"viewer"},
     "matplotlib": {"bench", "study", "sweep"},
     "numba": {"render"},
     "llvmlite": {"render"},

@@ -69,12 +69,13 @@ class Source:
         return camera_up(viewmats).up
 
 
-def open_source(job: Job, model: str) -> Source:
+def open_source(job: Job, model: str, *, verb: str = "render") -> Source:
     """Returns the trained scene of a workspace.
 
     Args:
         job: whose workspace it is.
         model: auto, base or pruned; auto takes the pruned one where there is a fresh one.
+        verb: that asks, for messages.
 
     Raises:
         StageError: there is no such model that is fresh.
@@ -83,10 +84,10 @@ def open_source(job: Job, model: str) -> Source:
     look = job.inspect()
     origin = Origin.of(job.workspace.folder("train"))
     if origin and not origin.views:
-        _fresh(look, "train")
+        _fresh(look, "train", verb)
         return _viewless(job, model, origin)
-    manifests = {name: _fresh(look, name) for name in _NEEDS}
-    pruned = _take_pruned(look, model)
+    manifests = {name: _fresh(look, name, verb) for name in _NEEDS}
+    pruned = _take_pruned(look, model, verb)
     folders = {name: job.workspace.folder(name) for name in _NEEDS}
     config = read_config(folders["train"])
     splats = read_ply(job.workspace.folder("prune" if pruned else "train") / "splats.ply")
@@ -111,21 +112,21 @@ def _viewless(job: Job, model: str, origin: Origin) -> Source:
         has_views=False)
 
 
-def _fresh(look: Inspection, name: str) -> Manifest:
+def _fresh(look: Inspection, name: str, verb: str) -> Manifest:
     check = look.check(name)
     if check.manifest is None or not check.fresh:
         raise StageError(
-            f"render needs {name}, which is {check.described()}.",
+            f"{verb} needs {name}, which is {check.described()}.",
             hint=f"Run `{pipeline.command(look, check)}` first.")
     return check.manifest
 
 
-def _take_pruned(look: Inspection, model: str) -> bool:
+def _take_pruned(look: Inspection, model: str, verb: str) -> bool:
     check = look.check("prune")
     if model == "pruned" and not check.fresh:
         raise StageError(
             f"The pruned model was asked for, but it is {check.described()}.",
-            hint="Run `recon prune` first, or render with --model base.")
+            hint=f"Run `recon prune` first, or `recon {verb} --model base`.")
     if model == "auto" and check.manifest and not check.fresh:
         logger.warning("the pruned model is left out: it is %s", check.described())
     return check.fresh and model != "base"

@@ -1,0 +1,1 @@
+"""`recon view` and `recon train --view`: Gaussians in the browser, through viser."""

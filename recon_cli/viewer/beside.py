@@ -1,0 +1,89 @@
+"""A view's photo and our own render of it, side by side, and thumbnails for all of them."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon_cli.execute import Job, rendering
+from recon_cli.io.images import (
+    eight_bit,
+    fitted_camera,
+    fitted_size,
+    read_image,
+    read_masked_image,
+)
+from recon_cli.metrics import leaves_enough, psnr
+from recon_cli.render import render
+from recon_cli.scene.scene import View
+from recon_cli.scene.splats import Splats
+from recon_cli.stages.context import StageContext
+
+_THUMBNAIL = 160  # pixels, longest side
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A view twice.
+
+    Attributes:
+        truth: [H, W, 3] the photo at the size of training; masked pixels in one colour.
+        ours: [H, W, 3] rendered by recon, with all harmonics.
+        psnr_db: as `recon eval` computes it; None where a mask leaves too little.
+    """
+
+    truth: NDArray[np.uint8]
+    ours: NDArray[np.uint8]
+    psnr_db: float | None
+
+
+class Pictures:
+    """Photos and renders of the views, made when they are asked for.
+
+    Args:
+        job: device, backend and threads to render with.
+        max_size: longest side in pixels.
+    """
+
+    def __init__(self, job: Job, max_size: int) -> None:
+        self._job, self._max_size = job, max_size
+        self._thumbnails: dict[str, NDArray[np.uint8]] = {}
+        self._one_at_a_time = threading.Lock()
+
+    @cached_property
+    def _ctx(self) -> StageContext:
+        return rendering(self._job.compute, self._job.progress)
+
+    def beside(self, view: View, splats: Splats) -> Beside:
+        """Returns a view's photo beside its render.
+
+        Raises:
+            BackendError: the rasterizer that was asked for is not here.
+            FormatError: the photo cannot be read.
+        """
+        camera = fitted_camera(view.camera, self._max_size)
+        truth, mask = read_masked_image(view.original, view.mask, camera.width, camera.height)
+        with self._one_at_a_time, torch.no_grad():
+            device = self._ctx.device
+            rgb = render(
+                splats.map(lambda tensor: tensor.to(device)), camera,
+                torch.zeros(3, device=device), splats.sh_degree, backend=self._ctx.backend).rgb
+            image: NDArray[np.float32] = rgb.cpu().numpy()
+        enough = mask is None or leaves_enough(mask)
+        return Beside(truth, eight_bit(image), psnr(image, truth, mask) if enough else None)
+
+    def thumbnail(self, view: View) -> NDArray[np.uint8]:
+        """Returns a small picture of a view.
+
+        Raises:
+            FormatError: the photo cannot be read.
+        """
+        if view.name not in self._thumbnails:
+            size = fitted_size(view.camera.width, view.camera.height, _THUMBNAIL)
+            self._thumbnails[view.name] = read_image(view.original, *size)
+        return self._thumbnails[view.name]

@@ -1,0 +1,58 @@
+"""The cameras in the scene: what each saw, and a way to jump to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import viser
+
+from recon_cli.scene.transformed import quaternion
+from recon_cli.viewer.beside import Pictures
+from recon_cli.viewer.content import HELD_OUT, Content, ShownView, vertical_fov
+
+_SIZE = 0.06  # of the distance to what is looked at
+_COLORS = {HELD_OUT: (255, 140, 40)}
+_OTHERS = (150, 170, 200)
+
+
+class Frustums:
+    """The cameras of all views in one browser.
+
+    Args:
+        client: the browser.
+        content: whose views they are.
+        on_click: called with the view whose camera was clicked.
+    """
+
+    def __init__(
+        self, client: viser.ClientHandle, content: Content, *,
+        on_click: Callable[[ShownView], None],
+    ) -> None:
+        self._client, self._content, self._on_click = client, content, on_click
+        self._parent = client.scene.add_frame("/cameras", show_axes=False)
+        with client.atomic():
+            self._handles = {
+                shown.label: self._add(number, shown)
+                for number, shown in enumerate(content.views)}
+
+    def _add(self, number: int, shown: ShownView) -> viser.CameraFrustumHandle:
+        camera = shown.view.camera
+        handle = self._client.scene.add_camera_frustum(
+            f"/cameras/{number}", vertical_fov(camera), camera.width / camera.height,
+            scale=_SIZE * self._content.distance, thickness=1.5, thickness_units="screen",
+            color=_COLORS.get(shown.part, _OTHERS),
+            wxyz=quaternion(camera.viewmat[:3, :3].T), position=camera.center,
+            cast_shadow=False, receive_shadow=False)
+        handle.on_click(lambda _: self._on_click(shown))
+        return handle
+
+    def show(self, visible: bool) -> None:
+        """Shows or hides all of them."""
+        self._parent.visible = visible
+
+    def fill(self, pictures: Pictures, stopped: Callable[[], bool]) -> None:
+        """Puts the photos in, until it is told to stop."""
+        for shown in self._content.views:
+            if stopped():
+                return
+            self._handles[shown.label].image = pictures.thumbnail(shown.view)
