@@ -10,7 +10,7 @@ from recon_cli.scene.transformed import quaternion
 from recon_cli.viewer.beside import Pictures
 from recon_cli.viewer.content import HELD_OUT, Content, ShownView, vertical_fov
 
-_SIZE = 0.06  # of the distance to what is looked at
+_SIZE = 0.05  # of the distance to what is looked at
 _COLORS = {HELD_OUT: (255, 140, 40)}
 _OTHERS = (150, 170, 200)
 
@@ -21,14 +21,13 @@ class Frustums:
     Args:
         client: the browser.
         content: whose views they are.
-        on_click: called with the view whose camera was clicked.
+        jump: called with the label of the view whose camera was clicked.
     """
 
     def __init__(
-        self, client: viser.ClientHandle, content: Content, *,
-        on_click: Callable[[ShownView], None],
+        self, client: viser.ClientHandle, content: Content, jump: Callable[[str], None]
     ) -> None:
-        self._client, self._content, self._on_click = client, content, on_click
+        self._client, self._content, self._jump = client, content, jump
         self._parent = client.scene.add_frame("/cameras", show_axes=False)
         with client.atomic():
             self._handles = {
@@ -43,7 +42,7 @@ class Frustums:
             color=_COLORS.get(shown.part, _OTHERS),
             wxyz=quaternion(camera.viewmat[:3, :3].T), position=camera.center,
             cast_shadow=False, receive_shadow=False)
-        handle.on_click(lambda _: self._on_click(shown))
+        handle.on_click(lambda _: self._jump(shown.label))
         return handle
 
     def show(self, visible: bool) -> None:

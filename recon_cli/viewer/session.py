@@ -53,15 +53,14 @@ class Session:
         self._seen_from: NDArray[np.float64] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._current: ShownView | None = None
+        self._frustums: Frustums | None = None  # until they are asked for: they begin hidden,
+        # for who stands at a camera has those beside it before his eyes
         self._by_label = {shown.label: shown for shown in content.views}
         with client.atomic():
             self._node = self._add_gaussians()
             self._add_panel()
         if any(packed.splats.sh_degree for packed in content.models.values()):
             client.camera.on_update(self._moved)
-        if pictures is not None:
-            self._frustums = Frustums(client, content, on_click=self._jump_from_scene)
-            self._later(lambda: self._frustums.fill(pictures, lambda: self._gone))
 
     def leave(self) -> None:
         """Stops working for a browser that is gone."""
@@ -98,9 +97,9 @@ class Session:
 
     def _add_views(self) -> None:
         gui = self._client.gui
-        cameras = gui.add_checkbox("Cameras", True, hint="Training cameras and their photos; "
-                                   "held-out ones are orange. A click jumps to one.")
-        cameras.on_update(lambda _: self._frustums.show(cameras.value))
+        self._cameras = gui.add_checkbox("Cameras", False, hint="All cameras with their photos; "
+                                         "held-out ones are orange. A click jumps to one.")
+        self._cameras.on_update(lambda _: self._show_cameras())
         with gui.add_folder("Views"):
             self._view = gui.add_dropdown("Jump to", [NO_VIEW, *self._by_label])
             self._view.on_update(self._chosen)
@@ -196,11 +195,21 @@ class Session:
         at = labels.index(self._current.label) if self._current else (-1 if by > 0 else 0)
         self._jump_to(labels[(at + by) % len(labels)])
 
-    def _jump_from_scene(self, shown: ShownView) -> None:
-        self._jump_to(shown.label)
+    def _show_cameras(self) -> None:
+        with self._lock:
+            if self._frustums is None and self._cameras.value and self._pictures is not None:
+                frustums, pictures = Frustums(
+                    self._client, self._content, self._jump_to), self._pictures
+                self._later(lambda: frustums.fill(pictures, lambda: self._gone))
+                self._frustums = frustums
+            if self._frustums is not None:
+                self._frustums.show(self._cameras.value)
 
     def _jump_to(self, label: str) -> None:
-        """Puts the camera where a view was taken, and the photo into the panel."""
+        """Puts the camera where a view was taken, and the photo into the panel.
+
+        Hides the cameras, among which the browser then stands.
+        """
         with self._lock:
             shown = self._current = self._by_label.get(label)
             if self._view.value != label:
@@ -208,6 +217,7 @@ class Session:
             for part in (self._truth, self._ours, self._score):
                 part.visible = False
             if shown is not None:
+                self._cameras.value = False  # type: ignore[misc]  # has a setter
                 eye = eye_of(shown.view.camera, self._content.distance, self._content.start.far)
                 stand(self._client, eye, self._content.up, shown.view.camera)
                 self._compare(shown)
