@@ -6,6 +6,7 @@ import dataclasses
 import json
 import logging
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -34,7 +35,7 @@ from recon_cli.stages import STAGES
 from recon_cli.study.command import study
 from recon_cli.sweep import command as sweeping
 from recon_cli.verbs import beside, perform
-from recon_cli.viewer.command import view
+from recon_cli.viewer.command import looking_on, view
 from recon_cli.workspace import Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
@@ -131,16 +132,22 @@ def sfm(call: Call) -> None:
     help="Then branch off in mid-training, prune there and train the rest of the run again.  "
          "[default: off]")
 @options.of(PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"), lead="With --prune: ")
+@click.option(
+    "--view", "with_view", is_flag=True,
+    help="Show the Gaussians in the browser while they are trained; the result is the same.  "
+         "[default: off]")
 @options.stage(TrainConfig, renders=True)
 @pass_call
-def train(call: Call, with_prune: bool) -> None:
+def train(call: Call, with_prune: bool, with_view: bool) -> None:
     """Fit Gaussians; denoise and sfm run first where needed."""
-    if with_prune:
-        perform(call, "train --prune", ["train", "prune"], forced=MID)
-        return
-    for name in call.settings.get("prune", {}):
+    for name in call.settings.get("prune", {}) if not with_prune else ():
         raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
-    perform(call, "train", ["train"])
+    with looking_on(call) if with_view and not call.print_config else nullcontext() as watcher:
+        if with_prune:
+            perform(
+                call, "train --prune", ["train", "prune"], forced=MID, watcher=watcher)
+        else:
+            perform(call, "train", ["train"], watcher=watcher)
 
 
 cli.add_command(import_scene)

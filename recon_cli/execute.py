@@ -23,6 +23,7 @@ from recon_cli.progress import NullProgress, Progress
 from recon_cli.settings import Settings
 from recon_cli.stages import STAGES, Stage
 from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.watching import Nobody, Watcher
 from recon_cli.workspace import Workspace, combined
 
 _RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
@@ -54,6 +55,7 @@ class Job:
         progress: opens progress bars.
         report: called with every stage that is done or was already.
         table: the stages.
+        watcher: looks on while Gaussians are trained; no part of what is computed.
     """
 
     workspace: Workspace
@@ -62,6 +64,7 @@ class Job:
     progress: Progress = field(default_factory=NullProgress)
     report: Callable[[Outcome], None] = _say_nothing
     table: Sequence[Stage] = STAGES
+    watcher: Watcher = field(default_factory=Nobody)
 
     def inspect(self) -> Inspection:
         """Returns a look at the workspace as it is now."""
@@ -183,7 +186,8 @@ def _recorder(
 def context_for(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:
     """Returns what a stage is given, with device and threads set up."""
     if row.renders:
-        return dataclasses.replace(rendering(job.compute, job.progress), record=record)
+        return dataclasses.replace(
+            rendering(job.compute, job.progress), record=record, watcher=job.watcher)
     threads = job.compute.threads or machine.usable_threads()
     return StageContext(progress=job.progress, threads=threads, record=record)
 

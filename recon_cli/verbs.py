@@ -15,6 +15,7 @@ from recon_cli.pipeline import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress
 from recon_cli.settings import C, Settings
 from recon_cli.stages import STAGES
+from recon_cli.watching import Nobody, Watcher
 from recon_cli.workspace import Workspace
 
 
@@ -26,6 +27,7 @@ def perform(
     sources: tuple[Path, ...] = (),
     base: Settings | None = None,
     forced: Settings | None = None,
+    watcher: Watcher | None = None,
 ) -> None:
     """Runs stages one after the other, or prints their options.
 
@@ -36,6 +38,7 @@ def perform(
         sources: the user's files, for ingest.
         base: defaults of the verb; recon.toml, --config and options win over them.
         forced: what the verb itself means; it wins over everything.
+        watcher: looks on while Gaussians are trained.
     """
     given = options.explicit(call)
     values = layers.merged([base or {}, given, call.settings, forced or {}])
@@ -45,7 +48,9 @@ def perform(
     if call.print_config:
         click.echo(layers.to_toml({**configs, "compute": compute}), nl=False)
         return
-    job = Job(Workspace(call.workspace), given, compute, TqdmProgress(), tell, STAGES)
+    job = Job(
+        Workspace(call.workspace), given, compute, TqdmProgress(), tell, STAGES,
+        watcher or Nobody())
     targets = [
         Target(row.name, configs[row.name], () if row.needs else sources) for row in rows]
     pipeline.run(job, verb, targets, again=call.again)

@@ -42,11 +42,13 @@ ALLOWED: dict[str, set[str]] = {
     "capture": BOTTOM | OPTIONS | {"progress", "io", "scene"},
     "mapping": BOTTOM | OPTIONS | {"progress", "io", "scene"},
     "train": BOTTOM | OPTIONS | {"progress", "scene", "render"},
+    "watching": {"scene"},
     "stages": BOTTOM | OPTIONS | {
-        "digests", "holdout_option", "progress", "metrics", "machine", "capture", "mapping",
-        "scene", "io", "train", "render"},
+        "watching", "digests", "holdout_option", "progress", "metrics", "machine", "capture",
+        "mapping", "scene", "io", "train", "render"},
     "freshness": OPTIONS | RECORDS | {"settings", "stages"},
     "execute": OPTIONS | RECORDS | {
+        "watching",
         "settings", "stages", "freshness", "machine", "progress", "render"},
     "pipeline": OPTIONS | RECORDS | {"settings", "stages", "freshness", "execute"},
     "cleaning": RECORDS | {"errors", "execute"},
@@ -68,6 +70,7 @@ ALLOWED: dict[str, set[str]] = {
         "settings", "options", "progress", "metrics", "lock", "digests", "workspace", "stages",
         "execute", "bench"},
     "verbs": OPTIONS | {
+        "watching",
         "settings", "options", "pipeline", "report", "progress", "stages", "workspace"},
     "shots": BOTTOM | {
         "config", "settings", "options", "machine", "progress", "digests", "manifest", "lock",
@@ -78,8 +81,8 @@ ALLOWED: dict[str, set[str]] = {
     "importing": OPTIONS | {
         "settings", "options", "pipeline", "progress", "stages", "verbs", "workspace"},
     "viewer": BOTTOM | {
-        "config", "settings", "options", "progress", "workspace", "metrics", "scene", "render",
-        "io", "stages", "execute", "pipeline", "shots"},
+        "config", "settings", "options", "progress", "watching", "workspace", "metrics", "scene",
+        "render", "io", "stages", "execute", "pipeline", "shots"},
     "cli": OPTIONS | {
         "verbs", "scoreboard", "page", "importing", "viewer",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",

@@ -270,7 +270,7 @@ def run_fit(
         task: views and plan.
         until: total number of steps.
         out: partial folder of the stage.
-        ctx: progress and record.
+        ctx: progress, record and watcher.
         label: of the progress bar.
         first: step at which this stage's own work begins.
         earlier_seconds: training seconds before that.
@@ -291,6 +291,7 @@ def run_fit(
         def on_step(now: TrainState) -> None:
             bar.advance(now.iteration - counted[0])
             counted[0] = now.iteration
+            ctx.watcher.step(now.iteration, now.splats)
             if keep and now.iteration in keep:
                 save_state(out / keep[now.iteration], now)
             if importance is None and (now.iteration % every == 0 or pressed):
@@ -302,6 +303,7 @@ def run_fit(
         def on_report(report: Report) -> None:
             log.add(report)
             value = report.validation_psnr_db
+            ctx.watcher.report(report.iteration, value)
             shown = "" if value is None else f", validation {value:.2f} dB"
             bar.note(f"loss {report.loss:.4f}{shown}, {report.gaussians:,} Gaussians")
             if report.goes_on_at is not None:
@@ -309,4 +311,6 @@ def run_fit(
                             "on at step %d, with falling rates", report.iteration,
                             report.goes_on_at)
 
+        ctx.watcher.begin(
+            label, end or until, [view.camera for view in task.train], state.splats)
         fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance)

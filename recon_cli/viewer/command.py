@@ -6,6 +6,8 @@ import os
 import sys
 import threading
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -16,6 +18,7 @@ from recon_cli.errors import InputError
 from recon_cli.options import Call, pass_call
 from recon_cli.pipeline import Job
 from recon_cli.progress import TqdmProgress
+from recon_cli.watching import Watcher
 from recon_cli.workspace import Workspace
 
 
@@ -66,6 +69,26 @@ def view(
         if _at_a_desktop() if opening is None else opening:
             webbrowser.open(address)
         wait_for_the_end()
+
+
+@contextmanager
+def looking_on(call: Call) -> Iterator[Watcher]:
+    """Yields a watcher that shows a training in the browser, on this machine alone.
+
+    Raises:
+        ConfigError: no port is free.
+    """
+    from recon_cli.viewer.live import LiveView
+    from recon_cli.viewer.server import HOST, serving
+
+    with serving(HOST, None, label="recon train") as (server, address):
+        live = LiveView(server, Workspace(call.workspace))
+        click.echo(f"The training can be watched at {address}")
+        try:
+            yield live
+        finally:
+            live.close()
+    click.echo("The page is closed; `recon view` shows the finished scene.", err=True)
 
 
 def _workspace(call: Call, item: Path | None) -> Path | None:

@@ -24,7 +24,7 @@ from recon_cli.viewer.gaussians import Packed, packed
 
 HELD_OUT, TRAINING, VALIDATION = "held-out", "training", "validation"
 _FOLDERS = {"pruned": "prune", "base": "train"}
-_FAR = 1000.0  # world units; what viser draws to by itself
+FAR = 1000.0  # world units; what viser draws to by itself
 _FOV = math.radians(60)  # of a file, which has no lens
 
 
@@ -141,7 +141,7 @@ def vertical_fov(camera: Camera) -> float:
 
 def _farthest(models: Mapping[str, Packed]) -> float:
     """Returns a distance beyond all Gaussians."""
-    return max(_FAR, *(2 * _reach(model.splats) for model in models.values()))
+    return max(FAR, *(2 * _reach(model.splats) for model in models.values()))
 
 
 def _reach(splats: Splats) -> float:
