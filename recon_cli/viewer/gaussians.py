@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.scene.harmonics import basis_rest
-from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.render.spherical_harmonics import colors_from_sh
+from recon_cli.scene.splats import Splats
 
 _LARGEST = 200.0  # standard deviation as sent; its square still is a half-precision number
 # Largest Gaussian in medians of their longest axes; in four scenes it was 450 to 3,000. Beyond,
@@ -50,13 +50,11 @@ class Packed:
         Args:
             place: [3] in world units; None leaves harmonics of degrees 1 and up out.
         """
-        splats, count = self.splats, len(self.splats.sh_rest)
-        rgb = SH_C0 * splats.sh_dc + 0.5
-        if place is not None and splats.sh_degree:
-            directions = torch.nn.functional.normalize(
-                splats.means[:count] - splats.means.new_tensor(place), dim=1)
-            basis = basis_rest(directions, splats.sh_degree)
-            rgb[:count] += torch.einsum("mt,mtc->mc", basis, splats.sh_rest)
+        splats = self.splats
+        offsets = splats.means - splats.means.new_tensor((0.0, 0.0, 0.0) if place is None else place)
+        degree = 0 if place is None else splats.sh_degree
+        rgb = colors_from_sh(
+            offsets, splats.sh_dc, splats.sh_rest, torch.arange(len(splats)), degree)
         return _eight_bit(rgb.numpy())
 
 
@@ -81,11 +79,9 @@ def packed(splats: Splats) -> Packed:
 
 def _finite(splats: Splats) -> Splats:
     good = torch.ones(len(splats), dtype=torch.bool)
-    for name, value in splats.parameters().items():
-        if name == "sh_rest":
-            good[:len(value)] &= torch.isfinite(value).flatten(1).all(dim=1)
-        else:
-            good &= torch.isfinite(value).reshape(len(splats), -1).all(dim=1)
+    for value in splats.parameters().values():
+        finite = torch.isfinite(value)
+        good[:len(value)] &= (finite[:, None] if value.ndim == 1 else finite.flatten(1)).all(dim=1)  # sh_rest may have fewer rows
     return splats if bool(good.all()) else splats.select(good)
 
 

@@ -1,0 +1,147 @@
+"""The viewer in headless Chromium: what the page shows is what was asked for."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from viewing import complaints, nodes, opened, until, view
+
+from recon_cli.io.images import read_image
+from recon_cli.metrics import psnr
+from recon_cli.render import render
+from recon_cli.viewer.session import Session
+
+
+@pytest.fixture
+def sessions(monkeypatch):
+    """All sessions that begin, in order."""
+    found = []
+    begin = Session.__init__
+
+    def remembered(self, *args):
+        begin(self, *args)
+        found.append(self)
+
+    monkeypatch.setattr(Session, "__init__", remembered)
+    return found
+
+
+def picture(elsewhere, page, client, camera):
+    """What the browser draws for a camera, [H, W, 3] over black."""
+    turn = camera.viewmat[:3, :3].T
+    import viser.transforms
+
+    asked = elsewhere.submit(
+        client.get_render, camera.height, camera.width, transport_format="png", timeout=60,
+        position=camera.center, wxyz=viser.transforms.SO3.from_matrix(turn).wxyz,
+        fov=2 * math.atan(camera.height / 2 / camera.fy))
+    until(page, asked.done)
+    rgba = asked.result() / 255
+    return rgba[..., :3] * rgba[..., 3:]
+
+
+def test_the_page_draws_what_recon_renders_and_asks_nobody_else(shown, page, elsewhere):
+    client = opened(page, shown)
+    until(page, lambda: nodes(page, "GaussianSplatsMessage"))
+    page.page.wait_for_timeout(700)  # new Gaussians fade in for half a second
+    camera = shown.content.views[-1].view.camera.resized(192, 144)
+    splats = shown.content.models["pruned"].splats
+    with torch.no_grad():
+        ours = render(splats.with_degree(0), camera, torch.zeros(3), 0).rgb.clamp(0, 1)
+    drawn = picture(elsewhere, page, client, camera)
+    print("DB", psnr(drawn.astype(np.float32), (255 * ours).round().byte().numpy()))
+    assert psnr(drawn.astype(np.float32), (255 * ours).round().byte().numpy()) > 20
+    assert not complaints(page)
+    assert all(shown.address in address or address.startswith(("data:", "blob:"))
+               for address in page.addresses)
+
+
+def test_a_jump_puts_the_camera_where_the_view_is_and_shows_its_photo_and_score(shown, page):
+    client = opened(page, shown)
+    page.page.get_by_text("next", exact=True).click()
+    page.page.get_by_text("PSNR").wait_for(timeout=60_000)
+    view = shown.content.views[0].view
+    assert view.name == "000000.png"
+    text = page.page.inner_text("body")
+    assert "000000.png (held-out), pruned: PSNR" in text
+    with torch.no_grad():
+        splats = shown.content.models["pruned"].splats
+        ours = render(splats, view.camera, torch.zeros(3), 3).rgb.numpy()
+    expected = psnr(ours, read_image(view.original, 48, 36))
+    assert float(text.split("PSNR ")[1].split(" dB")[0]) == pytest.approx(expected, abs=0.02)
+    reported = until(page, lambda: np.allclose(
+        client.camera.position, view.camera.center, atol=1e-4) and client.camera)
+    import viser.transforms
+
+    turn = viser.transforms.SO3(reported.wxyz).as_matrix()
+    np.testing.assert_allclose(turn, view.camera.viewmat[:3, :3].T, atol=1e-3)
+    assert reported.fov == pytest.approx(2 * math.atan(18 / 40), abs=1e-3)
+    photos = page.page.locator("img:visible")
+    assert [photo.evaluate("image => image.naturalWidth") for photo in photos.all()] == [48, 48]
+    page.page.get_by_text("previous", exact=True).click()
+    page.page.get_by_text(f"{shown.content.views[-1].label}, pruned").wait_for(timeout=60_000)
+
+
+def test_the_cameras_come_with_their_photos_when_they_are_asked_for(shown, page):
+    opened(page, shown)
+    assert not nodes(page, "CameraFrustumMessage")
+    page.page.get_by_label("Cameras").locator("visible=true").click()
+    until(page, lambda: len(nodes(page, "CameraFrustumMessage")) == 12)
+    until(page, lambda: page.page.evaluate(
+        """() => Object.values(window.__viserSceneTree.getState()).filter(node =>
+            node?.message.type === 'CameraFrustumMessage' && node.message.props._image_data)
+            .length""") == 12)
+    page.page.get_by_text("next", exact=True).click()  # who stands among them sees nothing else
+    until(page, lambda: not nodes(page, "CameraFrustumMessage"))
+
+
+def test_another_model_is_shown_and_counted(shown, page):
+    opened(page, shown)
+    assert "25 of 25 Gaussians (pruned)" in page.page.inner_text("body")
+    page.page.locator("input[value=pruned]").click()
+    page.page.get_by_role("option", name="base").click()
+    page.page.get_by_text("of 60 Gaussians (base)").wait_for(timeout=60_000)
+
+
+def test_the_box_hides_what_is_outside_and_is_given_as_export_takes_it(shown, page, sessions):
+    opened(page, shown)
+    page.page.get_by_text("Crop", exact=True).click()
+    page.page.get_by_label("Hide what is outside").locator("visible=true").click()
+    lowest = page.page.locator("input[inputmode]:visible").first
+    lowest.fill("0.5")
+    lowest.press("Enter")
+    words = until(page, lambda: page.page.get_by_text("recon export --crop 0.5").all())
+    numbers = [float(word) for word in words[0].inner_text().split("--crop ")[1].split()]
+    means = shown.content.models["pruned"].splats.means
+    inside = ((means >= torch.tensor(numbers[:3])) & (means <= torch.tensor(numbers[3:]))).all(1)
+    assert 0 < inside.sum() < 25
+    page.page.get_by_text(f"{inside.sum()} of 25 Gaussians").wait_for(timeout=60_000)
+
+
+def test_browsers_come_go_and_reload_and_each_has_its_own_colours(
+    shown, page, chromium, sessions
+):
+    opened(page, shown)
+    other = chromium.new_page()
+    other.goto(shown.address)
+    until(page, lambda: len(sessions) == 2)
+    page.page.get_by_text("next", exact=True).click()
+    first, second = sessions
+    seen = [one.view.camera.center for one in shown.content.views]
+    packed = shown.content.models["pruned"]
+    until(page, lambda: np.abs(
+        first._node.rgbs.astype(int) - packed.colors(seen[0].tolist())).max() <= 1)
+    assert np.abs(first._node.rgbs.astype(int) - second._node.rgbs).max() > 1
+    other.close()
+    until(page, lambda: len(shown.server.get_clients()) == 1)
+    page.page.reload()
+    until(page, lambda: len(sessions) == 3 and len(shown.server.get_clients()) == 1)
+    page.page.get_by_text("25 of 25 Gaussians").wait_for(timeout=60_000)
+
+
+def test_a_viewer_that_ends_lets_go_of_its_browsers(room, page):
+    with view(room) as shown:
+        opened(page, shown)
+        page.page.get_by_text("next", exact=True).click()
+    assert not shown.server.get_clients()
