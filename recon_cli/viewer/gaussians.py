@@ -51,8 +51,8 @@ class Packed:
             place: [3] in world units; None leaves harmonics of degrees 1 and up out.
         """
         splats = self.splats
-        offsets = splats.means - splats.means.new_tensor((0.0, 0.0, 0.0) if place is None else place)
         degree = 0 if place is None else splats.sh_degree
+        offsets = splats.means - splats.means.new_tensor(place or (0.0, 0.0, 0.0))
         rgb = colors_from_sh(
             offsets, splats.sh_dc, splats.sh_rest, torch.arange(len(splats)), degree)
         return _eight_bit(rgb.numpy())
@@ -81,7 +81,8 @@ def _finite(splats: Splats) -> Splats:
     good = torch.ones(len(splats), dtype=torch.bool)
     for value in splats.parameters().values():
         finite = torch.isfinite(value)
-        good[:len(value)] &= (finite[:, None] if value.ndim == 1 else finite.flatten(1)).all(dim=1)  # sh_rest may have fewer rows
+        rows = finite[:, None] if value.ndim == 1 else finite.flatten(1)
+        good[:len(value)] &= rows.all(dim=1)  # sh_rest may have fewer
     return splats if bool(good.all()) else splats.select(good)
 
 

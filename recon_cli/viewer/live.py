@@ -108,9 +108,8 @@ class LiveView:
             if not self._closed:
                 logger.debug("an update could not be shown", exc_info=True)
         finally:
-            now = time.perf_counter()
-            cost = now - start + _SETTLE_SECONDS
-            self._due = now + cost * (1 / SHARE - 1)
+            cost = time.perf_counter() - start + _SETTLE_SECONDS
+            self._due = start + cost / SHARE
             self._busy = False
 
     def _show(self, iteration: int, splats: Splats) -> None:

@@ -8,7 +8,6 @@ order each round, and what is compared are the seconds of training that the log 
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import shutil
@@ -19,33 +18,36 @@ import tempfile
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import click
 from browser import browser, watched
 
 KINDS = ("without", "nobody", "looked at")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("workspace", type=Path)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--iterations", type=int, default=1500)
-    asked = parser.parse_args()
+@click.command()
+@click.argument("source", type=click.Path(exists=True, path_type=Path))
+@click.option("--rounds", default=3)
+@click.option("--threads", default=1)
+@click.option("--iterations", default=1500)
+def main(source: Path, rounds: int, threads: int, iterations: int) -> None:
+    """Prints the seconds of each kind and their ratio to those without."""
     seconds: dict[str, list[float]] = {kind: [] for kind in KINDS}
     with tempfile.TemporaryDirectory() as folder:
         workspace = Path(folder) / "ws"
         for stage in ("ingest", "denoise", "sfm"):
-            shutil.copytree(asked.workspace / stage, workspace / stage)
-        digests = set()
-        for number in range(asked.rounds):
+            shutil.copytree(source / stage, workspace / stage)
+        results = set()
+        for number in range(rounds):
             for kind in (*KINDS[number % 3:], *KINDS[:number % 3]):
-                seconds[kind].append(train(workspace, kind, asked.iterations, asked.threads))
-                digests.add((workspace / "train" / "splats.ply").read_bytes())
-    plain = statistics.median(seconds["without"])
+                seconds[kind].append(train(workspace, kind, iterations, threads))
+                results.add((workspace / "train" / "splats.ply").read_bytes())
     for kind, values in seconds.items():
         shown = ", ".join(f"{value:.1f}" for value in values)
-        print(f"{kind:10} {shown} s; median {statistics.median(values) / plain:.3f} of without")
-    print(f"{len(digests)} different splats.ply")
+        ratio = statistics.median(
+            value / plain for value, plain in zip(values, seconds["without"], strict=True))
+        click.echo(f"{kind:10} {shown} s; median of the rounds {ratio:.3f} of without; "
+                   f"shortest {min(values) / min(seconds['without']):.3f}")
+    click.echo(f"{len(results)} different splats.ply")
 
 
 def train(workspace: Path, kind: str, iterations: int, threads: int) -> float:

@@ -1,0 +1,108 @@
+"""`recon view` as it is typed: what it takes, what it refuses, and how it ends."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from recon_cli.cli import main
+from recon_cli.io.splats.registry import FORMATS
+from recon_cli.viewer import command
+from recon_cli.viewer.content import of_file
+
+
+@pytest.fixture
+def ended(monkeypatch):
+    """Ends the viewer as soon as it is there."""
+    monkeypatch.setattr(command, "wait_for_the_end", lambda: None)
+
+
+@pytest.mark.usefixtures("ended")
+def test_it_prints_its_address_and_opens_no_browser_where_there_is_no_terminal(
+    room, capsys, monkeypatch
+):
+    opened = []
+    monkeypatch.setattr(command.webbrowser, "open", opened.append)
+    assert main(["view", "-w", str(room)]) == 0
+    address = re.search(r"http://127\.0\.0\.1:\d+", capsys.readouterr().out)[0]
+    assert not opened
+    assert main(["view", str(room), "--open"]) == 0
+    assert opened == [address]
+
+
+@pytest.mark.usefixtures("ended")
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_a_file_of_any_format_is_shown_without_cameras(room, tmp_path, name):
+    path = tmp_path / f"some.{name}"
+    FORMATS[name].write(path, FORMATS["ply"].read(room / "train" / "splats.ply"))
+    content = of_file(path)
+    assert [len(packed.splats) for packed in content.models.values()] == [60]
+    assert content.views == ()
+    assert main(["view", str(path)]) == 0
+
+
+@pytest.mark.parametrize(("words", "code", "said"), [
+    (["nothing.ply"], 3, "does not exist"),
+    (["empty"], 3, "neither a workspace nor a file"),
+    (["text.txt"], 3, "no known format"),
+    (["room", "-w", "room"], 2, "exclude each other"),
+    (["room/train/splats.ply", "--model", "base"], 2, "no effect on a file"),
+    (["-w", "none"], 4, "view needs ingest"),
+    (["room", "--model", "half"], 2, "half"),
+    (["room", "--port", "70000"], 2, "70000"),
+    (["room", "--host", "no.such.host.invalid"], 2, "no.such.host.invalid"),
+])
+def test_what_cannot_be_shown_is_refused_with_a_hint(
+    room, tmp_path, monkeypatch, capsys, words, code, said
+):
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    Path("text.txt").write_text("no Gaussians")
+    Path("room").symlink_to(room)
+    assert main(["view", *words]) == code
+    found = capsys.readouterr().err
+    assert said in found
+    assert "hint:" in found
+
+
+def test_the_pruned_model_that_is_not_there_is_refused(room, tmp_path, capsys):
+    workspace = shutil.copytree(room, tmp_path / "ws")
+    shutil.rmtree(workspace / "prune")
+    assert main(["view", str(workspace), "--model", "pruned"]) == 4
+    assert "recon prune" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_is_refused(room, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["view", str(room), "--port", str(port)]) == 2
+    assert f"the port {port} is taken" in capsys.readouterr().err.lower()
+
+
+def test_ctrl_c_ends_it_without_a_word_too_many_and_frees_the_port(room):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "recon_cli", "view", str(room)], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    killer = threading.Timer(120, process.kill)
+    killer.start()
+    try:
+        assert process.stdout
+        address = re.search(r"http://127\.0\.0\.1:(\d+)", process.stdout.readline())
+        assert address
+        with urllib.request.urlopen(address[0]) as page:
+            assert b"<html" in page.read()
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate()
+    finally:
+        killer.cancel()
+    assert process.returncode == 0
+    assert said == "closed\n"
+    socket.create_server(("127.0.0.1", int(address[1]))).close()
