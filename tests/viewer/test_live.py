@@ -22,7 +22,6 @@ from recon_cli.viewer.live import SHARE, LiveView
 from recon_cli.viewer.server import HOST, serving
 from recon_cli.workspace import Workspace
 
-
 SHORT = dataclasses.replace(CONFIG, iterations=60)
 
 
@@ -59,7 +58,7 @@ def test_a_watcher_sees_every_step_and_changes_nothing(plain, tmp_path):
     assert (tmp_path / "train" / "splats.ply").read_bytes() == expected
     assert [(label, until, cameras) for label, until, cameras, _ in spy.begun] == [
         ("train", 60, 8)]
-    assert [iteration for iteration, _ in spy.steps] == list(range(1, 161))
+    assert [iteration for iteration, _ in spy.steps] == list(range(1, 61))
     assert spy.reports[-1][0] == 60
     last = read_ply(tmp_path / "train" / "splats.ply")
     assert torch.equal(last.means, spy.last)

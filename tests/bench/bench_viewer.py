@@ -1,0 +1,198 @@
+"""How fast and how true `recon view` is: `python tests/bench/bench_viewer.py WORKSPACE`.
+
+In headless Chromium, whose WebGL is SwiftShader: in software, on the processors of this machine.
+A GPU draws the same pictures faster, never slower. Prints
+
+- the PSNR of the browser's picture against recon's own of the same camera and size, without
+  harmonics, over black, for every held-out view. The pixels come from the page's canvas by viser's
+  get_render, which leaves the panel out;
+- the seconds from the command to the first picture of the scene, for the workspace;
+- pictures a second while the camera turns, for a synthetic room of 100,000 and of 500,000.
+
+`--picture FILE` takes a picture of the page for the documentation and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import click
+import numpy as np
+import torch
+import viser.transforms
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from browser import browser, watched
+
+from recon_cli.bench.scenes import room
+from recon_cli.execute import rendering
+from recon_cli.io.images import eight_bit, fitted_camera
+from recon_cli.metrics import psnr
+from recon_cli.pipeline import Job
+from recon_cli.render import render
+from recon_cli.scene.camera import Camera
+from recon_cli.viewer.beside import Pictures
+from recon_cli.viewer.content import (
+    FAR,
+    HELD_OUT,
+    Content,
+    eye_of,
+    of_workspace,
+)
+from recon_cli.viewer.gaussians import packed
+from recon_cli.viewer.pose import stand
+from recon_cli.viewer.run import showing
+from recon_cli.viewer.server import HOST
+from recon_cli.workspace import Workspace
+
+DRAWN = """() => Object.values(window.__viserSceneTree?.getState() ?? {}).some(
+    node => node?.message.type === 'GaussianSplatsMessage')"""
+FRAMES = "() => window.__viserTestpoints?.rendererInfo.render.frame ?? 0"
+SECONDS = 8.0  # of turning
+WIDTH, HEIGHT = 1280, 720
+
+
+def started(chromium: Browser, workspace: Path) -> float:
+    """Returns the seconds from the command to two pictures after the Gaussians came."""
+    with watched(chromium, width=WIDTH, height=HEIGHT) as page:
+        begin = time.perf_counter()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "recon_cli", "view", str(workspace)],
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        try:
+            assert process.stdout
+            address = re.search(r"http://\S+", process.stdout.readline())
+            assert address
+            page.page.goto(address[0])
+            page.page.wait_for_function(DRAWN)
+            count = page.page.evaluate(FRAMES)
+            page.page.wait_for_function(f"({FRAMES})() >= {count + 2}")
+            return time.perf_counter() - begin
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait()
+
+
+def speed(chromium: Browser, content: Content) -> float:
+    """Returns the pictures a second while the mouse turns the camera."""
+    with (showing(content, None, HOST, None) as (_, address),
+          watched(chromium, width=WIDTH, height=HEIGHT) as page):
+        page.page.goto(address)
+        page.page.wait_for_function(DRAWN)
+        page.page.wait_for_timeout(3000)
+        page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
+        page.page.mouse.down()
+        begin, count = time.perf_counter(), page.page.evaluate(FRAMES)
+        step = 0
+        while time.perf_counter() - begin < SECONDS:
+            step += 1
+            page.page.mouse.move(WIDTH / 2 + 150 * math.sin(step / 10), HEIGHT / 2)
+        return (page.page.evaluate(FRAMES) - count) / (time.perf_counter() - begin)
+
+
+def of_room(count: int) -> Content:
+    """Returns the synthetic room of `recon bench`, looked at by its camera."""
+    splats, camera = room(count, WIDTH, HEIGHT)
+    start = eye_of(camera, 3.0, FAR)
+    return Content({"room": packed(splats)}, (), -camera.viewmat[1, :3], start, 3.0, 0)
+
+
+def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
+    """Yields a line for each held-out view, and one for their mean."""
+    job = Job(Workspace(workspace))
+    content = of_workspace(job, "auto")
+    name, shown = next(iter(content.models.items()))
+    splats = shown.splats.with_degree(0)
+    flat = dataclasses.replace(content, models={name: dataclasses.replace(shown, splats=splats)})
+    ctx = rendering(job.compute, job.progress)
+    found = []
+    with (showing(flat, None, HOST, None) as (server, address),
+          watched(chromium, width=WIDTH, height=HEIGHT) as page,
+          ThreadPoolExecutor(1) as elsewhere):
+        page.page.goto(address)
+        page.page.wait_for_function(DRAWN)
+        page.page.wait_for_timeout(3000)
+        (client,) = server.get_clients().values()
+        for one in content.views:
+            if one.part == HELD_OUT:
+                camera = fitted_camera(one.view.camera, content.max_size)
+                with torch.no_grad():
+                    ours = render(splats, camera, torch.zeros(3), 0, backend=ctx.backend).rgb
+                page.page.set_viewport_size({"width": camera.width, "height": camera.height})
+                asked = elsewhere.submit(drawn, client, content, camera)
+                while not asked.done():
+                    page.page.wait_for_timeout(20)
+                found.append(psnr(asked.result(), eight_bit(ours.numpy())))
+                yield (f"{one.view.name} {camera.width}x{camera.height}: {found[-1]:.2f} dB "
+                       "between the browser and recon")
+    yield f"least {min(found):.2f} dB, mean {statistics.fmean(found):.2f} dB"
+
+
+def drawn(
+    client: viser.ClientHandle, content: Content, camera: Camera
+) -> NDArray[np.float32]:
+    """Returns the browser's picture of a camera of the size of its page, over black."""
+    stand(client, eye_of(camera, content.distance, content.start.far), content.up, camera)
+    # get_render projects with the lens of the picture before
+    while (client.camera.image_width, client.camera.image_height) != (camera.width, camera.height):
+        time.sleep(0.05)
+    client.get_render(camera.height, camera.width)
+    rgba = client.get_render(camera.height, camera.width, transport_format="png").astype(np.float32)
+    return rgba[..., :3] * rgba[..., 3:] / 255**2
+
+
+def photographed(chromium: Browser, workspace: Path, path: Path) -> None:
+    """Takes a picture of the page, with a held-out view beside its photo."""
+    job = Job(Workspace(workspace))
+    content = of_workspace(job, "auto")
+    with (showing(content, Pictures(job, content.max_size), HOST, None) as (_, address),
+          watched(chromium, width=WIDTH, height=HEIGHT) as page):
+        page.page.goto(address)
+        page.page.wait_for_function(DRAWN)
+        # viser warns of a browser without a GPU
+        page.page.locator(".mantine-Notification-closeButton").first.click()
+        page.page.get_by_text("next", exact=True).click()
+        page.page.get_by_text("PSNR").wait_for()
+        page.page.get_by_label("Cameras").locator("visible=true").click()
+        page.page.mouse.move(WIDTH / 3, HEIGHT / 2)
+        page.page.mouse.wheel(0, 500)
+        page.page.wait_for_timeout(8000)
+        taken = page.page.screenshot()
+    with Image.open(io.BytesIO(taken)) as image:
+        image.save(path, quality=85)
+
+
+@click.command()
+@click.argument("workspace", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--picture", type=click.Path(path_type=Path))
+def main(workspace: Path, picture: Path | None) -> None:
+    """Prints the figures of a workspace."""
+    with browser() as chromium:
+        if picture is not None:
+            photographed(chromium, workspace, picture)
+            return
+        for line in truth(chromium, workspace):
+            click.echo(line)
+        starts = [started(chromium, workspace) for _ in range(3)]
+        click.echo(f"command to first picture: {statistics.median(starts):.1f} s (of 3)")
+        for count in (100_000, 500_000):
+            click.echo(f"{count:,} Gaussians at {WIDTH}x{HEIGHT}: "
+                       f"{speed(chromium, of_room(count)):.2f} pictures a second")
+
+
+if __name__ == "__main__":
+    main()
