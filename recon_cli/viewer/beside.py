@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -27,23 +25,8 @@ from recon_cli.stages.context import StageContext
 _THUMBNAIL = 160  # pixels, longest side
 
 
-@dataclass(frozen=True, eq=False)
-class Beside:
-    """A view twice.
-
-    Attributes:
-        truth: [H, W, 3] the photo at the size of training; masked pixels in one colour.
-        ours: [H, W, 3] rendered by recon, with all harmonics.
-        psnr_db: as `recon eval` computes it; None where a mask leaves too little.
-    """
-
-    truth: NDArray[np.uint8]
-    ours: NDArray[np.uint8]
-    psnr_db: float | None
-
-
 class Pictures:
-    """Photos and renders of the views, made when they are asked for.
+    """Photos and renders of the views, made when they are asked for, by one thread at a time.
 
     Args:
         job: device, backend and threads to render with.
@@ -53,29 +36,38 @@ class Pictures:
     def __init__(self, job: Job, max_size: int) -> None:
         self._job, self._max_size = job, max_size
         self._thumbnails: dict[str, NDArray[np.uint8]] = {}
-        self._one_at_a_time = threading.Lock()
 
     @cached_property
     def _ctx(self) -> StageContext:
         return rendering(self._job.compute, self._job.progress)
 
-    def beside(self, view: View, splats: Splats) -> Beside:
-        """Returns a view's photo beside its render.
+    def photo(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """Returns a photo [H, W, 3] at the size of training, painted under its mask [H, W].
+
+        Raises:
+            FormatError: it cannot be read.
+        """
+        camera = fitted_camera(view.camera, self._max_size)
+        return read_masked_image(view.original, view.mask, camera.width, camera.height)
+
+    def rendered(self, view: View, splats: Splats) -> tuple[NDArray[np.uint8], float | None]:
+        """Returns recon's own picture [H, W, 3] of a view, and its PSNR in dB as of `recon eval`.
+
+        The PSNR is None where a mask leaves too little of the view.
 
         Raises:
             BackendError: the rasterizer that was asked for is not here.
             FormatError: the photo cannot be read.
         """
-        camera = fitted_camera(view.camera, self._max_size)
-        truth, mask = read_masked_image(view.original, view.mask, camera.width, camera.height)
-        with self._one_at_a_time, torch.no_grad():
-            device = self._ctx.device
+        truth, mask = self.photo(view)
+        camera, device = fitted_camera(view.camera, self._max_size), self._ctx.device
+        with torch.no_grad():
             rgb = render(
                 splats.map(lambda tensor: tensor.to(device)), camera,
                 torch.zeros(3, device=device), splats.sh_degree, backend=self._ctx.backend).rgb
-            image: NDArray[np.float32] = rgb.cpu().numpy()
+        image: NDArray[np.float32] = rgb.cpu().numpy()
         enough = mask is None or leaves_enough(mask)
-        return Beside(truth, eight_bit(image), psnr(image, truth, mask) if enough else None)
+        return eight_bit(image), psnr(image, truth, mask) if enough else None
 
     def thumbnail(self, view: View) -> NDArray[np.uint8]:
         """Returns a small picture of a view.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
+import time
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -64,11 +64,14 @@ def view(
         job = Job(Workspace(workspace), explicit, compute, TqdmProgress())
         content = of_workspace(job, model)
         pictures = Pictures(job, content.max_size)
-    with showing(content, pictures, host, port) as (_, address):
-        click.echo(f"The scene is at {address} (Ctrl-C ends it)")
-        if _at_a_desktop() if opening is None else opening:
-            webbrowser.open(address)
-        wait_for_the_end()
+    try:
+        with showing(content, pictures, host, port) as (_, address):
+            click.echo(f"The scene is at {address} (Ctrl-C ends it)")
+            if _at_a_desktop() if opening is None else opening:
+                webbrowser.open(address)
+            wait()
+    except KeyboardInterrupt:  # how a viewer is meant to end
+        click.echo("closed", err=True)
 
 
 @contextmanager
@@ -120,9 +123,7 @@ def _at_a_desktop() -> bool:
     return sys.stdout.isatty() and desktop
 
 
-def wait_for_the_end() -> None:
-    """Returns when Ctrl-C is pressed, which is how a viewer is meant to end."""
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        click.echo("closed", err=True)
+def wait() -> None:
+    """Waits for Ctrl-C."""
+    while True:
+        time.sleep(3600)

@@ -223,24 +223,30 @@ class Session:
                 self._compare(shown)
 
     def _compare(self, shown: ShownView) -> None:
-        """Shows a view's photo beside our render as soon as it is there."""
+        """Shows a view's photo, and our render of it and its score as soon as they are there."""
         model, packed, pictures = self._model, self._packed, self._pictures
         assert pictures is not None
 
-        def compare() -> None:
-            found = pictures.beside(shown.view, packed.splats)
+        def photo() -> None:
+            image, _ = pictures.photo(shown.view)
             with self._lock:
-                if (self._current, self._model) != (shown, model):
-                    return  # the user has gone on
-                with self._client.atomic():
-                    self._truth.image, self._ours.image = found.truth, found.ours
-                    score = "its mask leaves too little to score" if found.psnr_db is None else (
-                        f"PSNR **{found.psnr_db:.2f} dB**")
-                    self._score.content = f"{shown.label}, {model}: {score}"
-                    for part in (self._truth, self._ours, self._score):
-                        part.visible = True
+                if self._current == shown:
+                    self._truth.image, self._truth.visible = image, True
 
-        self._later(compare)
+        def rendered() -> None:
+            if (self._current, self._model) != (shown, model):
+                return  # the user has gone on
+            image, psnr_db = pictures.rendered(shown.view, packed.splats)
+            with self._lock, self._client.atomic():
+                if (self._current, self._model) == (shown, model):
+                    score = "its mask leaves too little to score" if psnr_db is None else (
+                        f"PSNR **{psnr_db:.2f} dB**")
+                    self._score.content = f"{shown.label}, {model}: {score}"
+                    self._ours.image = image
+                    self._ours.visible = self._score.visible = True
+
+        self._later(photo)
+        self._later(rendered)
 
     def _later(self, task: Callable[[], None]) -> None:
         """Does something that takes long after what was asked for before, unless the user left."""

@@ -22,7 +22,7 @@ from recon_cli.viewer.content import of_file
 @pytest.fixture
 def ended(monkeypatch):
     """Ends the viewer as soon as it is there."""
-    monkeypatch.setattr(command, "wait_for_the_end", lambda: None)
+    monkeypatch.setattr(command, "wait", lambda: None)
 
 
 @pytest.mark.usefixtures("ended")
