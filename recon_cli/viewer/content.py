@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.errors import FormatError
 from recon_cli.execute import Job
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import read_splats
@@ -117,10 +118,13 @@ def of_file(path: Path) -> Content:
     """Returns a file of Gaussians, looked at from a corner of its room.
 
     Raises:
-        FormatError: its format is not known, or the file is damaged.
+        FormatError: its format is not known, or it is damaged or empty.
     """
     splats = read_splats(path)
     models = {path.name: packed(splats)}
+    if not len(models[path.name].splats):
+        raise FormatError(
+            f"{path} holds no Gaussian that can be drawn.", hint="Give another file.")
     box = box_around(splats)
     low, high = np.array(box.low), np.array(box.high)
     middle, corner = (low + high) / 2, low + 0.8 * (high - low)

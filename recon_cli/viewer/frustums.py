@@ -10,7 +10,7 @@ from recon_cli.scene.transformed import quaternion
 from recon_cli.viewer.beside import Pictures
 from recon_cli.viewer.content import HELD_OUT, Content, ShownView, vertical_fov
 
-_SIZE = 0.05  # of the distance to what is looked at
+_SIZE = 0.03  # of the distance to what is looked at
 _COLORS = {HELD_OUT: (255, 140, 40)}
 _OTHERS = (150, 170, 200)
 

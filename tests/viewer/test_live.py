@@ -100,6 +100,11 @@ def test_a_training_with_view_is_the_same_work_as_one_without(room, capsys):
     assert "recon view" in said.err
 
 
+def test_options_that_are_only_printed_open_no_page(room, capsys):
+    assert main(["train", "-w", str(room), "--view", "--print-config"]) == 0
+    assert "http" not in capsys.readouterr().out
+
+
 class Clock:
     """A clock that moves when it is told."""
 

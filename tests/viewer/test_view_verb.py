@@ -12,6 +12,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+import torch
 
 from recon_cli.cli import main
 from recon_cli.io.splats.registry import FORMATS
@@ -71,6 +72,13 @@ def test_what_cannot_be_shown_is_refused_with_a_hint(
     found = capsys.readouterr().err
     assert said in found
     assert "hint:" in found
+
+
+def test_a_file_without_a_gaussian_is_refused(room, tmp_path, capsys):
+    splats = FORMATS["ply"].read(room / "train" / "splats.ply")
+    FORMATS["ply"].write(tmp_path / "none.ply", splats.select(torch.zeros(60, dtype=torch.bool)))
+    assert main(["view", str(tmp_path / "none.ply")]) == 3
+    assert "hint:" in capsys.readouterr().err
 
 
 def test_the_pruned_model_that_is_not_there_is_refused(room, tmp_path, capsys):
