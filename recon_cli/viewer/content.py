@@ -72,7 +72,7 @@ class Content:
 
     Attributes:
         models: by name, the one to begin with first.
-        views: the held-out ones first; none for a file.
+        views: the held-out ones first; none for a file, or a scene imported without views.
         up: [3] unit vector; None where it is not known.
         start: where every browser begins.
         distance: from a camera to what it looks at, world units.
@@ -105,7 +105,8 @@ def of_workspace(job: Job, model: str) -> Content:
         models[name] = packed(read_ply(job.workspace.folder(_FOLDERS[name]) / "splats.ply"))
     scene = source.scene
     parts = {HELD_OUT: scene.test, TRAINING: scene.train, VALIDATION: scene.validation}
-    views = tuple(ShownView(view, part) for part, some in parts.items() for view in some)
+    views = tuple(ShownView(view, part) for part, some in parts.items() for view in some
+                  if source.has_views)
     first = scene.train[0].camera
     seen = depths_seen(first, scene.points)
     distance = float(np.median(seen)) if len(seen) else scene.extent
