@@ -50,7 +50,7 @@ def write_html(
         FormatError: there are no Gaussians, one is too large or too far away, or a parameter is
             not finite.
     """
-    packed = spz_bytes(path, splats)
+    packed = spz_bytes(path, splats, harmonic_step=1)  # beside the scripts size hardly counts
     scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '
              f'data-bytes="{len(packed)}">{base64.b64encode(packed).decode("ascii")}</script>')
     write_bytes(path, page(title, scene, views or [first_look(splats, up)], splats, up))
