@@ -91,7 +91,7 @@ every_backend = pytest.mark.parametrize("case", CASES, ids=str)
 
 
 def at_size(cases: Sequence[Case]) -> list[Any]:
-    """The cases for a test whose scene takes an interpreter minutes: there it is marked slow."""
+    """The cases for tests that take an interpreter minutes: there they are marked slow."""
     return [pytest.param(case, marks=pytest.mark.slow if case.interpreted else ())
             for case in cases]
 

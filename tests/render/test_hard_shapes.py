@@ -12,7 +12,7 @@ from backends import (
     IMAGE_TOLERANCE,
     ORACLE_SH_TOLERANCE,
     compared,
-    every_backend,
+    every_backend_at_size,
 )
 from scenes import camera_at, joined, leaves, one_splat, random_splats
 
@@ -20,7 +20,7 @@ from recon_cli.render.contract import ALPHA_MIN, NEAR
 from recon_cli.render.projection import project, rotation_matrices
 from recon_cli.scene.camera import Camera
 
-pytestmark = every_backend
+pytestmark = every_backend_at_size
 
 STRAIGHT = Camera(50, 37, 40.0, 44.0, 26.3, 17.8, np.eye(4))  # world and camera axes agree
 # The long axis of a needle hardly changes its picture: the gradient of its scale is a remainder

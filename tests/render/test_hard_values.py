@@ -13,14 +13,14 @@ from backends import (
     IMAGE_TOLERANCE,
     ORACLE_SH_TOLERANCE,
     compared,
-    every_backend,
+    every_backend_at_size,
 )
 from oracle import brute_force
 from scenes import camera_at, joined, one_splat, random_splats
 
 from recon_cli.scene.splats import SH_C0
 
-pytestmark = every_backend
+pytestmark = every_backend_at_size
 
 NOT_FINITE = [math.nan, math.inf, -math.inf]
 PARAMETERS = list(random_splats(1).parameters())

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 import torch
-from backends import GREENISH, Case, every_backend
+from backends import GREENISH, Case, every_backend_at_size
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from oracle import composited
@@ -20,7 +20,7 @@ from recon_cli.render.projection import project
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
-pytestmark = every_backend
+pytestmark = every_backend_at_size
 
 EXACT = Case("torch", "cpu", torch.float64)
 # An error of the mean, of the offset to a pixel or of an axis is relative: `reach` pixels times
