@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import random
 import warnings
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -31,6 +33,16 @@ def edge_splats(degree: int = 3, colored: int = N, *, far: float = 2000.0, seed:
         "sh_rest": rng.uniform(-0.99, 0.99, (colored, TERMS[degree], 3)),
     }
     return Splats(**{name: torch.tensor(value).float() for name, value in values.items()})
+
+
+def few(count: int = 9, degree: int = 3) -> Splats:
+    """The first of them."""
+    return edge_splats(degree).select(torch.arange(count))
+
+
+def plain(path: Path) -> bytes:
+    """The bytes of an SPZ file of version 3 before gzip, which readers take as well."""
+    return gzip.decompress(path.read_bytes())
 
 
 def unit(quats: torch.Tensor) -> torch.Tensor:
