@@ -118,8 +118,11 @@ class TrainConfig(StageConfig):
         "reference (clone, split and reset as in 3DGS) or mcmc (relocation and noise).",
         choices=("budget", "reference", "mcmc"))
     iterations: int | None = option(
-        None, "Optimization steps, one view each.", unit="steps", minimum=1,
+        None, "Optimization steps of --batch-views views each.", unit="steps", minimum=1,
         automatic="by --quality: 1,500, 3,000 or 8,000")
+    batch_views: int = option(
+        1, "Views of one step, whose mean gradient is taken; processes that train together each "
+        "take so many.", unit="views", minimum=1)
     max_size: int | None = option(
         None, "Longest side of a training image; larger ones are reduced by area.",
         unit="pixels", minimum=16, automatic="by --quality: 400, 600 or 800")

@@ -100,7 +100,8 @@ class Course:
     @property
     def rounds(self) -> int:
         """How many rounds there are."""
-        return self.config.rounds or rounds_within(self.until - self.first, len(self.task.train))
+        epoch = self.task.schedule.epoch(len(self.task.train))
+        return self.config.rounds or rounds_within(self.until - self.first, epoch)
 
     def recovering(self, first: int, until: int) -> Task:
         """Returns the task with learning rates for a recovery between two steps."""
@@ -208,17 +209,18 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
     steps = config.recovery
     if steps is None:
         rest = load(final).steps - start.steps if config.at == "mid" else 0
-        steps = _recovery(config, train_config, len(task.train), rest)
+        steps = _recovery(
+            config, train_config, task.schedule.epoch(len(task.train)), rest)
     return Course(
         config, task, begin, load, out, ctx, start.iteration,
         start.iteration + steps, seconds_at(train / LOG, start.iteration))
 
 
-def _recovery(config: PruneConfig, train: RunConfig, views: int, rest: int) -> int:
+def _recovery(config: PruneConfig, train: RunConfig, epoch: int, rest: int) -> int:
     """Returns how many steps the recovery takes; `rest` are those of training from its middle."""
     if config.at == "mid":  # as many as the unpruned run took, which may have stopped early
         return rest
-    return max(train.iterations // _END_RECOVERY, _END_EPOCHS * views)
+    return max(train.iterations // _END_RECOVERY, _END_EPOCHS * epoch)
 
 
 def _name(number: int | str) -> str:

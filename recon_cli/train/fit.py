@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
 
-from recon_cli.errors import TrainingError
 from recon_cli.render import render
 from recon_cli.train.early_stop import next_iteration
-from recon_cli.train.gathered import Gathered
 from recon_cli.train.importance import Importance
 from recon_cli.train.pyramid import Pyramid
+from recon_cli.train.ranks import ALONE, Ranks
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.sh import color_spread, needed, reduced, visibility
 from recon_cli.train.state import TrainState
-from recon_cli.train.step import GradientStep, TrainView, gradient_step
-from recon_cli.train.strategies import STRATEGIES
+from recon_cli.train.step import TrainView
+from recon_cli.train.stepping import Stepper
 
 _REPORT_EVERY = 100  # steps between looks at the validation views, at least
 _REPORTS = 40  # of a long run; each costs a picture of every validation view
-_SKIPPED = 0.02  # share of the run's steps that may come to nothing
-_SKIPPED_FLOOR = 5
-_COLOR_VIEWS = 30  # from which colours are compared
 
 
 @dataclass(frozen=True)
@@ -66,6 +61,7 @@ class Task:
         jump: (iteration, iteration at which it goes on) of the run that this one branches off;
             this one does the same.
         camera_error: how far cameras may be off, in rad; for their refinement.
+        ranks: this process among those that take the steps together.
     """
 
     train: list[TrainView]
@@ -76,6 +72,7 @@ class Task:
     device: torch.device
     jump: tuple[int, int] | None = None
     camera_error: float | None = None
+    ranks: Ranks = ALONE
 
     @cached_property
     def pyramid(self) -> Pyramid:
@@ -106,10 +103,10 @@ def fit(
         TrainingError: the loss is not finite, or no Gaussian is left.
     """
     start, cpu_start = time.perf_counter(), time.process_time()
-    compute = gradient_step(task.backend)
+    stepper = Stepper(state, task, importance)
     every = report_every(task.schedule)
     while state.iteration < until:
-        loss = _step(state, task, compute, importance)
+        loss = stepper.step()
         if state.iteration % every == 0 or state.iteration == until:
             psnr = validation_psnr(state, task)
             regular = state.iteration % every == 0
@@ -136,81 +133,6 @@ def _goes_on_at(state: TrainState, task: Task, psnr: float | None) -> int | None
 def report_every(schedule: Schedule) -> int:
     """Returns the steps between two reports, a multiple of a hundred."""
     return _REPORT_EVERY * max(1, schedule.config.iterations // (_REPORTS * _REPORT_EVERY))
-
-
-def _step(
-    state: TrainState, task: Task, compute: GradientStep, importance: Importance | None
-) -> float:
-    """Takes one optimization step and returns its loss."""
-    if not state.queue:
-        state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
-    iteration = state.iteration + 1
-    schedule, strategy = task.schedule, STRATEGIES[task.schedule.config.densify]
-    index = state.queue.pop()
-    view = task.pyramid.view(index, schedule.level(iteration))
-    if state.poses is not None:
-        view = replace(view, camera=state.poses.camera(index, view.camera))
-    degree, gathers = schedule.sh_degree(iteration), schedule.gathers(iteration)
-    loss, statistics = compute(
-        state.optimizer, view, degree, schedule.config.ssim_weight,
-        variance=gathers and strategy.variance,
-        gain=None if state.exposure is None else state.exposure.gain(index),
-        scores=importance is not None and importance.weighs,
-        loo=importance is not None and importance.leaves_out)
-    state.iteration = iteration
-    if not np.isfinite(loss):
-        _skip(state, task)
-        return loss
-    if statistics is not None:
-        if importance is not None:
-            importance.add(statistics)
-        if gathers:
-            state.gathered.add(statistics, view.camera.width, view.camera.height)
-        if state.poses is not None:
-            pull = compute.camera_gradient(state.optimizer, view.camera, degree)
-            state.poses.step(index, pull, schedule.share(iteration))
-        if state.exposure is not None:
-            state.exposure.step(index, compute.log_gain_gradient, schedule.share(iteration))
-        state.optimizer.regularize(schedule.recipe.regularize)
-        state.optimizer.step(
-            schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
-            factor=schedule.rate_factor(iteration))
-    strategy.control(state, task)
-    if iteration == schedule.review:
-        drop_harmonics(state, task)
-    return loss
-
-
-def drop_harmonics(state: TrainState, task: Task) -> None:
-    """Takes the harmonics from Gaussians that look alike from all training views.
-
-    (Papantonakis et al. 2024; `train.sh`.) Over a sample of the views.
-    """
-    threshold = task.schedule.config.sh_uniform
-    if threshold <= 0 or len(state.splats.sh_rest) == 0:
-        return
-    every = max(1, -(-len(task.train) // _COLOR_VIEWS))
-    cameras = [view.camera for view in task.train[::every]]
-    splats = state.splats.map(lambda tensor: tensor.detach())
-    spread = color_spread(splats, cameras, visibility(splats, cameras))
-    few, order = reduced(splats, needed(spread, threshold=threshold), colors=spread.mean)
-    state.optimizer.replace(few, order)
-    state.gathered = Gathered.zeros(len(few), few.means.device)
-
-
-def _skip(state: TrainState, task: Task) -> None:
-    """Counts a step whose loss is not finite; the parameters stay as they are.
-
-    Raises:
-        TrainingError: there were too many.
-    """
-    state.skipped += 1
-    most = max(_SKIPPED_FLOOR, int(_SKIPPED * task.schedule.config.iterations))
-    if state.skipped > most:
-        raise TrainingError(
-            f"The loss is not finite at step {state.iteration}, as at {state.skipped - 1} steps "
-            f"before it; {most} are borne with.",
-            hint="Lower the learning rates, or run `recon train --again` with another --seed.")
 
 
 def validation_psnr(state: TrainState, task: Task) -> float | None:

@@ -195,7 +195,7 @@ class _Bench:
         if key not in self._scores:
             self._scores[key] = self._trained(replace(
                 config, iterations=_STEPS, max_gaussians=min(config.max_gaussians, _CAP),
-                early_stop=False))
+                early_stop=False, batch_views=1))
         return self._scores[key]
 
     def _trained(self, config: RunConfig) -> list[float]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from recon_cli.render import Statistics
+from recon_cli.train.ranks import Ranks
 
 
 @dataclass(eq=False)
@@ -35,12 +36,24 @@ class Gathered:
 
     def add(self, statistics: Statistics, width: int, height: int) -> None:
         """Adds what one backward pass over an image of width x height found."""
-        seen = statistics.radii > 0
-        scale = statistics.means2d_grad.new_tensor([width / 2, height / 2])
-        self.pull += (statistics.means2d_grad * scale).norm(dim=-1)
-        self.count += seen
+        # numbers and not a tensor of them: a copy to a GPU would wait for it
+        across, down = statistics.means2d_grad.unbind(-1)
+        self.pull += torch.stack((across * (width / 2), down * (height / 2)), -1).norm(dim=-1)
+        self.count += statistics.radii > 0
         self.radius = torch.maximum(self.radius, statistics.radii)
         self.variance += statistics.variance
+
+    def over(self, ranks: Ranks) -> None:
+        """Takes together what the processes found that train together."""
+        ranks.add([self.pull, self.count, self.variance])
+        ranks.raise_to_most(self.radius)
+
+    def join(self, other: Gathered) -> None:
+        """Adds what was found elsewhere."""
+        self.pull += other.pull
+        self.count += other.count
+        self.radius = torch.maximum(self.radius, other.radius)
+        self.variance += other.variance
 
     @property
     def mean_pull(self) -> Tensor:

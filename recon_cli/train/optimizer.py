@@ -52,6 +52,7 @@ class SplatOptimizer:
         self.count = 0
         self._factor = 1.0
         self._buffers: dict[str, dict[str, Tensor]] = {}
+        self._kept: dict[str, Tensor] = {}
         self._capacity = max(len(splats), config.max_gaussians)
         self._show(splats)
         with torch.no_grad():
@@ -112,6 +113,46 @@ class SplatOptimizer:
             raise ValueError(f"{name} has no gradient")
         return gradient
 
+    @torch.no_grad()
+    def keep(self, share: float, *, sh_rest: bool) -> None:
+        """Adds a share of the gradients to those that are kept for `kept`, and uses them up.
+
+        Args:
+            share: of one view in a step of several.
+            sh_rest: those of the higher SH degrees, too.
+        """
+        for name in self._moved(sh_rest=sh_rest):
+            value = getattr(self.splats, name)
+            if not self._fused and value.grad is None:
+                continue
+            if name not in self._kept:
+                self._kept[name] = torch.zeros_like(value)
+            self._kept[name].add_(self.gradient(name), alpha=share)
+        self.discard()
+
+    def discard(self) -> None:
+        """Uses the gradients up without a step."""
+        for value in self.splats.parameters().values():
+            value.grad = None  # autograd would add the next one to it
+
+    @torch.no_grad()
+    def kept(self, *, sh_rest: bool) -> list[Tensor]:
+        """Makes what was kept the gradients of the next step, and returns them to be changed."""
+        gradients = []
+        for name in self._moved(sh_rest=sh_rest):
+            value = getattr(self.splats, name)
+            kept = self._kept.pop(name, None)
+            total = torch.zeros_like(value) if kept is None else kept
+            if self._fused:
+                total = self._view(name, "gradient").copy_(total)
+            else:
+                value.grad = total
+            gradients.append(total)
+        return gradients
+
+    def _moved(self, *, sh_rest: bool) -> list[str]:
+        return [name for name in self._buffers if sh_rest or name != "sh_rest"]
+
     def step(
         self, means_rate: float, *, sh_rest: bool = True, factor: float = 1.0
     ) -> None:
@@ -125,7 +166,7 @@ class SplatOptimizer:
         self._factor = factor
         self._rates["means"] = means_rate * self._extent / factor
         self.count += 1
-        names = [name for name in self._buffers if sh_rest or name != "sh_rest"]
+        names = self._moved(sh_rest=sh_rest)
         if self._fused:
             self._step_fused(names)
         else:
@@ -147,7 +188,7 @@ class SplatOptimizer:
         for name in self._buffers:
             value = getattr(self.splats, name)
             if value.grad is None or name not in names:
-                value.grad = None  # autograd would add the next one to it
+                value.grad = None
                 continue
             count = torch.full((), self.count - 1.0, device=value.device)
             adam([value], [value.grad], [self._view(name, "exp_avg")],

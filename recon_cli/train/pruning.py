@@ -145,7 +145,8 @@ def scored(
     if not found.needs_views:
         advance(state, until, None)
     else:
-        advance(state, max(state.iteration, until - len(task.train)), None)
+        epoch = task.schedule.epoch(len(task.train))
+        advance(state, max(state.iteration, until - epoch), None)
         left = list(range(len(task.train)))
         if state.iteration < until:
             state.queue = []  # a new epoch, in which no view comes twice

@@ -40,6 +40,10 @@ class Schedule:
         """Returns how much of the run is done after a step, 0 to 1."""
         return min(1.0, iteration / self.config.iterations)
 
+    def epoch(self, views: int) -> int:
+        """Returns the steps in which no view need come twice; at least one."""
+        return max(1, views // self.config.batch_views)
+
     @property
     def reset_every(self) -> int:
         """Steps from one opacity reset to the next."""

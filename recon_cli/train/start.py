@@ -87,7 +87,8 @@ def _parts(
         error = task.camera_error
         if error is None:  # asked for without a sign: as far as makes it worth while
             error = WORTH_PX / float(np.mean([view.camera.fx for view in task.train]))
-        poses = Poses(centers, task.extent, visits=config.iterations / images, error=error)
+        visits = config.iterations * config.batch_views / images
+        poses = Poses(centers, task.extent, visits=visits, error=error)
     return exposure, poses
 
 

@@ -267,7 +267,7 @@ def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monke
     before = state.splats.map(lambda tensor: tensor.detach().clone())
     compute = gradient_step(backend)
     monkeypatch.setattr(
-        "recon_cli.train.fit.gradient_step",
+        "recon_cli.train.stepping.gradient_step",
         lambda _: lambda *given, **named: (float("nan"), compute(*given, **named)[1]))
     run(state, task, 2)
     assert (state.iteration, state.skipped, state.optimizer.count) == (2, 2, 0)
