@@ -18,7 +18,7 @@ from recon_cli.config import RunConfig
 from recon_cli.render.numba.loss import C1, C2, MAPS, RADIUS, photometric, taps
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
-from recon_cli.train.step import TrainView, fuses, gradient_step
+from recon_cli.train.step import TrainView, gradient_step
 
 Mark = Callable[[str], None]
 ADAM = "adam"  # the part of a step that moves the parameters
@@ -33,8 +33,9 @@ def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
     still = replace(
         RunConfig(), means_rate=0.0, quats_rate=0.0, scales_rate=0.0, opacities_rate=0.0,
         sh_rate=0.0)
-    optimizer = SplatOptimizer(scene.splats, still, 1.0, fused=fuses(backend))
-    compute, view = gradient_step(backend), TrainView(scene.camera, noise(scene))
+    optimizer = SplatOptimizer(scene.splats, still, 1.0, backend=backend)
+    compute = gradient_step(backend, scene.splats.means.device)
+    view = TrainView(scene.camera, noise(scene))
 
     def step(mark: Mark) -> None:
         compute(optimizer, view, scene.sh_degree, still.ssim_weight)

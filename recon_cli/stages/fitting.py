@@ -29,7 +29,7 @@ from recon_cli.train.importance import Importance
 from recon_cli.train.memory import MemoryEstimate, estimate, refuse_what_does_not_fit, room
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
-from recon_cli.train.step import TrainView, fuses
+from recon_cli.train.step import TrainView
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
@@ -64,6 +64,8 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
             hint=MASK_HINT)
+    if ctx.device == "cuda":
+        train = [view.page_locked() for view in train]
     error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
     return Task(
         train, load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
@@ -142,7 +144,7 @@ def _memory(
     width, height = sizes_of([fitted_camera(view.camera, config.max_size) for view in views])[0]
     return estimate(
         views=len(views), width=width, height=height, gaussians=gaussians,
-        fused=fuses(ctx.backend), sh_degree=config.sh_degree,
+        fused=ctx.backend == "numba", sh_degree=config.sh_degree,
         masks=sum(view.mask is not None for view in views))
 
 
@@ -313,4 +315,5 @@ def run_fit(
 
         ctx.watcher.begin(
             label, end or until, [view.camera for view in task.train], state.splats)
-        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance)
+        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance,
+            looks=lambda now: now % every == 0 or now in (keep or ()))

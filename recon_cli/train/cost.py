@@ -25,7 +25,6 @@ from recon_cli.train.fit import Task, fit, report_every, validation_psnr
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, new_state, save_state
-from recon_cli.train.step import fuses
 
 # Of the Gaussians that stand for trained ones. With .3 a step takes what a real one of the same
 # level and count takes, within 10%, with the .1 that training begins with up to 25% less (room
@@ -201,7 +200,7 @@ class _Probe:
 
     def _state(self, splats: Splats) -> TrainState:
         task = self._task
-        return new_state(splats, task.schedule.config, task.extent, fused=fuses(task.backend))
+        return new_state(splats, task.schedule.config, task.extent, backend=task.backend)
 
     def _step_ms(self, splats: Splats, level: int) -> float:
         """Returns the median of a few steps in the middle of a level; at least of one."""

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from recon_cli.render import render
+from recon_cli.train import ahead
 from recon_cli.train.early_stop import next_iteration
 from recon_cli.train.importance import Importance
 from recon_cli.train.pyramid import Pyramid
@@ -18,7 +19,6 @@ from recon_cli.train.ranks import ALONE, Ranks
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.step import TrainView
-from recon_cli.train.stepping import Stepper
 
 _REPORT_EVERY = 100  # steps between looks at the validation views, at least
 _REPORTS = 40  # of a long run; each costs a picture of every validation view
@@ -77,7 +77,7 @@ class Task:
     @cached_property
     def pyramid(self) -> Pyramid:
         """The training views at every size."""
-        return Pyramid(self.train)
+        return Pyramid(self.train, page_locked=self.device.type == "cuda")
 
 
 def fit(
@@ -88,6 +88,7 @@ def fit(
     on_step: Callable[[TrainState], None],
     on_report: Callable[[Report], None],
     importance: Importance | None = None,
+    looks: Callable[[int], bool] = lambda _: True,
 ) -> None:
     """Runs `state` on until it has done `until` steps.
 
@@ -95,18 +96,21 @@ def fit(
         state: changed in place.
         task: views and plan.
         until: total number of steps, those already done included.
-        on_step: called after each step; may save the state.
+        on_step: called after steps at which `looks` is true, and maybe others; may save the state.
         on_report: called every hundred steps and at the end.
         importance: gets the scores of every step's view, from the very passes that train.
+        looks: whether on_step must see the state after a step; the host goes ahead of a device that
+            need not be waited for.
 
     Raises:
         TrainingError: the loss is not finite, or no Gaussian is left.
     """
     start, cpu_start = time.perf_counter(), time.process_time()
-    stepper = Stepper(state, task, importance)
     every = report_every(task.schedule)
+    advance = ahead.advancing(
+        state, task, importance, lambda i: i == until or i % every == 0 or looks(i))
     while state.iteration < until:
-        loss = stepper.step()
+        loss = advance()
         if state.iteration % every == 0 or state.iteration == until:
             psnr = validation_psnr(state, task)
             regular = state.iteration % every == 0

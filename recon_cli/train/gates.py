@@ -209,7 +209,8 @@ class _Bench:
                      task.backend, task.device, camera_error=task.camera_error)
         # reduced views would be reduced once more in the search for what lies far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
-        fit(state, small, _STEPS, on_step=lambda _: None, on_report=lambda _: None)
+        fit(state, small, _STEPS, on_step=lambda _: None, on_report=lambda _: None,
+            looks=lambda _: False)
         return [_score(state.splats, reduced(view, LEVEL), config, task) for view in held_out]
 
 

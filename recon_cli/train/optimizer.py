@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,19 +30,18 @@ class SplatOptimizer:
         splats: their values are copied.
         config: learning rates, and how many Gaussians there may be.
         extent: of the scene in world units; scales the rate of the means.
-        fused: a backend writes the gradients into `gradients`, and one kernel moves all
-            parameters (float32 on the CPU). Otherwise autograd leaves them in `splats`.
+        backend: numba and triton write the gradients into `gradients`, and one kernel of theirs
+            moves all parameters. With torch autograd leaves them in `splats`.
 
     Attributes:
         splats: leaves that autograd knows; views of the buffers.
         gradients: views of the buffers, of the same shapes.
-        count: steps taken.
     """
 
     def __init__(
-        self, splats: Splats, config: RunConfig, extent: float, *, fused: bool = False
+        self, splats: Splats, config: RunConfig, extent: float, *, backend: str = "torch"
     ) -> None:
-        self._extent, self._fused = extent, fused
+        self._extent, self._backend = extent, backend
         recipe = RECIPES[config.densify]
         self._rates = {
             "means": config.means_rate * extent, "quats": config.quats_rate,
@@ -49,7 +49,10 @@ class SplatOptimizer:
             "logit_opacities": config.opacities_rate, "sh_dc": recipe.sh_rate * config.sh_rate,
             "sh_rest": recipe.sh_rate * config.sh_rate * _REST_FACTOR,
         }
-        self.count = 0
+        # on the device where a step may come to nothing there without the host's knowledge
+        self._taken = torch.zeros(1, dtype=torch.int64)
+        if backend == "triton":
+            self._taken = self._taken.to(splats.means.device)
         self._factor = 1.0
         self._buffers: dict[str, dict[str, Tensor]] = {}
         self._kept: dict[str, Tensor] = {}
@@ -61,8 +64,18 @@ class SplatOptimizer:
                 for role in _MOMENTS:
                     self._view(name, role).zero_()
 
+    @property
+    def fused(self) -> bool:
+        """Whether the backend writes the gradients and moves the parameters by its own kernels."""
+        return self._backend in ("numba", "triton")
+
+    @property
+    def count(self) -> int:
+        """Steps taken; with triton this waits for the device."""
+        return int(self._taken)
+
     def _reserve(self, name: str, like: Tensor, rows: int) -> None:
-        roles = _ROLES if self._fused else [role for role in _ROLES if role != "gradient"]
+        roles = _ROLES if self.fused else [role for role in _ROLES if role != "gradient"]
         self._buffers[name] = {
             role: torch.empty(rows, *like.shape[1:], dtype=like.dtype, device=like.device)
             for role in roles}
@@ -85,14 +98,14 @@ class SplatOptimizer:
             name: self._view(name, "value").detach().requires_grad_() for name in self._buffers})
         self.gradients = Splats(**{
             name: self._view(name, "gradient") for name in self._buffers}
-        ) if self._fused else self.splats
+        ) if self.fused else self.splats
 
     @property
     def bytes_per_gaussian(self) -> int:
         """Memory of values, gradients and moments of one Gaussian that has all of them."""
         held = sum(math.prod(buffer.shape[1:]) * buffer.element_size()
                    for roles in self._buffers.values() for buffer in roles.values())
-        return held if self._fused else held // 3 * 4  # autograd holds the gradients
+        return held if self.fused else held // 3 * 4  # autograd holds the gradients
 
     @torch.no_grad()
     def regularize(self, weight: float) -> None:
@@ -106,7 +119,7 @@ class SplatOptimizer:
 
     def gradient(self, name: str) -> Tensor:
         """Returns the gradient of a parameter that the last backward pass left, to be changed."""
-        if self._fused:
+        if self.fused:
             return self._view(name, "gradient")
         gradient: Tensor | None = getattr(self.splats, name).grad
         if gradient is None:
@@ -123,7 +136,7 @@ class SplatOptimizer:
         """
         for name in self._moved(sh_rest=sh_rest):
             value = getattr(self.splats, name)
-            if not self._fused and value.grad is None:
+            if not self.fused and value.grad is None:
                 continue
             if name not in self._kept:
                 self._kept[name] = torch.zeros_like(value)
@@ -143,7 +156,7 @@ class SplatOptimizer:
             value = getattr(self.splats, name)
             kept = self._kept.pop(name, None)
             total = torch.zeros_like(value) if kept is None else kept
-            if self._fused:
+            if self.fused:
                 total = self._view(name, "gradient").copy_(total)
             else:
                 value.grad = total
@@ -154,7 +167,8 @@ class SplatOptimizer:
         return [name for name in self._buffers if sh_rest or name != "sh_rest"]
 
     def step(
-        self, means_rate: float, *, sh_rest: bool = True, factor: float = 1.0
+        self, means_rate: float, *, sh_rest: bool = True, factor: float = 1.0,
+        counted: Tensor | None = None,
     ) -> None:
         """Moves the parameters against their gradients, which are then used up.
 
@@ -162,26 +176,32 @@ class SplatOptimizer:
             means_rate: learning rate of the means in units of the scene extent.
             sh_rest: the higher SH degrees are moved; otherwise they stay as they are.
             factor: of all learning rates but that of the means.
+            counted: [1] int32 on the device, zero where nothing is to be moved; with triton alone.
         """
         self._factor = factor
         self._rates["means"] = means_rate * self._extent / factor
-        self.count += 1
         names = self._moved(sh_rest=sh_rest)
-        if self._fused:
-            self._step_fused(names)
+        if self._backend == "triton":
+            from recon_cli.render.triton.optimizer import step as triton_step
+
+            triton_step(*self._groups(names), taken=self._taken, counted=counted, betas=_BETAS,
+                        epsilon=_EPSILON)
+            return
+        self._taken += 1
+        if self.fused:
+            from recon_cli.render.numba.optimizer import step as numba_step
+
+            numba_step(*self._groups(names), count=self.count, betas=_BETAS, epsilon=_EPSILON)
         else:
             self._step_torch(names)
 
-    def _step_fused(self, names: list[str]) -> None:
-        from recon_cli.render.numba.optimizer import step
-
-        def flat(role: str) -> list[Tensor]:
-            return [self._view(name, role).reshape(-1) for name in self._buffers]
-
+    def _groups(self, names: list[str]) -> tuple[Any, ...]:
+        """Returns values, gradients, moments and rates, each as a list over all parameters."""
+        roles = ([self._view(name, role).reshape(-1) for name in self._buffers]
+                 for role in _ROLES)
         rates = [self._factor * self._rates[name] if name in names else None
                  for name in self._buffers]
-        step(flat("value"), flat("gradient"), flat("exp_avg"), flat("exp_avg_sq"), rates,
-             count=self.count, betas=_BETAS, epsilon=_EPSILON)
+        return (*roles, rates)
 
     @torch.no_grad()
     def _step_torch(self, names: list[str]) -> None:
@@ -232,7 +252,7 @@ class SplatOptimizer:
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Takes moments and the step count back from what `tensors` returned."""
-        self.count = int(tensors["adam.count"])
+        self._taken.fill_(int(tensors["adam.count"]))
         for name in self._buffers:
             for role in _MOMENTS:
                 self._view(name, role).copy_(tensors[f"adam.{name}.{role}"])

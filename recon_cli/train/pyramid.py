@@ -36,14 +36,16 @@ class Pyramid:
 
     Args:
         views: at full size.
+        page_locked: those that are made lie in memory that a GPU reads by itself.
     """
 
-    def __init__(self, views: Sequence[TrainView]) -> None:
-        self._views = views
+    def __init__(self, views: Sequence[TrainView], *, page_locked: bool = False) -> None:
+        self._views, self._page_locked = views, page_locked
         self._at = cache(self._reduced)
 
     def _reduced(self, index: int, factor: int) -> TrainView:
-        return reduced(self._views[index], factor)
+        view = reduced(self._views[index], factor)
+        return view.page_locked() if self._page_locked else view
 
     def view(self, index: int, factor: int) -> TrainView:
         """Returns a view reduced by a factor."""

@@ -16,7 +16,6 @@ from recon_cli.train.fit import Task
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.poses import WORTH_PX, Poses
 from recon_cli.train.state import TrainState, load_state, new_state
-from recon_cli.train.step import fuses
 
 
 def first_state(
@@ -46,7 +45,7 @@ def first_state(
     exposure, poses = _parts(task, gains)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
-        fused=fuses(task.backend), exposure=exposure, poses=poses)
+        backend=task.backend, exposure=exposure, poses=poses)
 
 
 def saved_state(path: Path, task: Task) -> TrainState:
@@ -58,7 +57,7 @@ def saved_state(path: Path, task: Task) -> TrainState:
     """
     exposure, poses = _parts(task, None)
     return load_state(
-        path, task.schedule.config, task.extent, task.device, fused=fuses(task.backend),
+        path, task.schedule.config, task.extent, task.device, backend=task.backend,
         exposure=exposure, poses=poses)
 
 
@@ -69,7 +68,7 @@ def finished_state(splats: Splats, task: Task) -> TrainState:
     """
     state = new_state(
         splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.extent,
-        fused=fuses(task.backend))
+        backend=task.backend)
     state.iteration = task.schedule.config.iterations
     state.jump = 0, state.iteration
     return state

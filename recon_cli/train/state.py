@@ -70,7 +70,7 @@ class TrainState:
 
 
 def new_state(
-    splats: Splats, config: RunConfig, extent: float, *, fused: bool = False,
+    splats: Splats, config: RunConfig, extent: float, *, backend: str = "torch",
     exposure: Exposure | None = None, poses: Poses | None = None,
 ) -> TrainState:
     """Returns the state before the first step.
@@ -79,14 +79,14 @@ def new_state(
         splats: to begin with.
         config: of the run.
         extent: of the scene, world units.
-        fused: as in `SplatOptimizer`.
+        backend: as in `SplatOptimizer`.
         exposure: gains of the training images, where they are part of the model.
         poses: refinement of their cameras, likewise.
     """
     generator = torch.Generator().manual_seed(config.seed)
     gathered = Gathered.zeros(len(splats), splats.means.device)
     return TrainState(
-        SplatOptimizer(splats, config, extent, fused=fused), gathered, generator,
+        SplatOptimizer(splats, config, extent, backend=backend), gathered, generator,
         first_count=len(splats), exposure=exposure, poses=poses)
 
 
@@ -112,7 +112,7 @@ def save_state(path: Path, state: TrainState) -> None:
 
 
 def load_state(
-    path: Path, config: RunConfig, extent: float, device: torch.device, *, fused: bool = False,
+    path: Path, config: RunConfig, extent: float, device: torch.device, *, backend: str = "torch",
     exposure: Exposure | None = None, poses: Poses | None = None,
 ) -> TrainState:
     """Returns the state that `save_state` wrote; `exposure` and `poses` take theirs back.
@@ -132,7 +132,7 @@ def load_state(
         tensors = {name: value.to(device) for name, value in tensors.items()}
         splats = Splats(**_under("splats.", tensors))
         state = TrainState(
-            SplatOptimizer(splats, config, extent, fused=fused),
+            SplatOptimizer(splats, config, extent, backend=backend),
             Gathered(**_under("gathered.", tensors)), generator, int(scalars["iteration"]),
             [int(i) for i in scalars["queue"]], int(scalars["first_count"]),
             int(scalars["skipped"]), [(int(at), float(psnr)) for at, psnr in scalars["looks"]],

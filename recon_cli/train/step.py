@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from recon_cli.scene.camera import Camera
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import camera_gradient
+
+if TYPE_CHECKING:
+    from recon_cli.render.triton.ledger import Account
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +38,11 @@ class TrainView:
     def __post_init__(self) -> None:
         if self.mask is not None and self.mask.shape != self.image.shape[:2]:
             raise ValueError(f"a mask of {self.mask.shape} for an image of {self.image.shape}")
+
+    def page_locked(self) -> TrainView:
+        """Returns the view in memory that a GPU reads by itself while the host goes on."""
+        mask = None if self.mask is None else torch.from_numpy(self.mask).pin_memory().numpy()
+        return TrainView(self.camera, torch.from_numpy(self.image).pin_memory().numpy(), mask)
 
     def pixels(self, device: torch.device) -> Tensor:
         """Returns the image as float32 in [0, 1], [H, W, 3]."""
@@ -78,14 +86,30 @@ class GradientStep(Protocol):
         """
 
 
-def gradient_step(backend: str) -> GradientStep:
+class DeferredStep(GradientStep, Protocol):
+    """A gradient step that can also be started without waiting for what comes of it."""
+
+    @property
+    def counted(self) -> Tensor:
+        """[1] int32 on the device: zero where the last view came to nothing."""
+
+    def start(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False,
+    ) -> Statistics:
+        """Starts the work on one view and returns its statistics, zeros where it counts nothing."""
+
+    def close(self) -> Account:
+        """Waits for the work, and tells what became of the views since it was last called."""
+
+
+def gradient_step(backend: str, device: torch.device | str = "cpu") -> GradientStep:
     """Returns the way from a view to its gradients that is fastest with a backend."""
-    return _FusedStep() if fuses(backend) else _AutogradStep(backend)
-
-
-def fuses(backend: str) -> bool:
-    """Tells whether a backend computes loss and gradients without autograd."""
-    return backend == "numba"
+    if backend == "numba":
+        return _FusedStep()
+    if backend == "triton":
+        return _DeviceStep(torch.device(device))
+    return _AutogradStep(backend)
 
 
 class _FusedStep:
@@ -123,6 +147,66 @@ class _FusedStep:
         return loss, self._compute.statistics if self._compute.instances else None
 
 
+class _DeviceStep:
+    """The triton backend's own loss and gradients; nothing but `close` waits for the device."""
+
+    def __init__(self, device: torch.device) -> None:
+        from recon_cli.render.triton.step import PhotometricStep
+
+        self._compute = PhotometricStep(device)
+        self.log_gain_gradient = np.zeros(3)
+
+    @property
+    def counted(self) -> Tensor:
+        """[1] int32, zero where the last view came to nothing."""
+        return self._compute.counted
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        return camera_gradient(optimizer.splats, optimizer.gradients, camera, sh_degree)
+
+    def start(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
+    ) -> Statistics:
+        """Starts the work on one view and returns its statistics."""
+        from recon_cli.render.triton.step import Photograph
+
+        splats = optimizer.splats.map(lambda tensor: tensor.detach())
+        photograph = Photograph(
+            torch.from_numpy(view.image),
+            None if view.mask is None else torch.from_numpy(view.mask),
+            None if gain is None else torch.from_numpy(gain).to(splats.means.device))
+        self._compute(
+            splats, optimizer.gradients, view.camera, photograph, sh_degree, ssim_weight,
+            details=variance, scores=scores, loo=loo)
+        return self._compute.statistics
+
+    def close(self) -> Account:
+        """Waits for the work, and tells what became of it."""
+        return self._compute.close()
+
+    def __call__(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
+    ) -> tuple[float, Statistics | None]:
+        """Returns the loss and the statistics of the view."""
+        while True:
+            statistics = self.start(
+                optimizer, view, sh_degree, ssim_weight, variance=variance, gain=gain,
+                scores=scores, loo=loo)
+            account = self.close()
+            if account.stopped is None:  # else there is room for it now
+                break
+        if gain is not None:
+            self.log_gain_gradient = self._compute.log_gain_gradient.cpu().numpy()
+        return account.loss, statistics if account.seen else None
+
+
 class _AutogradStep:
     """Any backend that is differentiable by autograd."""
 
@@ -154,7 +238,7 @@ class _AutogradStep:
         if gain is not None:
             log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
             rgb = rgb * log_gain.exp()
-        loss = self._loss(rgb, view, ssim_weight, counting)
+        loss = photometric_loss(rgb, view.pixels(device), ssim_weight, mask=counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None
@@ -163,14 +247,3 @@ class _AutogradStep:
             if log_gain is not None and log_gain.grad is not None:
                 self.log_gain_gradient = log_gain.grad.cpu().double().numpy()
         return value, output.statistics
-
-    def _loss(
-        self, rgb: Tensor, view: TrainView, ssim_weight: float, counting: Tensor | None
-    ) -> Tensor:
-        """Returns the loss, by kernels of the backend where it has them."""
-        if self._backend != "triton":
-            return photometric_loss(rgb, view.pixels(rgb.device), ssim_weight, mask=counting)
-        from recon_cli.render.triton.loss import photometric_loss as by_kernels
-
-        truth = torch.from_numpy(view.image).to(rgb.device)
-        return by_kernels(rgb, truth, ssim_weight, mask=counting)

@@ -59,7 +59,7 @@ class Stepper:
 
     def __init__(self, state: TrainState, task: Task, importance: Importance | None) -> None:
         self._state, self._task, self._importance = state, task, importance
-        self._compute = gradient_step(task.backend)
+        self._compute = gradient_step(task.backend, task.device)
         self._strategy = STRATEGIES[task.schedule.config.densify]
 
     def step(self) -> float:
@@ -70,27 +70,18 @@ class Stepper:
         """
         state, task = self._state, self._task
         iteration = state.iteration + 1
-        batch = [self._next() for _ in range(task.schedule.config.batch_views)]
+        batch = [next_view(state, task) for _ in range(task.schedule.config.batch_views)]
         found = self._gather(batch, iteration)
         state.iteration = iteration
         loss = float(found.loss.mean())
         if not np.isfinite(loss):
-            _skip(state, task)
+            state.optimizer.discard()
+            skip(state, task)
             return loss
         if found.seen.any():
             self._move(batch, found, iteration)
-        self._strategy.control(state, task)
-        if iteration == task.schedule.review:
-            drop_harmonics(state, task)
+        control(state, task)
         return loss
-
-    def _next(self) -> int:
-        """Returns the view whose turn it is; every epoch has an order of its own."""
-        state = self._state
-        if not state.queue:
-            state.queue = torch.randperm(
-                len(self._task.train), generator=state.generator).tolist()
-        return state.queue.pop()
 
     def _gather(self, batch: list[int], iteration: int) -> _Found:
         """Looks at this process's share of the views and leaves their mean gradient."""
@@ -165,6 +156,20 @@ class Stepper:
             factor=schedule.rate_factor(iteration))
 
 
+def next_view(state: TrainState, task: Task) -> int:
+    """Returns the view whose turn it is; every epoch has an order of its own."""
+    if not state.queue:
+        state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
+    return state.queue.pop()
+
+
+def control(state: TrainState, task: Task) -> None:
+    """Adds and deletes Gaussians, and takes harmonics away, where the schedule says so."""
+    STRATEGIES[task.schedule.config.densify].control(state, task)
+    if state.iteration == task.schedule.review:
+        drop_harmonics(state, task)
+
+
 def drop_harmonics(state: TrainState, task: Task) -> None:
     """Takes the harmonics from Gaussians that look alike from all training views.
 
@@ -182,14 +187,13 @@ def drop_harmonics(state: TrainState, task: Task) -> None:
     state.gathered = Gathered.zeros(len(few), few.means.device)
 
 
-def _skip(state: TrainState, task: Task) -> None:
-    """Counts a step whose loss is not finite; the parameters stay as they are.
+def skip(state: TrainState, task: Task, steps: int = 1) -> None:
+    """Counts steps whose loss is not finite; the parameters stayed as they were.
 
     Raises:
         TrainingError: there were too many.
     """
-    state.optimizer.discard()
-    state.skipped += 1
+    state.skipped += steps
     most = max(_SKIPPED_FLOOR, int(_SKIPPED * task.schedule.config.iterations))
     if state.skipped > most:
         raise TrainingError(

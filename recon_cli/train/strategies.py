@@ -27,10 +27,12 @@ class Strategy:
     Attributes:
         control: called after each step; adds and deletes Gaussians where the schedule says so.
         variance: it needs the variance of the gradient over each Gaussian's pixels.
+        each_step: it changes something after every step, and not only when the schedule says so.
     """
 
     control: Callable[[TrainState, Task], None]
     variance: bool = False
+    each_step: bool = False
 
 
 def replaced(state: TrainState, splats: Splats, source: torch.Tensor) -> None:
@@ -87,5 +89,5 @@ def _mcmc(state: TrainState, task: Task) -> None:
 STRATEGIES = {
     "reference": Strategy(_reference),
     "budget": Strategy(_budget, variance=True),
-    "mcmc": Strategy(_mcmc),
+    "mcmc": Strategy(_mcmc, each_step=True),
 }

@@ -1,4 +1,6 @@
-"""Runs of both kinds of Adam on gradients as training has them, and how they are compared."""
+"""Runs of every kind of Adam on gradients as training has them, and how they are compared."""
+
+import importlib.util
 
 import pytest
 import torch
@@ -11,12 +13,16 @@ from recon_cli.train.optimizer import SplatOptimizer
 STEPS_TOLERANCE = 1e-6
 ROLES = "exp_avg", "exp_avg_sq"
 CONFIG = RunConfig(max_gaussians=50)
-both_kinds = pytest.mark.parametrize("fused", [False, True])
+# triton in its interpreter; on a GPU tests/train/test_triton_step.py holds it against torch
+INTERPRETED = bool(importlib.util.find_spec("triton")) and not torch.cuda.is_available()
+BACKENDS = ("torch", "numba", "triton")[:3 if INTERPRETED else 2]
+KERNELS = BACKENDS[1:]  # which move all parameters at once
+every_kind = pytest.mark.parametrize("backend", BACKENDS)
 
 
-def optimizer_of(n, *, fused, config=CONFIG):
+def optimizer_of(n, *, backend, config=CONFIG):
     splats = random_splats(n, dtype=torch.float32)
-    return SplatOptimizer(splats, config, extent=2.0, fused=fused)
+    return SplatOptimizer(splats, config, extent=2.0, backend=backend)
 
 
 def gradients_of(n, step):
@@ -31,18 +37,18 @@ def gradients_of(n, step):
     return random_splats(n, dtype=torch.float32).map(draw)
 
 
-def feed(optimizer, gradients, *, fused):
+def feed(optimizer, gradients):
     """Leaves gradients where each kind of optimizer looks for them."""
     for name, value in gradients.parameters().items():
-        if fused:
+        if optimizer.fused:
             getattr(optimizer.gradients, name).copy_(value)
         else:
             getattr(optimizer.splats, name).grad = value.clone()
 
 
-def walk(optimizer, steps, *, fused, start=0, sh_rest=True):
+def walk(optimizer, steps, *, start=0, sh_rest=True):
     for step in range(start, start + steps):
-        feed(optimizer, gradients_of(len(optimizer.splats), step), fused=fused)
+        feed(optimizer, gradients_of(len(optimizer.splats), step))
         optimizer.step(1e-4, sh_rest=sh_rest)
 
 

@@ -12,7 +12,7 @@ from recon_cli.render.numba.crew import crew
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView, fuses, gradient_step
+from recon_cli.train.step import TrainView, gradient_step
 
 # Gradients of float32 against float64, relative in the 2-norm, as in test_step.
 TOLERANCE = 1e-5
@@ -34,11 +34,11 @@ def masked_view():
 
 def step_of(splats, view, backend, gain):
     """Loss, gradients of the splats and of the log-gain that a step leaves."""
-    state = new_state(splats, CONFIG, 1.0, fused=fuses(backend))
+    state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
     loss, _ = compute(state.optimizer, view, 3, 0.2, gain=gain)
     held = state.optimizer.gradients.parameters().items()
-    if not fuses(backend):
+    if not state.optimizer.fused:
         held = ((name, leaf.grad) for name, leaf in state.splats.parameters().items())
     return loss, {name: value.clone() for name, value in held}, compute.log_gain_gradient
 
@@ -92,7 +92,7 @@ def test_a_white_picture_of_a_gray_room_has_the_slope_of_its_brightness(backend)
     splats = random_splats(200, seed=13, dtype=torch.float32)
     view = TrainView(CAMERA, np.full((41, 60, 3), 255, np.uint8))
     gain = np.array([0.1, 0.2, 0.05], np.float32)
-    state = new_state(splats, CONFIG, 1.0, fused=fuses(backend))
+    state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
     compute(state.optimizer, view, 3, 0.0, gain=gain)
     with torch.no_grad():

@@ -14,7 +14,7 @@ from recon_cli.train.importance import (
     paper_score,
 )
 from recon_cli.train.optimizer import SplatOptimizer
-from recon_cli.train.step import TrainView, fuses, gradient_step
+from recon_cli.train.step import TrainView, gradient_step
 
 CPU = torch.device("cpu")
 
@@ -132,7 +132,7 @@ def test_a_training_step_leaves_the_scores_of_its_view(backend):
     splats = random_splats(60, dtype=torch.float32)
     mask = np.random.default_rng(0).random((20, 30)) < 0.5
     view = blank(camera_at(30, 20), mask)
-    optimizer = SplatOptimizer(splats, RunConfig(), 1.0, fused=fuses(backend))
+    optimizer = SplatOptimizer(splats, RunConfig(), 1.0, backend=backend)
     _, statistics = gradient_step(backend)(optimizer, view, 0, 0.2, scores=True, loo=True)
     trained = Importance.zeros(60, CPU)
     trained.add(statistics)

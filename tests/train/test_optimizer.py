@@ -2,7 +2,17 @@
 
 import pytest
 import torch
-from adam_runs import CONFIG, ROLES, assert_close, both_kinds, held, optimizer_of, walk
+from adam_runs import (
+    BACKENDS,
+    CONFIG,
+    KERNELS,
+    ROLES,
+    assert_close,
+    every_kind,
+    held,
+    optimizer_of,
+    walk,
+)
 from scenes import joined, random_splats
 
 from recon_cli.config import RunConfig
@@ -69,11 +79,12 @@ def test_forgetting_touches_one_parameter_only():
 
 # ---- fused: gradients in buffers, one kernel for all parameters ----
 
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize("n", [1, 5, 37])  # numbers of values that no vector divides
-def test_fused_steps_equal_those_of_torch(n):
-    plain, fused = optimizer_of(n, fused=False), optimizer_of(n, fused=True)
-    walk(plain, 20, fused=False)
-    walk(fused, 20, fused=True)
+def test_fused_steps_equal_those_of_torch(n, backend):
+    plain, fused = optimizer_of(n, backend="torch"), optimizer_of(n, backend=backend)
+    walk(plain, 20)
+    walk(fused, 20)
     assert plain.count == fused.count == 20
     assert_close(held(fused), held(plain))
 
@@ -82,32 +93,33 @@ def test_fused_steps_have_the_same_bits_with_any_number_of_threads(monkeypatch):
     found = []
     for threads in (1, 2, 3):
         monkeypatch.setattr(crew, "threads", threads)
-        optimizer = optimizer_of(1200, fused=True)  # several blocks of the largest group
-        walk(optimizer, 2, fused=True)
+        optimizer = optimizer_of(1200, backend="numba")  # several blocks of the largest group
+        walk(optimizer, 2)
         found.append(held(optimizer))
     for name, value in found[0].items():
         assert torch.equal(value, found[1][name]), name
         assert torch.equal(value, found[2][name]), name
 
 
-@both_kinds
-def test_higher_degrees_that_are_not_in_use_stay_as_they_are(fused):
-    optimizer = optimizer_of(7, fused=fused)
+@every_kind
+def test_higher_degrees_that_are_not_in_use_stay_as_they_are(backend):
+    optimizer = optimizer_of(7, backend=backend)
     before = held(optimizer)
-    walk(optimizer, 3, fused=fused, sh_rest=False)
+    walk(optimizer, 3, sh_rest=False)
     after = held(optimizer)
     for name, value in before.items():
         kept = "sh_rest" in name
         assert torch.equal(value, after[name]) == kept, name
 
 
-def test_fused_steps_without_higher_degrees_equal_those_of_torch():
-    plain, fused = optimizer_of(9, fused=False), optimizer_of(9, fused=True)
-    for optimizer, kind in ((plain, False), (fused, True)):
-        walk(optimizer, 5, fused=kind, sh_rest=False)
+@pytest.mark.parametrize("backend", KERNELS)
+def test_fused_steps_without_higher_degrees_equal_those_of_torch(backend):
+    plain, fused = optimizer_of(9, backend="torch"), optimizer_of(9, backend=backend)
+    for optimizer in (plain, fused):
+        walk(optimizer, 5, sh_rest=False)
         for value in optimizer.splats.parameters().values():
             value.grad = None
-        walk(optimizer, 5, fused=kind, start=5)
+        walk(optimizer, 5, start=5)
     assert_close(held(fused), held(plain))
 
 
@@ -118,12 +130,12 @@ SOURCES = {
 }
 
 
-@both_kinds
+@every_kind
 @pytest.mark.parametrize("case", SOURCES)
-def test_rows_keep_values_and_moments_when_gaussians_are_replaced(case, fused):
+def test_rows_keep_values_and_moments_when_gaussians_are_replaced(case, backend):
     source = SOURCES[case]
-    optimizer = optimizer_of(9, fused=fused)
-    walk(optimizer, 3, fused=fused)
+    optimizer = optimizer_of(9, backend=backend)
+    walk(optimizer, 3)
     before = held(optimizer)
     new = random_splats(len(source), seed=3, dtype=torch.float32)
     optimizer.replace(new, source)
@@ -137,20 +149,21 @@ def test_rows_keep_values_and_moments_when_gaussians_are_replaced(case, fused):
             expected = before[key][source.clamp_min(0)]
             expected[source < 0] = 0
             assert torch.equal(after[key], expected), key
-    walk(optimizer, 2, fused=fused, start=3)
+    walk(optimizer, 2, start=3)
     assert all(torch.isfinite(value).all() for value in optimizer.tensors().values())
 
 
 @pytest.mark.parametrize("case", SOURCES)
-def test_both_kinds_go_on_alike_after_gaussians_were_replaced(case):
+def test_every_kind_goes_on_alike_after_gaussians_were_replaced(case):
     source, found = SOURCES[case], []
-    for fused in (False, True):
-        optimizer = optimizer_of(9, fused=fused)
-        walk(optimizer, 3, fused=fused)
+    for backend in BACKENDS:
+        optimizer = optimizer_of(9, backend=backend)
+        walk(optimizer, 3)
         optimizer.replace(random_splats(len(source), seed=3, dtype=torch.float32), source)
-        walk(optimizer, 5, fused=fused, start=3)
+        walk(optimizer, 5, start=3)
         found.append(held(optimizer))
-    assert_close(found[1], found[0])
+    for other in found[1:]:
+        assert_close(other, found[0])
 
 
 def places(optimizer):
@@ -158,9 +171,9 @@ def places(optimizer):
             if name != "adam.count"}
 
 
-@both_kinds
-def test_nothing_is_allocated_anew_while_the_gaussians_fit(fused):
-    optimizer = optimizer_of(9, fused=fused)
+@every_kind
+def test_nothing_is_allocated_anew_while_the_gaussians_fit(backend):
+    optimizer = optimizer_of(9, backend=backend)
     before = places(optimizer)
     for n in (30, 3, 50):  # the last is the capacity
         source = torch.full((n,), -1)
@@ -170,28 +183,28 @@ def test_nothing_is_allocated_anew_while_the_gaussians_fit(fused):
     assert places(optimizer) != before
 
 
-@both_kinds
-def test_a_gaussian_takes_as_many_bytes_as_promised(fused):
-    optimizer = optimizer_of(9, fused=fused)
+@every_kind
+def test_a_gaussian_takes_as_many_bytes_as_promised(backend):
+    optimizer = optimizer_of(9, backend=backend)
     values = sum(value[0].numel() for value in optimizer.splats.parameters().values())
     assert optimizer.bytes_per_gaussian == 4 * 4 * values  # value, gradient and two moments
     assert optimizer.bytes_per_gaussian <= BYTES
 
 
-@both_kinds
-@pytest.mark.parametrize("other", [False, True])
-def test_what_a_checkpoint_holds_comes_back_bit_by_bit(fused, other):
-    optimizer = optimizer_of(9, fused=fused)
-    walk(optimizer, 3, fused=fused)
+@every_kind
+@pytest.mark.parametrize("other", BACKENDS)
+def test_what_a_checkpoint_holds_comes_back_bit_by_bit(backend, other):
+    optimizer = optimizer_of(9, backend=backend)
+    walk(optimizer, 3)
     saved = held(optimizer)
     values = {name.removeprefix("splats."): value
               for name, value in saved.items() if name.startswith("splats.")}
-    resumed = SplatOptimizer(Splats(**values), CONFIG, extent=2.0, fused=other)
+    resumed = SplatOptimizer(Splats(**values), CONFIG, extent=2.0, backend=other)
     resumed.restore(saved)
     for name, value in held(resumed).items():
         assert torch.equal(value, saved[name]), name
-    if other == fused:
-        walk(optimizer, 2, fused=fused, start=3)
-        walk(resumed, 2, fused=fused, start=3)
+    if other == backend:
+        walk(optimizer, 2, start=3)
+        walk(resumed, 2, start=3)
         for name, value in held(resumed).items():
             assert torch.equal(value, held(optimizer)[name]), name

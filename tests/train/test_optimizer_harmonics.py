@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from adam_runs import CONFIG, ROLES, assert_close, both_kinds, feed, gradients_of, held
+from adam_runs import BACKENDS, CONFIG, ROLES, assert_close, every_kind, feed, gradients_of, held
 from scenes import random_splats, with_harmonics
 
 from recon_cli.scene.splats import TERMS
@@ -21,7 +21,7 @@ def filled(optimizer):
                 value.copy_(torch.arange(1.0, 1 + value.numel()).view(value.shape))
 
 
-@both_kinds
+@every_kind
 @pytest.mark.parametrize(("colored", "after", "source"), [
     (9, 4, [1, 3, 5, 7, 0, 2, 4, 6, 8]),  # some lose their coefficients
     (4, 9, [0, 1, 2, 3, 4, 5, 6, 7, 8]),  # all get some
@@ -30,8 +30,8 @@ def filled(optimizer):
     (0, 2, [8, -1, 1, 2]),
 ])
 @pytest.mark.parametrize("degree", [1, 3])
-def test_moments_of_coefficients_follow_their_gaussian(fused, colored, after, source, degree):
-    optimizer = SplatOptimizer(some(9, 3, colored), CONFIG, extent=2.0, fused=fused)
+def test_moments_of_coefficients_follow_their_gaussian(backend, colored, after, source, degree):
+    optimizer = SplatOptimizer(some(9, 3, colored), CONFIG, extent=2.0, backend=backend)
     filled(optimizer)
     before = held(optimizer)
     new = some(len(source), degree, after, seed=3)
@@ -51,21 +51,22 @@ def test_moments_of_coefficients_follow_their_gaussian(fused, colored, after, so
 
 
 @pytest.mark.parametrize(("degree", "colored"), [(0, 9), (1, 4), (2, 9), (3, 5), (3, 0)])
-def test_both_kinds_step_alike_whatever_the_share(degree, colored):
+def test_every_kind_steps_alike_whatever_the_share(degree, colored):
     found = []
-    for fused in (False, True):
-        optimizer = SplatOptimizer(some(9, degree, colored), CONFIG, extent=2.0, fused=fused)
+    for backend in BACKENDS:
+        optimizer = SplatOptimizer(some(9, degree, colored), CONFIG, extent=2.0, backend=backend)
         for step in range(5):
             gradients = with_harmonics(gradients_of(9, step), degree, colored)
-            feed(optimizer, gradients, fused=fused)
+            feed(optimizer, gradients)
             optimizer.step(1e-4)
         found.append(held(optimizer))
-    assert_close(found[1], found[0])
+    for other in found[1:]:
+        assert_close(other, found[0])
 
 
-@both_kinds
-def test_no_memory_is_held_for_coefficients_that_nobody_has(fused):
-    optimizer = SplatOptimizer(some(9, 3, 9), CONFIG, extent=2.0, fused=fused)
+@every_kind
+def test_no_memory_is_held_for_coefficients_that_nobody_has(backend):
+    optimizer = SplatOptimizer(some(9, 3, 9), CONFIG, extent=2.0, backend=backend)
     optimizer.replace(some(9, 3, 4), torch.arange(9))
     assert all(len(buffer) == 4 for buffer in optimizer._buffers["sh_rest"].values())
     optimizer.replace(some(9, 3, 9), torch.arange(9))

@@ -74,7 +74,7 @@ def poses_for(views, visits):
 
 def train(splats, views, epochs, *, poses, scene_moves):
     config = TrainConfig(iterations=epochs * VIEWS, max_gaussians=300)
-    state = new_state(splats, config, EXTENT, fused=True)
+    state = new_state(splats, config, EXTENT, backend="numba")
     compute, generator = gradient_step("numba"), torch.Generator().manual_seed(0)
     for step in range(epochs * VIEWS):
         if step % VIEWS == 0:

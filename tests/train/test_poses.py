@@ -12,7 +12,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.poses import Poses, camera_gradient, moved, worth_a_trial
 from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView, fuses, gradient_step
+from recon_cli.train.step import TrainView, gradient_step
 
 BLACK = torch.zeros(3, dtype=torch.float64)
 CONFIG = TrainConfig(iterations=10, max_gaussians=6000)
@@ -48,7 +48,7 @@ def collected(held):
 
 
 def after_a_step(splats, camera, degree, backend):
-    state = new_state(splats, CONFIG, 1.0, fused=fuses(backend))
+    state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
     compute(state.optimizer, TrainView(camera, photograph()), degree, 0.2)
     return state, compute

@@ -10,7 +10,7 @@ from recon_cli.io.images import painted
 from recon_cli.render import render
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView, fuses, gradient_step
+from recon_cli.train.step import TrainView, gradient_step
 
 # Gradients of float32 against float64, relative in the 2-norm. Measured 3e-6 (torch), 8e-7 (numba).
 TOLERANCE = 1e-5
@@ -34,10 +34,10 @@ def photograph(seed=0):
 
 def gradients_of(splats, view, backend, degree=3):
     """The loss and the gradients that a step leaves in the optimizer."""
-    state = new_state(splats, CONFIG, 1.0, fused=fuses(backend))
+    state = new_state(splats, CONFIG, 1.0, backend=backend)
     loss, statistics = gradient_step(backend)(state.optimizer, view, degree, 0.2)
     held = state.optimizer.gradients.parameters().items()
-    if not fuses(backend):
+    if not state.optimizer.fused:
         held = ((name, leaf.grad) for name, leaf in state.splats.parameters().items())
     return loss, {name: value.clone() for name, value in held}, statistics
 

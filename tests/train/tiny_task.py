@@ -8,7 +8,7 @@ from recon_cli.render import render
 from recon_cli.train.fit import Task
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
-from recon_cli.train.step import TrainView, fuses
+from recon_cli.train.step import TrainView
 
 CONFIG = RunConfig(
     iterations=60, densify="reference", densify_every=10, densify_gradient=1e-5, max_gaussians=90,
@@ -35,14 +35,14 @@ def first_state(config=CONFIG, device="cpu", backend="torch", *, colored=40):
         random_splats(40, seed=0, dtype=torch.float32), config.sh_degree, colored)
     splats.sh_dc = torch.zeros(40, 3)
     return new_state(splats.map(lambda tensor: tensor.to(device)), config, EXTENT,
-                     fused=fuses(backend))
+                     backend=backend)
 
 
 def saved_and_loaded(state, folder, device="cpu", backend="torch", config=CONFIG):
     """The state after a process that ended and another that began, maybe on another backend."""
     save_state(folder / "state.safetensors", state)
     return load_state(folder / "state.safetensors", config, EXTENT, torch.device(device),
-                      fused=fuses(backend))
+                      backend=backend)
 
 
 def same(a, b):

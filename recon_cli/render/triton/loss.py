@@ -8,7 +8,6 @@ columns. The truth is read as bytes. Each program sums its own part, and torch a
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 import triton
@@ -180,52 +179,32 @@ def gradient_of(image, truth, mask, maps, width, count, by_error, by_ssim, gradi
     tl.store(parts + tl.program_id(0), tl.sum(tl.where(here, tl.abs(error), 0.0)))
 
 
-def photometric_loss(
-    image: Tensor, truth: Tensor, ssim_weight: float, *, mask: Tensor | None = None
-) -> Tensor:
-    """Returns the loss as `train.losses.photometric_loss` does, for a truth in bytes.
+def loss_and_gradient(
+    image: Tensor, truth: Tensor, ssim_weight: float, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Returns the loss, float64, and its gradient [H, W, 3]; nothing waits for the device.
 
     Args:
-        image: [H, W, 3] float32, gradients flow here.
-        truth: [H, W, 3] uint8.
+        image: [H, W, 3] float32, contiguous.
+        truth: [H, W, 3] uint8, contiguous.
         ssim_weight: w in [0, 1].
-        mask: [H, W] bool, True where a pixel counts; None where all do.
+        mask: [H, W] uint8, not zero where a pixel counts; None where all do.
     """
-    loss: Tensor = _Photometric.apply(image, truth, ssim_weight, mask)
-    return loss
-
-
-class _Photometric(torch.autograd.Function):
-    """The gradient is taken with the value: training asks for both."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, truth: Tensor, ssim_weight: float, mask: Tensor | None
-    ) -> Tensor:
-        image, truth = image.contiguous(), truth.contiguous()
-        bytes_of_mask = None if mask is None else mask.contiguous().to(torch.uint8)
-        count, width = image.numel(), image.shape[1]
-        grid = (triton.cdiv(count, _BLOCK),)
-        maps, slopes = image.new_empty(5 * count), image.new_empty(3 * count)
-        similar, wrong = image.new_zeros(grid), image.new_empty(grid)
-        gradient, masked = torch.empty_like(image), mask is not None
-        if ssim_weight > 0:
-            blur_products[grid](
-                image, truth, bytes_of_mask, width, count, maps, MASKED=masked, BLOCK=_BLOCK)
-            similarity[grid](maps, width, count, slopes, similar, BLOCK=_BLOCK)
-            blur_slopes[grid](slopes, width, count, maps, BLOCK=_BLOCK)
-        gradient_of[grid](
-            image, truth, bytes_of_mask, maps, width, count, (1 - ssim_weight) / count,
-            -ssim_weight / count, gradient, wrong, MASKED=masked, SSIM=ssim_weight > 0,
-            BLOCK=_BLOCK)
-        ctx.save_for_backward(gradient)
-        error = wrong.double().sum() / count
-        if ssim_weight == 0:
-            return error.float()
-        similarity_mean = similar.double().sum() / count
-        return ((1 - ssim_weight) * error + ssim_weight * (1 - similarity_mean)).float()
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        gradient, = ctx.saved_tensors
-        return gradient * grad, None, None, None
+    count, width = image.numel(), image.shape[1]
+    grid = (triton.cdiv(count, _BLOCK),)
+    maps, slopes = image.new_empty(5 * count), image.new_empty(3 * count)
+    similar, wrong = image.new_zeros(grid), image.new_empty(grid)
+    gradient, masked = torch.empty_like(image), mask is not None
+    if ssim_weight > 0:
+        blur_products[grid](
+            image, truth, mask, width, count, maps, MASKED=masked, BLOCK=_BLOCK)
+        similarity[grid](maps, width, count, slopes, similar, BLOCK=_BLOCK)
+        blur_slopes[grid](slopes, width, count, maps, BLOCK=_BLOCK)
+    gradient_of[grid](
+        image, truth, mask, maps, width, count, (1 - ssim_weight) / count, -ssim_weight / count,
+        gradient, wrong, MASKED=masked, SSIM=ssim_weight > 0, BLOCK=_BLOCK)
+    error = wrong.double().sum() / count
+    if ssim_weight == 0:
+        return error, gradient
+    similarity_mean = similar.double().sum() / count
+    return (1 - ssim_weight) * error + ssim_weight * (1 - similarity_mean), gradient

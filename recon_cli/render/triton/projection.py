@@ -41,7 +41,7 @@ LARGE = tl.constexpr(1e30)  # a determinant or a pixel beyond it is of no use
 INFINITE = tl.constexpr(3e38)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count", "colored"))
 def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, colored, records,
             shapes, centers, depths, touched, radii, broken,
             STRIDE: tl.constexpr, TERMS: tl.constexpr, BLOCK: tl.constexpr):
@@ -195,8 +195,8 @@ def span(shape, center_x, center_y, row, view, here):
     return first, tl.where(meets, last, first - 1)
 
 
-@triton.jit
-def list_tiles(shapes, centers, depths, touched, starts, view, count, tiles_x, keys, owners,
+@triton.jit(do_not_specialize=("count",))
+def list_tiles(shapes, centers, depths, starts, view, count, tiles_x, keys, owners,
                BLOCK: tl.constexpr):
     """Writes the instances of each Gaussian into its slots.
 
@@ -204,8 +204,7 @@ def list_tiles(shapes, centers, depths, touched, starts, view, count, tiles_x, k
         shapes: [N, SHAPE].
         centers: [N, 2] float64.
         depths: [N].
-        touched: [N] int32, tiles of each Gaussian.
-        starts: [N + 1] int32, first slot of each.
+        starts: [N + 1] int32, first slot of each; without slots a Gaussian is left out.
         view: see `view.view_numbers`.
         count: N.
         tiles_x: tiles in a row.
@@ -215,14 +214,15 @@ def list_tiles(shapes, centers, depths, touched, starts, view, count, tiles_x, k
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
-    here = here & (tl.load(touched + i, mask=here, other=0) > 0)
+    slot, end = tl.load(starts + i, mask=here, other=0), tl.load(starts + i + 1, mask=here, other=0)
+    here = here & (slot < end)
     center_x = tl.load(centers + 2 * i, mask=here, other=0.0)
     center_y = tl.load(centers + 2 * i + 1, mask=here, other=0.0)
     shape = shapes + i * SHAPE
     depth = tl.load(depths + i, mask=here, other=1.0).to(tl.int32, bitcast=True).to(tl.int64)
     low, high = rows_of(center_y, tl.load(shape + 1, mask=here, other=0.0), view)
     high = tl.where(here, high, low - 1)
-    slot, row = tl.load(starts + i, mask=here, other=0), low
+    row = low
     while tl.max(high - row) >= 0:
         tile, last = span(shape, center_x, center_y, row, view, here & (row <= high))
         while tl.max(last - tile) >= 0:
@@ -235,8 +235,8 @@ def list_tiles(shapes, centers, depths, touched, starts, view, count, tiles_x, k
         row += 1
 
 
-@triton.jit
-def place(keys, slots, owners, centers, records, count, tiles_x, members, offsets,
+@triton.jit(do_not_specialize=("count",))
+def place(keys, slots, owners, centers, records, starts, count, tiles_x, members, offsets,
           BLOCK: tl.constexpr):
     """Writes what compositing reads of each instance, in the order of compositing.
 
@@ -246,14 +246,15 @@ def place(keys, slots, owners, centers, records, count, tiles_x, members, offset
         owners: [E] int32, Gaussian by slot.
         centers: [N, 2] float64.
         records: [N, FLOATS].
-        count: E.
+        starts: [N + 1] int32; the last one is how many instances there are.
+        count: N.
         tiles_x: tiles in a row.
         members: [E] int32 out, Gaussian.
         offsets: [E, 2] out, u and v at the tile's first pixel.
         BLOCK: instances a program.
     """
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = e < count
+    here = e < tl.load(starts + count)
     tile = (tl.load(keys + e, mask=here, other=0) >> 32).to(tl.int32)
     owner = tl.load(owners + tl.load(slots + e, mask=here, other=0), mask=here, other=0)
     i = owner.to(tl.int64)

@@ -29,10 +29,11 @@ from recon_cli.render.triton.view import BOTTOM, FX, FY, LEFT, RIGHT, TOP
 WHITE = tl.constexpr(1.0 / UNIT.value)  # u and v hold sqrt(log2(e) / 2)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count", "colored"))
 def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, records, starts,
-              sums, g_means, g_quats, g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad,
-              absolute_grad, variance, loo, STRIDE: tl.constexpr, TERMS: tl.constexpr,
+              sums, counted, g_means, g_quats, g_log_scales, g_logits, g_sh_dc, g_sh_rest,
+              means2d_grad, absolute_grad, variance, loo, STRIDE: tl.constexpr, TERMS: tl.constexpr,
+              GATED: tl.constexpr, PLAIN: tl.constexpr, DETAILS: tl.constexpr,
               SCORES: tl.constexpr, BLOCK: tl.constexpr):
     """Writes the gradients of all Gaussians, zero for those that no pixel shows.
 
@@ -48,6 +49,7 @@ def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, r
         records: [N, FLOATS].
         starts: [N + 1] int32, first slot of each Gaussian.
         sums: [E, SLOT], see `raster_backward.decompose`.
+        counted: [1] int32; with GATED, everything that is written is zero where this is.
         g_means: [N, 3] out, and so on for every parameter.
         g_quats: [N, 4] out.
         g_log_scales: [N, 3] out.
@@ -55,17 +57,22 @@ def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, r
         g_sh_dc: [N, 3] out.
         g_sh_rest: [M, STRIDE / 3, 3] out; not written at degree 0.
         means2d_grad: [N, 2] out, see `Statistics`; so the next three.
-        absolute_grad: [N, 2] out.
-        variance: [N] out.
+        absolute_grad: [N, 2] out with DETAILS.
+        variance: [N] out with DETAILS.
         loo: [N] out with SCORES.
         STRIDE: numbers in a row of sh_rest.
         TERMS: coefficients a channel that are in use.
+        GATED: see `counted`.
+        PLAIN: `sums` hold nothing of depths.
+        DETAILS: `sums` hold what the statistics are made of.
         SCORES: `sums` hold what leaving each out would change.
         BLOCK: Gaussians a program.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     slot, end = tl.load(starts + i, mask=here, other=0), tl.load(starts + i + 1, mask=here, other=0)
+    if GATED:
+        end = tl.where(tl.load(counted) != 0, end, slot)
     drawn = slot < end
     zero = slot.to(tl.float32) * 0.0
     red, green, blue, depth, s, s_u, s_v = zero, zero, zero, zero, zero, zero, zero
@@ -76,17 +83,19 @@ def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, r
         red += tl.load(at, mask=more, other=0.0)
         green += tl.load(at + 1, mask=more, other=0.0)
         blue += tl.load(at + 2, mask=more, other=0.0)
-        depth += tl.load(at + 3, mask=more, other=0.0)
+        if PLAIN == 0:
+            depth += tl.load(at + 3, mask=more, other=0.0)
         s += tl.load(at + 4, mask=more, other=0.0)
         s_u += tl.load(at + 5, mask=more, other=0.0)
         s_v += tl.load(at + 6, mask=more, other=0.0)
         s_uu += tl.load(at + 7, mask=more, other=0.0)
         s_uv += tl.load(at + 8, mask=more, other=0.0)
         s_vv += tl.load(at + 9, mask=more, other=0.0)
-        abs_x += tl.load(at + 10, mask=more, other=0.0)
-        abs_y += tl.load(at + 11, mask=more, other=0.0)
-        squared += tl.load(at + 12, mask=more, other=0.0)
-        hits += tl.load(at + 13, mask=more, other=0.0)
+        if DETAILS:
+            abs_x += tl.load(at + 10, mask=more, other=0.0)
+            abs_y += tl.load(at + 11, mask=more, other=0.0)
+            squared += tl.load(at + 12, mask=more, other=0.0)
+            hits += tl.load(at + 13, mask=more, other=0.0)
         if SCORES:
             left_out += tl.load(at + 14, mask=more, other=0.0)
         slot += 1
@@ -130,10 +139,11 @@ def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, r
     d_x, d_y = u_x * s_u, u_y * s_u + v_y * s_v
     tl.store(means2d_grad + 2 * i, d_x, mask=here)
     tl.store(means2d_grad + 2 * i + 1, d_y, mask=here)
-    tl.store(absolute_grad + 2 * i, abs_x * (WHITE * WHITE), mask=here)
-    tl.store(absolute_grad + 2 * i + 1, abs_y * (WHITE * WHITE), mask=here)
-    spread = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
-    tl.store(variance + i, tl.maximum(spread, 0.0).to(tl.float32), mask=here)
+    if DETAILS:
+        tl.store(absolute_grad + 2 * i, abs_x * (WHITE * WHITE), mask=here)
+        tl.store(absolute_grad + 2 * i + 1, abs_y * (WHITE * WHITE), mask=here)
+        spread = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
+        tl.store(variance + i, tl.maximum(spread, 0.0).to(tl.float32), mask=here)
     if SCORES:
         tl.store(loo + i, left_out, mask=here)
     odds = tl.exp2(tl.minimum(-tl.load(logits + i, mask=drawn, other=0.0) * LOG2E, 126.0))

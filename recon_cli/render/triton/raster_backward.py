@@ -31,7 +31,8 @@ from recon_cli.render.triton.fragments import (
 @triton.jit
 def decompose(order, first, members, offsets, records, background, width, height, tiles_x,
               final, last, grad_rgb, grad_alpha, grad_depth, slots, counting, sums,
-              SCORES: tl.constexpr, MASKED: tl.constexpr):
+              PLAIN: tl.constexpr, DETAILS: tl.constexpr, SCORES: tl.constexpr,
+              MASKED: tl.constexpr):
     """Sums the gradients of every instance of a tile over its pixels.
 
     Args:
@@ -47,13 +48,15 @@ def decompose(order, first, members, offsets, records, background, width, height
         final: [tiles, AREA] transmittance behind the last fragment.
         last: [tiles, AREA] int32, number of the last fragment.
         grad_rgb: [H, W, 3] dL/drgb.
-        grad_alpha: [H, W] dL/dalpha.
+        grad_alpha: [H, W] dL/dalpha; not read with PLAIN, nor is the next.
         grad_depth: [H, W] dL/ddepth.
         slots: [E] int64.
         counting: [H, W] uint8.
         sums: [E, SLOT] out by slot: dL/d(red, green, blue, depth), then the sums of s times 1, u,
             v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back, without its
             factor), of s^2, the fragments, and what leaving the instance out would change.
+        PLAIN: the loss depends on colours alone.
+        DETAILS: also |s y|, s^2 and the fragments.
         SCORES: also the last of these.
         MASKED: that one of the pixels in `counting` alone.
     """
@@ -69,12 +72,15 @@ def decompose(order, first, members, offsets, records, background, width, height
     g_red = tl.load(grad_rgb + 3 * at, mask=inside, other=0.0)
     g_green = tl.load(grad_rgb + 3 * at + 1, mask=inside, other=0.0)
     g_blue = tl.load(grad_rgb + 3 * at + 2, mask=inside, other=0.0)
-    g_depth = tl.load(grad_depth + at, mask=inside, other=0.0)
+    g_depth = T * 0.0
+    if PLAIN == 0:
+        g_depth = tl.load(grad_depth + at, mask=inside, other=0.0)
     behind_red, behind_green = T * 0.0 + tl.load(background), T * 0.0 + tl.load(background + 1)
     behind_blue = T * 0.0 + tl.load(background + 2)
     # coverage is 1 - T at the end: a colour of -1 behind everything
-    R = (g_red * behind_red + g_green * behind_green + g_blue * behind_blue
-         - tl.load(grad_alpha + at, mask=inside, other=0.0))
+    R = g_red * behind_red + g_green * behind_green + g_blue * behind_blue
+    if PLAIN == 0:
+        R -= tl.load(grad_alpha + at, mask=inside, other=0.0)
     counts = inside
     if MASKED:
         counts = inside & (tl.load(counting + at, mask=inside, other=0) != 0)
@@ -89,8 +95,10 @@ def decompose(order, first, members, offsets, records, background, width, height
         T = T / (1.0 - a)
         weight = a * T
         red, green, blue = tl.load(record + 4), tl.load(record + 5), tl.load(record + 6)
-        shade = tl.fma(g_red, red, tl.fma(g_green, green, tl.fma(
-            g_blue, blue, g_depth * tl.load(record + 7))))
+        shade = g_blue * blue
+        if PLAIN == 0:
+            shade = tl.fma(g_blue, blue, g_depth * tl.load(record + 7))
+        shade = tl.fma(g_red, red, tl.fma(g_green, green, shade))
         slope = shade - R
         R = tl.fma(a, slope, R)
         s = tl.where(power <= LOG2_ALPHA_MAX, weight * slope, 0.0)
@@ -99,18 +107,20 @@ def decompose(order, first, members, offsets, records, background, width, height
         tl.store(to, tl.sum(weight * g_red))
         tl.store(to + 1, tl.sum(weight * g_green))
         tl.store(to + 2, tl.sum(weight * g_blue))
-        tl.store(to + 3, tl.sum(weight * g_depth))
+        if PLAIN == 0:
+            tl.store(to + 3, tl.sum(weight * g_depth))
         tl.store(to + 4, tl.sum(s))
         tl.store(to + 5, tl.sum(su))
         tl.store(to + 6, tl.sum(sv))
         tl.store(to + 7, tl.sum(su * u))
         tl.store(to + 8, tl.sum(su * v))
         tl.store(to + 9, tl.sum(sv * v))
-        u_x, u_y, v_y = tl.load(record), tl.load(record + 1), tl.load(record + 2)
-        tl.store(to + 10, tl.sum(tl.abs(su)) * u_x)
-        tl.store(to + 11, tl.sum(tl.abs(tl.fma(su, u_y, sv * v_y))))
-        tl.store(to + 12, tl.sum(s * s))
-        tl.store(to + 13, tl.sum(part.to(tl.float32)))
+        if DETAILS:
+            u_x, u_y, v_y = tl.load(record), tl.load(record + 1), tl.load(record + 2)
+            tl.store(to + 10, tl.sum(tl.abs(su)) * u_x)
+            tl.store(to + 11, tl.sum(tl.abs(tl.fma(su, u_y, sv * v_y))))
+            tl.store(to + 12, tl.sum(s * s))
+            tl.store(to + 13, tl.sum(part.to(tl.float32)))
         if SCORES:
             away_red, away_green, away_blue = (
                 red - behind_red, green - behind_green, blue - behind_blue)

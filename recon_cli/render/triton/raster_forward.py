@@ -100,7 +100,7 @@ def composite(order, first, members, offsets, records, background, width, height
     tl.store(depth + at, z, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("count",))
 def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
           BLOCK: tl.constexpr):
     """Sums hits and weights and takes the greatest peak over the slots of each Gaussian.

@@ -1,0 +1,94 @@
+"""Recorded launches: what is started again and again in the same sizes is started as one.
+
+A recording holds every size and address of its first time. What differs from step to step must
+therefore lie in memory that the work reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from typing import Protocol
+
+import torch
+
+_BEFORE = 2  # times that work is done as it is: kernels are compiled, and few steps need no more
+_MOST = 8  # recordings that are kept at a time
+
+Work = Callable[[], None]
+
+
+class Recorder(Protocol):
+    """Turns work into work that does the same to the same memory."""
+
+    def __call__(self, work: Work) -> Work:
+        """Returns what repeats the work; the work itself may or may not have been done."""
+
+
+class Graphs:
+    """Records work that comes up again.
+
+    Args:
+        recorder: None does all work as it is.
+    """
+
+    def __init__(self, recorder: Recorder | None) -> None:
+        self._recorder = recorder
+        self._times: dict[Hashable, int] = {}
+        self._recorded: dict[Hashable, Work] = {}
+
+    @staticmethod
+    def of(device: torch.device) -> Graphs:
+        """Returns what suits a device: CUDA graphs, or nothing."""
+        return Graphs(_CudaGraphs(device) if device.type == "cuda" else None)
+
+    def run(self, key: Hashable, work: Work) -> None:
+        """Does the work, by its recording once there is one.
+
+        Args:
+            key: of all sizes and addresses; equal keys mean the same launches.
+            work: reads what else differs from memory.
+        """
+        if self._recorder is None:
+            work()
+            return
+        self._times[key] = self._times.get(key, 0) + 1
+        if self._times[key] <= _BEFORE:
+            work()
+            return
+        if key not in self._recorded:
+            if len(self._recorded) >= _MOST:
+                self._recorded.pop(next(iter(self._recorded)))
+            self._recorded[key] = self._recorder(work)
+        self._recorded[key]()
+
+    def forget(self) -> None:
+        """Drops all recordings, for sizes or addresses have changed."""
+        self._times.clear()
+        self._recorded.clear()
+
+
+class _CudaGraphs:
+    """Records CUDA graphs, which share their memory: only one of them runs at a time."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device)
+        self._pool = torch.cuda.graph_pool_handle()
+
+    def __call__(self, work: Work) -> Work:
+        graph = torch.cuda.CUDAGraph()
+        self._stream.wait_stream(torch.cuda.current_stream(self._device))
+        # not by torch.cuda.graph: it waits for the device and empties the allocator's cache
+        with torch.cuda.stream(self._stream):
+            # thread_local: a viewer may use the device meanwhile
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            try:
+                work()
+            finally:
+                graph.capture_end()
+        torch.cuda.current_stream(self._device).wait_stream(self._stream)
+
+        def replay(_reads_from: Work = work) -> None:  # its memory must stay
+            graph.replay()
+
+        return replay

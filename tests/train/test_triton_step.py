@@ -1,0 +1,114 @@
+"""The triton backend's whole step of a view, in an interpreter or on a GPU, against float64."""
+
+import numpy as np
+import pytest
+import torch
+from adam_runs import CONFIG, gradients_of
+from scenes import camera_at, random_splats
+
+from recon_cli.render import render
+from recon_cli.train.losses import photometric_loss
+from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.poses import camera_gradient
+from recon_cli.train.step import TrainView, gradient_step
+
+pytest.importorskip("triton", reason="triton is not installed")
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+CAMERA = camera_at(24, 18)
+DEGREE, WEIGHT = 3, 0.2
+LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-6, 1e-4
+GAIN = np.array([0.8, 1.1, 1.3], np.float32)
+SEEN = random_splats(30, seed=3).map(torch.Tensor.float)
+
+
+def photograph():
+    return np.random.default_rng(0).integers(0, 256, (18, 24, 3), np.uint8)
+
+
+def half():
+    return np.random.default_rng(1).random((18, 24)) < 0.5
+
+
+def step(splats, view, **wanted):
+    """The optimizer that a step leaves its gradients in, the step, loss and statistics."""
+    optimizer = SplatOptimizer(
+        splats.map(lambda tensor: tensor.clone().to(DEVICE)), CONFIG, 1.0, backend="triton")
+    compute = gradient_step("triton", DEVICE)
+    loss, statistics = compute(optimizer, view, DEGREE, WEIGHT, **wanted)
+    return optimizer, compute, loss, statistics
+
+
+def exact(splats, view, gain=None):
+    """Loss, leaves with their gradients, gradient of the log-gain and statistics in float64."""
+    leaves = splats.map(lambda tensor: tensor.detach().double().requires_grad_())
+    counting = view.counting(torch.device("cpu"))
+    out = render(leaves, view.camera, torch.zeros(3, dtype=torch.float64), DEGREE,
+                 backend="torch", scores=True, mask=counting)
+    log_gain = torch.zeros(3, dtype=torch.float64) if gain is None else (
+        torch.from_numpy(gain).double().log())
+    log_gain.requires_grad_()
+    truth = torch.from_numpy(view.image).double() / 255
+    loss = photometric_loss(out.rgb * log_gain.exp(), truth, WEIGHT, mask=counting)
+    loss.backward()
+    return loss.item(), leaves, log_gain.grad, out.statistics
+
+
+def near(ours, theirs, tolerance=GRADIENT_TOLERANCE):
+    error = (ours.detach().double().cpu() - theirs).norm()
+    return error <= tolerance * max(theirs.norm(), 1e-12)
+
+
+@pytest.mark.parametrize(("mask", "gain"), [(None, None), (half(), GAIN)], ids=["plain", "both"])
+def test_a_step_leaves_loss_gradients_and_statistics(mask, gain):
+    view = TrainView(CAMERA, photograph(), mask)
+    optimizer, compute, loss, statistics = step(
+        SEEN, view, gain=gain, variance=True, scores=True, loo=True)
+    true_loss, leaves, true_gain, truth = exact(SEEN, view, gain)
+    assert loss == pytest.approx(true_loss, abs=LOSS_TOLERANCE)
+    for name, leaf in leaves.parameters().items():
+        assert near(optimizer.gradient(name), leaf.grad), name
+    for name in ("radii", "hits", "blend_sum", "blend_max", "means2d_grad", "variance", "loo"):
+        assert near(getattr(statistics, name), getattr(truth, name).double()), name
+    gradients = leaves.map(lambda leaf: leaf.grad)
+    turned = camera_gradient(leaves, gradients, CAMERA, DEGREE)
+    ours = compute.camera_gradient(optimizer, CAMERA, DEGREE)
+    assert np.linalg.norm(ours - turned) <= 1e-3 * np.linalg.norm(turned)
+    if gain is not None:
+        assert near(torch.from_numpy(compute.log_gain_gradient), true_gain)
+
+
+def test_a_view_that_sees_nothing_has_a_loss_and_no_gradient():
+    behind = SEEN.map(torch.clone)
+    behind.means = behind.means - torch.tensor([0.0, 0.0, 50.0])
+    optimizer, compute, loss, statistics = step(behind, TrainView(CAMERA, photograph()))
+    assert statistics is None
+    assert loss == pytest.approx(exact(behind, TrainView(CAMERA, photograph()))[0], abs=1e-6)
+    assert compute.counted.item() == 0
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh_dc"):
+        assert not optimizer.gradient(name).any(), name
+
+
+def test_a_view_under_a_mask_that_hides_all_moves_nothing():
+    view = TrainView(CAMERA, photograph(), np.zeros((18, 24), bool))
+    optimizer, _, loss, _ = step(SEEN, view)
+    assert loss == 0
+    assert not optimizer.gradient("means").any()
+
+
+def test_adam_moves_as_torch_does_and_only_where_the_step_counts():
+    counts = {one: torch.full((1,), one, dtype=torch.int32, device=DEVICE) for one in (0, 1)}
+    ours, plain = (SplatOptimizer(
+        SEEN.map(lambda tensor, to=to: tensor.clone().to(to)), CONFIG, 1.0, backend=backend)
+        for backend, to in (("triton", DEVICE), ("torch", "cpu")))
+    for number, counted in enumerate((1, 0, 1, 1, 0)):
+        gradients = gradients_of(30, number)
+        for name, value in gradients.parameters().items():
+            getattr(ours.gradients, name).copy_(value)
+            getattr(plain.splats, name).grad = value.clone()
+        ours.step(1e-4, counted=counts[counted])
+        if counted:
+            plain.step(1e-4)
+    assert ours.count == plain.count == 3
+    for name, value in plain.tensors().items():
+        scale = value.abs().max().clamp_min(1e-12)
+        assert ((ours.tensors()[name].cpu() - value).abs().max()) <= 1e-6 * scale, name
