@@ -147,6 +147,17 @@ def test_recorded_launches_give_the_same_bits(reference, monkeypatch):
     assert_same(held(state), reference)
 
 
+def test_launches_that_cannot_be_recorded_are_started_one_by_one(reference, monkeypatch, caplog):
+    def recorder(_):
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    with_step(monkeypatch, [], graphs=Graphs(recorder))
+    state = first()
+    run(state, task_of())
+    assert caplog.text.count("without CUDA graphs") == 1
+    assert_same(held(state), reference)
+
+
 def test_a_checkpoint_goes_on_to_the_same_bits(reference, folder):
     state = load_state(
         folder / "state.safetensors", CONFIG, 1.0, device_of("triton"), backend="triton")

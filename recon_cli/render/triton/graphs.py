@@ -6,10 +6,13 @@ therefore lie in memory that the work reads.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Hashable
 from typing import Protocol
 
 import torch
+
+logger = logging.getLogger("recon")
 
 _BEFORE = 2  # times that work is done as it is: kernels are compiled, and few steps need no more
 _MOST = 8  # recordings that are kept at a time
@@ -21,7 +24,11 @@ class Recorder(Protocol):
     """Turns work into work that does the same to the same memory."""
 
     def __call__(self, work: Work) -> Work:
-        """Returns what repeats the work; the work itself may or may not have been done."""
+        """Returns what repeats the work, which it does not do.
+
+        Raises:
+            RuntimeError: the work cannot be recorded.
+        """
 
 
 class Graphs:
@@ -58,7 +65,13 @@ class Graphs:
         if key not in self._recorded:
             if len(self._recorded) >= _MOST:
                 self._recorded.pop(next(iter(self._recorded)))
-            self._recorded[key] = self._recorder(work)
+            try:
+                self._recorded[key] = self._recorder(work)
+            except RuntimeError as error:  # the driver's, of whatever kind; nothing was done yet
+                logger.warning("training goes on without CUDA graphs, more slowly: %s", error)
+                self._recorder = None
+                work()
+                return
         self._recorded[key]()
 
     def forget(self) -> None:
