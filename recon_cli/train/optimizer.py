@@ -16,11 +16,6 @@ from recon_cli.train.recipe import RECIPES
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-15  # of the reference: gradients of single Gaussians are tiny
 _REST_FACTOR = 1 / 20  # learning rate of higher SH degrees against the base colour
-# All rates grow with this power of the views of a step. The square root keeps the noise of a path
-# that Adam takes (Malladi et al. 2022; Zhao et al. 2024 for Gaussians), the first power its length.
-# On two scenes, 500 steps of 4 views: .5 ends .5 dB below 2,000 steps of one view, .75 at the same
-# PSNR, 1 at .2 dB more; 125 steps of 16 views end best with .75 (docs/training.md).
-_BATCH_POWER = 0.75
 _ROLES = ("value", "gradient", "exp_avg", "exp_avg_sq")
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -47,7 +42,7 @@ class SplatOptimizer:
         self, splats: Splats, config: RunConfig, extent: float, *, backend: str = "torch"
     ) -> None:
         self._extent, self._backend = extent, backend
-        recipe, self._faster = RECIPES[config.densify], config.batch_views**_BATCH_POWER
+        recipe = RECIPES[config.densify]
         self._rates = {
             "means": config.means_rate * extent, "quats": config.quats_rate,
             "log_scales": recipe.scales_rate * config.scales_rate,
@@ -183,7 +178,7 @@ class SplatOptimizer:
             factor: of all learning rates but that of the means.
             counted: [1] int32 on the device, zero where nothing is to be moved; with triton alone.
         """
-        self._factor = factor * self._faster
+        self._factor = factor
         self._rates["means"] = means_rate * self._extent / factor
         names = self._moved(sh_rest=sh_rest)
         if self._backend == "triton":

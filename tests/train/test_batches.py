@@ -60,21 +60,14 @@ def test_backends_walk_the_same_way_in_steps_of_several_views():
 
 
 @every_cpu_backend
-def test_a_batch_of_the_same_view_moves_its_way_by_higher_rates(backend):
+def test_a_batch_of_the_same_view_moves_like_the_view_alone(backend):
     config = with_batches(2)
     twice, once = first_state(config, backend=backend), first_state(backend=backend)
     twice.queue, once.queue = [2, 2], [2]
     Stepper(twice, tiny_task(config, backend=backend), None).step()
     Stepper(once, tiny_task(backend=backend), None).step()
-    start = first_state(backend=backend).splats
-    for name, value in start.parameters().items():
-        far, near = (getattr(state.splats, name) - value for state in (twice, once))
-        # what a step adds to a number is rounded as the number is
-        assert (far - 2**0.75 * near).norm() <= 5e-3 * far.norm(), name
     # half and half of a number is the number, exactly
-    for name in ("means", "quats", "sh_dc"):
-        moments = (state.optimizer.tensors()[f"adam.{name}.exp_avg"] for state in (twice, once))
-        assert torch.equal(*moments), name
+    assert same(twice, once)
     assert torch.equal(twice.gathered.count, 2 * once.gathered.count)
     assert torch.equal(twice.gathered.radius, once.gathered.radius)
 
