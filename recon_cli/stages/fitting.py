@@ -24,12 +24,13 @@ from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.train.fit import Report, Task, fit
+from recon_cli.train.fit import Report, Task
 from recon_cli.train.importance import Importance
 from recon_cli.train.memory import MemoryEstimate, estimate, refuse_what_does_not_fit, room
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.step import TrainView, fuses
+from recon_cli.train.together import fit_together
 
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
@@ -147,7 +148,8 @@ def _memory(
 
 
 def _free_bytes(ctx: StageContext) -> int:
-    return torch.cuda.mem_get_info()[0] if ctx.device == "cuda" else free_memory_bytes()
+    return (torch.cuda.mem_get_info()[0] if ctx.device == "cuda"
+            else free_memory_bytes() // ctx.ranks.local)
 
 
 def _check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
@@ -263,7 +265,7 @@ def run_fit(
     checkpoint: str = CHECKPOINT,
     importance: Importance | None = None,
 ) -> None:
-    """Fits until `until` steps, saving the state in `out` as it goes.
+    """Fits until `until` steps with all of `ctx.ranks`, saving the state in `out` as it goes.
 
     Args:
         state: changed in place.
@@ -313,4 +315,6 @@ def run_fit(
 
         ctx.watcher.begin(
             label, end or until, [view.camera for view in task.train], state.splats)
-        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance)
+        fit_together(
+            state, dataclasses.replace(task, ranks=ctx.ranks), until, on_step=on_step,
+            on_report=on_report, importance=importance, threads=ctx.threads)

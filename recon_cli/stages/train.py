@@ -49,5 +49,6 @@ def _summary(state: TrainState, task: Task, out: Path, ctx: StageContext) -> Sum
         "parts": model_parts(config),
         "skipped_steps": state.skipped, "estimated_seconds": made["seconds"],
         "calibration_seconds": round(made["cost"]["seconds"], 3),
+        **({} if ctx.ranks.alone else {"processes": ctx.ranks.count}),
         "cuda_peak_bytes": torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,
     }
