@@ -17,6 +17,8 @@ from recon_cli.train.ranks import ALONE, Ranks
 # RANK and WORLD_SIZE alone are set by other programs as well, for purposes of their own.
 _MARK = "TORCHELASTIC_RUN_ID"
 
+logger = logging.getLogger("recon")
+
 
 def follows() -> bool:
     """Tells whether this process is one of the others."""
@@ -24,7 +26,7 @@ def follows() -> bool:
 
 
 def _are_several() -> bool:
-    return _MARK in os.environ and os.environ["WORLD_SIZE"] != "1"
+    return _MARK in os.environ and os.environ.get("WORLD_SIZE", "1") != "1"
 
 
 @contextmanager
@@ -37,6 +39,9 @@ def leading() -> Iterator[Ranks]:
     if not _are_several():
         yield ALONE
         return
+    # to be seen where they never all come: under somebody else's torchrun
+    logger.info("one of %s processes that torchrun started: waiting for the others",
+                os.environ["WORLD_SIZE"])
     from recon_cli.train.processes import Processes
     from recon_cli.train.together import dismiss
 
@@ -58,7 +63,7 @@ def follow() -> int:
         BackendError: the processes cannot be connected.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    logging.getLogger("recon").setLevel(logging.WARNING)
+    logger.setLevel(logging.WARNING)
     from recon_cli.train.processes import Processes
     from recon_cli.train.together import follow
 

@@ -24,6 +24,7 @@ from recon_cli.stages.fitting import (
 )
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate
+from recon_cli.train.exchange import with_exchange
 from recon_cli.train.fit import Task
 from recon_cli.train.gates import PARTS, Candidate, Needs, described, examine
 from recon_cli.train.plan import Facts, Plan
@@ -95,7 +96,7 @@ def _plan(
 ) -> Plan:
     """Returns a plan, by the time that steps are found to take and that was spent already.
 
-    Of several processes each step is timed with the views of one, without what they exchange.
+    Of several processes each step is timed with the views of one, and what they exchange.
     """
     seconds = plan.CALIBRATION_SECONDS
     if config.minutes is not None:
@@ -105,6 +106,7 @@ def _plan(
     cost = calibrate(
         _with(task, probe), scene.points, scene.colors,
         scratch=out / "calibration.safetensors", seconds=seconds)
+    cost = with_exchange(cost, ctx.ranks, probe.max_gaussians, probe.sh_degree, task.device)
     return plan.make_plan(config, facts, cost, spent=spent)
 
 

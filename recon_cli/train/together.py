@@ -16,6 +16,7 @@ from torch import Tensor
 
 from recon_cli.errors import LostError, TrainingError
 from recon_cli.render import registry
+from recon_cli.train.exchange import EXCHANGE, join_exchange
 from recon_cli.train.fit import Report, Task, fit
 from recon_cli.train.handing import Fit, hand_out, packed, receive, unpacked
 from recon_cli.train.importance import Importance
@@ -23,7 +24,7 @@ from recon_cli.train.ranks import Ranks
 from recon_cli.train.state import TrainState, tensors_of
 from recon_cli.train.stepping import Stepper
 
-_DONE, _FIT = 0, 1  # between fits
+_DONE, _FIT = 0, 1  # between fits, and EXCHANGE
 _STOP, _END, _COMPARE = -1, -2, -3  # in a fit
 
 logger = logging.getLogger("recon")
@@ -110,19 +111,23 @@ def dismiss(ranks: Ranks) -> None:
 
 
 def follow(ranks: Ranks) -> None:
-    """Takes part in every fit of the leader's until it says that it is done.
+    """Takes part in what the leader begins until it says that it is done.
 
     Raises:
         LostError: the leader is gone.
     """
     ready: set[str] = set()
-    while ranks.told(_DONE) == _FIT:
+    while (word := ranks.told(_DONE)) != _DONE:
+        if word == EXCHANGE:
+            join_exchange(ranks)
+            continue
         given = unpacked(receive(ranks), ranks)
         if given.task.backend not in ready:
             registry.use_threads(given.task.backend, given.threads)
             registry.prepare(given.task.backend, lambda: None)
             ready.add(given.task.backend)
         _take_part(given)
+        del given  # the next one needs the room
     ranks.leave()
 
 

