@@ -20,6 +20,7 @@ from recon_cli.io.ply import read_ply
 from recon_cli.options import Call
 from recon_cli.progress import NullProgress
 from recon_cli.render import registry
+from recon_cli.stages.context import StageContext
 from recon_cli.train.ranks import ALONE, Ranks
 
 BIN = Path(sys.executable).parent
@@ -151,6 +152,14 @@ def test_processes_share_the_cores_of_their_machine(monkeypatch):
         ctx = execute.rendering(
             ComputeConfig("cpu", "torch", typed), NullProgress(), Ranks(0, 9, local))
         assert ctx.threads == threads
+
+
+@pytest.mark.parametrize(("count", "notices"), [(4, 1), (3, 0), (1, 0)])
+def test_processes_that_no_view_is_left_for_are_told_of(count, notices, caplog):
+    with caplog.at_level("WARNING", logger="recon"):
+        StageContext(ranks=Ranks(0, count)).notice_idle(3)
+    assert [record.getMessage() for record in caplog.records] == notices * [
+        "1 of the 4 processes have nothing to do: a step takes --batch-views 3"]
 
 
 def test_a_process_without_a_gpu_is_named_before_anything_is_done(monkeypatch):

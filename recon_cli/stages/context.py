@@ -65,3 +65,10 @@ class StageContext:
         """
         logger.warning("%s", "".join(
             one if one.isprintable() else repr(one)[1:-1] for one in text))
+
+    def notice_idle(self, views: int) -> None:
+        """Tells the user where steps of so many views leave processes without one."""
+        idle = self.ranks.count - views
+        if idle > 0:
+            self.notice(f"{idle} of the {self.ranks.count} processes have nothing to do: a step "
+                        f"takes --batch-views {views}")

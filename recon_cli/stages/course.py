@@ -196,6 +196,7 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
+    ctx.notice_idle(train_config.batch_views)
     final = train / "final.safetensors"
     source = train / "mid.safetensors" if config.at == "mid" else final
 

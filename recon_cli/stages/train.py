@@ -25,6 +25,7 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs, validation=config.validation)
     task = planned_task(config, scene, out, ctx)
+    ctx.notice_idle(task.schedule.config.batch_views)
     state = first_or_saved(task, scene, out / CHECKPOINT)
     run_fit(
         state, task, task.schedule.config.iterations, out, ctx, label="train",

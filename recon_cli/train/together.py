@@ -7,7 +7,6 @@ and the others wait for the next fit; in the middle of a step nothing can be sai
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -26,8 +25,6 @@ from recon_cli.train.stepping import Stepper
 
 _DONE, _FIT = 0, 1  # between fits, and EXCHANGE
 _STOP, _END, _COMPARE = -1, -2, -3  # in a fit
-
-logger = logging.getLogger("recon")
 
 
 def fit_together(
@@ -60,7 +57,6 @@ def fit_together(
         fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance)
         return
     arrays = packed(Fit(state, task, importance, threads))
-    _notice_idle(task)
     between = False  # of two steps: the others wait for a word
 
     def go_on() -> None:
@@ -173,12 +169,3 @@ def _digest(tensor: Tensor) -> int:
     """Returns the sum of a tensor's bits, in words: cheap, and what differs soon differs widely."""
     flat = tensor.contiguous().reshape(-1)
     return int((flat if flat.dtype == torch.uint8 else flat.view(torch.int32)).sum())
-
-
-def _notice_idle(task: Task) -> None:
-    """Says, once for the same views, that a step has fewer of them than there are processes."""
-    views, ranks = task.schedule.config.batch_views, task.ranks
-    if views < ranks.count and ranks.views is not task.train:
-        logger.warning(
-            "a step has %d of the views, so that %d of the %d processes have nothing to do",
-            views, ranks.count - views, ranks.count)
