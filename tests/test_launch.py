@@ -26,7 +26,8 @@ from recon_cli.train.ranks import ALONE, Ranks
 BIN = Path(sys.executable).parent
 ROOT = Path(cli.__file__).parents[1]
 OPTIONS = ["--iterations", "400", "--max-gaussians", "300", "--validation", "0.2", "--far", "off",
-           "--sh-degree", "0", "--no-early-stop", "--threads", "1", "--checkpoint-every", "100000"]
+           "--sh-degree", "0", "--no-early-stop", "--threads", "1", "--checkpoint-every", "100000",
+           "--device", "cpu"]
 PATIENCE = 120  # seconds
 torchrun_is_here = pytest.mark.skipif(
     not (BIN / "torchrun").exists(), reason="torchrun is not beside python")
