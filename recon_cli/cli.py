@@ -11,7 +11,17 @@ from pathlib import Path
 
 import click
 
-from recon_cli import __version__, cleaning, comparing, console, doctor, options, pipeline, report
+from recon_cli import (
+    __version__,
+    cleaning,
+    comparing,
+    console,
+    doctor,
+    launch,
+    options,
+    pipeline,
+    report,
+)
 from recon_cli.bench.command import bench
 from recon_cli.config import (
     ComputeConfig,
@@ -64,7 +74,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     call = Call()
     handler = console.show_log(detailed=lambda: call.verbose)
     try:
-        code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
+        if launch.follows():
+            return launch.follow()
+        with launch.leading() as call.ranks:
+            code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
         return code if isinstance(code, int) else 0
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted; run the same command again to resume", err=True)

@@ -55,6 +55,10 @@ class TrainingError(ReconstructionError):
     """Training diverged or has nothing to fit."""
 
 
+class LostError(TrainingError):
+    """Another of the processes that train together is gone."""
+
+
 class BackendError(ReconError):
     """The rasterizer or device that was asked for is not available."""
 

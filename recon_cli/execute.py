@@ -15,7 +15,7 @@ from pathlib import Path
 from recon_cli import machine
 from recon_cli.config import ComputeConfig
 from recon_cli.digests import Source, read_source
-from recon_cli.errors import ConfigError, ManifestError, ReconError
+from recon_cli.errors import BackendError, ConfigError, ManifestError, ReconError
 from recon_cli.fields import StageConfig
 from recon_cli.freshness import Inspection
 from recon_cli.manifest import Basis, Manifest, RunRecord, Unfinished
@@ -23,6 +23,7 @@ from recon_cli.progress import NullProgress, Progress
 from recon_cli.settings import Settings
 from recon_cli.stages import STAGES, Stage
 from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.train.ranks import ALONE, Ranks
 from recon_cli.watching import Nobody, Watcher
 from recon_cli.workspace import Workspace, combined
 
@@ -56,6 +57,7 @@ class Job:
         report: called with every stage that is done or was already.
         table: the stages.
         watcher: looks on while Gaussians are trained; no part of what is computed.
+        ranks: the processes that train together, which this one leads.
     """
 
     workspace: Workspace
@@ -65,6 +67,7 @@ class Job:
     report: Callable[[Outcome], None] = _say_nothing
     table: Sequence[Stage] = STAGES
     watcher: Watcher = field(default_factory=Nobody)
+    ranks: Ranks = ALONE
 
     def inspect(self) -> Inspection:
         """Returns a look at the workspace as it is now."""
@@ -187,13 +190,20 @@ def context_for(job: Job, row: Stage, record: Callable[[int, int], None]) -> Sta
     """Returns what a stage is given, with device and threads set up."""
     if row.renders:
         return dataclasses.replace(
-            rendering(job.compute, job.progress), record=record, watcher=job.watcher)
+            rendering(job.compute, job.progress, job.ranks), record=record, watcher=job.watcher)
     threads = job.compute.threads or machine.usable_threads()
     return StageContext(progress=job.progress, threads=threads, record=record)
 
 
-def rendering(compute: ComputeConfig, progress: Progress) -> StageContext:
+def rendering(
+    compute: ComputeConfig, progress: Progress, ranks: Ranks = ALONE
+) -> StageContext:
     """Returns where to train and render, once the rasterizer is ready.
+
+    Args:
+        compute: device, backend and threads as asked for.
+        progress: opens progress bars.
+        ranks: that train together; each takes its share of the cores.
 
     Raises:
         BackendError: what was asked for is not there.
@@ -201,11 +211,28 @@ def rendering(compute: ComputeConfig, progress: Progress) -> StageContext:
     # Importing torch takes seconds, which status and --help must not pay.
     from recon_cli.render import registry  # noqa: PLC0415
 
-    threads = compute.threads or machine.usable_threads()
-    backend, device = registry.resolve(compute.backend, compute.device)
+    threads = compute.threads or ranks.threads_of(machine.usable_threads())
+    backend, device = _resolved(compute, ranks)
     registry.use_threads(backend, threads)
     _prepare_kernels(progress, backend)
-    return StageContext(progress, device, backend, threads)
+    return StageContext(progress, device, backend, threads, ranks=ranks)
+
+
+def _resolved(compute: ComputeConfig, ranks: Ranks) -> tuple[str, str]:
+    """Returns (backend, device) to train and render with.
+
+    Raises:
+        BackendError: what was asked for is not there, or not for every process.
+    """
+    from recon_cli.render import registry  # noqa: PLC0415 (imports torch)
+
+    backend, device = registry.resolve(compute.backend, compute.device)
+    if device == "cuda" and ranks.lacks_gpu:
+        raise BackendError(
+            f"{ranks.count} processes were started, but some of them have no GPU of their own.",
+            hint="Give torchrun as many processes a machine as it has GPUs (--nproc-per-node gpu), "
+            "or train with --device cpu.")
+    return backend, device
 
 
 def _prepare_kernels(progress: Progress, backend: str) -> None:
@@ -225,10 +252,9 @@ def refuse_missing_backend(job: Job, stages: Sequence[str]) -> None:
     """Fails before hours of other work where a device or backend was named that is not here.
 
     Raises:
-        BackendError: one of `stages` renders, and what was asked for cannot be had.
+        BackendError: one of `stages` renders, and what it would render with cannot be had.
     """
     named = (job.compute.device, job.compute.backend) != ("auto", "auto")
-    if named and any(row.renders for row in job.table if row.name in stages):
-        from recon_cli.render import registry  # noqa: PLC0415 (imports torch)
-
-        registry.resolve(job.compute.backend, job.compute.device)
+    doubtful = named or job.ranks.lacks_gpu
+    if doubtful and any(row.renders for row in job.table if row.name in stages):
+        _resolved(job.compute, job.ranks)

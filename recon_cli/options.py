@@ -25,6 +25,7 @@ from recon_cli.settings import (
     parse_assignment,
     read_settings,
 )
+from recon_cli.train.ranks import ALONE, Ranks
 
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
@@ -44,6 +45,7 @@ class Call:
         print_config: show the merged options and stop.
         settings: the fields that were given as options of their own.
         assigned: the fields that were given by --set.
+        ranks: the processes that train together, which this one leads; nobody types it.
     """
 
     workspace: Path = Path("workspace")
@@ -53,6 +55,7 @@ class Call:
     print_config: bool = False
     settings: Settings = field(default_factory=dict)
     assigned: Settings = field(default_factory=dict)
+    ranks: Ranks = ALONE
 
 
 pass_call = click.make_pass_decorator(Call, ensure=True)

@@ -9,7 +9,7 @@ import click
 
 from recon_cli import options, pipeline, report
 from recon_cli import settings as layers
-from recon_cli.config import ComputeConfig
+from recon_cli.config import ComputeConfig, TrainConfig
 from recon_cli.options import Call
 from recon_cli.pipeline import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress
@@ -41,7 +41,7 @@ def perform(
         watcher: looks on while Gaussians are trained.
     """
     given = options.explicit(call)
-    values = layers.merged([base or {}, given, call.settings, forced or {}])
+    values = layers.merged([base or {}, given, _of_all_processes(call, given), forced or {}])
     rows = [row for row in STAGES if row.name in stages]
     configs = {row.name: layers.build(row.config, values) for row in rows}
     compute = layers.build(ComputeConfig, values)
@@ -50,7 +50,7 @@ def perform(
         return
     job = Job(
         Workspace(call.workspace), given, compute, TqdmProgress(), tell, STAGES,
-        watcher or Nobody())
+        watcher or Nobody(), call.ranks)
     targets = [
         Target(row.name, configs[row.name], () if row.needs else sources) for row in rows]
     pipeline.run(job, verb, targets, again=call.again)
@@ -58,12 +58,26 @@ def perform(
         click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
 
 
+def _of_all_processes(call: Call, given: Settings) -> Settings:
+    """Returns the settings that were typed, with the views that all processes together take.
+
+    `--batch-views` counts those of one process. What is recorded, and what files and --set say, are
+    the views of a step: a result does not depend on who computed it.
+    """
+    own = call.settings.get("train", {}).get("batch_views")
+    if own is None and "batch_views" not in given.get("train", {}):
+        own = TrainConfig.batch_views
+    together = {} if own is None else {"batch_views": own * call.ranks.count}
+    return layers.merged([call.settings, {"train": together}])
+
+
 def beside(call: Call, kind: type[C]) -> tuple[Job, C]:
     """Returns what a command needs that only looks at a stage, and the stage's options."""
     given = options.explicit(call)
     values = layers.merged([given, call.settings])
     compute = layers.build(ComputeConfig, values)
-    job = Job(Workspace(call.workspace), given, compute, TqdmProgress(), table=STAGES)
+    job = Job(
+        Workspace(call.workspace), given, compute, TqdmProgress(), table=STAGES, ranks=call.ranks)
     return job, layers.build(kind, values)
 
 

@@ -46,10 +46,11 @@ ALLOWED: dict[str, set[str]] = {
     "stages": BOTTOM | OPTIONS | {
         "watching", "digests", "holdout_option", "progress", "metrics", "machine", "capture",
         "mapping", "scene", "io", "train", "render"},
+    "launch": {"errors", "train"},
     "freshness": OPTIONS | RECORDS | {"settings", "stages"},
     "execute": OPTIONS | RECORDS | {
         "watching",
-        "settings", "stages", "freshness", "machine", "progress", "render"},
+        "settings", "stages", "freshness", "machine", "progress", "render", "train"},
     "pipeline": OPTIONS | RECORDS | {"settings", "stages", "freshness", "execute"},
     "cleaning": RECORDS | {"errors", "execute"},
     "comparing": OPTIONS | BOTTOM | {"tables", "capture", "execute", "pipeline", "workspace"},
@@ -58,7 +59,7 @@ ALLOWED: dict[str, set[str]] = {
         "workspace", "progress"},
     "doctor": {"errors", "machine", "render"},
     "report": {"doctor", "pipeline"},
-    "options": OPTIONS | {"settings"},
+    "options": OPTIONS | {"settings", "train"},
     "bench": BOTTOM | OPTIONS | {
         "settings", "options", "machine", "progress", "metrics", "tables", "scene", "render",
         "train", "io",
@@ -84,7 +85,7 @@ ALLOWED: dict[str, set[str]] = {
         "config", "settings", "options", "progress", "watching", "workspace", "metrics", "scene",
         "render", "io", "stages", "execute", "pipeline", "shots"},
     "cli": OPTIONS | {
-        "verbs", "scoreboard", "page", "importing", "viewer",
+        "verbs", "scoreboard", "page", "importing", "viewer", "launch",
         "settings", "options", "pipeline", "cleaning", "comparing", "report", "doctor", "console",
         "progress", "stages", "workspace", "bench", "study", "sweep", "shots"},
     "__main__": {"cli"},
@@ -151,6 +152,12 @@ def test_a_file_imports_only_what_lies_below_it(path: Path) -> None:
 def test_a_package_that_has_a_home_is_imported_nowhere_else(path: Path) -> None:
     for package in outside(path) & AT_HOME.keys():
         assert part(path) in AT_HOME[package], f"{package} belongs to {AT_HOME[package]}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_one_module_knows_how_processes_are_connected(path: Path) -> None:
+    if path != PACKAGE / "train" / "processes.py":
+        assert not [name for name in imports(path) if name.startswith("torch.distributed")]
 
 
 @pytest.mark.parametrize("path", FILES, ids=ids)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.progress import NullProgress, Progress
+from recon_cli.train.ranks import ALONE, Ranks
 from recon_cli.watching import Nobody, Watcher
 
 Summary = dict[str, Any]  # JSON values only; goes into the manifest
@@ -46,6 +47,7 @@ class StageContext:
         record: called with (done, total) whenever that much would survive a crash;
             `recon status` shows it as partial (412/600).
         watcher: looks on while Gaussians are trained.
+        ranks: the processes that train together, which this one leads.
     """
 
     progress: Progress = field(default_factory=NullProgress)
@@ -54,6 +56,7 @@ class StageContext:
     threads: int = 1
     record: Callable[[int, int], None] = _ignore
     watcher: Watcher = field(default_factory=Nobody)
+    ranks: Ranks = ALONE
 
     def notice(self, text: str) -> None:
         """Tells the user something that is no error but must not be missed, in one line.
@@ -62,3 +65,10 @@ class StageContext:
         """
         logger.warning("%s", "".join(
             one if one.isprintable() else repr(one)[1:-1] for one in text))
+
+    def notice_idle(self, views: int) -> None:
+        """Tells the user where steps of so many views leave processes without one."""
+        idle = self.ranks.count - views
+        if idle > 0:
+            self.notice(f"{idle} of the {self.ranks.count} processes have nothing to do: a step "
+                        f"takes --batch-views {views}")

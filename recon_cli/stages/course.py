@@ -23,15 +23,13 @@ from recon_cli.errors import ConfigError
 from recon_cli.io.ply import read_ply
 from recon_cli.stages.context import StageContext, StageInputs
 from recon_cli.stages.fitting import (
-    LOG,
-    Log,
     load_scene,
     load_task,
     read_config,
     run_fit,
-    seconds_at,
 )
 from recon_cli.stages.origin import Origin
+from recon_cli.stages.training_log import LOG, Log, seconds_at
 from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.pruning import Recovery, remove, rounds_within, scored, survivors
@@ -196,6 +194,7 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
+    ctx.notice_idle(train_config.batch_views)
     final = train / "final.safetensors"
     source = train / "mid.safetensors" if config.at == "mid" else final
 

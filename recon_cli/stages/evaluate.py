@@ -37,10 +37,8 @@ from recon_cli.metrics.perceptual import LPIPS_CONVENTION, perceptual
 from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.fitting import (
-    LOG,
     load_scene,
     read_config,
-    seconds_at,
     size_summary,
     sizes_of,
 )
@@ -55,6 +53,7 @@ from recon_cli.stages.held_out import (
     truths,
 )
 from recon_cli.stages.origin import Origin
+from recon_cli.stages.training_log import LOG, seconds_at
 
 _GAIN = 4  # of the difference images
 _EVER = 1 << 62  # an iteration beyond any

@@ -24,15 +24,16 @@ from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.train.fit import Report, Task, fit
+from recon_cli.stages.training_log import LOG, Log
+from recon_cli.train.fit import Report, Task
 from recon_cli.train.importance import Importance
 from recon_cli.train.memory import MemoryEstimate, estimate, refuse_what_does_not_fit, room
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.step import TrainView
+from recon_cli.train.together import fit_together
 
 CHECKPOINT = "checkpoint.safetensors"
-LOG = "log.jsonl"
 MASK_HINT = "Run `recon ingest` with masks that hide less."
 
 logger = logging.getLogger("recon")
@@ -149,7 +150,8 @@ def _memory(
 
 
 def _free_bytes(ctx: StageContext) -> int:
-    return torch.cuda.mem_get_info()[0] if ctx.device == "cuda" else free_memory_bytes()
+    return (torch.cuda.mem_get_info()[0] if ctx.device == "cuda"
+            else free_memory_bytes() // ctx.ranks.local)
 
 
 def _check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
@@ -174,56 +176,6 @@ def read_config(folder: Path) -> RunConfig:
     values = read_json(folder / "config.json")
     names = {item.name for item in dataclasses.fields(RunConfig)}
     return RunConfig(**{name: value for name, value in values.items() if name in names})
-
-
-def seconds_at(log: Path, iteration: int, *, clock: str = "seconds") -> float:
-    """Returns the training seconds that a log counts up to an iteration, by one of its clocks."""
-    seconds = 0.0
-    for line in log.read_text(encoding="utf-8").splitlines() if log.exists() else []:
-        row = json.loads(line)
-        if row["iteration"] <= iteration:
-            seconds = float(row[clock])
-    return seconds
-
-
-def jump_in(log: Path) -> tuple[int, int] | None:
-    """Returns (iteration, iteration at which it went on) of a run that stopped early, or None."""
-    for line in log.read_text(encoding="utf-8").splitlines():
-        row = json.loads(line)
-        if row.get("goes_on_at") is not None:
-            return row["iteration"], row["goes_on_at"]
-    return None
-
-
-class Log:
-    """One JSON line a report; what a crash left behind the checkpoint is cut off."""
-
-    def __init__(self, path: Path, iteration: int, earlier_seconds: float) -> None:
-        self._path = path
-        lines = path.read_text(encoding="utf-8").splitlines(True) if path.exists() else []
-        # a kill in mid-write leaves a last line without its end
-        whole = [line for line in lines if line.endswith("\n")]
-        kept = [line for line in whole if json.loads(line)["iteration"] <= iteration]
-        if not kept:  # a branch starts where the other run stood
-            first = {"iteration": iteration, "seconds": earlier_seconds, "cpu_seconds": 0.0}
-            kept = [json.dumps(first) + "\n"]
-        write_bytes(path, "".join(kept).encode())
-        self._earlier = seconds_at(path, iteration)
-        self._earlier_cpu = seconds_at(path, iteration, clock="cpu_seconds")
-
-    def add(self, report: Report) -> None:
-        """Appends a report; its seconds count from the very start of training."""
-        self._write(dataclasses.asdict(report), report.seconds, report.cpu_seconds)
-
-    def spend(self, iteration: int, seconds: float, cpu_seconds: float) -> None:
-        """Counts time in which no step was taken."""
-        self._write({"iteration": iteration}, seconds, cpu_seconds)
-
-    def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
-        row["seconds"] = round(self._earlier + seconds, 3)
-        row["cpu_seconds"] = round(self._earlier_cpu + cpu_seconds, 3)
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
 
 
 @contextmanager
@@ -265,7 +217,7 @@ def run_fit(
     checkpoint: str = CHECKPOINT,
     importance: Importance | None = None,
 ) -> None:
-    """Fits until `until` steps, saving the state in `out` as it goes.
+    """Fits until `until` steps with all of `ctx.ranks`, saving the state in `out` as it goes.
 
     Args:
         state: changed in place.
@@ -315,5 +267,7 @@ def run_fit(
 
         ctx.watcher.begin(
             label, end or until, [view.camera for view in task.train], state.splats)
-        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance,
+        fit_together(
+            state, dataclasses.replace(task, ranks=ctx.ranks), until, on_step=on_step,
+            on_report=on_report, importance=importance, threads=ctx.threads,
             looks=lambda now: now % every == 0 or now in (keep or ()))

@@ -24,6 +24,7 @@ from recon_cli.stages.fitting import (
 )
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate
+from recon_cli.train.exchange import with_exchange
 from recon_cli.train.fit import Task
 from recon_cli.train.gates import PARTS, Candidate, Needs, described, examine
 from recon_cli.train.plan import Facts, Plan
@@ -51,7 +52,7 @@ def planned_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = Facts(plan.detail(task.train), len(task.train), len(scene.points), fit_memory)
-    made = _plan(asked, facts, task, scene, out, needs.seconds)
+    made = _plan(asked, facts, task, scene, out, ctx, spent=needs.seconds)
     _tell(made, asked, facts, ctx)
     run_config = made.config(asked)
     write_config(out, run_config)
@@ -90,15 +91,22 @@ def parts_needed(
 
 
 def _plan(
-    config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, spent: float
+    config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, ctx: StageContext, *,
+    spent: float,
 ) -> Plan:
-    """Returns a plan, by the time that steps are found to take and that was spent already."""
+    """Returns a plan, by the time that steps are found to take and that was spent already.
+
+    Of several processes each step is timed with the views of one, and what they exchange.
+    """
     seconds = plan.CALIBRATION_SECONDS
     if config.minutes is not None:
         seconds = plan.CALIBRATION_SHARE * 60 * config.minutes
+    probe = dataclasses.replace(
+        plan.probe_config(config, facts), batch_views=ctx.ranks.most_of(config.batch_views))
     cost = calibrate(
-        _with(task, plan.probe_config(config, facts)), scene.points, scene.colors,
+        _with(task, probe), scene.points, scene.colors,
         scratch=out / "calibration.safetensors", seconds=seconds)
+    cost = with_exchange(cost, ctx.ranks, probe.max_gaussians, probe.sh_degree, task.device)
     return plan.make_plan(config, facts, cost, spent=spent)
 
 

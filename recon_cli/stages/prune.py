@@ -15,8 +15,8 @@ from recon_cli.io.ply import most_gaussians, write_ply
 from recon_cli.scene.splats import Splats
 from recon_cli.stages.context import StageContext, StageInputs, Summary
 from recon_cli.stages.course import Round, course_of
-from recon_cli.stages.fitting import LOG, seconds_at
 from recon_cli.stages.rounds import prune_to, prune_while_good
+from recon_cli.stages.training_log import LOG, seconds_at
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.pruning import RATIO, remaining
 from recon_cli.train.state import TrainState

@@ -15,8 +15,9 @@ import torch
 from recon_cli.config import TrainConfig
 from recon_cli.io.ply import write_ply
 from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.stages.fitting import CHECKPOINT, LOG, load_scene, run_fit, size_summary
+from recon_cli.stages.fitting import CHECKPOINT, load_scene, run_fit, size_summary
 from recon_cli.stages.planning import first_or_saved, model_parts, planned_task, recorded_plan
+from recon_cli.stages.training_log import LOG
 from recon_cli.train.fit import Task
 from recon_cli.train.state import TrainState, save_state
 
@@ -25,6 +26,7 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs, validation=config.validation)
     task = planned_task(config, scene, out, ctx)
+    ctx.notice_idle(task.schedule.config.batch_views)
     state = first_or_saved(task, scene, out / CHECKPOINT)
     run_fit(
         state, task, task.schedule.config.iterations, out, ctx, label="train",
@@ -49,5 +51,6 @@ def _summary(state: TrainState, task: Task, out: Path, ctx: StageContext) -> Sum
         "parts": model_parts(config),
         "skipped_steps": state.skipped, "estimated_seconds": made["seconds"],
         "calibration_seconds": round(made["cost"]["seconds"], 3),
+        **({} if ctx.ranks.alone else {"processes": ctx.ranks.count}),
         "cuda_peak_bytes": torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,
     }

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from recon_cli.render import Statistics, render
 from recon_cli.scene.splats import Splats
+from recon_cli.train.ranks import Ranks
 from recon_cli.train.step import TrainView
 
 _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
@@ -73,6 +74,13 @@ class Importance:
             self.blend_max = torch.maximum(self.blend_max, statistics.blend_max.double())
         if self.leaves_out:
             self.loo += statistics.loo
+
+    def over(self, ranks: Ranks) -> None:
+        """Takes together what the processes found that train together."""
+        views = torch.tensor([self.views])
+        ranks.add([views, self.hits, self.blend_sum, self.loo])
+        ranks.raise_to_most(self.blend_max)
+        self.views = int(views)
 
     def score(
         self, name: str, splats: Splats, *, beta: float, generator: torch.Generator

@@ -96,12 +96,7 @@ def save_state(path: Path, state: TrainState) -> None:
     Raises:
         TrainingError: a parameter is not finite; the checkpoint before it stays.
     """
-    tensors = state.optimizer.tensors()
-    for name, value in vars(state.gathered).items():
-        tensors[f"gathered.{name}"] = value
-    tensors["generator"] = state.generator.get_state()
-    for part in (state.exposure, state.poses):
-        tensors |= {} if part is None else part.tensors()
+    tensors = tensors_of(state)
     check_finite(tensors, "Training diverged")
     scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue,
                "first_count": state.first_count, "skipped": state.skipped,
@@ -109,6 +104,17 @@ def save_state(path: Path, state: TrainState) -> None:
     with replacing(path) as temporary:
         save_file({name: value.contiguous().cpu() for name, value in tensors.items()},
                   temporary, metadata={"state": json.dumps(scalars)})
+
+
+def tensors_of(state: TrainState) -> dict[str, Tensor]:
+    """Returns all tensors of a state by name."""
+    tensors = state.optimizer.tensors()
+    for name, value in vars(state.gathered).items():
+        tensors[f"gathered.{name}"] = value
+    tensors["generator"] = state.generator.get_state()
+    for part in (state.exposure, state.poses):
+        tensors |= {} if part is None else part.tensors()
+    return tensors
 
 
 def load_state(

@@ -82,7 +82,7 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
     def press(done, total):
         recorded.append((done, total))
 
-    original = fitting.fit
+    original = fitting.fit_together
 
     def fit_and_press(state, task, until, *, on_step, **others):
         def step(now):
@@ -92,7 +92,7 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
         original(state, task, until, on_step=step, **others)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "fit", fit_and_press)
+        patch.setattr(fitting, "fit_together", fit_and_press)
         with pytest.raises(KeyboardInterrupt):
             run(train, CONFIG, inputs, tmp_path / "out", replace(CONTEXT, record=press))
     assert recorded[-1] == (10, 160)

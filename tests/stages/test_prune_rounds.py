@@ -110,7 +110,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
 def test_ctrl_c_while_scores_are_gathered_costs_no_byte_either(
     inputs, whole, tmp_path, monkeypatch
 ):
-    original = fitting.fit
+    original = fitting.fit_together
 
     def interrupted(state, task, until, *, importance, **others):
         if importance is not None and state.iteration > 125:
@@ -118,7 +118,7 @@ def test_ctrl_c_while_scores_are_gathered_costs_no_byte_either(
         original(state, task, until, importance=importance, **others)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "fit", interrupted)
+        patch.setattr(fitting, "fit_together", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(THREE, inputs, tmp_path / "out")
     run(THREE, inputs, tmp_path / "out")

@@ -268,7 +268,7 @@ def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monke
     compute = gradient_step(backend)
     monkeypatch.setattr(
         "recon_cli.train.stepping.gradient_step",
-        lambda _: lambda *given, **named: (float("nan"), compute(*given, **named)[1]))
+        lambda *_: lambda *given, **named: (float("nan"), compute(*given, **named)[1]))
     run(state, task, 2)
     assert (state.iteration, state.skipped, state.optimizer.count) == (2, 2, 0)
     assert all(torch.equal(value, getattr(before, name))

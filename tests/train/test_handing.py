@@ -1,0 +1,39 @@
+"""A fit that is handed to another process is the same there."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from tiny_task import CONFIG, first_state, same, tiny_task
+
+from recon_cli.train.handing import Fit, packed, unpacked
+from recon_cli.train.importance import Importance
+from recon_cli.train.pruning import Recovery
+from recon_cli.train.ranks import Ranks
+from recon_cli.train.start import _parts
+
+
+def test_a_fit_is_the_same_after_it_was_handed_over():
+    config = dataclasses.replace(CONFIG, batch_views=2, exposure="on")
+    plan = Recovery(config, first=3, until=9)
+    task = dataclasses.replace(tiny_task(config), schedule=plan, camera_error=0.25)
+    task.train[2] = dataclasses.replace(task.train[2], mask=np.eye(30, 40) > 0)
+    state = first_state(config)
+    state.exposure, state.poses = _parts(task, None)
+    found = Importance.of_score("paper", 40, torch.device("cpu"))
+    ranks = Ranks(1, 2)
+    first = unpacked(packed(Fit(state, task, found, 3)), ranks)
+    known = dataclasses.replace(task, ranks=Ranks(0, 2, views=task.train))
+    second = packed(Fit(state, known, None, 3))
+    assert not [name for name in second if name.startswith("image")]
+    for one in (first, unpacked(second, ranks)):
+        assert one.task.schedule == plan
+        assert (one.task.camera_error, one.task.extent, one.threads) == (0.25, 1.0, 3)
+        assert same(one.state, state)
+        for mine, theirs in zip(task.train, one.task.train, strict=True):
+            assert np.array_equal(mine.image, theirs.image)
+            assert np.array_equal(mine.camera.viewmat, theirs.camera.viewmat)
+            assert mine.camera.fx == theirs.camera.fx
+            assert (mine.mask is None) == (theirs.mask is None)
+        assert np.array_equal(one.task.train[2].mask, task.train[2].mask)
+    assert (first.importance.weighs, first.importance.leaves_out) == (True, False)
