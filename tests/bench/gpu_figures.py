@@ -17,6 +17,7 @@ import torch
 
 from recon_cli import atomic, machine
 
+_LONGEST = 300  # characters of a failure in the table
 _GRACE = 40  # seconds after the deadline in which a part may still end by itself
 
 
@@ -127,7 +128,8 @@ class Figures:
             work()
         except Exception as error:  # whatever it is, the table must come
             click.echo(traceback.format_exc())
-            self.failures.append(f"{name} broke off: {type(error).__name__}: {error}"[:300])
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            self.failures.append(f"{name} broke off: {said}"[:_LONGEST])
 
     def table(self) -> str:
         """Returns all figures in Markdown, and what failed."""
