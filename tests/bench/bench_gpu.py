@@ -78,6 +78,7 @@ def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room
             "steps checked": lambda: gpu_checks.recordings(figures, whole),
             "waiting checked": lambda: gpu_checks.waiting(figures, whole),
             "pictures": lambda: gpu_speed.pictures(figures, whole, rounds),
+            "gsplat": lambda: gpu_speed.gsplat(figures, whole, rounds),
             "steps": lambda: gpu_speed.steps(figures, whole, rounds, stretch),
             "floor": lambda: gpu_floor.run(figures, whole, rounds),
         }

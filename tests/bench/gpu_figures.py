@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
@@ -162,8 +161,3 @@ class Figures:
         clock.daemon = True
         clock.start()
         return clock
-
-
-def compact(numbers: dict[str, float]) -> str:
-    """Returns named numbers in a line."""
-    return json.dumps({name: round(value, 3) for name, value in numbers.items()})

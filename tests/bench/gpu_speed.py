@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from gpu_clock import clear, in_turn, middle, spread
-from gpu_figures import Figures, Goal, compact
+from gpu_figures import Figures, Goal
 from gpu_gsplat import Gsplat, installed
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
 
 from recon_cli.bench.scenes import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
+from recon_cli.train import ahead
+from recon_cli.train.fit import Task
+from recon_cli.train.state import TrainState
 
 TORCH, GSPLAT = Goal(15, 40), Goal(0.5, 1.2)  # times as fast
 STEP = Goal(8, 3)  # ms
@@ -21,6 +24,7 @@ MEMORY = Goal(2, 1)  # GB
 _NEAR_GSPLAT = 5e-3  # rms; the same picture but for the greatest alpha
 _STRETCH = 96  # steps between two densifications
 _BATCH = 4
+_RECORDED, _AT_ONCE = 6, 16  # steps; so few that the device's queue is never full
 _FEW = 1_000  # Gaussians while kernels are compiled; the image has its size, which is compiled in
 _GB = 1e9
 
@@ -69,35 +73,45 @@ class _Ours(_Candidate):
 
 
 def pictures(figures: Figures, size: SceneSize, rounds: int) -> None:
-    """Times pictures and gradients of every backend, and of gsplat."""
+    """Times pictures and gradients of the two backends that a GPU has."""
     scene = build_scene(size, 3, figures.device)
-    candidates = {name: _Ours(scene, name) for name in ("triton", "torch")}
-    rivals: dict[str, _Candidate] = dict(candidates)
-    if figures.device == "cuda" and installed():
-        rival = Gsplat(scene)
-        rivals["gsplat"] = _Candidate(scene, rival.leaves, rival.picture)
-        error = float((rivals["gsplat"].forward() - rivals["triton"].forward())
-                      .square().mean().sqrt())
-        word = "as ours" if error <= _NEAR_GSPLAT else "NOT AS OURS: the ratio means nothing"
-        figures.add("gsplat's picture, rms difference x 1000", 1000 * error, "", note=word)
+    _compare(figures, {name: _Ours(scene, name) for name in ("triton", "torch")}, TORCH, rounds)
+
+
+def gsplat(figures: Figures, size: SceneSize, rounds: int) -> None:
+    """Times gsplat's kernels on the same scene, where that package is installed."""
+    if figures.device == "cpu" or not installed():
+        figures.add("triton : gsplat, forward + backward", None, "x", GSPLAT,
+                    note="gsplat is not installed")
+        return
+    scene = build_scene(size, 3, figures.device)
+    theirs = Gsplat(scene)
+    rivals = {"triton": _Ours(scene, "triton"),
+              "gsplat": _Candidate(scene, theirs.leaves, theirs.picture)}
+    one, other = (rival.forward() for rival in rivals.values())
+    error = float((one - other).square().mean().sqrt())
+    word = "as ours" if error <= _NEAR_GSPLAT else "NOT AS OURS: the ratio means nothing"
+    figures.add("gsplat's picture, rms difference x 1000", 1000 * error, "", note=word)
+    _compare(figures, rivals, GSPLAT, rounds)
+
+
+def _compare(
+    figures: Figures, rivals: Mapping[str, _Candidate], goal: Goal, rounds: int
+) -> None:
+    """Times triton and another candidate in turn."""
+    other = next(name for name in rivals if name != "triton")
     for what, works in (
         ("forward", {name: one.forward for name, one in rivals.items()}),
         ("forward + backward", {name: one.gradients for name, one in rivals.items()}),
     ):
         times = in_turn(works, rounds, figures.device)
         ms = {name: middle(found) for name, found in times.items()}
-        figures.say(f"{what}, ms: {compact(ms)}")
-        both = what != "forward"
+        beside = "" if other == "torch" else f" beside {other}"
         for name, found in times.items():
-            figures.add(f"{what}, {name}", ms[name], "ms", note=spread(found))
-        figures.add(f"triton : torch, {what}", ms["torch"] / ms["triton"], "x",
-                    TORCH if both else None)
-        if "gsplat" in ms:
-            figures.add(f"triton : gsplat, {what}", ms["gsplat"] / ms["triton"], "x",
-                        GSPLAT if both else None)
-    if "gsplat" not in rivals:
-        figures.add("triton : gsplat, forward + backward", None, "x", GSPLAT,
-                    note="gsplat is not installed")
+            figures.add(f"{what}, {name}{beside if name == 'triton' else ''}", ms[name], "ms",
+                        note=spread(found))
+        figures.add(f"triton : {other}, {what}", ms[other] / ms["triton"], "x",
+                    goal if what != "forward" else None)
 
 
 def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH) -> None:
@@ -119,6 +133,9 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH)
     for name, found in in_turn(works, rounds, device).items():
         figures.add(f"training step {name}", middle(found) / count, "ms",
                     None if "without" in name else STEP, note=spread(found, count))
+    if device == "cuda":
+        figures.add("the host's part of a training step", _started(state, task), "ms",
+                    note="to start it, with graphs; the device works at the same time")
     del works, state, task
     clear(device)
     state, task = training(size, device, still=True, batch_views=_BATCH)
@@ -127,6 +144,21 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH)
     found = in_turn(batch, rounds, device)[""]
     figures.add(f"training step of {_BATCH} views", middle(found) / number, "ms",
                 note=f"{spread(found, number)}; waits after every view")
+
+
+def _started(state: TrainState, task: Task) -> float:
+    """Returns the milliseconds in which the host starts a step that was recorded before."""
+    state.iteration = GATHERING
+    trainer = ahead.Ahead(state, task, lambda _: False)
+    for _ in range(_RECORDED):
+        trainer._start()
+    torch.cuda.synchronize()
+    begin = time.perf_counter()
+    for _ in range(_AT_ONCE):
+        trainer._start()
+    seconds = time.perf_counter() - begin
+    torch.cuda.synchronize()
+    return 1000 * seconds / _AT_ONCE
 
 
 def _allocated(device: str) -> float:
