@@ -85,8 +85,12 @@ def project(splats: Splats, view: Tensor, terms: int) -> Projected:
             *splats.parameters().values(), view, n, len(splats.sh_rest), records, shapes, centers,
             depths, touched, radii, broken, STRIDE=3 * TERMS[splats.sh_degree], TERMS=terms,
             BLOCK=kernels.BLOCK)
-    ends = torch.nn.functional.pad(torch.cumsum(touched, 0), (1, 0))
-    return Projected(records, shapes, centers, depths, radii, ends, broken)
+    return Projected(records, shapes, centers, depths, radii, before_each(touched), broken)
+
+
+def before_each(touched: Tensor) -> Tensor:
+    """Returns the tiles [N + 1] int64 that the Gaussians before each meet, and in all."""
+    return torch.nn.functional.pad(torch.cumsum(touched, 0), (1, 0))
 
 
 def listed(
@@ -101,22 +105,50 @@ def listed(
         view: its numbers.
         room: instances that there is memory for; `starts` ends there or before.
     """
-    n, like = len(seen.depths), seen.depths
     tiles_x, tiles_y = triton.cdiv(camera.width, SIDE.value), triton.cdiv(camera.height, SIDE.value)
-    keys = torch.full((room,), _BEHIND, dtype=torch.int64, device=like.device)
-    owners = torch.empty(room, dtype=torch.int32, device=like.device)
-    members, offsets = torch.empty_like(owners), like.new_empty(room, 2)
+    keys, owners = keyed(seen, starts, view, tiles_x, room)
+    keys, slots = in_order(keys)
+    members, offsets = placed(seen, starts, keys, slots, owners, tiles_x)
+    first, order = by_tile(keys, tiles_x * tiles_y)
+    return Lists(tiles_x, seen.records, starts, order, first, members, slots, offsets)
+
+
+def keyed(
+    seen: Projected, starts: Tensor, view: Tensor, tiles_x: int, room: int
+) -> tuple[Tensor, Tensor]:
+    """Returns key [room] int64 and Gaussian [room] int32 of each instance, by slot."""
+    n, device = len(seen.depths), seen.depths.device
+    keys = torch.full((room,), _BEHIND, dtype=torch.int64, device=device)
+    owners = torch.empty(room, dtype=torch.int32, device=device)
     if n and room:
         kernels.list_tiles[(triton.cdiv(n, kernels.BLOCK),)](
             seen.shapes, seen.centers, seen.depths, starts, view, n, tiles_x, keys, owners,
             BLOCK=kernels.BLOCK)
+    return keys, owners
+
+
+def in_order(keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the keys in order, and the slot [room] int64 of each."""
     # slots ascend with the Gaussians, so that a stable sort leaves ties in order of index
-    keys, slots = torch.sort(keys, stable=True)
+    ordered, slots = torch.sort(keys, stable=True)
+    return ordered, slots
+
+
+def placed(
+    seen: Projected, starts: Tensor, keys: Tensor, slots: Tensor, owners: Tensor, tiles_x: int
+) -> tuple[Tensor, Tensor]:
+    """Returns members and offsets of `Lists`, by keys in order."""
+    n, room = len(seen.depths), len(keys)
+    members, offsets = torch.empty_like(owners), seen.depths.new_empty(room, 2)
     if n and room:
         kernels.place[(triton.cdiv(room, kernels.BLOCK),)](
             keys, slots, owners, seen.centers, seen.records, starts, n, tiles_x, members, offsets,
             BLOCK=kernels.BLOCK)
-    tiles = torch.arange(tiles_x * tiles_y + 1, device=like.device)
-    first = torch.searchsorted(keys, tiles * _LOWER).int()
-    order = torch.argsort(first[1:] - first[:-1], descending=True, stable=True).int()
-    return Lists(tiles_x, seen.records, starts, order, first, members, slots, offsets)
+    return members, offsets
+
+
+def by_tile(keys: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
+    """Returns first and order of `Lists`, by keys in order."""
+    numbers = torch.arange(tiles + 1, device=keys.device)
+    first = torch.searchsorted(keys, numbers * _LOWER).int()
+    return first, torch.argsort(first[1:] - first[:-1], descending=True, stable=True).int()
