@@ -16,6 +16,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -39,6 +40,25 @@ def smaller(size: SceneSize) -> SceneSize:
                      max(_LEAST[1], size.width // _SMALL), max(_LEAST[1], size.height // _SMALL))
 
 
+def parts(
+    figures: Figures, whole: SceneSize, rounds: int, stretch: int
+) -> list[tuple[str, str, Callable[[], None]]]:
+    """Returns the parts in order: what --only calls them, their names, and their work."""
+    small = smaller(whole)
+    return [
+        ("kernels", "kernels", lambda: gpu_speed.build(figures, whole, stretch)),
+        ("checks", "small pictures checked", lambda: gpu_checks.agreement(figures, small)),
+        ("checks", "small steps checked", lambda: gpu_checks.recordings(figures, small)),
+        ("checks", "pictures checked", lambda: gpu_checks.agreement(figures, whole)),
+        ("checks", "steps checked", lambda: gpu_checks.recordings(figures, whole)),
+        ("checks", "waiting checked", lambda: gpu_checks.waiting(figures, whole)),
+        ("pictures", "pictures", lambda: gpu_speed.pictures(figures, whole, rounds)),
+        ("gsplat", "gsplat", lambda: gpu_speed.gsplat(figures, whole, rounds)),
+        ("steps", "steps", lambda: gpu_speed.steps(figures, whole, rounds, stretch)),
+        ("floor", "floor", lambda: gpu_floor.run(figures, whole, rounds)),
+    ]
+
+
 @click.command()
 @click.option("--device", default="cuda", type=click.Choice(["cuda", "cpu"]), show_default=True)
 @click.option("--gaussians", default=500_000, show_default=True)
@@ -51,11 +71,15 @@ def smaller(size: SceneSize) -> SceneSize:
 @click.option("--steps", default="1000,2000,4000,8000,30000", metavar="N,...", show_default=True,
               help="Lengths of the runs in the room.")
 @click.option("--room-size", type=int, help="Longest side there.  [default: that of recon train]")
+@click.option("--only", multiple=True, type=click.Choice(
+    ["kernels", "checks", "pictures", "gsplat", "steps", "floor", "room"]),
+    help="Part to do; may be repeated.  [default: all]")
 @click.option("--minutes", default=9.0, show_default=True, help="What does not fit is left out.")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path),
               help="Write all figures as JSON.  [default: nowhere]")
 def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room: Path | None,
-         steps: str, room_size: int | None, minutes: float, out: Path | None) -> None:
+         steps: str, room_size: int | None, only: tuple[str, ...], minutes: float,
+         out: Path | None) -> None:
     """Check and measure the triton backend on DEVICE."""
     width, _, height = size.partition("x")
     whole, lengths = SceneSize(gaussians, int(width), int(height)), [
@@ -70,22 +94,11 @@ def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room
     with tempfile.TemporaryDirectory(prefix="recon-triton-") as cache:
         # kernels of earlier runs are not found: their compilation is timed
         os.environ["TRITON_CACHE_DIR"] = cache
-        parts = {
-            "kernels": lambda: gpu_speed.build(figures, whole, stretch),
-            "small pictures checked": lambda: gpu_checks.agreement(figures, smaller(whole)),
-            "small steps checked": lambda: gpu_checks.recordings(figures, smaller(whole)),
-            "pictures checked": lambda: gpu_checks.agreement(figures, whole),
-            "steps checked": lambda: gpu_checks.recordings(figures, whole),
-            "waiting checked": lambda: gpu_checks.waiting(figures, whole),
-            "pictures": lambda: gpu_speed.pictures(figures, whole, rounds),
-            "gsplat": lambda: gpu_speed.gsplat(figures, whole, rounds),
-            "steps": lambda: gpu_speed.steps(figures, whole, rounds, stretch),
-            "floor": lambda: gpu_floor.run(figures, whole, rounds),
-        }
-        if room is not None:
-            parts["room"] = lambda: gpu_room.run(figures, room, lengths, room_size)
-        for name, part in parts.items():
-            figures.part(name, lambda part=part: (clear(device), part()))
+        for group, name, work in parts(figures, whole, rounds, stretch):
+            if not only or group in only:
+                figures.part(name, lambda work=work: (clear(device), work()))
+        if room is not None and (not only or "room" in only):
+            figures.part("room", lambda: gpu_room.run(figures, room, lengths, room_size))
     clock.cancel()
     click.echo(f"\n{figures.table()}")
     if out is not None:
