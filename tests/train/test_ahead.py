@@ -134,16 +134,24 @@ def test_the_room_that_there_was_changes_no_bit(reference, monkeypatch):
 def test_recorded_launches_give_the_same_bits(reference, monkeypatch):
     played = []
 
-    def recorder(work):
-        def play():
-            played.append(1)
-            work()
-        return play
+    class Recorder:
+        pools = 0
 
+        def begin_anew(self):
+            self.pools += 1
+
+        def __call__(self, work):
+            def play():
+                played.append(1)
+                work()
+            return play
+
+    recorder = Recorder()
     with_step(monkeypatch, [], graphs=Graphs(recorder))
     state = first()
     run(state, task_of())
     assert played
+    assert recorder.pools  # a densification changed all sizes
     assert_same(held(state), reference)
 
 

@@ -23,6 +23,9 @@ Work = Callable[[], None]
 class Recorder(Protocol):
     """Turns work into work that does the same to the same memory."""
 
+    def begin_anew(self) -> None:
+        """Gives back the memory of all recordings, which nobody has any more."""
+
     def __call__(self, work: Work) -> Work:
         """Returns what repeats the work, which it does not do.
 
@@ -77,7 +80,9 @@ class Graphs:
     def forget(self) -> None:
         """Drops all recordings, for sizes or addresses have changed."""
         self._times.clear()
-        self._recorded.clear()
+        if self._recorded and self._recorder is not None:
+            self._recorded.clear()
+            self._recorder.begin_anew()
 
 
 class _CudaGraphs:
@@ -87,6 +92,11 @@ class _CudaGraphs:
         self._device = device
         self._stream = torch.cuda.Stream(device)
         self._pool = torch.cuda.graph_pool_handle()
+
+    def begin_anew(self) -> None:
+        """Takes another pool: torch refuses one whose graphs are all gone."""
+        self._pool = torch.cuda.graph_pool_handle()
+        torch.cuda.empty_cache()  # or the old one's blocks would stay until memory runs out
 
     def __call__(self, work: Work) -> Work:
         graph = torch.cuda.CUDAGraph()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -19,20 +18,21 @@ GROUPS = 6  # means, quats, log_scales, logit_opacities, sh_dc, sh_rest
 
 
 @triton.jit
-def move(value, gradient, first, second, block, count, rate, keep1, keep2, add1, add2, root1,
-         root2, epsilon, BLOCK: tl.constexpr):
+def move(value, gradient, first, second, i, here, rate, keep1, keep2, add1, add2, root1, root2,
+         epsilon, WHOLE: tl.constexpr):
     """Moves a block of one group against its gradient.
 
         m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2,
         p <- p - rate (m / c1) / (sqrt(v / c2) + epsilon)
 
     Args:
-        value: [count] changed, as are the moments.
-        gradient: [count].
-        first: [count] m.
-        second: [count] v.
-        block: number of the block.
-        count: numbers in the group.
+        value: numbers that are changed, as are the moments.
+        gradient: of them.
+        first: m.
+        second: v.
+        i: [BLOCK] which.
+        here: [BLOCK] whether there is such a number; not looked at with WHOLE, which lets a lane
+            take four numbers at a time.
         rate: learning rate.
         keep1: b1.
         keep2: b2.
@@ -41,17 +41,29 @@ def move(value, gradient, first, second, block, count, rate, keep1, keep2, add1,
         root1: 1 / c1.
         root2: 1 / sqrt(c2).
         epsilon: keeps the quotient finite.
-        BLOCK: numbers in a block.
+        WHOLE: all are there.
     """
+    mask = None if WHOLE else here
+    g = tl.load(gradient + i, mask=mask)
+    m = tl.load(first + i, mask=mask) * keep1 + g * add1
+    v = tl.load(second + i, mask=mask) * keep2 + g * g * add2
+    p = tl.load(value + i, mask=mask)
+    tl.store(first + i, m, mask=mask)
+    tl.store(second + i, v, mask=mask)
+    tl.store(value + i, p - m * (rate * root1) / (tl.sqrt(v) * root2 + epsilon), mask=mask)
+
+
+@triton.jit
+def move_block(value, gradient, first, second, block, count, rate, keep1, keep2, add1, add2,
+               root1, root2, epsilon, BLOCK: tl.constexpr):
+    """Moves block `block` of `count` numbers; see `move`."""
     i = block.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
-    g = tl.load(gradient + i, mask=here, other=0.0)
-    m = tl.load(first + i, mask=here, other=0.0) * keep1 + g * add1
-    v = tl.load(second + i, mask=here, other=0.0) * keep2 + g * g * add2
-    p = tl.load(value + i, mask=here, other=0.0)
-    tl.store(first + i, m, mask=here)
-    tl.store(second + i, v, mask=here)
-    tl.store(value + i, p - m * (rate * root1) / (tl.sqrt(v) * root2 + epsilon), mask=here)
+    if (block + 1) * BLOCK <= count:
+        move(value, gradient, first, second, i, i < count, rate, keep1, keep2, add1, add2, root1,
+             root2, epsilon, WHOLE=True)
+    else:
+        move(value, gradient, first, second, i, i < count, rate, keep1, keep2, add1, add2, root1,
+             root2, epsilon, WHOLE=False)
 
 
 @triton.jit(do_not_specialize=("n0", "n1", "n2", "n3", "n4", "n5"))
@@ -66,8 +78,8 @@ def adam(p0, p1, p2, p3, p4, p5, g0, g1, g2, g3, g4, g5, m0, m1, m2, m3, m4, m5,
         g0: gradients.
         m0: first moments.
         v0: second moments.
-        n0: numbers in the group.
-        r0: its learning rate; negative leaves the group as it is.
+        n0: numbers in the group that are to be moved; all or none.
+        r0: its learning rate.
         taken: [1] int64, steps taken, this one included.
         counted: [1] int32; with GATED nothing moves where it is zero.
         keep1: decay of the first moments.
@@ -95,28 +107,23 @@ def adam(p0, p1, p2, p3, p4, p5, g0, g1, g2, g3, g4, g5, m0, m1, m2, m3, m4, m5,
         b4 = b3 - tl.cdiv(n3, BLOCK)
         b5 = b4 - tl.cdiv(n4, BLOCK)
         if b1 < 0:
-            if r0 >= 0.0:
-                move(p0, g0, m0, v0, b, n0, r0, keep1, keep2, add1, add2, root1, root2,
-                     epsilon, BLOCK)
+            move_block(p0, g0, m0, v0, b, n0, r0, keep1, keep2, add1, add2, root1,
+                       root2, epsilon, BLOCK)
         elif b2 < 0:
-            if r1 >= 0.0:
-                move(p1, g1, m1, v1, b1, n1, r1, keep1, keep2, add1, add2, root1, root2,
-                     epsilon, BLOCK)
+            move_block(p1, g1, m1, v1, b1, n1, r1, keep1, keep2, add1, add2, root1,
+                       root2, epsilon, BLOCK)
         elif b3 < 0:
-            if r2 >= 0.0:
-                move(p2, g2, m2, v2, b2, n2, r2, keep1, keep2, add1, add2, root1, root2,
-                     epsilon, BLOCK)
+            move_block(p2, g2, m2, v2, b2, n2, r2, keep1, keep2, add1, add2, root1,
+                       root2, epsilon, BLOCK)
         elif b4 < 0:
-            if r3 >= 0.0:
-                move(p3, g3, m3, v3, b3, n3, r3, keep1, keep2, add1, add2, root1, root2,
-                     epsilon, BLOCK)
+            move_block(p3, g3, m3, v3, b3, n3, r3, keep1, keep2, add1, add2, root1,
+                       root2, epsilon, BLOCK)
         elif b5 < 0:
-            if r4 >= 0.0:
-                move(p4, g4, m4, v4, b4, n4, r4, keep1, keep2, add1, add2, root1, root2,
-                     epsilon, BLOCK)
-        elif r5 >= 0.0:
-            move(p5, g5, m5, v5, b5, n5, r5, keep1, keep2, add1, add2, root1, root2,
-                 epsilon, BLOCK)
+            move_block(p4, g4, m4, v4, b4, n4, r4, keep1, keep2, add1, add2, root1,
+                       root2, epsilon, BLOCK)
+        else:
+            move_block(p5, g5, m5, v5, b5, n5, r5, keep1, keep2, add1, add2, root1,
+                       root2, epsilon, BLOCK)
 
 
 def step(
@@ -140,15 +147,10 @@ def step(
     if len(values) != GROUPS:
         raise ValueError(f"{len(values)} groups of parameters, needed {GROUPS}")
     taken += 1 if counted is None else counted
-    sizes = [value.numel() for value in values]
+    sizes = [0 if rate is None else value.numel()
+             for value, rate in zip(values, rates, strict=True)]
     programs = sum(triton.cdiv(size, BLOCK) for size in sizes)
     adam[(programs,)](
-        *values, *gradients, *first, *second, *sizes,
-        *(-1.0 if rate is None else rate for rate in rates), taken, counted,
-        *betas, 1 - betas[0], 1 - betas[1], math.log2(betas[0]), math.log2(betas[1]),
+        *values, *gradients, *first, *second, *sizes, *(rate or 0.0 for rate in rates), taken,
+        counted, *betas, 1 - betas[0], 1 - betas[1], math.log2(betas[0]), math.log2(betas[1]),
         epsilon, GATED=counted is not None, BLOCK=BLOCK)
-
-
-def no_steps(device: torch.device) -> Tensor:
-    """Returns the count [1] int64 before the first step."""
-    return torch.zeros(1, dtype=torch.int64, device=device)

@@ -106,7 +106,7 @@ def decomposed(
         grad_depth: [H, W]; likewise.
     """
     height, width = picture.alpha.shape
-    sums = lists.records.new_empty(len(lists.members), SUMS)
+    sums = lists.records.new_zeros(len(lists.members), SUMS)
     decompose[(len(lists.order),)](
         lists.order, lists.first, lists.members, lists.offsets, lists.records, background,
         width, height, lists.tiles_x, picture.final, picture.last, grad_rgb, grad_alpha,

@@ -129,9 +129,11 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     shape = shapes + i * SHAPE
     tl.store(shape, extent_x, mask=here)
     tl.store(shape + 1, extent_y, mask=here)
-    tl.store(shape + 2, b / a, mask=here)
-    tl.store(shape + 3, b / c, mask=here)
-    tl.store(shape + 4, tl.sqrt(reach * (det / c)), mask=here)
+    slope_y, slope_x = b / a, b / c
+    tl.store(shape + 2, slope_y, mask=here)
+    tl.store(shape + 3, slope_x, mask=here)
+    half = tl.sqrt(reach * (det / c))
+    tl.store(shape + 4, half, mask=here)
     tl.store(centers + 2 * i, center_x, mask=here)
     tl.store(centers + 2 * i + 1, center_y, mask=here)
     tl.store(depths + i, z.to(tl.float32), mask=here)
@@ -140,12 +142,13 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     low, high = tl.where(seen, low, 0), tl.where(seen, high, -1)
     tiles, row = low * 0, low
     while tl.max(high - row) >= 0:
-        first, last = span(shape, center_x, center_y, row, view, here & (row <= high))
+        first, last = span(extent_x, extent_y, slope_y, slope_x, half, center_x, center_y, row,
+                           view, here & (row <= high))
         tiles += tl.maximum(last - first + 1, 0)
         row += 1
     tl.store(touched + i, tiles, mask=here)
-    middle, half = 0.5 * (a + c), 0.5 * (a - c)
-    radius = 3.0 * tl.sqrt(middle + tl.sqrt(half * half + b * b))
+    middle, apart = 0.5 * (a + c), 0.5 * (a - c)
+    radius = 3.0 * tl.sqrt(middle + tl.sqrt(apart * apart + b * b))
     inside = seen & (center_x + extent_x > 0.0) & (
         center_x - extent_x < tl.load(view + WIDTH)) & (center_y + extent_y > 0.0) & (
         center_y - extent_y < tl.load(view + HEIGHT))
@@ -164,17 +167,24 @@ def rows_of(center_y, extent_y, view):
 
 
 @triton.jit
-def span(shape, center_x, center_y, row, view, here):
+def span(extent_x, extent_y, slope_y, slope_x, half, center_x, center_y, row, view, here):
     """Returns the first and the last tile of a row that ellipses meet; last < first for none.
 
     Between two heights the ellipse reaches farthest right at its rightmost point, or at the height
     that is nearest to it.
+
+    Args:
+        extent_x: half width; so the next four as `project` writes them into `shapes`.
+        extent_y: half height.
+        slope_y: b / a.
+        slope_x: b / c.
+        half: sqrt(reach det / c).
+        center_x: pixels.
+        center_y: pixels.
+        row: of tiles.
+        view: see `view.view_numbers`.
+        here: whose spans are wanted.
     """
-    extent_x = tl.load(shape, mask=here, other=0.0)
-    extent_y = tl.load(shape + 1, mask=here, other=1.0)
-    slope_y = tl.load(shape + 2, mask=here, other=0.0)
-    slope_x = tl.load(shape + 3, mask=here, other=0.0)
-    half = tl.load(shape + 4, mask=here, other=0.0)
     top = (row * SIDE + 0.5 - center_y).to(tl.float32)
     low, high = tl.maximum(top, -extent_y), tl.minimum(top + (SIDE - 1), extent_y)
     rightmost = slope_y * extent_x  # the height of the rightmost point
@@ -219,12 +229,18 @@ def list_tiles(shapes, centers, depths, starts, view, count, tiles_x, keys, owne
     center_x = tl.load(centers + 2 * i, mask=here, other=0.0)
     center_y = tl.load(centers + 2 * i + 1, mask=here, other=0.0)
     shape = shapes + i * SHAPE
+    extent_x = tl.load(shape, mask=here, other=0.0)
+    extent_y = tl.load(shape + 1, mask=here, other=1.0)
+    slope_y = tl.load(shape + 2, mask=here, other=0.0)
+    slope_x = tl.load(shape + 3, mask=here, other=0.0)
+    half = tl.load(shape + 4, mask=here, other=0.0)
     depth = tl.load(depths + i, mask=here, other=1.0).to(tl.int32, bitcast=True).to(tl.int64)
-    low, high = rows_of(center_y, tl.load(shape + 1, mask=here, other=0.0), view)
+    low, high = rows_of(center_y, extent_y, view)
     high = tl.where(here, high, low - 1)
     row = low
     while tl.max(high - row) >= 0:
-        tile, last = span(shape, center_x, center_y, row, view, here & (row <= high))
+        tile, last = span(extent_x, extent_y, slope_y, slope_x, half, center_x, center_y, row,
+                          view, here & (row <= high))
         while tl.max(last - tile) >= 0:
             more = tile <= last
             key = (row * tiles_x + tile).to(tl.int64) * 4294967296 + depth

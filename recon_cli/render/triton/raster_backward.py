@@ -52,16 +52,17 @@ def decompose(order, first, members, offsets, records, background, width, height
         grad_depth: [H, W] dL/ddepth.
         slots: [E] int64.
         counting: [H, W] uint8.
-        sums: [E, SLOT] out by slot: dL/d(red, green, blue, depth), then the sums of s times 1, u,
-            v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back, without its
-            factor), of s^2, the fragments, and what leaving the instance out would change.
+        sums: [E, SLOT] out by slot, zeros before: dL/d(red, green, blue, depth), then the sums of
+            s times 1, u, v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back,
+            without its factor), of s^2, the fragments, and what leaving the instance out would
+            change.
         PLAIN: the loss depends on colours alone.
         DETAILS: also |s y|, s^2 and the fragments.
         SCORES: also the last of these.
         MASKED: that one of the pixels in `counting` alone.
     """
     tile = tl.load(order + tl.program_id(0))
-    begin, end = tl.load(first + tile), tl.load(first + tile + 1)
+    begin = tl.load(first + tile)
     pixel = tl.arange(0, AREA)
     x, y = tile % tiles_x * SIDE + pixel % SIDE, tile // tiles_x * SIDE + pixel // SIDE
     column, row = (pixel % SIDE).to(tl.float32), (pixel // SIDE).to(tl.float32)
@@ -84,8 +85,7 @@ def decompose(order, first, members, offsets, records, background, width, height
     counts = inside
     if MASKED:
         counts = inside & (tl.load(counting + at, mask=inside, other=0) != 0)
-    e = begin + tl.max(latest)
-    drawn = e
+    e = begin + tl.max(latest)  # what no pixel reached stays zero
     while e > begin:
         e -= 1
         record = records + tl.load(members + e).to(tl.int64) * FLOATS
@@ -129,8 +129,3 @@ def decompose(order, first, members, offsets, records, background, width, height
             behind_blue = tl.fma(a, away_blue, behind_blue)
             error = away_red * away_red + away_green * away_green + away_blue * away_blue
             tl.store(to + 14, tl.sum(tl.where(counts, weight * weight * error, 0.0)))
-    nothing = tl.arange(0, SLOT).to(tl.float32) * 0.0
-    while drawn < end:  # what no pixel reached
-        to = sums + tl.load(slots + drawn).to(tl.int64) * SLOT
-        tl.store(to + tl.arange(0, SLOT), nothing)
-        drawn += 1

@@ -26,10 +26,11 @@ from recon_cli.render.triton.view import view_numbers
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import TERMS, Splats
 
-_FIRST_ROOM = 6  # instances a Gaussian; rooms have 2 to 5 of those in view
+_FIRST_ROOM = 2  # instances a Gaussian; a room has 2 to 5 of each that is in view
 _LEAST_ROOM = 1 << 10
-_GROWTH = 1.5  # of what was needed
+_SPARE = 1.5  # times the most that was needed so far
 _FULL = 0.8  # of the room, from which more is made before it runs out
+_CAMERAS = 4096  # whose numbers stay on the device
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +68,8 @@ class PhotometricStep:
         self, device: torch.device, *, graphs: Graphs | None = None, room: int | None = None
     ) -> None:
         self._graphs = Graphs.of(device) if graphs is None else graphs
-        self._room, self._ledger = room or 0, Ledger(device)
-        self._given = room is not None
+        self._room, self._ledger, self._most = room or 0, Ledger(device), 0
+        self._cameras: dict[int, tuple[Camera, Tensor]] = {}
         self.statistics = Statistics.zeros(torch.zeros(0, 3, device=device))
         self.counted, self._fits = (
             torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
@@ -101,9 +102,9 @@ class PhotometricStep:
         if len(self.statistics.radii) != len(splats):
             self.statistics = Statistics.zeros(splats.means.detach())
             self._graphs.forget()  # recorded for other sizes
-        if not self._given and self._room < _FIRST_ROOM * len(splats):
+        if not self._room:
             self._room = max(_LEAST_ROOM, _FIRST_ROOM * len(splats))
-        self._view.copy_(view_numbers(camera, self._view.device))
+        self._view.copy_(self._numbers(camera))
         truth = self._brought("truth", photograph.pixels)
         mask = photograph.mask
         counting = None if mask is None else self._brought("mask", mask.view(torch.uint8))
@@ -111,8 +112,10 @@ class PhotometricStep:
         work = self._work(
             splats, gradients, camera, truth, counting, gain, min(sh_degree, splats.sh_degree),
             ssim_weight, Wanted(plain=True, details=details, loo=loo), scores=scores)
-        key = (len(splats), len(splats.sh_rest), gradients.means.data_ptr(), camera.width,
-               camera.height, mask is None, sh_degree, ssim_weight, details, self._room)
+        places = (tensor.data_ptr() for held in (splats, gradients)
+                  for tensor in held.parameters().values())
+        key = (*places, len(splats), len(splats.sh_rest), camera.width, camera.height,
+               mask is None, sh_degree, ssim_weight, details, self._room)
         if gain is None and not scores and not loo:
             self._graphs.run(key, work)
         else:
@@ -124,10 +127,23 @@ class PhotometricStep:
         Where one was stopped there is room for it from now on.
         """
         account = self._ledger.close()
-        if account.needed > _FULL * self._room:
-            self._room = int(_GROWTH * account.needed)
+        self._most = max(self._most, account.needed)
+        enough = max(_LEAST_ROOM, int(_SPARE * self._most))
+        if self._most > _FULL * self._room or self._room > _SPARE * enough:
+            self._room = enough
             self._graphs.forget()
         return account
+
+    def _numbers(self, camera: Camera) -> Tensor:
+        """Returns the numbers of a camera on the device, where they stay."""
+        known = self._cameras.get(id(camera))
+        if known is None:
+            if len(self._cameras) >= _CAMERAS:
+                self._cameras.clear()
+            # with the camera itself: its id is its own as long as it lives
+            known = camera, view_numbers(camera, self._view.device)
+            self._cameras[id(camera)] = known
+        return known[1]
 
     def _brought(self, name: str, source: Tensor) -> Tensor:
         """Returns the device's own copy of what lies on the host, in the same place each time."""
