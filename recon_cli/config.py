@@ -180,7 +180,8 @@ class TrainConfig(StageConfig):
         unit="share", minimum=0.05, maximum=1.0)
     seed: int = option(0, "Seed of every random choice.", minimum=0)
     checkpoint_every: int = option(
-        250, "Save the full state this often.", unit="steps", minimum=1, hashed=False)
+        250, "Save the full state this often, or as often as takes a tenth of the time.",
+        unit="steps", minimum=1, hashed=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()

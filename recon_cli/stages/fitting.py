@@ -6,7 +6,8 @@ import dataclasses
 import json
 import logging
 import signal
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from recon_cli.train.fit import Report, Task
 from recon_cli.train.importance import Importance
 from recon_cli.train.memory import MemoryEstimate, estimate, refuse_what_does_not_fit, room
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import TrainState, save_state
+from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
 from recon_cli.train.step import TrainView
 from recon_cli.train.together import fit_together
 
@@ -202,6 +203,32 @@ def _deferred_interrupt() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
+class Pace:
+    """Keeps large checkpoints of fast steps from taking the time that the steps should have.
+
+    It changes when a state is saved, and never what is.
+
+    Args:
+        clock: seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock, self._last, self._took = clock, clock(), 0.0
+
+    def allows(self) -> bool:
+        """Tells whether another checkpoint keeps to its share of the time."""
+        return self._took <= LONG_SAVE or (
+            SAVE_SHARE * (self._clock() - self._last) >= self._took)
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Times a checkpoint."""
+        begin = self._clock()
+        yield
+        self._last = self._clock()
+        self._took = self._last - begin
+
+
 def run_fit(
     state: TrainState,
     task: Task,
@@ -239,6 +266,7 @@ def run_fit(
     """
     log = Log(out / LOG, state.iteration, earlier_seconds)
     every, counted = task.schedule.config.checkpoint_every, [state.iteration]
+    pace = Pace()
     with _deferred_interrupt() as pressed, ctx.progress.bar(
         label, (end or until) - first, unit="step", done=state.iteration - first
     ) as bar:
@@ -248,8 +276,10 @@ def run_fit(
             ctx.watcher.step(now.iteration, now.splats)
             if keep and now.iteration in keep:
                 save_state(out / keep[now.iteration], now)
-            if importance is None and (now.iteration % every == 0 or pressed):
-                save_state(out / checkpoint, now)
+            due = now.iteration % every == 0 and pace.allows()
+            if importance is None and (due or pressed):
+                with pace.saving():
+                    save_state(out / checkpoint, now)
                 ctx.record(now.iteration - first, (end or until) - first)
             if pressed:
                 raise KeyboardInterrupt

@@ -24,7 +24,7 @@ from recon_cli.train import budget
 from recon_cli.train.fit import Task, fit, report_every, validation_psnr
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import TrainState, new_state, save_state
+from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, new_state, save_state
 
 # Of the Gaussians that stand for trained ones. With .3 a step takes what a real one of the same
 # level and count takes, within 10%, with the .1 that training begins with up to 25% less (room
@@ -83,9 +83,11 @@ class CostModel:
         every, saves = report_every(schedule), config.checkpoint_every
         for begin, end, count in counts(schedule, first):
             steps = end - begin
-            total += steps * costs[schedule.level((begin + end) // 2 + 1)].ms(count)
+            total += steps * (step := costs[schedule.level((begin + end) // 2 + 1)].ms(count))
             total += steps / every * self.report.ms(count)
-            total += steps / saves * self.save_ms * count / 1000
+            save = self.save_ms * count / 1000
+            most = SAVE_SHARE * step if save > 1000 * LONG_SAVE else math.inf
+            total += steps * min(save / saves, most)
         return total / 1000
 
 

@@ -24,6 +24,8 @@ from recon_cli.train.gathered import Gathered
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import Poses
 
+LONG_SAVE = 0.25  # seconds; a checkpoint that takes longer is written less often
+SAVE_SHARE = 0.1  # of the time, that such checkpoints may take
 _VERSION = 5
 
 

@@ -184,3 +184,22 @@ def test_a_checkpoint_cut_short_is_refused_with_what_to_type(inputs, tmp_path, m
     with pytest.raises(FormatError) as caught:
         run(train, CONFIG, inputs, tmp_path / "out")
     assert "--again" in caught.value.hint
+
+
+def test_large_checkpoints_take_no_more_than_a_tenth_of_the_time():
+    now = [0.0]
+    pace = fitting.Pace(lambda: now[0])
+
+    def save(seconds):
+        with pace.saving():
+            now[0] += seconds
+
+    assert pace.allows()
+    save(0.2)  # soon written: as often as is asked for
+    assert pace.allows()
+    save(0.5)
+    assert not pace.allows()
+    now[0] += 4.9
+    assert not pace.allows()
+    now[0] += 0.2
+    assert pace.allows()

@@ -44,6 +44,16 @@ def test_reports_and_checkpoints_are_counted():
     assert saves.run_seconds(plan(checkpoint_every=100), 8000) == pytest.approx(0.16)
 
 
+def test_long_checkpoints_take_a_tenth_of_the_steps():
+    costs = replace(model(_4=(3.0, 0.0), _2=(3.0, 0.0), _1=(3.0, 0.0)), save_ms=50.0)
+    # 8,000 Gaussians take .4 s to save, each hundred steps .3 s
+    assert costs.run_seconds(plan(checkpoint_every=100), 8000) == pytest.approx(3.3)
+    # and where there are few it is not worth a thought
+    assert costs.run_seconds(plan(checkpoint_every=500), 8000) == pytest.approx(3.3)
+    assert costs.run_seconds(plan(checkpoint_every=1000, max_gaussians=4000), 4000) == (
+        pytest.approx(3.2))
+
+
 @pytest.mark.parametrize("iterations", [1, 7, 99, 1000, 30_000])
 def test_the_pieces_of_a_run_join_and_the_count_grows_to_its_cap(iterations):
     pieces = counts(plan(iterations=iterations), 2000)
