@@ -106,7 +106,7 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
 
     to_x, to_y, to_z, _ = direction(means, view, i, here)
     red, green, blue = colors(
-        sh_dc, sh_rest, i, here, here & (i < colored), to_x, to_y, to_z, STRIDE, TERMS)
+        sh_dc, sh_rest, i, here, seen & (i < colored), to_x, to_y, to_z, STRIDE, TERMS)
     lit = tl.abs(red) + tl.abs(green) + tl.abs(blue) < INFINITE
     whole = tl.where(seen, finite & lit & sound, finite & lit)
     tl.store(broken + tl.program_id(0), tl.sum(tl.where(here & (whole == 0), 1, 0)))

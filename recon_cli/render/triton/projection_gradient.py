@@ -26,6 +26,7 @@ from recon_cli.render.triton.harmonics import C0, basis, slope
 from recon_cli.render.triton.projection import LOW_PASS
 from recon_cli.render.triton.view import BOTTOM, FX, FY, LEFT, RIGHT, TOP
 
+AT_ONCE = tl.constexpr(4)  # slots; a Gaussian as large as the image has thousands
 WHITE = tl.constexpr(1.0 / UNIT.value)  # u and v hold sqrt(log2(e) / 2)
 
 
@@ -79,26 +80,28 @@ def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, r
     s_uu, s_uv, s_vv, abs_x, abs_y, squared, hits, left_out = (
         zero, zero, zero, zero, zero, zero, zero, zero)
     while tl.max(end - slot) > 0:
-        more, at = slot < end, sums + slot.to(tl.int64) * SLOT
-        red += tl.load(at, mask=more, other=0.0)
-        green += tl.load(at + 1, mask=more, other=0.0)
-        blue += tl.load(at + 2, mask=more, other=0.0)
-        if PLAIN == 0:
-            depth += tl.load(at + 3, mask=more, other=0.0)
-        s += tl.load(at + 4, mask=more, other=0.0)
-        s_u += tl.load(at + 5, mask=more, other=0.0)
-        s_v += tl.load(at + 6, mask=more, other=0.0)
-        s_uu += tl.load(at + 7, mask=more, other=0.0)
-        s_uv += tl.load(at + 8, mask=more, other=0.0)
-        s_vv += tl.load(at + 9, mask=more, other=0.0)
-        if DETAILS:
-            abs_x += tl.load(at + 10, mask=more, other=0.0)
-            abs_y += tl.load(at + 11, mask=more, other=0.0)
-            squared += tl.load(at + 12, mask=more, other=0.0)
-            hits += tl.load(at + 13, mask=more, other=0.0)
-        if SCORES:
-            left_out += tl.load(at + 14, mask=more, other=0.0)
-        slot += 1
+        # several at once: their loads wait together, and the order of the sums stays
+        for _ in tl.static_range(AT_ONCE):
+            more, at = slot < end, sums + slot.to(tl.int64) * SLOT
+            red += tl.load(at, mask=more, other=0.0)
+            green += tl.load(at + 1, mask=more, other=0.0)
+            blue += tl.load(at + 2, mask=more, other=0.0)
+            if PLAIN == 0:
+                depth += tl.load(at + 3, mask=more, other=0.0)
+            s += tl.load(at + 4, mask=more, other=0.0)
+            s_u += tl.load(at + 5, mask=more, other=0.0)
+            s_v += tl.load(at + 6, mask=more, other=0.0)
+            s_uu += tl.load(at + 7, mask=more, other=0.0)
+            s_uv += tl.load(at + 8, mask=more, other=0.0)
+            s_vv += tl.load(at + 9, mask=more, other=0.0)
+            if DETAILS:
+                abs_x += tl.load(at + 10, mask=more, other=0.0)
+                abs_y += tl.load(at + 11, mask=more, other=0.0)
+                squared += tl.load(at + 12, mask=more, other=0.0)
+                hits += tl.load(at + 13, mask=more, other=0.0)
+            if SCORES:
+                left_out += tl.load(at + 14, mask=more, other=0.0)
+            slot += 1
     record = records + i * FLOATS
     red = tl.where(tl.load(record + 4, mask=drawn, other=0.0) > 0.0, red, 0.0)
     green = tl.where(tl.load(record + 5, mask=drawn, other=0.0) > 0.0, green, 0.0)
