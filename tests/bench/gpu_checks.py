@@ -59,8 +59,7 @@ def recordings(figures: Figures, size: SceneSize) -> None:
     with mock.patch.object(
             torch.cuda.CUDAGraph, "replay", _counted(torch.cuda.CUDAGraph.replay, replayed)):
         # the interpreter has no graphs; work that is done again stands for them
-        graphs = None if figures.device == "cuda" else triton_step.Graphs(
-            lambda work: _counted(work, replayed))
+        graphs = None if figures.device == "cuda" else triton_step.Graphs(_Again(replayed))
         recorded, _ = _moved(size, figures.device, graphs=graphs)
     before, after = size.gaussians, len(plain["splats.means"])
     figures.check(_same(plain, recorded), "steps as CUDA graphs",
@@ -72,6 +71,20 @@ def recordings(figures: Figures, size: SceneSize) -> None:
     figures.check(_same(plain, tight), "steps whose room runs out",
                   f"stopped {stopped} times, {_word(plain, tight)}")
     figures.check(stopped > 0, "room ran out", f"{stopped} times")
+
+
+class _Again:
+    """Stands for a recorder: does the work again, and notes each time in `calls`."""
+
+    def __init__(self, calls: list[int]) -> None:
+        self._calls = calls
+
+    def begin_anew(self) -> None:
+        """Has no memory to give back."""
+
+    def __call__(self, work: Callable[[], None]) -> Callable[[], None]:
+        """Returns the work, counted."""
+        return _counted(work, self._calls)
 
 
 def _counted(work: Callable[..., None], calls: list[int]) -> Callable[..., None]:
