@@ -19,7 +19,7 @@ from recon_cli import settings as layers
 from recon_cli.digests import Source, read_source
 from recon_cli.errors import ConfigError, ManifestError
 from recon_cli.fields import StageConfig
-from recon_cli.manifest import Basis, Manifest, Unfinished, differences
+from recon_cli.manifest import Basis, Manifest, Unfinished, differences, how_far
 from recon_cli.settings import Settings
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace import Workspace, changed_outputs
@@ -60,7 +60,7 @@ class Check:
     def described(self) -> str:
         """Returns the state with its reason or progress, as part of a sentence."""
         if self.state == "partial" and self.unfinished:
-            return f"unfinished ({self.unfinished.done}/{self.unfinished.total})"
+            return f"unfinished ({how_far(self.unfinished.done, self.unfinished.total)})"
         return f"{self.state}: {'; '.join(self.reasons)}" if self.reasons else self.state
 
 

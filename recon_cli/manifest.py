@@ -148,6 +148,11 @@ class Manifest:
             RunRecord(**run))
 
 
+def how_far(done: int, total: int) -> str:
+    """Returns how far a run came, in a few words; `total` is 0 before anything was saved."""
+    return f"{done}/{total}" if total else "just begun"
+
+
 @dataclass(frozen=True)
 class Unfinished:
     """How far an interrupted run came; lies beside its folder in .partial."""

@@ -31,7 +31,7 @@ from recon_cli.execute import (
 )
 from recon_cli.fields import OptionInfo, StageConfig, option_info
 from recon_cli.freshness import Check, Inspection, is_imported
-from recon_cli.manifest import Manifest
+from recon_cli.manifest import Manifest, how_far
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace import LOG, disk_errors
 
@@ -78,6 +78,11 @@ class StageStatus:
     seconds: float | None
     summary: dict[str, Any]
     notices: tuple[str, ...]
+
+    @property
+    def how_far(self) -> str:
+        """How far an interrupted run came, in a few words."""
+        return how_far(self.done, self.total)
 
 
 def status(job: Job) -> tuple[StageStatus, ...]:

@@ -46,7 +46,7 @@ def status_table(stages: Sequence[StageStatus]) -> str:
     """Returns stage, state, time, and what is worth knowing, one line a stage."""
     rows = [("stage", "state", "time", "")]
     for one in stages:
-        state = f"partial ({one.done}/{one.total})" if one.state == "partial" else one.state
+        state = f"partial ({one.how_far})" if one.state == "partial" else one.state
         told = "; ".join(one.reasons)
         if not told and one.summary:
             told = summary_line("", one.summary).removeprefix(": ")

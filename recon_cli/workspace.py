@@ -21,7 +21,7 @@ from recon_cli import lock, manifest
 from recon_cli.atomic import sync_folder
 from recon_cli.digests import FileDigest, digest_file, sha256_json
 from recon_cli.errors import ManifestError, ReconError, WorkspaceError
-from recon_cli.manifest import Basis, Manifest, Unfinished
+from recon_cli.manifest import Basis, Manifest, Unfinished, how_far
 
 LOG = "recon.log"
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
@@ -100,7 +100,7 @@ class Workspace:
         self._refuse_foreign(basis.stage)
         partial, earlier = self.partial(basis.stage), self.unfinished(basis.stage)
         if earlier and earlier.basis.fingerprint == basis.fingerprint:
-            logger.info("%s: resuming at %d of %d", basis.stage, earlier.done, earlier.total)
+            logger.info("%s: resuming (%s)", basis.stage, how_far(earlier.done, earlier.total))
             for path in partial.rglob(_LEFTOVERS):
                 path.unlink()
         else:

@@ -100,7 +100,7 @@ def test_ctrl_c_saves_the_state_and_one_process_goes_on(mapped, trained, tmp_pat
     left = states(workspace, capsys)["train"]
     assert 100 <= left["done"] < 400
     assert main(["train", "-w", str(workspace), *OPTIONS, "--batch-views", "2"]) == 0
-    assert f"resuming at {left['done']} of 400" in capsys.readouterr().err
+    assert f"resuming ({left['done']}/400)" in capsys.readouterr().err
     mine, theirs = (read_ply(w / "train" / "splats.ply") for w in (workspace, trained[0]))
     assert len(mine) == len(theirs)
     assert (mine.means - theirs.means).norm() <= 1e-2 * theirs.means.norm()

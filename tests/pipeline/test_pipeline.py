@@ -14,7 +14,7 @@ import fake_stages
 import pytest
 from fake_stages import STEPS, bring, job_at, stale
 
-from recon_cli import pipeline
+from recon_cli import pipeline, report
 from recon_cli.config import ComputeConfig
 from recon_cli.errors import (
     BackendError,
@@ -197,7 +197,8 @@ def test_an_interrupted_run_is_partial_until_what_it_reads_changes(job: Job) -> 
     shutil.rmtree(job.workspace.folder("train"))
     one = pipeline.status(job)[3]
     assert (one.state, one.done, one.total) == ("partial", 0, 0)
-    with pytest.raises(StageError, match="unfinished") as caught:
+    assert "partial (just begun)" in report.status_table([one])
+    with pytest.raises(StageError, match=r"unfinished \(just begun\)") as caught:
         bring(job, "prune", again=True)
     assert caught.value.hint == "Run `recon train --iterations 100` first."
     bring(job, "sfm", changes={"sfm": {"max_features": 500}})
