@@ -268,7 +268,8 @@ def _followed(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
     """
     if moment.shape[1:] != like.shape[1:]:
         moment = with_terms(moment, like.shape[1])
-    result = torch.zeros_like(like)
-    known = (source >= 0) & (source < len(moment))
-    result[known] = moment[source[known]]
-    return result
+    if len(moment) == 0:
+        return torch.zeros_like(like)
+    known = ((source >= 0) & (source < len(moment))).reshape(-1, *[1] * (like.dim() - 1))
+    # no mask as an index: a GPU would be waited for
+    return torch.where(known, moment[source.clamp(0, len(moment) - 1)], 0.0)

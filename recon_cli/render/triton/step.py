@@ -114,7 +114,7 @@ class PhotometricStep:
             ssim_weight, Wanted(plain=True, details=details, loo=loo), scores=scores)
         places = (tensor.data_ptr() for held in (splats, gradients)
                   for tensor in held.parameters().values())
-        key = (*places, len(splats), len(splats.sh_rest), camera.width, camera.height,
+        key = (*places, len(splats), splats.sh_rest.shape, camera.width, camera.height,
                mask is None, sh_degree, ssim_weight, details, self._room)
         if gain is None and not scores and not loo:
             self._graphs.run(key, work)
