@@ -38,6 +38,7 @@ from recon_cli.importing.command import import_scene
 from recon_cli.options import Call, pass_call
 from recon_cli.page.command import report as write_report
 from recon_cli.pipeline import Job
+from recon_cli.progress import bars_aside
 from recon_cli.scoreboard import command as scoreboard
 from recon_cli.settings import Settings
 from recon_cli.shots.command import render
@@ -72,7 +73,7 @@ def cli() -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit code."""
     call = Call()
-    handler = console.show_log(detailed=lambda: call.verbose)
+    handler = console.show_log(detailed=lambda: call.verbose, aside=bars_aside)
     try:
         if launch.follows():
             return launch.follow()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import TextIO
 
 import click
 
@@ -19,14 +21,31 @@ class _Plain(logging.Formatter):
         return f"notice: {text}" if record.levelno >= logging.WARNING else text
 
 
-def show_log(*, detailed: Callable[[], bool]) -> logging.Handler:
+class _Beside(logging.StreamHandler[TextIO]):
+    """Writes on stderr where something else may be drawn, which makes way meanwhile."""
+
+    def __init__(self, aside: Callable[[], AbstractContextManager[None]]) -> None:
+        super().__init__()
+        self._aside = aside
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Writes a record on a line of its own."""
+        with self._aside():
+            super().emit(record)
+
+
+def show_log(
+    *, detailed: Callable[[], bool],
+    aside: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> logging.Handler:
     """Shows the log on stderr and returns the handler, to be removed at the end.
 
     Args:
         detailed: whether debug messages are shown too; asked anew for each of them, because the
             log is there before the command line has been read.
+        aside: lets progress bars make way while a message is written.
     """
-    handler = logging.StreamHandler()
+    handler = _Beside(aside)
     handler.setFormatter(_Plain())
     handler.addFilter(lambda record: record.levelno >= logging.INFO or detailed())
     logger.addHandler(handler)

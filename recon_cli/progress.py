@@ -59,6 +59,16 @@ class _TqdmBar:
         self._bar.set_postfix_str(text, refresh=False)
 
 
+@contextmanager
+def bars_aside() -> Iterator[None]:
+    """Takes the bars from a terminal's last line, and draws them again below what was written."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    with tqdm.external_write_mode(file=sys.stderr):
+        yield
+
+
 class TqdmProgress:
     """Bars on stderr. Where stderr is no terminal, one line every 20 seconds is enough."""
 

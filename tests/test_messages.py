@@ -1,0 +1,48 @@
+"""What is said while a bar is drawn stands on a line of its own."""
+
+import os
+import pty
+import subprocess
+import sys
+import termios
+
+SAYS = """
+import logging
+from recon_cli import console
+from recon_cli.progress import TqdmProgress, bars_aside
+console.show_log(detailed=lambda: False, aside=bars_aside)
+with TqdmProgress().bar("train", 10) as bar:
+    bar.advance(3)
+    logging.getLogger("recon").warning("a frame is dark")
+    bar.advance(7)
+"""
+
+
+def shown(*, terminal):
+    """The lines of stderr, each as a terminal would show it in the end."""
+    reader, writer = pty.openpty() if terminal else os.pipe()
+    if terminal:
+        termios.tcsetwinsize(writer, (24, 80))
+    subprocess.run([sys.executable, "-c", SAYS], stderr=writer, check=True)
+    os.close(writer)
+    parts = []
+    try:
+        while part := os.read(reader, 4096):
+            parts.append(part)
+    except OSError:  # how a terminal says that nobody writes any more
+        pass
+    os.close(reader)
+    lines = b"".join(parts).decode().replace("\r\n", "\n").split("\n")
+    return [line.rstrip().rsplit("\r", 1)[-1] for line in lines]
+
+
+def test_a_message_takes_the_bars_place_on_a_terminal_and_the_bar_goes_on_below():
+    lines = shown(terminal=True)
+    place = lines.index("notice: a frame is dark")
+    assert "10/10" in lines[place + 1]
+
+
+def test_without_a_terminal_nothing_is_drawn_over():
+    text = "\n".join(shown(terminal=False))
+    assert "notice: a frame is dark" in text
+    assert "10/10" in text
