@@ -17,7 +17,7 @@ from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import camera_gradient
 
 if TYPE_CHECKING:
-    from recon_cli.render.triton.ledger import Account
+    from recon_cli.render.triton.ledger import Account, Ledger
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +93,10 @@ class DeferredStep(GradientStep, Protocol):
     def counted(self) -> Tensor:
         """[1] int32 on the device: zero where the last view came to nothing."""
 
+    @property
+    def ledger(self) -> Ledger:
+        """What the device writes down of each view."""
+
     def start(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
         variance: bool = False,
@@ -160,6 +164,11 @@ class _DeviceStep:
     def counted(self) -> Tensor:
         """[1] int32, zero where the last view came to nothing."""
         return self._compute.counted
+
+    @property
+    def ledger(self) -> Ledger:
+        """What the device writes down of each view."""
+        return self._compute.ledger
 
     def camera_gradient(
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int

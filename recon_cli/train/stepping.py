@@ -88,9 +88,10 @@ class Stepper:
         state, ranks = self._state, self._task.ranks
         moves_sh = self._task.schedule.moves_sh(iteration)
         found, gathers = _Found.nothing(len(batch)), self._task.schedule.gathers(iteration)
-        gathered = state.gathered if ranks.alone else Gathered.zeros(
-            len(state.splats), self._task.device)
         several = len(batch) > 1 or not ranks.alone
+        # in a sum of its own, so that who looked at which view changes no bit
+        gathered = state.gathered if not several else Gathered.zeros(
+            len(state.splats), self._task.device)
         for place in range(ranks.rank, len(batch), ranks.count):
             view = self._view(batch[place], iteration)
             statistics = self._look(view, batch[place], place, found, iteration)
@@ -106,7 +107,8 @@ class Stepper:
             ranks.add([torch.from_numpy(values) for values in vars(found).values()])
             if gathers:
                 gathered.over(ranks)
-                state.gathered.join(gathered)
+        if several and gathers:
+            state.gathered.join(gathered)
         return found
 
     def _view(self, index: int, iteration: int) -> TrainView:

@@ -143,7 +143,7 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH)
     batch = {"": stretch(state, task, GATHERING, number)}
     found = in_turn(batch, rounds, device)[""]
     figures.add(f"training step of {_BATCH} views", middle(found) / number, "ms",
-                note=f"{spread(found, number)}; waits after every view")
+                note=spread(found, number))
 
 
 def _started(state: TrainState, task: Task) -> float:

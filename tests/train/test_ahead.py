@@ -250,8 +250,41 @@ class NoWaiting(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def test_a_step_never_waits_for_the_device():
-    state, task = first(), task_of()
+def test_steps_of_several_views_go_ahead_to_the_same_bits(monkeypatch):
+    config = dataclasses.replace(CONFIG, batch_views=2)
+    failing, states, accounts = {5}, [], []  # the third step comes to nothing
+    for room in (None, 1000, 12):
+        with monkeypatch.context() as patch:
+            with_step(patch, accounts, room=room)
+            failing_at(patch, failing if room != 12 else set())
+            state, task = first(config=config), task_of(config=config)
+            if room is None:
+                stepper = Stepper(state, task, None)
+                for _ in range(5):
+                    stepper.step()
+            else:
+                accounts.clear()
+                run(state, task, 5)
+            states.append(state)
+    one_by_one, ahead_of, stopped = states
+    assert (ahead_of.skipped, ahead_of.optimizer.count) == (1, 4)
+    assert one_by_one.skipped == 1
+    assert_same(held(ahead_of), held(one_by_one))
+    for name, value in vars(one_by_one.gathered).items():
+        assert torch.equal(getattr(ahead_of.gathered, name), value), name
+    # a step that was stopped at its second view is taken again as a whole
+    assert any((account.stopped or 0) % 2 for account in accounts)
+    with monkeypatch.context() as patch:
+        with_step(patch, [], room=1000)
+        state = first(config=config)
+        run(state, task_of(config=config), 5)
+    assert_same(held(stopped), held(state))
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_step_never_waits_for_the_device(views):
+    config = dataclasses.replace(CONFIG, batch_views=views)
+    state, task = first(config=config), task_of(config=config)
     steps = ahead.Ahead(state, task, lambda _: False)
     steps._start()
     with NoWaiting():
@@ -273,6 +306,6 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
     assert chosen("numba") is Stepper
     assert chosen(importance=Importance.zeros(COUNT, torch.device("cpu"))) is Stepper
     assert chosen(exposure=True) is Stepper
-    assert chosen(batch_views=2) is Stepper
+    assert chosen(batch_views=2) is ahead.Ahead
     assert chosen(densify="mcmc") is Stepper
     assert chosen(ranks=Ranks(0, 2)) is Stepper

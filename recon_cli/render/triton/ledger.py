@@ -96,6 +96,21 @@ class Ledger:
         self.numbers = torch.tensor(_FIRST, dtype=torch.float64).to(device)
         self._first = self.numbers.clone()
 
+    @property
+    def going(self) -> Tensor:
+        """[] bool on the device: no step was stopped since the host last looked."""
+        return self.numbers[STOPPED.value] < 0
+
+    @property
+    def skipped(self) -> Tensor:
+        """[] float64 on the device: steps since then whose loss was not finite."""
+        return self.numbers[SKIPPED.value]
+
+    @property
+    def loss(self) -> Tensor:
+        """[] float64 on the device: of the last step."""
+        return self.numbers[LOSS.value]
+
     def close(self) -> Account:
         """Waits for the device, returns what it wrote, and begins anew."""
         _, stopped, needed, skipped, seen, loss = self.numbers.tolist()

@@ -57,6 +57,7 @@ class PhotometricStep:
         counted: [1] int32 on the device, zero where the last view came to nothing: its loss was not
             finite, it saw no Gaussian, or it was stopped.
         log_gain_gradient: [3] float64 on the device, of the last view that had a gain.
+        ledger: what the device writes down.
 
     Args:
         device: where everything lies.
@@ -68,7 +69,7 @@ class PhotometricStep:
         self, device: torch.device, *, graphs: Graphs | None = None, room: int | None = None
     ) -> None:
         self._graphs = Graphs.of(device) if graphs is None else graphs
-        self._room, self._ledger, self._most = room or 0, Ledger(device), 0
+        self._room, self.ledger, self._most = room or 0, Ledger(device), 0
         self._cameras: dict[int, tuple[Camera, Tensor]] = {}
         self.statistics = Statistics.zeros(torch.zeros(0, 3, device=device))
         self.counted, self._fits = (
@@ -126,7 +127,7 @@ class PhotometricStep:
 
         Where one was stopped there is room for it from now on.
         """
-        account = self._ledger.close()
+        account = self.ledger.close()
         self._most = max(self._most, account.needed)
         enough = max(_LEAST_ROOM, int(_SPARE * self._most))
         if self._most > _FULL * self._room or self._room > _SPARE * enough:
@@ -164,7 +165,7 @@ class PhotometricStep:
 
         def work() -> None:
             seen = project(splats, self._view, terms)
-            starts = admitted(seen.ends, room, self._ledger, self._fits)
+            starts = admitted(seen.ends, room, self.ledger, self._fits)
             lists = listed(seen, starts, camera, self._view, room)
             made = composited(
                 lists, camera, self._background, counting, statistics if scores else None)
@@ -174,7 +175,7 @@ class PhotometricStep:
                 # y = g x: dL/dlog g = g dL/dg = sum over pixels of y dL/dy
                 self.log_gain_gradient.copy_((rgb.double() * grad_rgb).sum((0, 1)))
                 grad_rgb = grad_rgb * gain
-            noted(seen.ends, room, loss, self._fits, self._ledger, self.counted)
+            noted(seen.ends, room, loss, self._fits, self.ledger, self.counted)
             sums = decomposed(lists, made, self._background, counting, wanted, grad_rgb)
             unprojected(splats, self._view, lists, sums, wanted, terms, gradients, statistics,
                         counted=self.counted)
