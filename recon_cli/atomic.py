@@ -11,6 +11,8 @@ from typing import Any
 
 from recon_cli.errors import FormatError
 
+LEFTOVERS = ".*.tmp*"  # files that `replacing` had not finished when it was killed
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -51,6 +53,12 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise FormatError(f"{path} cannot be read as JSON: {error}.") from error
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Deletes what was begun in a folder, and below it, when a process was killed."""
+    for path in folder.rglob(LEFTOVERS):
+        path.unlink()
 
 
 def sync_folder(folder: Path) -> None:

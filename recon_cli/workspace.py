@@ -18,14 +18,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from recon_cli import lock, manifest
-from recon_cli.atomic import sync_folder
+from recon_cli.atomic import clear_leftovers, sync_folder
 from recon_cli.digests import FileDigest, digest_file, sha256_json
 from recon_cli.errors import ManifestError, ReconError, WorkspaceError
 from recon_cli.manifest import Basis, Manifest, Unfinished, how_far
 
 LOG = "recon.log"
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
-_LEFTOVERS = ".*.tmp*"  # of files that atomic.replacing had not finished when it was killed
 
 logger = logging.getLogger("recon")
 
@@ -101,8 +100,7 @@ class Workspace:
         partial, earlier = self.partial(basis.stage), self.unfinished(basis.stage)
         if earlier and earlier.basis.fingerprint == basis.fingerprint:
             logger.info("%s: resuming (%s)", basis.stage, how_far(earlier.done, earlier.total))
-            for path in partial.rglob(_LEFTOVERS):
-                path.unlink()
+            clear_leftovers(partial)
         else:
             if earlier:
                 logger.info("%s: unfinished work for other settings is discarded", basis.stage)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from recon_cli.atomic import read_json, write_json
+from recon_cli.atomic import LEFTOVERS, clear_leftovers, read_json, write_json
 from recon_cli.digests import sha256_json
 from recon_cli.errors import FormatError, WorkspaceError
 from recon_cli.lock import HOLDER, LOCK
@@ -20,14 +20,13 @@ from recon_cli.shots.pictures import FOLDERS
 RECORD = "render.json"
 PATH = "camera_path.json"
 _SCHEMA = 1  # goes up when a picture changes meaning
-_LEFTOVERS = ".*.tmp*"  # of files that atomic.replacing had not finished when it was killed
 
 logger = logging.getLogger("recon")
 
 
 def refuse_foreign(root: Path) -> None:
     """Raises WorkspaceError where a folder holds files that no earlier run left."""
-    others = {one.name for one in root.iterdir() if not one.match(_LEFTOVERS)} - {LOCK, HOLDER}
+    others = {one.name for one in root.iterdir() if not one.match(LEFTOVERS)} - {LOCK, HOLDER}
     if others and RECORD not in others:
         raise WorkspaceError(
             f"{root} is in the way: it holds {min(others)}, but no {RECORD}, so recon did not make "
@@ -66,8 +65,7 @@ class Frames:
                            ", ".join(changed) or "its record was changed by hand")
             self._clear()
             before = None
-        for leftover in self.root.rglob(_LEFTOVERS):
-            leftover.unlink()
+        clear_leftovers(self.root)
         missing = tuple(name for name in self.names if not all(
             self.picture(folder, name).is_file() for folder in self._folders))
         video = before["video"] if before and not missing else None

@@ -10,6 +10,7 @@ import psutil
 import pytest
 from sfm_inputs import every_nth, run, write_inputs
 
+from recon_cli.atomic import clear_leftovers
 from recon_cli.capture.frames import read_png
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images, read_scene
@@ -165,6 +166,7 @@ def kill_when(base, out, reached):
     parent.wait()
     _, alive = psutil.wait_procs(children, timeout=20)
     assert not alive, "the mapping process outlived its parent"
+    clear_leftovers(out)  # as a workspace does before a run goes on
 
 
 def noted(out, step):
