@@ -11,19 +11,21 @@ from pathlib import Path
 
 import click
 
-from recon_cli import (
-    __version__,
-    cleaning,
-    comparing,
-    console,
-    doctor,
-    launch,
-    options,
-    pipeline,
-    report,
-)
-from recon_cli.bench.command import bench
-from recon_cli.config import (
+from recon_cli import __version__
+from recon_cli.commands import compare_filters, console, doctor, options
+from recon_cli.commands import compare_scores as scoreboard
+from recon_cli.commands import console as report
+from recon_cli.commands import prune_sweep as sweeping
+from recon_cli.commands.bench import bench
+from recon_cli.commands.import_scene import import_scene
+from recon_cli.commands.options import Call, pass_call
+from recon_cli.commands.render import render
+from recon_cli.commands.report import report as write_report
+from recon_cli.commands.shared import beside, perform
+from recon_cli.commands.study import study
+from recon_cli.commands.view import looking_on, view
+from recon_cli.config.settings import Settings
+from recon_cli.config.stages import (
     ComputeConfig,
     DenoiseConfig,
     EvaluateConfig,
@@ -34,20 +36,14 @@ from recon_cli.config import (
     TrainConfig,
 )
 from recon_cli.errors import ReconError
-from recon_cli.importing.command import import_scene
-from recon_cli.options import Call, pass_call
-from recon_cli.page.command import report as write_report
-from recon_cli.pipeline import Job
+from recon_cli.evaluation import tables
+from recon_cli.pipeline import clean as cleaning
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.plan import Job
 from recon_cli.progress import bars_aside
-from recon_cli.scoreboard import command as scoreboard
-from recon_cli.settings import Settings
-from recon_cli.shots.command import render
 from recon_cli.stages import STAGES
-from recon_cli.study.command import study
-from recon_cli.sweep import command as sweeping
-from recon_cli.verbs import beside, perform
-from recon_cli.viewer.command import looking_on, view
-from recon_cli.workspace import Workspace
+from recon_cli.train.distributed import launch
+from recon_cli.workspace.layout import Workspace
 
 SAMPLE = Path(__file__).parent / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # what the paper does: prune while training goes on
@@ -127,7 +123,7 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 def denoise(call: Call, compare: bool) -> None:
     """Filter noisy frames and pass the others through."""
     if compare:
-        click.echo(comparing.compare_filters(*beside(call, DenoiseConfig)))
+        click.echo(compare_filters.compare_filters(*beside(call, DenoiseConfig)))
         return
     perform(call, "denoise", ["denoise"])
 
@@ -265,7 +261,7 @@ def demo(call: Call) -> None:
 def status(call: Call, as_json: bool) -> None:
     """Show what is fresh, stale and why, partial, or missing."""
     job = Job(Workspace(call.workspace), options.explicit(call), table=STAGES)
-    stages = pipeline.status(job)
+    stages = plan.status(job)
     if as_json:
         click.echo(json.dumps({
             "workspace": str(job.workspace.root),
@@ -294,9 +290,9 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
     job = Job(Workspace(call.workspace), table=STAGES)
     freed = cleaning.clean(job, stages, dry=dry_run)
     for one in freed:
-        click.echo(f"{one.path}: {report.megabytes(one.size)}")
+        click.echo(f"{one.path}: {tables.format_megabytes(one.size)}")
     verb = "would be freed" if dry_run else "freed"
-    click.echo(f"{report.megabytes(sum(one.size for one in freed))} {verb}")
+    click.echo(f"{tables.format_megabytes(sum(one.size for one in freed))} {verb}")
 
 
 @cli.command("doctor")

@@ -14,14 +14,14 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from recon_cli import pipeline
-from recon_cli import settings as layers
-from recon_cli.fields import StageConfig
-from recon_cli.pipeline import Job, Target
-from recon_cli.settings import Settings
+from recon_cli.config import settings as layers
+from recon_cli.config.fields import StageConfig
+from recon_cli.config.settings import Settings
+from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import STAGES
-from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.workspace import Workspace
+from recon_cli.workspace.layout import Workspace
 
 TABLE = tuple(dataclasses.replace(row, module="fake_stages") for row in STAGES)
 NAMES = [row.name for row in TABLE]
@@ -76,13 +76,13 @@ def bring(
         Target(row.name, layers.build(row.config, values),
                (video,) if video and row.name == "ingest" else ())
         for row in TABLE if row.name in names]
-    pipeline.run(job, " ".join(names), targets, again=again)
+    plan.run(job, " ".join(names), targets, again=again)
     return ran[before:]
 
 
 def stale(job: Job) -> dict[str, Sequence[str]]:
     """Returns the stages that are not fresh, each with the reasons."""
-    return {one.name: one.reasons for one in pipeline.status(job) if one.state != "fresh"}
+    return {one.name: one.reasons for one in plan.status(job) if one.state != "fresh"}
 
 
 if __name__ == "__main__":  # python fake_stages.py WORKSPACE STAGE: run by the tests to be killed

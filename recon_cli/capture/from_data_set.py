@@ -9,20 +9,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture import frames as store
-from recon_cli.capture.frames import Frame, Group
 from recon_cli.capture.images import read_as_stored
+from recon_cli.capture.ingested_source import Context, Taken
 from recon_cli.capture.masks import opaque, read_mask, write_mask
 from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import MIN_FRAMES, names_in_order
-from recon_cli.capture.taken import Context, Taken
-from recon_cli.config import IngestConfig
+from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
+from recon_cli.io import frames as store
 from recon_cli.io.depth_points import points_from_depth
+from recon_cli.io.frames import Frame, Group
 from recon_cli.io.layouts import describe, read_posed
-from recon_cli.io.posed import PosedImage, PosedSet
-from recon_cli.io.poses import KnownPoses
-from recon_cli.scene.lens import Lens
+from recon_cli.io.posed import KnownPoses, PosedImage, PosedSet
+from recon_cli.scene.camera import Lens
 
 
 def take(config: IngestConfig, path: Path, out: Path, ctx: Context) -> Taken:

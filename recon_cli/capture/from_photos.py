@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli import atomic
-from recon_cli.capture import frames as store
-from recon_cli.capture.candidates import Candidate, Reason
-from recon_cli.capture.contact import ContactSheet
-from recon_cli.capture.duplicates import (
+from recon_cli.capture.camera_groups import PhotoGroup, group_notices, group_photos
+from recon_cli.capture.contact_sheet import ContactSheet
+from recon_cli.capture.from_video import report_reduced
+from recon_cli.capture.images import Photo, read_photo
+from recon_cli.capture.ingested_source import Choice, Context, Taken
+from recon_cli.capture.masks import FoundMasks, find_masks, photo_mask, write_mask
+from recon_cli.capture.near_duplicates import (
     NAMED,
     PhotoLook,
     choose_photos,
@@ -22,17 +24,15 @@ from recon_cli.capture.duplicates import (
     look_at_photo,
     named,
 )
-from recon_cli.capture.frames import Frame, Group
-from recon_cli.capture.from_video import report_reduced
-from recon_cli.capture.groups import PhotoGroup, group_notices, group_photos
-from recon_cli.capture.images import Photo, read_photo
-from recon_cli.capture.masks import FoundMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import Folder, check_count, frame_names, list_photos, photo_folder
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
-from recon_cli.capture.taken import Choice, Context, Taken
-from recon_cli.config import IngestConfig
+from recon_cli.capture.selection_record import Candidate, Reason
+from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
+from recon_cli.io import frames as store
+from recon_cli.io.frames import Frame, Group
+from recon_cli.workspace import atomic
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next try and for the curious
 

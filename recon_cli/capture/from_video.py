@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli import atomic
-from recon_cli.capture import candidates
-from recon_cli.capture import frames as store
-from recon_cli.capture.choose import (
+from recon_cli.capture import selection_record
+from recon_cli.capture.contact_sheet import ContactSheet
+from recon_cli.capture.frame_selection import (
     NO_MOTION,
     Judgement,
     automatic_count,
@@ -21,16 +20,16 @@ from recon_cli.capture.choose import (
     judged,
     travelled,
 )
-from recon_cli.capture.contact import ContactSheet
-from recon_cli.capture.exposure import check_exposure, well_exposed
-from recon_cli.capture.frames import Frame, Group
+from recon_cli.capture.ingested_source import Choice, Context, Taken
 from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import MIN_FRAMES
-from recon_cli.capture.scan import Scan, decode_threads, scan_video
-from recon_cli.capture.taken import Choice, Context, Taken
+from recon_cli.capture.scan import Scan, check_exposure, decode_threads, scan_video, well_exposed
 from recon_cli.capture.video import claimed_length, frames_at
-from recon_cli.config import IngestConfig
+from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
+from recon_cli.io import frames as store
+from recon_cli.io.frames import Frame, Group
+from recon_cli.workspace import atomic
 
 # A count that was made from the duration is off by this much, as a share or in frames (sound that
 # ends a little later), without anything being lost.
@@ -119,7 +118,7 @@ def take(
     _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
-    record = candidates.of_video(
+    record = selection_record.of_video(
         path.name, scan.sharpness, judgement.refused, look.way, names, same=NO_MOTION)
     sheet = ContactSheet(path.name, record, scan.width, scan.height)
     _write(look, names, sheet, config.max_size, out, ctx)

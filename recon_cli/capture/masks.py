@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli import atomic
 from recon_cli.capture.images import PHOTO_SUFFIXES, RAW_SUFFIXES, Photo, read_alpha, read_rgb
 from recon_cli.errors import InputError
+from recon_cli.workspace import atomic
 
 FOLDER = "masks"
 SUFFIXES = PHOTO_SUFFIXES - RAW_SUFFIXES

@@ -18,9 +18,9 @@ from av.stream import Disposition
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from recon_cli.capture.clues import codec_name, lacks_index
-from recon_cli.capture.fields import progressive
-from recon_cli.capture.picture import Gap, Picture, Tags, tags_of
+from recon_cli.capture.container_probe import codec_name, lacks_index
+from recon_cli.capture.decoded_picture import Gap, Picture, Tags, tags_of
+from recon_cli.capture.deinterlace import progressive
 from recon_cli.errors import InputError
 
 # FFmpeg renders text and text art as video; nobody means that by a capture.

@@ -1,25 +1,95 @@
-"""COLMAP's binary models, as far as a scene needs them: one pinhole camera a view, and points.
-
-Read here byte by byte rather than by pycolmap, which does not notice a cameras.bin cut short, does
-not come back from a points3D.bin cut short, and is native code in the process that trains.
-Observations and tracks are skipped. The layout is that of COLMAP's src/colmap/scene/
-reconstruction_io; rigs.bin and frames.bin, which newer models have beside it, say nothing more
-where each image has a camera of its own place.
-"""
+"""COLMAP models of undistorted views, binary or as text, written by pycolmap."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.errors import FormatError
-from recon_cli.io.colmap_bytes import Reader, damaged, rigid
+from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View, split_views
+
+
+class Reader:
+    """Takes values off a file, and notices when it ends too soon or too late."""
+
+    def __init__(self, path: Path, hint: str) -> None:
+        self._path = path
+        self._hint = hint
+        self._at = 0
+        try:
+            self._data = path.read_bytes()
+        except FileNotFoundError as error:
+            raise FormatError(f"{path} is missing.", hint=hint) from error
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """Returns the next values, laid out as `struct` says."""
+        start = self._at
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self._data, start)
+
+    def count(self, *, minimum: int) -> int:
+        """Returns the next value, a number of entries of at least `minimum` bytes each."""
+        (value,) = self.take("<Q")
+        if value * minimum > len(self._data) - self._at:
+            raise damaged(self._path, f"{value} entries promised", self._hint)
+        return int(value)
+
+    def text(self) -> str:
+        """Returns the next text, which ends with a zero byte."""
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            raise damaged(self._path, "a name without an end", self._hint)
+        value, self._at = self._data[self._at:end], end + 1
+        return value.decode(errors="replace")
+
+    def skip(self, size: int) -> None:
+        """Passes over `size` bytes."""
+        if self._at + size > len(self._data):
+            raise damaged(self._path, f"only {len(self._data)} bytes", self._hint)
+        self._at += size
+
+    def end(self) -> None:
+        """Raises FormatError when something is left."""
+        if self._at != len(self._data):
+            raise damaged(self._path, f"{len(self._data) - self._at} bytes too many", self._hint)
+
+
+def rotation(quat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the [3, 3] rotation of a quaternion, wxyz, of any length but zero."""
+    quat = quat / np.abs(quat).max()  # so that squares stay finite
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])
+
+
+def rigid(pose: Sequence[float]) -> NDArray[np.float64] | None:
+    """Returns [4, 4] of a quaternion wxyz and a translation; None unless they are a pose."""
+    if not np.isfinite(pose).all() or not any(pose[:4]):
+        return None
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation(np.array(pose[:4]))
+    matrix[:3, 3] = pose[4:]
+    return matrix
+
+
+def damaged(path: Path, what: str, hint: str) -> FormatError:
+    """Returns the error for a file that ends too soon or holds what cannot be."""
+    return FormatError(f"{path} is not a whole COLMAP model: {what}.", hint=hint)
+
 
 _PINHOLE = 1  # COLMAP's id of the model with fx, fy, cx, cy
 _HINT = "Run `recon sfm --again`."
@@ -187,3 +257,58 @@ def _check_size(path: Path, camera: Camera) -> None:
         raise FormatError(
             f"{path} is {size[0]}x{size[1]} pixels, but its camera {camera.width}x{camera.height}.",
             hint=_HINT)
+
+
+def write_colmap(
+    folder: Path,
+    views: Sequence[tuple[str, Camera]],
+    points: NDArray[np.float64],  # [P, 3]
+    colors: NDArray[np.uint8],  # [P, 3]
+    *,
+    text: bool = False,
+) -> None:
+    """Writes a model of pinhole cameras, whole or not at all.
+
+    Views with the same intrinsics share a camera. Nothing says which view sees which point.
+
+    Args:
+        folder: of the model, such as sparse/0; it may not exist yet, or has to be empty.
+        views: name of each image below the images' folder, and its camera.
+        points: in world units.
+        colors: RGB.
+        text: write cameras.txt and so on in place of the binary files.
+
+    Raises:
+        InputError: there are no views, or the folder holds something.
+    """
+    if not views:
+        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder} is not empty.", hint="Name another folder, or remove it.")
+    model = _model(views)
+    for point, color in zip(points, colors, strict=True):
+        model.add_point3D(point, pycolmap.Track(), color)
+    partial = folder.with_name(f".{folder.name}.tmp{os.getpid()}")
+    partial.mkdir(parents=True)
+    try:
+        (model.write_text if text else model.write_binary)(partial)
+        if folder.exists():
+            folder.rmdir()
+        partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:
+    model, ids = pycolmap.Reconstruction(), dict[tuple[float, ...], int]()
+    for number, (name, camera) in enumerate(views, start=1):
+        inner = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        if inner not in ids:
+            ids[inner] = len(ids) + 1
+            model.add_camera_with_trivial_rig(pycolmap.Camera(
+                camera_id=ids[inner], model="PINHOLE", width=camera.width, height=camera.height,
+                params=inner[2:]))
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(image_id=number, name=name, camera_id=ids[inner]),
+            pycolmap.Rigid3d(camera.viewmat[:3]))
+    return model

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import checked_lens
-from recon_cli.io.colmap import read_images, read_points
-from recon_cli.io.colmap_bytes import Reader, damaged, rigid
+from recon_cli.io.colmap import Reader, damaged, read_images, read_points, rigid
 from recon_cli.io.colmap_text import (
     Sensor,
     read_cameras_text,
@@ -25,7 +24,7 @@ from recon_cli.io.colmap_text import (
     read_points_text,
     read_rigs_text,
 )
-from recon_cli.scene.lens import MODELS, Lens
+from recon_cli.scene.camera import MODELS, Lens
 
 # COLMAP's ids of its camera models, src/colmap/sensor/models.h and pycolmap 4.2's CameraModelId.
 _IDS = (

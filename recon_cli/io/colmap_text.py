@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import checked_lens
-from recon_cli.io.colmap_bytes import rigid
-from recon_cli.scene.lens import Lens
+from recon_cli.io.colmap import rigid
+from recon_cli.scene.camera import Lens
 
 _HINT = "Export the model again from COLMAP."
 _COUNT = re.compile(r"# Number of \w+: (\d+)")

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.atomic import write_bytes
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
+from recon_cli.workspace.atomic import write_bytes
 
 _COUNTS = 255  # in the file of a mask; anything less is ignored, half-covered edges included
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.depth_file import DepthFile
+from recon_cli.io.depth_points import DepthFile
 from recon_cli.io.posed import PosedImage
-from recon_cli.scene.lens import Lens
+from recon_cli.scene.camera import Lens
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")

@@ -21,12 +21,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.atomic import replacing
 from recon_cli.errors import FormatError
 from recon_cli.io.ply_table import Header, read_header, read_tables
-from recon_cli.io.splats.values import as_splats
-from recon_cli.io.splats.writable import refuse_not_finite
+from recon_cli.io.splats.values import as_splats, refuse_not_finite
 from recon_cli.scene.splats import TERMS, Splats, with_rows
+from recon_cli.workspace.atomic import replacing
 
 _REST = [f"f_rest_{i}" for i in range(3 * TERMS[-1])]
 _GROUPS = {

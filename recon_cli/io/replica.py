@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.atomic import read_json
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import checked_lens, viewmat_from_pose
-from recon_cli.io.depth_file import DepthFile
+from recon_cli.io.depth_points import DepthFile
 from recon_cli.io.listed import Listed, find_images
 from recon_cli.io.posed import PosedSet
-from recon_cli.scene.lens import Lens
+from recon_cli.scene.camera import Lens
+from recon_cli.workspace.atomic import read_json
 
 _FRAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)")
 _TRAJ, _PARAMS = "traj.txt", "cam_params.json"

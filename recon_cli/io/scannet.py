@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import lens_from_matrix, viewmat_from_pose
-from recon_cli.io.depth_file import DepthFile
+from recon_cli.io.depth_points import DepthFile
 from recon_cli.io.listed import Listed, find_images, image_size
 from recon_cli.io.posed import PosedSet
-from recon_cli.scene.lens import Lens
+from recon_cli.scene.camera import Lens
 
 _MILLIMETRE = 1e-3  # ScanNet's depth shift is 1000
 _COLORS = (".jpg", ".jpeg", ".png")

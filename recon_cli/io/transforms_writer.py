@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from recon_cli.atomic import write_json
 from recon_cli.errors import InputError
 from recon_cli.scene.camera import Camera
+from recon_cli.workspace.atomic import write_json
 
 _OPENGL = np.diag([1.0, -1, -1, 1])  # from OpenGL's camera axes to OpenCV's
 

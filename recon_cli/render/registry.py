@@ -90,7 +90,7 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
 def use_threads(backend: str, threads: int) -> None:
     """Lets a backend compute with `threads` CPU threads from now on."""
     if backend == "numba":
-        from recon_cli.render.numba.crew import crew
+        from recon_cli.render.numba.thread_pool import crew
 
         crew.threads = threads
         # torch's own threads spin after each operation and would take the cores from the kernels
@@ -124,7 +124,7 @@ def prepare(backend: str, on_kernel: Callable[[], None]) -> float:
 def renderer(backend: str) -> Renderer:
     """Returns the render function of a backend, imported only now."""
     if backend == "torch":
-        from recon_cli.render.torch_tiles import render as torch_render
+        from recon_cli.render.torch.tiles import render as torch_render
 
         return torch_render
     if backend == "numba":

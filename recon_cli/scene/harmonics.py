@@ -1,12 +1,16 @@
-"""The real spherical harmonics that colours are made of.
+"""Turning spherical harmonics with the scene that they colour.
 
-Basis, signs and order are those of INRIA's 3DGS (after Sloan 2013, "Efficient Spherical Harmonic
-Evaluation"), so that its .ply files show the same colours here.
+A rotation mixes the coefficients of one degree among themselves and leaves degree 0 as it is.
 """
 
 from __future__ import annotations
 
+import math
+from functools import cache
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 _C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
@@ -32,3 +36,84 @@ def basis_rest(directions: Tensor, degree: int) -> Tensor:
             _C3[4] * z * (xx - yy), -_C3[0] * x * (xx - 3 * yy),
         ]
     return torch.stack(terms, dim=-1)
+
+
+_DEGREE = 3
+# The 2l+1 functions of degree l are determined by their values in 2l+1 general directions. 64 of a
+# Fibonacci lattice keep the least squares at a condition number under 1.03 for every degree.
+_DIRECTIONS = 64
+_ROUNDING = 1e-9  # entries of a generator are 0 or at least 1
+
+
+def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
+    """Returns the matrices that turn the coefficients of degrees 1, 2 and 3.
+
+    With M of degree l and Y its row of basis functions, Y(R d) (M c) = Y(d) c for every direction
+    d and every c: what was seen along d is seen along R d. M solves that in the least squares over
+    fixed directions, and because Y(R d) spans the same functions as Y(d), without a residual.
+
+    Args:
+        rotation: [3, 3] R, from old to new axes.
+
+    Returns:
+        [3, 3], [5, 5] and [7, 7], float64; orthogonal.
+    """
+    directions = _lattice(_DIRECTIONS)
+    turned = directions @ torch.from_numpy(np.asarray(rotation, np.float64)).T
+    before, after = basis_rest(directions, _DEGREE), basis_rest(turned, _DEGREE)
+    blocks = []
+    for degree in range(1, _DEGREE + 1):
+        rows = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
+        blocks.append(torch.linalg.lstsq(after[:, rows], before[:, rows]).solution)
+    return tuple(blocks)
+
+
+@cache
+@torch.enable_grad()
+def generators() -> Tensor:
+    """Returns the matrices [3, 15, 15] of small turns about x, y and z, float64.
+
+    A turn by the small rotation vector w changes coefficients c of degrees 1 to 3 by
+    sum_i w_i (G_i c): with Y the row of basis functions, Y(R d) (c + w_i G_i c) = Y(d) c demands
+    Y(d) G_i = -dY(R d)/dw_i, solved as in `rotation_blocks`. Antisymmetric; 48 entries are not 0.
+    """
+    directions, matrices = _lattice(_DIRECTIONS).requires_grad_(), []
+    basis = basis_rest(directions, _DEGREE)
+    slopes = torch.stack([
+        torch.autograd.grad(function.sum(), directions, retain_graph=True)[0]
+        for function in basis.T])  # [15, directions, 3]
+    for axis in torch.eye(3, dtype=torch.float64):
+        turn = torch.linalg.cross(axis.expand_as(directions), directions.detach())
+        solved = torch.linalg.lstsq(basis.detach(), -(slopes * turn).sum(dim=2).T).solution
+        solved[solved.abs() < _ROUNDING] = 0
+        matrices.append((solved - solved.T) / 2)
+    return torch.stack(matrices)
+
+
+def rotated(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
+    """Returns the coefficients of the same colours in turned axes.
+
+    Args:
+        sh_rest: [M, T, 3] coefficients of degrees 1 and up, T one of 0, 3, 8, 15.
+        rotation: [3, 3] from old to new axes.
+
+    Returns:
+        [M, T, 3] of the same dtype and device; computed in float64.
+    """
+    turned, start = torch.empty_like(sh_rest), 0
+    for block in rotation_blocks(rotation):
+        end = start + len(block)
+        if end <= sh_rest.shape[1]:
+            terms = sh_rest[:, start:end].double()
+            turned[:, start:end] = (block.to(sh_rest.device) @ terms).to(sh_rest.dtype)
+        start = end
+    return turned
+
+
+def _lattice(count: int) -> Tensor:
+    """Returns `count` unit directions [count, 3], float64, evenly spread (Fibonacci lattice)."""
+    steps = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - 2 * steps / count
+    angle = steps * math.pi * (3 - math.sqrt(5))
+    ring = torch.sqrt(1 - z * z)
+    return torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=-1)

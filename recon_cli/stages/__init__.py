@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from recon_cli.config import (
+from recon_cli.config.fields import StageConfig
+from recon_cli.config.stages import (
     DenoiseConfig,
     EvaluateConfig,
     ExportConfig,
@@ -18,7 +19,6 @@ from recon_cli.config import (
     SfmConfig,
     TrainConfig,
 )
-from recon_cli.fields import StageConfig
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ STAGES: tuple[Stage, ...] = (
 )
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, 1, False,
-               "recon_cli.stages.imported", renders=True, takes="FILE")
+               "recon_cli.stages.import_scene", renders=True, takes="FILE")
 
 
 def stage(name: str) -> Stage:

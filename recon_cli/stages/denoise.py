@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from recon_cli import atomic
-from recon_cli.capture import frames as store
 from recon_cli.capture.filters import FILTERS
 from recon_cli.capture.noise import estimate_noise
 from recon_cli.capture.pace import paced
-from recon_cli.config import DenoiseConfig
-from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.config.stages import DenoiseConfig
+from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.io import frames as store
+from recon_cli.workspace import atomic
 
 NOISE = "noise.json"
 

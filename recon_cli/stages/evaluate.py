@@ -16,11 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.atomic import write_bytes, write_json
-from recon_cli.config import EvaluateConfig
-from recon_cli.io.images import eight_bit, write_png
-from recon_cli.io.ply import read_ply
-from recon_cli.metrics import (
+from recon_cli.config.stages import EvaluateConfig
+from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.evaluation import (
     MASK_CONVENTION,
     PSNR_8BIT_CONVENTION,
     PSNR_CONVENTION,
@@ -33,27 +31,26 @@ from recon_cli.metrics import (
     paper_table,
     view_table,
 )
-from recon_cli.metrics.perceptual import LPIPS_CONVENTION, perceptual
-from recon_cli.scene.scene import Scene, View
-from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.stages.fitting import (
-    load_scene,
-    read_config,
-    size_summary,
-    sizes_of,
-)
-from recon_cli.stages.held_out import (
+from recon_cli.evaluation.lpips import LPIPS_CONVENTION, perceptual
+from recon_cli.evaluation.reference_views import (
     LABELS,
     Scored,
     Truth,
+    load_scene,
     mean_psnr,
     scorable,
     scored,
+    size_summary,
+    sizes_of,
     truth_digest,
     truths,
 )
-from recon_cli.stages.origin import Origin
-from recon_cli.stages.training_log import LOG, seconds_at
+from recon_cli.io.images import eight_bit, write_png
+from recon_cli.io.import_record import Origin
+from recon_cli.io.ply import read_ply
+from recon_cli.scene.scene import Scene, View
+from recon_cli.train.runner import LOG, read_config, seconds_at
+from recon_cli.workspace.atomic import write_bytes, write_json
 
 _GAIN = 4  # of the difference images
 _EVER = 1 << 62  # an iteration beyond any

@@ -11,16 +11,15 @@ from pathlib import Path
 
 import torch
 
-from recon_cli.atomic import write_json
-from recon_cli.config import ExportConfig
+from recon_cli.config.stages import ExportConfig
+from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.errors import StageError, WorkspaceError
+from recon_cli.export.coordinate_frame import Frame, frame_of
+from recon_cli.export.exporter import Hand
+from recon_cli.export.synthetic_cameras import refuse_without_views
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.scene.splats import Splats, with_rows
-from recon_cli.scene.transformed import transformed
-from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.stages.frame import Frame, frame_of
-from recon_cli.stages.handing_out import Hand
-from recon_cli.stages.viewless import refuse_without_views
+from recon_cli.scene.splats import Splats, transformed, with_rows
+from recon_cli.workspace.atomic import write_json
 
 TRANSFORM = "transform.json"
 

@@ -9,16 +9,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from recon_cli.capture import frames as store
 from recon_cli.capture import from_data_set, from_photos, from_video
-from recon_cli.capture.frames import FrameList
 from recon_cli.capture.images import PHOTO_SUFFIXES
-from recon_cli.capture.taken import Taken, joined
-from recon_cli.config import IngestConfig
+from recon_cli.capture.ingested_source import Taken, joined
+from recon_cli.config.fields import parse_holdout
+from recon_cli.config.stages import IngestConfig
+from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.errors import InputError
-from recon_cli.holdout_option import parse_holdout
+from recon_cli.io import frames as store
+from recon_cli.io.frames import FrameList
 from recon_cli.io.layouts import recognise, refuse_incomplete
-from recon_cli.stages.context import StageContext, StageInputs, Summary
 
 MIN_TRAINED = 2  # one view holds no depth
 

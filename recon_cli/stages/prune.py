@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recon_cli.config import PruneConfig
+from recon_cli.config.stages import PruneConfig
+from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import most_gaussians, write_ply
 from recon_cli.scene.splats import Splats
-from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.stages.course import Round, course_of
-from recon_cli.stages.rounds import prune_to, prune_while_good
-from recon_cli.stages.training_log import LOG, seconds_at
 from recon_cli.train.fit import validation_psnr
+from recon_cli.train.prune_loop import prune_to, prune_while_good
+from recon_cli.train.prune_run import Round, course_of
 from recon_cli.train.pruning import RATIO, remaining
+from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.state import TrainState
 
 

@@ -10,18 +10,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from recon_cli.capture import frames as store
-from recon_cli.capture.frames import FrameList
 from recon_cli.capture.pace import paced
-from recon_cli.config import SfmConfig
+from recon_cli.config.stages import SfmConfig
+from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.errors import FormatError
-from recon_cli.io.poses import POSES, read_poses
-from recon_cli.mapping import process
-from recon_cli.mapping.doctor import listed
-from recon_cli.mapping.job import CameraGroup, Job
-from recon_cli.mapping.ledger import Ledger
-from recon_cli.mapping.measure import parse_place
-from recon_cli.stages.context import StageContext, StageInputs, Summary
+from recon_cli.io import frames as store
+from recon_cli.io.frames import FrameList
+from recon_cli.io.posed import POSES, read_poses
+from recon_cli.sfm import process
+from recon_cli.sfm.checks import listed
+from recon_cli.sfm.job import CameraGroup, Job
+from recon_cli.sfm.measure import parse_place
+from recon_cli.sfm.step_log import Ledger
 
 APART = 1e6  # seconds from clip to clip: the camera may have gone anywhere meanwhile
 

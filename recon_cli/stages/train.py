@@ -12,13 +12,13 @@ from pathlib import Path
 
 import torch
 
-from recon_cli.config import TrainConfig
+from recon_cli.config.stages import TrainConfig
+from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.evaluation.reference_views import load_scene, size_summary
 from recon_cli.io.ply import write_ply
-from recon_cli.stages.context import StageContext, StageInputs, Summary
-from recon_cli.stages.fitting import CHECKPOINT, load_scene, run_fit, size_summary
-from recon_cli.stages.planning import first_or_saved, model_parts, planned_task, recorded_plan
-from recon_cli.stages.training_log import LOG
 from recon_cli.train.fit import Task
+from recon_cli.train.planning import first_or_saved, model_parts, planned_task, recorded_plan
+from recon_cli.train.runner import CHECKPOINT, LOG, run_fit
 from recon_cli.train.state import TrainState, save_state
 
 

@@ -1,8 +1,4 @@
-"""What a run takes: a few timed steps at each resolution, summed over the schedule.
-
-The steps are taken on Gaussians of their own, made from the sparse points and thrown away, so that
-timing never changes a run.
-"""
+"""What processes send each other in a step, timed before a run: no view is looked at for that."""
 
 from __future__ import annotations
 
@@ -19,8 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.scene.splats import Splats
-from recon_cli.train import budget
+from recon_cli.context import Ranks
+from recon_cli.scene.splats import TERMS, Splats
+from recon_cli.train.densify import budget
+from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.fit import Task, fit, report_every, validation_psnr
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.schedule import Schedule
@@ -267,3 +265,67 @@ def _grown(
         splats, _ = budget.densify(splats, torch.ones(len(splats)), rule, generator)
     splats.logit_opacities = torch.logit(torch.full((len(splats),), _OPACITY))
     return splats
+
+
+EXCHANGE = 2  # what the leader says to have one timed
+_FEWEST, _MANY = 1000, 100_000  # Gaussians, at least and at most
+_ROUNDS, _WARM_UP = 7, 2
+_WIDTHS = 3, 4, 3, 1, 3  # numbers of a Gaussian, parameter by parameter, higher SH apart
+
+
+def with_exchange(
+    cost: CostModel, ranks: Ranks, most: int, sh_degree: int, device: torch.device
+) -> CostModel:
+    """Returns the cost of steps that `ranks` take together, from that of one process's share.
+
+    Args:
+        cost: of steps with the views of one process.
+        ranks: led by this process; the others wait for a word.
+        most: Gaussians of the run.
+        sh_degree: of the run.
+        device: where the tensors live.
+    """
+    if ranks.alone:
+        return cost
+    begin = time.perf_counter()
+    many = min(_MANY, max(2 * _FEWEST, most))
+    low, high = (_led(ranks, n, TERMS[sh_degree], device) for n in (_FEWEST, many))
+    each = max(0.0, (high - low) / ((many - _FEWEST) / 1000))
+    fixed = max(0.0, low - each * _FEWEST / 1000)
+    levels = tuple(
+        replace(one, fixed_ms=one.fixed_ms + fixed, each_ms=one.each_ms + each)
+        for one in cost.levels)
+    return replace(cost, levels=levels, seconds=cost.seconds + time.perf_counter() - begin)
+
+
+def _led(ranks: Ranks, count: int, terms: int, device: torch.device) -> float:
+    try:
+        ranks.told(EXCHANGE)
+        for number in (count, terms, int(device.type == "cuda")):
+            ranks.told(number)
+        return _exchange_ms(ranks, count, terms, device)
+    except BaseException:  # the others are in the middle of it, and hear of nothing else
+        ranks.leave()
+        raise
+
+
+def join_exchange(ranks: Ranks) -> None:
+    """Takes part in an exchange that the leader times."""
+    count, terms, on_gpu = (ranks.told(0) for _ in range(3))
+    _exchange_ms(ranks, count, terms, torch.device("cuda" if on_gpu else "cpu"))
+
+
+def _exchange_ms(ranks: Ranks, count: int, terms: int, device: torch.device) -> float:
+    """Returns the median of what a step with so many Gaussians exchanges."""
+    gradients = [torch.zeros(count, width, device=device) for width in (*_WIDTHS, 3 * terms)]
+    found, gathered = torch.zeros(11, dtype=torch.float64), Gathered.zeros(count, device)
+    marks = []
+    for _ in range(_ROUNDS + _WARM_UP + 1):
+        marks.append(time.perf_counter())
+        ranks.told(0)
+        ranks.add(gradients)
+        ranks.add([found])
+        gathered.over(ranks)
+        float(gathered.radius[0])  # waits for a GPU
+    return 1e3 * statistics.median(
+        end - start for start, end in zip(marks[_WARM_UP:], marks[_WARM_UP + 1 :], strict=False))

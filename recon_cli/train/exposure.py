@@ -1,30 +1,23 @@
-"""Exposure and white balance of each training image, as a gain for each channel.
+"""What the colours of sparse points say about exposure before any training.
 
-A camera that sets its exposure and white balance by itself shows one wall in many colours. What is
-rendered is multiplied by exp(log_gain), three numbers an image, before it is compared with the
-photograph, so that the Gaussians need not explain the camera.
-
-Gains and colours of the scene are known only up to a common factor: the mean log-gain over the
-training images is held at 0. Novel views, which have no gain, thus lie at the mean (geometric)
-exposure of the capture. The plain PSNR of a held-out photograph of another exposure falls with
-that; the one after its best gain (`trials.corrected_psnr`) tells what was gained.
-
-There is no offset. A gain acts on linear light and the pixels are gamma-coded, so that a power of
-the pixel would be right, and clipping bends it; but measured on two rooms of 100 frames whose gain
-drifts by .82 to 1.42, blurred frames differ from the undisturbed ones by 36.3 and 35.6 dB, after
-the best gain per channel by 43.0 and 38.3 dB, and with an offset as well by 43.6 and 38.8 dB. That
-.5 dB of an error that is a tenth of a trained model's is not worth three more numbers that fog can
-take for its own.
+A point shows the same surface to all views, so that the ratio of its colours in two views is the
+ratio of their gains. Occlusion is ignored: a point that lies behind something in one view gives a
+wrong ratio, and the median over all points that two views share does not mind a few.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.train.rows import Rows
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.sparse_adam import Rows
 
 # Falling to a tenth as in INRIA 3DGS (exposure_lr_init .01, exposure_lr_final .001), but lower: in
 # 2,000 steps on two phone videos, from gains that were estimated, held-out views gained .72 and
@@ -77,3 +70,141 @@ class Exposure:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Takes back what `tensors` returned."""
         self._rows.restore(_PREFIX, tensors)
+
+
+_SIDE = 100  # pixels of the longer side; a small view is denoised and does not mind blur
+_POINTS = 4000  # enough for medians of hundreds of points in two views that share a tenth
+_LEAST = 40  # points that two views must share; their median is known to a fifth of their spread
+_DARK, _BRIGHT = 12 / 255, 243 / 255  # means over a block; beyond, pixels of it may be clipped
+# Spread from which a capture drifts. Measured: .003 to .0194 in clean room videos (the larger ones
+# from gloss), .0326 to .0519 in rooms whose gain drifts by .82 to 1.42, .06 in photos from a phone
+# video, .14 and more in a walk from a window and in loose photos.
+_DRIFTS = 0.025
+_FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known better
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Log-gains of views as their sparse points show them.
+
+    Attributes:
+        log_gains: [F, 3] RGB, natural logarithm, of mean 0; zeros for a view without evidence.
+        spread: standard deviation of the log-gains over the views that have evidence, of the
+            channel where it is largest; 0 where no two views can be compared.
+        compared: pairs of views that share enough points.
+    """
+
+    log_gains: NDArray[np.float64]
+    spread: float
+    compared: int
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the views differ by more than gloss and occlusion make them differ."""
+        return self.spread > _DRIFTS
+
+
+def estimated(
+    views: Sequence[TrainView],
+    points: NDArray[np.float64],  # [P, 3]
+    *,
+    seed: int = 0,
+) -> Estimate:
+    """Returns the log-gain of each view from the colours that points have in several views.
+
+    Weighted least squares over pairs: the median log-ratio of the points that two views share
+    should be the difference of their log-gains.
+
+    Args:
+        views: F of them, of any size.
+        points: in the world of their cameras; of more than 4,000 a seeded draw is taken.
+        seed: of that draw.
+    """
+    if len(points) > _POINTS:
+        chosen = np.random.default_rng(seed).permutation(len(points))[:_POINTS]
+        points = points[np.sort(chosen)]
+    logs = np.stack([_log_colors(view, points) for view in views])
+    return _solved(*_pairs(logs), len(views))
+
+
+def _log_colors(
+    view: TrainView, points: NDArray[np.float64]
+) -> NDArray[np.float64]:  # [P, 3]
+    """Returns the logarithm of each point's colour; NaN where it is not seen or may be clipped."""
+    image, block = _reduced(view)
+    columns, rows, shown = _pixels(view.camera, points)
+    rows, columns = rows[shown] // block, columns[shown] // block
+    inside = (rows < image.shape[0]) & (columns < image.shape[1])
+    colors = np.full((len(points), 3), np.nan)
+    colors[np.flatnonzero(shown)[inside]] = image[rows[inside], columns[inside]]
+    fair = ((colors > _DARK) & (colors < _BRIGHT)).all(axis=1, keepdims=True)
+    return np.log(np.where(fair, colors, np.nan))
+
+
+def _reduced(view: TrainView) -> tuple[NDArray[np.float64], int]:
+    """Returns the means of square blocks of a view, NaN where the mask ignores a pixel."""
+    block = max(1, round(max(view.image.shape) / _SIDE))
+    height, width = (side // block * block for side in view.image.shape[:2])
+    image = view.image[:height, :width] / 255.0
+    if view.mask is not None:
+        image[~view.mask[:height, :width]] = np.nan
+    blocks = image.reshape(height // block, block, width // block, block, 3)
+    return np.asarray(blocks.mean(axis=(1, 3))), block
+
+
+def _pixels(
+    camera: Camera, points: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Returns column and row [P] of each point, and whether it lies in the picture."""
+    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
+    ahead = z > 0
+    z = np.where(ahead, z, 1.0)
+    at_x, at_y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    shown = ahead & (at_x >= 0) & (at_x < camera.width) & (at_y >= 0) & (at_y < camera.height)
+    return (np.where(shown, at_x, 0).astype(np.int64),
+            np.where(shown, at_y, 0).astype(np.int64), shown)
+
+
+_Pairs = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]
+
+
+def _pairs(logs: NDArray[np.float64]) -> _Pairs:
+    """Returns pairs [E, 2], their median log-ratios [E, 3] and weights [E, 3] from [F, P, 3]."""
+    seen = np.isfinite(logs[..., 0])
+    pairs, medians, weights = [], [], []
+    for first in range(len(logs)):
+        for second in range(first + 1, len(logs)):
+            both = seen[first] & seen[second]
+            if (count := int(both.sum())) < _LEAST:
+                continue
+            ratios = logs[second, both] - logs[first, both]
+            middle = np.median(ratios, axis=0)
+            spread = np.median(np.abs(ratios - middle), axis=0) + _FLOOR
+            pairs.append((first, second))
+            medians.append(middle)
+            weights.append(count / spread**2)
+    return (np.array(pairs, np.intp).reshape(-1, 2), np.array(medians).reshape(-1, 3),
+            np.array(weights).reshape(-1, 3))
+
+
+def _solved(
+    pairs: NDArray[np.intp], medians: NDArray[np.float64], weights: NDArray[np.float64], views: int
+) -> Estimate:
+    """Returns the log-gains g that minimise sum w (g_second - g_first - median)^2."""
+    gains = np.zeros((views, 3))
+    known = np.unique(pairs)
+    if len(known) == 0:
+        return Estimate(gains, 0.0, 0)
+    first, second = pairs.T
+    for channel in range(3):
+        weight, pull = weights[:, channel], weights[:, channel] * medians[:, channel]
+        normal, right = np.zeros((views, views)), np.zeros(views)
+        np.add.at(normal, (first, first), weight)
+        np.add.at(normal, (second, second), weight)
+        np.add.at(normal, (first, second), -weight)
+        np.add.at(normal, (second, first), -weight)
+        np.add.at(right, second, pull)
+        np.add.at(right, first, -pull)
+        # of the least norm: of mean 0 in each part that hangs together
+        gains[:, channel] = np.linalg.lstsq(normal, right, rcond=1e-10)[0]
+    return Estimate(gains, float(gains[known].std(axis=0).max()), len(pairs))

@@ -10,15 +10,14 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from recon_cli.context import ALONE, Ranks
 from recon_cli.render import render
-from recon_cli.train import ahead
-from recon_cli.train.early_stop import next_iteration
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train import async_trainer
 from recon_cli.train.importance import Importance
 from recon_cli.train.pyramid import Pyramid
-from recon_cli.train.ranks import ALONE, Ranks
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.schedule import Schedule, next_iteration
 from recon_cli.train.state import TrainState
-from recon_cli.train.step import TrainView
 
 _REPORT_EVERY = 100  # steps between looks at the validation views, at least
 _REPORTS = 40  # of a long run; each costs a picture of every validation view
@@ -107,7 +106,7 @@ def fit(
     """
     start, cpu_start = time.perf_counter(), time.process_time()
     every = report_every(task.schedule)
-    advance = ahead.advancing(
+    advance = async_trainer.advancing(
         state, task, importance, lambda i: i == until or i % every == 0 or looks(i))
     while state.iteration < until:
         loss = advance()

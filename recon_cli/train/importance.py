@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from recon_cli.context import Ranks
 from recon_cli.render import Statistics, render
 from recon_cli.scene.splats import Splats
-from recon_cli.train.ranks import Ranks
-from recon_cli.train.step import TrainView
+from recon_cli.scene.train_view import TrainView
 
 _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
 _BETA_SHIPPED = 0.1  # LightGaussian's --v_pow

@@ -1,14 +1,22 @@
-"""The first Gaussians: one at each sparse point."""
+"""The state before the first step, by what the options say is part of the model."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from recon_cli.config.stages import RunConfig
 from recon_cli.errors import TrainingError
-from recon_cli.scene.splats import SH_C0, TERMS, Splats
+from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
+from recon_cli.train.background import FarContent, far_content, splats_of
+from recon_cli.train.exposure import Exposure, estimated
+from recon_cli.train.fit import Task
+from recon_cli.train.poses import WORTH_PX, Poses
+from recon_cli.train.state import TrainState, load_state, new_state
 
 _OPACITY = 0.1  # initial opacity of the reference implementation
 _NEIGHBOURS = 3
@@ -50,3 +58,90 @@ def splats_from_points(
         sh_dc=(torch.tensor(colors, dtype=torch.float32) / 255 - 0.5) / SH_C0,
         sh_rest=torch.zeros(n, TERMS[sh_degree], 3),
     )
+
+
+def first_state(
+    task: Task,
+    points: NDArray[np.float64],  # [P, 3]
+    colors: NDArray[np.uint8],  # [P, 3]
+    *,
+    most: int,
+    far: FarContent | None = None,
+) -> TrainState:
+    """Returns the state of a run before its first step; the same for the same task and points.
+
+    Args:
+        task: views and plan.
+        points: sparse points in world units.
+        colors: of them.
+        most: Gaussians that begin at points; fewer where the cap must hold what lies far outside.
+        far: what lies there, where it is known already; taken only if that part is on.
+    """
+    config = task.schedule.config
+    if config.far != "on":
+        far = None
+    elif far is None:
+        far = far_content(task.train, points, task.extent)
+    gains = estimated(task.train, points).log_gains if config.exposure == "on" else None
+    splats = first_splats(config, points, colors, far, most=most)
+    exposure, poses = _parts(task, gains)
+    return new_state(
+        splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
+        backend=task.backend, exposure=exposure, poses=poses)
+
+
+def saved_state(path: Path, task: Task) -> TrainState:
+    """Returns the state of a run from its checkpoint.
+
+    Raises:
+        FormatError: the file is truncated or of another version.
+        TrainingError: it holds values that are not finite.
+    """
+    exposure, poses = _parts(task, None)
+    return load_state(
+        path, task.schedule.config, task.extent, task.device, backend=task.backend,
+        exposure=exposure, poses=poses)
+
+
+def finished_state(splats: Splats, task: Task) -> TrainState:
+    """Returns the state of a run that ended with these Gaussians, none of whose steps were taken.
+
+    For scenes that were trained elsewhere: all that a run does early on lies behind it.
+    """
+    state = new_state(
+        splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.extent,
+        backend=task.backend)
+    state.iteration = task.schedule.config.iterations
+    state.jump = 0, state.iteration
+    return state
+
+
+def _parts(
+    task: Task, log_gains: NDArray[np.float64] | None
+) -> tuple[Exposure | None, Poses | None]:
+    """Returns the optional parts that the options switch on, before any step."""
+    config, images = task.schedule.config, len(task.train)
+    exposure = Exposure(images, start=log_gains) if config.exposure == "on" else None
+    poses = None
+    if config.poses == "on":
+        centers = np.stack([view.camera.center for view in task.train])
+        error = task.camera_error
+        if error is None:  # asked for without a sign: as far as makes it worth while
+            error = WORTH_PX / float(np.mean([view.camera.fx for view in task.train]))
+        visits = config.iterations * config.batch_views / images
+        poses = Poses(centers, task.extent, visits=visits, error=error)
+    return exposure, poses
+
+
+def first_splats(
+    config: RunConfig, points: NDArray[np.float64], colors: NDArray[np.uint8],
+    far: FarContent | None, *, most: int,
+) -> Splats:
+    """Returns the Gaussians before the first step: of the points, and of what lies far outside."""
+    outside = 0 if far is None else len(far.positions)
+    near = splats_from_points(
+        points, colors, most=max(most // 2, min(most, config.max_gaussians - outside)),
+        seed=config.seed, sh_degree=config.sh_degree)
+    if far is None or len(far.positions) == 0:
+        return near
+    return joined([near, splats_of(far, near.sh_rest.shape[1])])[0]

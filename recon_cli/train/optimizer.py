@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.scene.splats import Splats, with_terms
-from recon_cli.train.recipe import RECIPES
+from recon_cli.train.schedule import RECIPES
 
 _BETAS = 0.9, 0.999
 _EPSILON = 1e-15  # of the reference: gradients of single Gaussians are tiny

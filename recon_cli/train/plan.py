@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from recon_cli.config import MIN_GAUSSIANS, RunConfig, TrainConfig
+from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig, TrainConfig
+from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel
-from recon_cli.train.recipe import RECIPES
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.step import TrainView
+from recon_cli.train.schedule import RECIPES, Schedule
 
 CALIBRATION_SHARE = 0.05  # of the minutes, at most
 CALIBRATION_SECONDS = 0.5  # where no time is given: a twentieth of a draft

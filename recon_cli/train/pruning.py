@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.fit import Task
-from recon_cli.train.gathered import Gathered
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
-from recon_cli.train.step import TrainView
 
 RATIO = 0.5  # that is removed where no limit is given
 # Share of the recovery by which the last round is over; what is left mends it. docs/pruning.md

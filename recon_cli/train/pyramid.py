@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from recon_cli.train.step import TrainView
+from recon_cli.scene.train_view import TrainView
 
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from recon_cli.render.projection import project
-from recon_cli.render.spherical_harmonics import colors_from_sh
+from recon_cli.render.torch.projection import colors_from_sh, project
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
 

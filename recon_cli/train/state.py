@@ -15,14 +15,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from recon_cli.atomic import replacing
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import Splats
+from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.exposure import Exposure
-from recon_cli.train.gathered import Gathered
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import Poses
+from recon_cli.workspace.atomic import replacing
 
 LONG_SAVE = 0.25  # seconds; a checkpoint that takes longer is written less often
 SAVE_SHARE = 0.1  # of the time, that such checkpoints may take

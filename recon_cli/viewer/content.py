@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.execute import Job
+from recon_cli.flythrough.smooth import depths_seen
+from recon_cli.flythrough.source import open_source
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import read_splats
+from recon_cli.pipeline.execute import Job
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import View
 from recon_cli.scene.splats import Splats
-from recon_cli.shots.orbit import depths_seen
-from recon_cli.shots.source import open_source
-from recon_cli.viewer.box import box_around
+from recon_cli.viewer.crop_box import box_around
 from recon_cli.viewer.gaussians import Packed, packed
 
 HELD_OUT, TRAINING, VALIDATION = "held-out", "training", "validation"

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.render.spherical_harmonics import colors_from_sh
+from recon_cli.render.torch.projection import colors_from_sh
 from recon_cli.scene.splats import Splats
 
 _LARGEST = 200.0  # standard deviation as sent; its square still is a half-precision number

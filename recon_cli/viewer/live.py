@@ -18,18 +18,17 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from recon_cli.atomic import read_json
 from recon_cli.errors import ReconError
+from recon_cli.flythrough.smooth import depths_seen
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.gravity import MIN_CAMERAS, camera_up
 from recon_cli.scene.splats import Splats
-from recon_cli.shots.orbit import depths_seen
 from recon_cli.viewer.content import FAR, eye_of
+from recon_cli.viewer.frustums import stand
 from recon_cli.viewer.gaussians import packed
-from recon_cli.viewer.pose import stand
-from recon_cli.viewer.run import begin_at
-from recon_cli.viewer.server import Server
-from recon_cli.workspace import Workspace
+from recon_cli.viewer.server import Server, begin_at
+from recon_cli.workspace.atomic import read_json
+from recon_cli.workspace.layout import Workspace
 
 SHARE = 0.04  # of the training's time, for all updates together
 # viser's page goes on drawing for a quarter of a second after an update (RENDER_SETTLE_MS).

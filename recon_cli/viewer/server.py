@@ -1,4 +1,4 @@
-"""A web server for browsers on this machine: a port that is free, and nobody else let in."""
+"""The viewer: a server, and a session for each browser that comes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ import ipaddress
 import logging
 import socket
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+import numpy as np
 import rich
 import viser
 
 from recon_cli.errors import ConfigError
+from recon_cli.viewer.content import Content, Eye
+from recon_cli.viewer.photo_pairs import Pictures
+from recon_cli.viewer.session import UPS, Session
 
 HOST, PORT = "127.0.0.1", 8080
 _TRIED = 100  # ports after the first, where none was asked for
@@ -120,3 +125,50 @@ def _address(host: str, port: int) -> str:
     if ":" in shown and not shown.startswith("["):
         shown = f"[{shown}]"
     return f"http://{shown}:{port}"
+
+
+@contextmanager
+def showing(
+    content: Content, pictures: Pictures | None, host: str, port: int | None
+) -> Iterator[tuple[Server, str]]:
+    """Yields a server that shows a scene to every browser that comes, and its address.
+
+    Args:
+        content: what is shown.
+        pictures: of its views; None where there are none.
+        host: address to listen on.
+        port: None takes the first free one.
+
+    Raises:
+        ConfigError: the port is taken, or the address is none of this machine.
+    """
+    sessions: dict[int, Session] = {}
+    with serving(host, port, label="recon") as (server, address):
+        work = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recon-view")
+        up = UPS["+z"] if content.up is None else content.up
+        server.scene.set_up_direction(np.asarray(up, float))
+        begin_at(server, content.start)
+
+        def come(client: viser.ClientHandle) -> None:
+            sessions[client.client_id] = Session(client, content, pictures, work)
+
+        def go(client: viser.ClientHandle) -> None:
+            session = sessions.pop(client.client_id, None)
+            if session is not None:
+                session.leave()
+
+        server.on_client_connect(come)
+        server.on_client_disconnect(go)
+        try:
+            yield server, address
+        finally:
+            for session in sessions.values():
+                session.leave()
+            work.shutdown(cancel_futures=True)
+
+
+def begin_at(server: Server, eye: Eye) -> None:
+    """Sets where browsers that come from now on begin."""
+    camera = server.initial_camera
+    camera.position, camera.look_at = eye.position, eye.look_at
+    camera.fov, camera.near, camera.far = eye.fov, eye.near, eye.far

@@ -13,12 +13,11 @@ import viser
 from numpy.typing import NDArray
 
 from recon_cli.errors import ReconError
-from recon_cli.viewer.beside import Pictures
-from recon_cli.viewer.box import Box, box_around
 from recon_cli.viewer.content import Content, ShownView, eye_of
-from recon_cli.viewer.frustums import Frustums
+from recon_cli.viewer.crop_box import Box, box_around
+from recon_cli.viewer.frustums import Frustums, stand
 from recon_cli.viewer.gaussians import Packed
-from recon_cli.viewer.pose import stand
+from recon_cli.viewer.photo_pairs import Pictures
 
 NO_VIEW = "none"
 UPS = {"+z": (0, 0, 1), "-y": (0, -1, 0), "+y": (0, 1, 0), "-z": (0, 0, -1), "+x": (1, 0, 0),

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import click
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 
 _RATES = ("means_rate", "quats_rate", "scales_rate", "opacities_rate", "sh_rate")
 _MOST = 0.2  # of the rate of opacities

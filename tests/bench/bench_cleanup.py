@@ -17,18 +17,19 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.export.cleanup import islands
+from recon_cli.export.floaters import floaters, sightings
+from recon_cli.export.verify import fidelity
 from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.render.registry import resolve
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, Splats, joined
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.stages.fidelity import fidelity
-from recon_cli.stages.fitting import load_scene, load_views, read_config
-from recon_cli.train.floaters import floaters, sightings
-from recon_cli.train.islands import islands
-from recon_cli.train.step import TrainView
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.runner import load_views, read_config
 
 PLANTED = 60
 

@@ -18,14 +18,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.bench.training.scoring import load_scored
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.experiments.trial import load_scored
 from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.stages.fitting import load_scene, read_config
-from recon_cli.train.step import TrainView
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.runner import read_config
 
 CLASSES = (0, 1, 3, 10, 1000)  # views that show a pixel: 0, 1 to 2, 3 to 9, 10 and more
 SLACK = 1.03  # of the depth

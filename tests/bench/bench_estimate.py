@@ -16,13 +16,14 @@ from pathlib import Path
 
 import click
 
-from recon_cli.config import TrainConfig
+from recon_cli.config.stages import TrainConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.render import registry
 from recon_cli.stages import train
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.stages.fitting import gaussians_that_fit, load_scene, load_task, run_fit
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate
+from recon_cli.train.runner import gaussians_that_fit, load_task, run_fit
 
 CLOCKS = {"cpu": time.process_time, "wall": time.perf_counter}
 

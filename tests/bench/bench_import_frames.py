@@ -13,12 +13,12 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.export.import_alignment import SOURCE, match
 from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import resolve
 from recon_cli.scene.similarity import Similarity
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.stages.fitting import load_scene
-from recon_cli.stages.matching import SOURCE, match
 
 MOVES = [  # degrees, extents, scale
     (0, 0, 1), (1, 0, 1), (3, 0, 1), (10, 0, 1), (45, 0, 1), (0, 0.05, 1), (0, 0.2, 1),

@@ -14,11 +14,11 @@ from pathlib import Path
 import click
 import torch
 
-from recon_cli.config import PruneConfig
+from recon_cli.config.stages import PruneConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.experiments.sweep import advancing
 from recon_cli.render.registry import use_threads
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.stages.course import Course, course_of
-from recon_cli.sweep.measure import advancing
+from recon_cli.train.prune_run import Course, course_of
 from recon_cli.train.pruning import remaining, removals, remove, scored, survivors
 
 REPEATS = 3

@@ -19,18 +19,17 @@ from typing import Any
 
 import click
 
-from recon_cli.bench.training.scenes import Place
-from recon_cli.bench.training.scoring import load_scored, score
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.experiments.scenes import Place
+from recon_cli.experiments.trial import load_scored, score
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.stages.fitting import load_task
 from recon_cli.train.fit import Task, fit
+from recon_cli.train.initialize import first_state
 from recon_cli.train.plan import first_count
-from recon_cli.train.recipe import RECIPES, Recipe
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.start import first_state
+from recon_cli.train.runner import load_task
+from recon_cli.train.schedule import RECIPES, Recipe, Schedule
 from recon_cli.train.state import TrainState
 
 WARM = 20  # steps that load what is compiled

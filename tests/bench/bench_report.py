@@ -20,14 +20,14 @@ from pathlib import Path
 import click
 import cv2
 
-from recon_cli.capture.frames import FOLDER, read_png, write_png
-from recon_cli.execute import Job
-from recon_cli.page.pictures import MAX_FILE_BYTES
-from recon_cli.page.records import MODELS, read_metrics
-from recon_cli.page.views import gallery
-from recon_cli.page.write import write
-from recon_cli.tables import Table
-from recon_cli.workspace import Workspace
+from recon_cli.evaluation.tables import Table
+from recon_cli.io.frames import FOLDER, read_png, write_png
+from recon_cli.pipeline.execute import Job
+from recon_cli.report.build import write
+from recon_cli.report.images import MAX_FILE_BYTES
+from recon_cli.report.records import MODELS, read_metrics
+from recon_cli.report.views import gallery
+from recon_cli.workspace.layout import Workspace
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from browser import browser, watched

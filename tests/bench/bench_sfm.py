@@ -16,10 +16,10 @@ from pathlib import Path
 import click
 from pose_errors import compare, model_poses, reference_poses
 
-from recon_cli.config import DenoiseConfig, IngestConfig, SfmConfig
+from recon_cli.config.stages import DenoiseConfig, IngestConfig, SfmConfig
+from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.progress import TqdmProgress
 from recon_cli.stages import denoise, ingest, sfm
-from recon_cli.stages.context import StageContext, StageInputs, Summary
 
 SHOWN = ("frames", "registered", "points", "mean_track_length", "reprojection_error_px",
          "median_triangulation_angle_deg", "models", "cameras")

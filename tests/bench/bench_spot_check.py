@@ -14,10 +14,11 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.frames import FOLDER, read_frame_list
-from recon_cli.io.poses import POSES, read_poses
-from recon_cli.mapping import known, spot_check
-from recon_cli.mapping.job import CameraGroup, Job
+from recon_cli.io.frames import FOLDER, read_frame_list
+from recon_cli.io.posed import POSES, read_poses
+from recon_cli.sfm import known_poses
+from recon_cli.sfm import known_poses as spot_check
+from recon_cli.sfm.job import CameraGroup, Job
 
 Poses = dict[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 
@@ -56,7 +57,7 @@ def main(workspace: Path) -> None:
             max_features=3000, min_registered=0.5, accept_weak=False, gravity=True,
             scale_between=None, max_minutes=5.0, seed=0, threads=2, sharpness={}, times={})
         for label, viewmats in spoilt(dict(read_poses(ingest / POSES).viewmats)).items():
-            found = spot_check.check(job, known.neighbours(viewmats), viewmats)
+            found = spot_check.check(job, known_poses.neighbours(viewmats), viewmats)
             share = "too few to tell" if found.share is None else f"{found.share:.3f}"
             click.echo(f"{label:<24} {found.matches:>6} matches, share {share}")
 

@@ -41,26 +41,19 @@ from playwright.sync_api import Browser
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from browser import browser, watched
 
-from recon_cli.bench.scenes import room
-from recon_cli.execute import rendering
+from recon_cli.evaluation import psnr
+from recon_cli.experiments.synthetic_room import room
 from recon_cli.io.images import eight_bit, fitted_camera
-from recon_cli.metrics import psnr
-from recon_cli.pipeline import Job
+from recon_cli.pipeline.execute import rendering
+from recon_cli.pipeline.plan import Job
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
-from recon_cli.viewer.beside import Pictures
-from recon_cli.viewer.content import (
-    FAR,
-    HELD_OUT,
-    Content,
-    eye_of,
-    of_workspace,
-)
+from recon_cli.viewer.content import FAR, HELD_OUT, Content, eye_of, of_workspace
+from recon_cli.viewer.frustums import stand
 from recon_cli.viewer.gaussians import packed
-from recon_cli.viewer.pose import stand
-from recon_cli.viewer.run import showing
-from recon_cli.viewer.server import HOST
-from recon_cli.workspace import Workspace
+from recon_cli.viewer.photo_pairs import Pictures
+from recon_cli.viewer.server import HOST, showing
+from recon_cli.workspace.layout import Workspace
 
 DRAWN = """() => Object.values(window.__viserSceneTree?.getState() ?? {}).some(
     node => node?.message.type === 'GaussianSplatsMessage')"""

@@ -23,9 +23,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from recon_cli.mapping.verdict import Verdict, examine
+from recon_cli.sfm.verdict import Verdict, examine
 
-sys.path += [str(Path(__file__).parents[1] / "mapping"), str(Path(__file__).parent)]
+sys.path += [str(Path(__file__).parents[1] / "sfm"), str(Path(__file__).parent)]
 from made_model import MadeModel, along, wall
 from pose_errors import similarity
 

@@ -10,11 +10,11 @@ from gpu_figures import Figures
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
 
-from recon_cli.bench.scenes import BenchScene, SceneSize, build_scene
+from recon_cli.experiments.synthetic_room import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.render.triton import step as triton_step
-from recon_cli.render.triton.ledger import Account
-from recon_cli.train import ahead
+from recon_cli.render.triton.step_status import Account
+from recon_cli.train import async_trainer
 
 _IMAGE, _GRADIENT = 1e-5, 1e-3  # greatest rms of a picture, relative error of a gradient
 _STEPS = 20  # half of them before a densification
@@ -132,7 +132,7 @@ def waiting(figures: Figures, size: SceneSize) -> None:
     state, task = training(size, figures.device, still=True)
     for start in (GATHERING, AFTER):
         state.iteration = start
-        steps = ahead.Ahead(state, task, lambda _: False)
+        steps = async_trainer.Ahead(state, task, lambda _: False)
         steps._start()  # compiles
         torch.cuda.synchronize()
         found = f"{_FREE} steps from {start:,} on, recordings among them"

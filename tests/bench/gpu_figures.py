@@ -14,7 +14,8 @@ from typing import Any
 import click
 import torch
 
-from recon_cli import atomic, machine
+from recon_cli import machine
+from recon_cli.workspace import atomic
 
 _LONGEST = 300  # characters of a failure in the table
 _GRACE = 40  # seconds after the deadline in which a part may still end by itself

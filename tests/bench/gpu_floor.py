@@ -40,12 +40,12 @@ from gpu_clock import StageClock, between, clear, hold, in_turn, middle, moment
 from gpu_figures import Figures, Goal
 from gpu_scene import AFTER, photometric, training, without_graphs
 
-from recon_cli.bench.scenes import SceneSize
+from recon_cli.experiments.synthetic_room import SceneSize
 from recon_cli.render import render
 from recon_cli.render.contract import TILE
-from recon_cli.render.triton import lists
 from recon_cli.render.triton import step as triton_step
-from recon_cli.train.step import gradient_step
+from recon_cli.render.triton import tile_lists
+from recon_cli.train.gradient import gradient_step
 
 SHARE = Goal(0, 40)  # percent of the floor; the least is to be known
 _COPIED = 1 << 31  # bytes; many times any cache
@@ -89,11 +89,11 @@ STAGES = {
     "project": Stage(
         ((triton_step, "project"),), lambda c: 52 * c.N + 264 * c.S),
     "prefix sum, admit": Stage(
-        ((lists, "before_each"), (triton_step, "admitted")), lambda c: 8 * c.N),
-    "list_tiles": Stage(((lists, "keyed"),), lambda c: 4 * c.N + 40 * c.S + 12 * c.E),
-    "sort": Stage(((lists, "in_order"),), lambda c: 20 * c.E),
-    "place": Stage(((lists, "placed"),), lambda c: 28 * c.E + 28 * c.S),
-    "tile ranges": Stage(((lists, "by_tile"),), lambda c: 8 * c.E + 8 * c.T),
+        ((tile_lists, "before_each"), (triton_step, "admitted")), lambda c: 8 * c.N),
+    "list_tiles": Stage(((tile_lists, "keyed"),), lambda c: 4 * c.N + 40 * c.S + 12 * c.E),
+    "sort": Stage(((tile_lists, "in_order"),), lambda c: 20 * c.E),
+    "place": Stage(((tile_lists, "placed"),), lambda c: 28 * c.E + 28 * c.S),
+    "tile ranges": Stage(((tile_lists, "by_tile"),), lambda c: 8 * c.E + 8 * c.T),
     "composite": Stage(
         ((triton_step, "composited"),),
         lambda c: 12 * c.E + 32 * c.S + 20 * c.P + 8 * _AREA * c.T, lambda c: 31 * c.Q),

@@ -15,16 +15,16 @@ from unittest import mock
 import numpy as np
 import torch
 
-from recon_cli.bench.scenes import SceneSize, room
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
+from recon_cli.experiments.synthetic_room import SceneSize, room
 from recon_cli.render.triton import step as triton_step
-from recon_cli.render.triton.ledger import Account
+from recon_cli.render.triton.step_status import Account
 from recon_cli.scene.camera import Camera
-from recon_cli.train import ahead
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train import async_trainer
 from recon_cli.train.fit import Task
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, new_state
-from recon_cli.train.step import TrainView
 
 _ITERATIONS = 30_000
 GATHERING = 15_000  # step after a densification; the next one is 100 steps away
@@ -78,7 +78,7 @@ def stretch(
     state: TrainState, task: Task, start: int, steps: int
 ) -> Callable[[], None]:
     """Returns what takes the steps after `start`, as `recon train` takes them, and waits."""
-    advance = ahead.advancing(state, task, None, lambda now: now == start + steps)
+    advance = async_trainer.advancing(state, task, None, lambda now: now == start + steps)
 
     def take() -> None:
         state.iteration = start

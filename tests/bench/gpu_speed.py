@@ -12,9 +12,9 @@ from gpu_gsplat import Gsplat, installed
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
 
-from recon_cli.bench.scenes import BenchScene, SceneSize, build_scene
+from recon_cli.experiments.synthetic_room import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
-from recon_cli.train import ahead
+from recon_cli.train import async_trainer
 from recon_cli.train.fit import Task
 from recon_cli.train.state import TrainState
 
@@ -149,7 +149,7 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH)
 def _started(state: TrainState, task: Task) -> float:
     """Returns the milliseconds in which the host starts a step that was recorded before."""
     state.iteration = GATHERING
-    trainer = ahead.Ahead(state, task, lambda _: False)
+    trainer = async_trainer.Ahead(state, task, lambda _: False)
     for _ in range(_RECORDED):
         trainer._start()
     torch.cuda.synchronize()

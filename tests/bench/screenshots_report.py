@@ -13,10 +13,10 @@ from pathlib import Path
 import click
 from PIL import Image
 
-from recon_cli.atomic import write_bytes
-from recon_cli.execute import Job
-from recon_cli.page.write import write
-from recon_cli.workspace import Workspace
+from recon_cli.pipeline.execute import Job
+from recon_cli.report.build import write
+from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.layout import Workspace
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "tests"))

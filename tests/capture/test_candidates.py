@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 
-from recon_cli.capture.candidates import Reason, counts, of_video, write_choice
+from recon_cli.capture.selection_record import Reason, counts, of_video, write_choice
 
 REFUSED = (None, None, Reason.BLURRED, None, Reason.DAMAGED, None)
 WAY = np.array([0.0, 0.0, 0.05, 0.08, 0.1, 0.12])

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from recon_cli.capture.candidates import Reason
-from recon_cli.capture.choose import (
+from recon_cli.capture.frame_selection import (
     FRAME_SPACING,
     MAX_GAP,
     MIN_AUTOMATIC,
@@ -14,6 +13,7 @@ from recon_cli.capture.choose import (
     sharp_frames,
     travelled,
 )
+from recon_cli.capture.selection_record import Reason
 from recon_cli.errors import InputError
 
 FINE, DARK, HALF_DARK = (0.0, 0.0, 40.0), (1.0, 0.0, 0.0), (0.7, 0.0, 20.0)

@@ -1,7 +1,7 @@
 import pytest
 from media import texture, write_video
 
-from recon_cli.capture.clues import codec_name, lacks_index
+from recon_cli.capture.container_probe import codec_name, lacks_index
 
 
 @pytest.fixture(scope="module")

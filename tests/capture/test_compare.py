@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from noisy_room import noisy, plain_room
 
-from recon_cli.capture import compare
-from recon_cli.capture.compare import Score, edges_kept
+from recon_cli.capture import denoise_comparison
+from recon_cli.capture.denoise_comparison import Score, edges_kept
 
 
 def score(name, psnr, edges, *, noise=5.0, offered=True):
@@ -35,31 +35,32 @@ def test_a_flat_picture_has_no_edges_to_lose():
 
 def test_halving_halves_independent_noise():
     flat = np.full((200, 300, 3), 128, np.uint8)
-    assert compare.halved(noisy(flat, 10)).std() == pytest.approx(5, rel=0.05)
+    assert denoise_comparison.halved(noisy(flat, 10)).std() == pytest.approx(5, rel=0.05)
 
 
 def test_the_measured_level_is_compared_too_unless_it_is_one_of_the_others():
-    assert compare.levels_with(7.04) == (3.0, 5.0, 7.0, 10.0, 15.0, 20.0)
-    assert compare.levels_with(5.2) == compare.LEVELS
-    assert compare.levels_with(0.2) == compare.LEVELS
+    assert denoise_comparison.levels_with(7.04) == (3.0, 5.0, 7.0, 10.0, 15.0, 20.0)
+    assert denoise_comparison.levels_with(5.2) == denoise_comparison.LEVELS
+    assert denoise_comparison.levels_with(0.2) == denoise_comparison.LEVELS
 
 
 def test_every_filter_is_scored_at_every_level_and_each_run_is_counted():
     ran = []
     levels = (5.0, 15.0)
-    scores = compare.compare([plain_room()[90:150, 40:140]], levels, step=lambda: ran.append(1))
-    assert len(ran) == len(scores) == compare.steps(levels)
+    scores = denoise_comparison.compare(
+        [plain_room()[90:150, 40:140]], levels, step=lambda: ran.append(1))
+    assert len(ran) == len(scores) == denoise_comparison.steps(levels)
     names = {one.filter for one in scores}
     assert {"none", "joint", "bilateral", "guided", "non-local means"} == names
     untouched = [one for one in scores if one.filter == "none"]
     for one, level in zip(untouched, levels, strict=True):
         assert one.psnr_db == pytest.approx(20 * np.log10(255 / level), abs=0.3)
-    assert all(compare.gain(scores, one) > 1 for one in scores if one.filter == "joint")
+    assert all(denoise_comparison.gain(scores, one) > 1 for one in scores if one.filter == "joint")
 
 
 def test_the_same_noise_is_added_every_time():
     scores = [
-        [(one.psnr_db, one.edges_kept) for one in compare.compare(
+        [(one.psnr_db, one.edges_kept) for one in denoise_comparison.compare(
             [plain_room()[90:150, 40:140]], (10.0,), step=lambda: None)]
         for _ in range(2)]
     assert scores[0] == scores[1]
@@ -69,10 +70,10 @@ def test_the_best_is_the_closest_that_is_offered_and_keeps_the_edges():
     scores = [
         score("none", 34, 1.0), score("joint", 39, 0.97), score("bilateral", 40, 0.9),
         score("non-local means", 41, 1.0, offered=False), score("none", 24, 1.0, noise=15.0)]
-    assert compare.best(scores, 5.1).filter == "joint"
-    assert compare.gain(scores, scores[1]) == 5
+    assert denoise_comparison.best(scores, 5.1).filter == "joint"
+    assert denoise_comparison.gain(scores, scores[1]) == 5
 
 
 def test_doing_nothing_can_be_the_best():
     scores = [score("none", 45, 1.0), score("joint", 44, 0.99)]
-    assert compare.best(scores, 5).filter == "none"
+    assert denoise_comparison.best(scores, 5).filter == "none"

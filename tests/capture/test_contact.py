@@ -5,9 +5,9 @@ import pytest
 from media import texture
 from PIL import Image
 
-from recon_cli.capture import contact
-from recon_cli.capture.candidates import Candidate, Reason
-from recon_cli.capture.contact import COLOURS, HELD_OUT, MAX_BYTES, ContactSheet
+from recon_cli.capture import contact_sheet
+from recon_cli.capture.contact_sheet import COLOURS, HELD_OUT, MAX_BYTES, ContactSheet
+from recon_cli.capture.selection_record import Candidate, Reason
 
 
 def capture(reasons):
@@ -85,8 +85,8 @@ def test_a_picture_that_takes_too_much_gets_fewer_colours(monkeypatch):
     noise = np.random.default_rng(0).integers(0, 256, (200, 300, 3)).astype(np.uint8)
     sizes = []
     for most in (3_000_000, 50_000, 31_000):
-        monkeypatch.setattr(contact, "MAX_BYTES", most)
-        data = contact._encoded(Image.fromarray(noise))
+        monkeypatch.setattr(contact_sheet, "MAX_BYTES", most)
+        data = contact_sheet._encoded(Image.fromarray(noise))
         assert len(data) <= most
         sizes.append(len(data))
         assert Image.open(io.BytesIO(data)).size == (300, 200)

@@ -4,14 +4,14 @@ import pytest
 from media import texture
 from noisy_room import noisy
 
-from recon_cli.capture.candidates import Reason
-from recon_cli.capture.duplicates import (
+from recon_cli.capture.near_duplicates import (
     choose_photos,
     dropped_photos,
     duplicates,
     look_at_photo,
     signature,
 )
+from recon_cli.capture.selection_record import Reason
 from recon_cli.errors import InputError
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from media import texture
 
-from recon_cli.capture.exposure import check_exposure, exposure, telling, well_exposed
+from recon_cli.capture.scan import check_exposure, exposure, telling, well_exposed
 from recon_cli.errors import InputError
 
 

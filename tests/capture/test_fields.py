@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from media import spoil_packets, woven, write_interlaced, write_video
 
-from recon_cli.capture.picture import Gap, Picture
+from recon_cli.capture.decoded_picture import Gap, Picture
 from recon_cli.capture.scan import scan_video
 from recon_cli.capture.video import decode, frames_at
 

@@ -3,7 +3,9 @@ import numpy as np
 import pytest
 from media import texture
 
-from recon_cli.capture.frames import (
+from recon_cli.config.fields import parse_holdout
+from recon_cli.errors import FormatError
+from recon_cli.io.frames import (
     Frame,
     FrameList,
     Group,
@@ -14,9 +16,7 @@ from recon_cli.capture.frames import (
     read_png,
     write_png,
 )
-from recon_cli.errors import FormatError
-from recon_cli.holdout_option import parse_holdout
-from recon_cli.scene.lens import Lens
+from recon_cli.scene.camera import Lens
 
 NAMES = [f"{index:06d}.png" for index in range(20)]
 

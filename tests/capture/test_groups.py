@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon_cli.capture.groups import group_notices, group_photos, odd_photos
+from recon_cli.capture.camera_groups import group_notices, group_photos, odd_photos
 from recon_cli.capture.images import Photo
 
 

@@ -6,9 +6,9 @@ import pytest
 from media import texture, turn_heic
 from PIL import Image
 
-from recon_cli.capture.frames import write_png
 from recon_cli.capture.images import Photo, inspect_photo, read_alpha, read_photo
 from recon_cli.errors import InputError
+from recon_cli.io.frames import write_png
 
 ORIENTATION, GPS = 0x0112, 0x8825
 

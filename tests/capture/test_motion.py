@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from media import texture
 
-from recon_cli.capture.motion import MotionMeter
+from recon_cli.capture.scan import MotionMeter
 
 # Lucas-Kanade finds whole-pixel shifts of a sharp texture to a twentieth of a pixel.
 TOLERANCE = 0.05 / 320

@@ -5,12 +5,7 @@ import pytest
 from PIL import Image
 
 from recon_cli.capture.images import Photo
-from recon_cli.capture.photos import (
-    check_count,
-    frame_names,
-    list_photos,
-    photo_folder,
-)
+from recon_cli.capture.photos import check_count, frame_names, list_photos, photo_folder
 from recon_cli.errors import InputError
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from media import set_display_matrix, texture, write_luma, write_video
 
-from recon_cli.capture.picture import Picture
+from recon_cli.capture.decoded_picture import Picture
 from recon_cli.capture.tone import (
     PEAK,
     SDR_WHITE,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from media import set_display_matrix, spoil_packets, texture, write_video
 
-from recon_cli.capture.picture import Picture
+from recon_cli.capture.decoded_picture import Picture
 from recon_cli.capture.scan import Scan, decode_threads, scan_video, sharpness
 from recon_cli.capture.video import decode, frames_at
 from recon_cli.errors import InputError

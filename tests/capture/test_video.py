@@ -5,7 +5,7 @@ from av.stream import Disposition
 from media import set_display_matrix, texture, write_sound, write_video
 from PIL import Image
 
-from recon_cli.capture.picture import Gap, Picture
+from recon_cli.capture.decoded_picture import Gap, Picture
 from recon_cli.capture.video import claimed_length, decode, frames_at, open_video
 from recon_cli.errors import InputError
 

@@ -16,7 +16,7 @@ from colmap_sets import (
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import read_model
 from recon_cli.io.colmap_set import is_colmap, read_colmap
-from recon_cli.scene.lens import MODELS
+from recon_cli.scene.camera import MODELS
 
 
 @pytest.fixture(params=FORMS)

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon_cli.io.rays import directions
-from recon_cli.scene.lens import Lens
+from recon_cli.io.calibration import directions
+from recon_cli.scene.camera import Lens
 
 K = np.array([[400.0, 0, 320.5], [0, 410, 240.25], [0, 0, 1]])
 INNER = (400.0, 410.0, 320.5, 240.25)

@@ -7,8 +7,8 @@ import posed_sets
 import pytest
 
 from recon_cli.errors import InputError
+from recon_cli.io.colmap import write_colmap
 from recon_cli.io.colmap_set import read_colmap
-from recon_cli.io.colmap_writer import write_colmap
 from recon_cli.io.splats.points import write_point_cloud
 from recon_cli.io.transforms import read_transforms
 from recon_cli.io.transforms_writer import write_transforms

@@ -8,7 +8,7 @@ import fake_stages
 import pytest
 from fake_stages import NAMES, bring, job_at
 
-from recon_cli.pipeline import Job
+from recon_cli.pipeline.plan import Job
 
 
 @pytest.fixture(autouse=True)

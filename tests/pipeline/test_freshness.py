@@ -8,13 +8,9 @@ import fake_stages
 import pytest
 from fake_stages import NAMES, bring, job_at, stale
 
-from recon_cli import pipeline
-from recon_cli.errors import (
-    ConfigError,
-    InputError,
-    StageError,
-)
-from recon_cli.pipeline import Job
+from recon_cli.errors import ConfigError, InputError, StageError
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.plan import Job
 
 AFTER = {name: NAMES[NAMES.index(name):] for name in NAMES}  # a stage and all behind it
 
@@ -109,7 +105,7 @@ def test_a_changed_input_is_named(job: Job, folder: Path) -> None:
 def test_an_input_that_is_gone_makes_nothing_stale_but_is_said(job: Job, folder: Path) -> None:
     (folder / "room.mp4").unlink()
     assert stale(job) == {}
-    assert pipeline.status(job)[0].notices == (f"the input {folder / 'room.mp4'} is gone",)
+    assert plan.status(job)[0].notices == (f"the input {folder / 'room.mp4'} is gone",)
     assert bring(job, "train", "ingest") == []
     with pytest.raises(InputError):
         bring(job, "ingest", again=True)
@@ -118,7 +114,7 @@ def test_an_input_that_is_gone_makes_nothing_stale_but_is_said(job: Job, folder:
 def test_a_touched_or_moved_input_is_the_same_input(job: Job, folder: Path) -> None:
     (folder / "room.mp4").rename(folder / "moved.mp4")
     assert bring(job, "ingest", video=folder / "moved.mp4") == []
-    assert pipeline.status(job)[0].notices == ()
+    assert plan.status(job)[0].notices == ()
 
 
 def test_another_input_is_taken_and_named(job: Job, folder: Path) -> None:

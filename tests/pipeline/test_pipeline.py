@@ -14,18 +14,13 @@ import fake_stages
 import pytest
 from fake_stages import STEPS, bring, job_at, stale
 
-from recon_cli import pipeline, report
-from recon_cli.config import ComputeConfig
-from recon_cli.errors import (
-    BackendError,
-    InputError,
-    ManifestError,
-    StageError,
-    WorkspaceError,
-)
-from recon_cli.manifest import NAME
-from recon_cli.pipeline import Job
-from recon_cli.settings import Settings
+from recon_cli.commands import console
+from recon_cli.config.settings import Settings
+from recon_cli.config.stages import ComputeConfig
+from recon_cli.errors import BackendError, InputError, ManifestError, StageError, WorkspaceError
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.plan import Job
+from recon_cli.workspace.manifest import NAME
 
 
 def written(job: Job, stage: str) -> str:
@@ -61,8 +56,8 @@ def test_the_command_to_type_is_one_that_the_shell_and_the_verb_take(job: Job) -
     changes = {"sfm": {"scale_between": ("my frame.png", "b.png", 1.5)}, "denoise": {"mode": "off"}}
     bring(job, "denoise", "sfm", changes=changes)
     look = job.inspect()
-    assert pipeline.command(look, look.check("denoise")) == "recon denoise --off"
-    assert pipeline.command(look, look.check("sfm")) == (
+    assert plan.command(look, look.check("denoise")) == "recon denoise --off"
+    assert plan.command(look, look.check("sfm")) == (
         "recon sfm --scale-between 'my frame.png' b.png 1.5")
 
 
@@ -174,7 +169,7 @@ def test_a_run_refused_at_its_start_leaves_nothing_to_resume(job: Job) -> None:
     shutil.rmtree(job.workspace.folder("train"))
     with pytest.raises(InputError):
         bring(job, "train")
-    assert pipeline.status(job)[3].state == "missing"
+    assert plan.status(job)[3].state == "missing"
     assert job.workspace.scraps() == []
 
 
@@ -195,14 +190,14 @@ def test_an_interrupted_run_is_partial_until_what_it_reads_changes(job: Job) -> 
         bring(job, "train", changes={"train": {"iterations": 100}})
     assert stale(job) == {}  # the old result is as good as before
     shutil.rmtree(job.workspace.folder("train"))
-    one = pipeline.status(job)[3]
+    one = plan.status(job)[3]
     assert (one.state, one.done, one.total) == ("partial", 0, 0)
-    assert "partial (just begun)" in report.status_table([one])
+    assert "partial (just begun)" in console.status_table([one])
     with pytest.raises(StageError, match=r"unfinished \(just begun\)") as caught:
         bring(job, "prune", again=True)
     assert caught.value.hint == "Run `recon train --iterations 100` first."
     bring(job, "sfm", changes={"sfm": {"max_features": 500}})
-    assert pipeline.status(job)[3].state == "missing"
+    assert plan.status(job)[3].state == "missing"
 
 
 def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) -> None:
@@ -213,7 +208,7 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
         env={**os.environ, "SLOW_TRAIN": "0.3"})
     try:
         started = time.monotonic()
-        while pipeline.status(job)[3].done < 2:
+        while plan.status(job)[3].done < 2:
             assert time.monotonic() - started < 60
             time.sleep(0.05)
         with pytest.raises(WorkspaceError, match=f"process {process.pid}") as caught:
@@ -222,7 +217,7 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    one = pipeline.status(job)[3]
+    one = plan.status(job)[3]
     assert one.state == "partial"
     assert 2 <= one.done < one.total == STEPS
     unfinished = job.workspace.unfinished("train")

@@ -19,23 +19,25 @@ from scenes import camera_at, leaves, random_splats
 from recon_cli.render import render
 from recon_cli.render.numba import (
     binning,
-    culling,
+    composite_backward,
+    composite_forward,
     kernel,
-    layout,
     loss,
     optimizer,
+    project_backward,
     projection,
-    projection_gradient,
-    raster_backward,
-    raster_forward,
+    soa,
     warm,
 )
-from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba import (
+    projection as culling,
+)
+from recon_cli.render.numba.thread_pool import crew
 
 STATISTICS = ("radii", "hits", "blend_sum", "blend_max", "means2d_grad", "absolute_grad",
               "variance", "loo")
-_MODULES = (binning, culling, loss, optimizer, projection, projection_gradient, raster_backward,
-            raster_forward)
+_MODULES = (binning, culling, loss, optimizer, projection, project_backward, composite_backward,
+            composite_forward)
 
 
 def picture(backend: str) -> dict[str, np.ndarray]:
@@ -73,7 +75,7 @@ def main(out: Path) -> None:
     (out / "report.json").write_text(json.dumps({
         "was_warm": was_warm, "is_warm": warm.is_warm(), "kernels_ready": len(ready),
         "seconds": seconds, "folder": str(folder) if folder else None,
-        "lanes": layout.LANES, "tile": [layout.TILE_WIDTH, layout.TILE_HEIGHT],
+        "lanes": soa.LANES, "tile": [soa.TILE_WIDTH, soa.TILE_HEIGHT],
         "hits": {name: sum(one.stats.cache_hits.values()) for name, one in used.items()},
         "misses": {name: sum(one.stats.cache_misses.values()) for name, one in used.items()},
     }), encoding="utf-8")

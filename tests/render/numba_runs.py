@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from recon_cli.render.numba import kernel, warm
-from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.simd import LANES
 
 HERE = Path(__file__).parent
 # What every CPU with AVX2 has; numba takes the name and the features together.

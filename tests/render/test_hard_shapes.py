@@ -17,7 +17,7 @@ from backends import (
 from scenes import camera_at, joined, leaves, one_splat, random_splats
 
 from recon_cli.render.contract import ALPHA_MIN, NEAR
-from recon_cli.render.projection import project, rotation_matrices
+from recon_cli.render.torch.projection import project, rotation_matrices
 from recon_cli.scene.camera import Camera
 
 pytestmark = every_backend_at_size

@@ -19,8 +19,8 @@ from backends import (
 )
 from scenes import camera_at, joined, one_splat, random_splats, with_harmonics
 
-from recon_cli.render.numba.crew import crew
 from recon_cli.render.numba.step import PhotometricStep
+from recon_cli.render.numba.thread_pool import crew
 from recon_cli.scene.splats import TERMS, with_rows
 
 N = 70

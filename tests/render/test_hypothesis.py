@@ -16,7 +16,7 @@ from oracle import composited
 from scenes import leaves
 
 from recon_cli.render.contract import DILATION, NEAR, TRANSMITTANCE_MIN
-from recon_cli.render.projection import project
+from recon_cli.render.torch.projection import project
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 

@@ -11,12 +11,12 @@ import pytest
 from numba_process import STATISTICS, picture
 from numba_runs import HASWELL, after_damage, after_repair, for_avx2
 
-from recon_cli.execute import Job, context_for
+from recon_cli.pipeline.execute import Job, context_for
 from recon_cli.render import registry
-from recon_cli.render.numba import kernel, lanes, warm
-from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba import kernel, simd, warm
+from recon_cli.render.numba.thread_pool import crew
 from recon_cli.stages import STAGES
-from recon_cli.workspace import Workspace
+from recon_cli.workspace.layout import Workspace
 
 # float32 against float32 in another order of operations; the backends' own bounds, see backends.py
 IMAGE_TOLERANCE = 1e-5
@@ -110,8 +110,8 @@ def test_name_and_features_of_the_cpu_change_the_fingerprint(monkeypatch):
     ("+avx2,+fma", 8), ("+avx2,+avx512f", 16), ("-avx512f", 8), ("", 8)])
 def test_the_number_of_lanes_follows_the_features_that_numba_compiles_for(
         monkeypatch, features, width):
-    monkeypatch.setattr(lanes.config, "CPU_FEATURES", features)
-    assert lanes.vector_width() == width
+    monkeypatch.setattr(simd.config, "CPU_FEATURES", features)
+    assert simd.vector_width() == width
 
 
 def test_a_change_of_any_source_changes_the_fingerprint(monkeypatch):

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from recon_cli.render.numba.crew import Crew
+from recon_cli.render.numba.thread_pool import Crew
 
 WAIT = 0.3  # seconds; long against a switch of threads, short for a test
 

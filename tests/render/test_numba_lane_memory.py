@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
-from recon_cli.render.numba.lane_functions import largest, total, totals
-from recon_cli.render.numba.lane_memory import (
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import largest, total, totals
+from recon_cli.render.numba.simd_memory import (
     copy,
     fetch_add,
     load,
@@ -17,7 +18,6 @@ from recon_cli.render.numba.lane_memory import (
     store,
     transpose,
 )
-from recon_cli.render.numba.lanes import LANES
 
 F32 = np.float32
 EPSILON = float(np.finfo(F32).eps)  # 2^-23

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba.core.errors import TypingError
 
-from recon_cli.render.numba.lane_functions import (
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import (
     absolute,
     bits,
     count_bits,
@@ -26,8 +27,7 @@ from recon_cli.render.numba.lane_functions import (
     square_root,
     total,
 )
-from recon_cli.render.numba.lane_memory import load, store
-from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.simd_memory import load, store
 
 F32 = np.float32
 EPSILON = float(np.finfo(F32).eps)  # 2^-23

@@ -3,7 +3,7 @@
 import torch
 from oracle import sh_basis
 
-from recon_cli.render.spherical_harmonics import basis_rest
+from recon_cli.render.torch.projection import basis_rest
 
 
 def test_the_basis_matches_the_associated_legendre_functions():

@@ -17,13 +17,15 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from recon_cli.render.triton import (
-    ledger,
+    compositing,
     loss,
     optimizer,
+    project_backward,
     projection,
-    projection_gradient,
-    raster_backward,
-    raster_forward,
+    step_status,
+)
+from recon_cli.render.triton import (
+    compositing as raster_forward,
 )
 
 TARGETS = (75, 90)  # Turing, the oldest that triton compiles for, and Hopper
@@ -53,23 +55,23 @@ KERNELS = (
     (raster_forward.composite, {"SCORES": False, "MASKED": False, "CHUNK": 16}, 1),
     (raster_forward.composite, {"SCORES": True, "MASKED": True, "CHUNK": 16}, 1),
     (raster_forward.tally, {"BLOCK": 128}, 4),
-    (raster_backward.decompose,
+    (compositing.decompose,
      {"PLAIN": True, "DETAILS": False, "SCORES": False, "MASKED": False}, 1),
-    (raster_backward.decompose,
+    (compositing.decompose,
      {"PLAIN": True, "DETAILS": True, "SCORES": False, "MASKED": False}, 1),
-    (raster_backward.decompose,
+    (compositing.decompose,
      {"PLAIN": False, "DETAILS": True, "SCORES": True, "MASKED": True}, 1),
     (projection.project, {"STRIDE": 45, "TERMS": 15, "BLOCK": 128}, 4),
     (projection.list_tiles, {"BLOCK": 128}, 4),
     (projection.place, {"BLOCK": 128}, 4),
-    (projection_gradient.unproject,
+    (project_backward.unproject,
      {"STRIDE": 45, "TERMS": 15, "GATED": True, "PLAIN": True, "DETAILS": False, "SCORES": False,
       "BLOCK": 128}, 4),
-    (projection_gradient.unproject,
+    (project_backward.unproject,
      {"STRIDE": 45, "TERMS": 15, "GATED": False, "PLAIN": False, "DETAILS": True, "SCORES": True,
       "BLOCK": 128}, 4),
-    (ledger.admit, {"BLOCK": 256}, 4),
-    (ledger.note, {}, 4),
+    (step_status.admit, {"BLOCK": 256}, 4),
+    (step_status.note, {}, 4),
     (optimizer.adam, {"GATED": True, "BLOCK": 1024}, 4),
     (optimizer.adam, {"GATED": False, "BLOCK": 1024}, 4),
     (loss.blur_products, {"MASKED": True, "BLOCK": 256}, 4),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon_cli.scene.axes import turn_onto
+from recon_cli.scene.gravity import turn_onto
 
 X, Y, Z = np.eye(3)
 RNG = np.random.default_rng(0)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from rooms import Room, degrees_between, looking, make_room
 
-from recon_cli.scene.axes import upright_axes
-from recon_cli.scene.gravity import camera_up, find_gravity
+from recon_cli.scene.gravity import camera_up, find_gravity, upright_axes
 from recon_cli.scene.surfaces import find_floor, find_walls
 
 SEEDS = range(6)

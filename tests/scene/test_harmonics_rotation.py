@@ -6,8 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from test_similarity import random_rotation
 
-from recon_cli.scene.harmonics import basis_rest
-from recon_cli.scene.harmonics_rotation import generators, rotated, rotation_blocks
+from recon_cli.scene.harmonics import basis_rest, generators, rotated, rotation_blocks
 
 EXACT = 1e-12
 DEGREES = {1: slice(0, 3), 2: slice(3, 8), 3: slice(8, 15)}

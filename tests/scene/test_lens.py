@@ -1,6 +1,6 @@
 import pytest
 
-from recon_cli.scene.lens import MODELS, Lens
+from recon_cli.scene.camera import MODELS, Lens
 
 
 def test_a_resized_image_keeps_its_rays_and_its_distortion():

@@ -10,7 +10,7 @@ from test_similarity import random_rotation
 
 from recon_cli.render import render
 from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.transformed import quaternion, transformed
+from recon_cli.scene.splats import quaternion, transformed
 
 # Float64 through projection, covariance and compositing; measured 2e-13 in the worst of the cases.
 PIXEL = 1e-10

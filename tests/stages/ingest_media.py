@@ -6,9 +6,9 @@ import av
 import numpy as np
 from PIL import Image
 
-from recon_cli.config import IngestConfig
+from recon_cli.config.stages import IngestConfig
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.stages import ingest
-from recon_cli.stages.context import StageContext, StageInputs
 
 
 def take(source, out, *, config=None, threads=2, record=None):

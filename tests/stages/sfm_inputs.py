@@ -4,10 +4,10 @@ import av
 import cv2
 import numpy as np
 
-from recon_cli.capture.frames import Frame, FrameList, Group, write_png
-from recon_cli.config import SfmConfig
+from recon_cli.config.stages import SfmConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.io.frames import Frame, FrameList, Group, write_png
 from recon_cli.stages import sfm
-from recon_cli.stages.context import StageContext, StageInputs
 
 
 def every_nth(video, step, count):

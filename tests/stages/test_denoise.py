@@ -5,11 +5,11 @@ import os
 import numpy as np
 import pytest
 
-from recon_cli.capture.frames import Frame, FrameList, Group, read_png, write_png
-from recon_cli.config import DenoiseConfig
+from recon_cli.config.stages import DenoiseConfig
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError
+from recon_cli.io.frames import Frame, FrameList, Group, read_png, write_png
 from recon_cli.stages import denoise
-from recon_cli.stages.context import StageContext, StageInputs
 
 SIGMAS = {"000000.png": 0, "000004.png": 15, "000008.png": 0, "000012.png": 8}
 

@@ -11,13 +11,13 @@ import pytest
 from tiny_scene import VIEWS
 from tiny_stages import holding_out, mean_colour_psnr, pruned, run, without
 
-from recon_cli.config import EvaluateConfig
+from recon_cli.config.stages import EvaluateConfig
+from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.evaluation import psnr, reference_views, ssim
 from recon_cli.io.images import read_image
-from recon_cli.metrics import psnr, ssim
-from recon_cli.stages import evaluate, held_out
-from recon_cli.stages.context import StageInputs
-from recon_cli.stages.fitting import read_config, write_config
+from recon_cli.stages import evaluate
+from recon_cli.train.runner import read_config, write_config
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_a_held_out_frame_without_a_camera_is_named(inputs, tmp_path, caplog):
 
 
 def test_views_too_small_to_score_are_a_usage_error(inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(held_out, "MIN_SIDE", 13)  # 16 pixels wide are 12 high here
+    monkeypatch.setattr(reference_views, "MIN_SIDE", 13)  # 16 pixels wide are 12 high here
     with pytest.raises(ConfigError, match="16x12 pixels are too small") as caught:
         run(evaluate, EvaluateConfig(max_size=16), inputs, tmp_path / "out")
     assert "--max-size" in caught.value.hint

@@ -11,14 +11,15 @@ import pytest
 import torch
 from tiny_stages import CONTEXT, LEARNT, trained
 
-from recon_cli.config import EXPORT_FORMATS, ExportConfig
+from recon_cli.config.stages import EXPORT_FORMATS, ExportConfig
+from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.export import exporter
 from recon_cli.io.colmap import read_images
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.ply_points import read_ply_points
+from recon_cli.io.ply_table import read_ply_points
 from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
-from recon_cli.stages import export, handing_out
-from recon_cli.stages.context import StageInputs
+from recon_cli.stages import export
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported):
         assert told["bytes"] == path.stat().st_size
         assert told["smaller"] == pytest.approx(
             ply.stat().st_size / path.stat().st_size, abs=1e-3)
-        assert -handing_out.MOST_LOSS_DB.get(name, 0.3) <= told["psnr_change_db"] < 0.3, name
+        assert -exporter.MOST_LOSS_DB.get(name, 0.3) <= told["psnr_change_db"] < 0.3, name
     assert abs(summary["files"]["glb"]["psnr_change_db"]) < 1e-3  # it keeps every value
 
 

@@ -12,20 +12,20 @@ import torch
 from scenes import random_splats
 from tiny_scene import make_inputs
 
-from recon_cli.atomic import write_json
-from recon_cli.config import ExportConfig, RunConfig
+from recon_cli.config.export import read_matrix
+from recon_cli.config.stages import ExportConfig, RunConfig
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.ply_points import read_ply_points
+from recon_cli.io.ply_table import read_ply_points
 from recon_cli.io.splats.registry import read_splats
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
 from recon_cli.stages import export
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.stages.fitting import write_config
-from recon_cli.transform_option import read_matrix
+from recon_cli.train.runner import write_config
+from recon_cli.workspace.atomic import write_json
 
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
 MOVED = Similarity(2.5, TURN, np.array([3.0, -2, 1]))

@@ -8,12 +8,12 @@ import pytest
 import torch
 from tiny_stages import CONTEXT, LEARNT, trained
 
-from recon_cli.config import ExportConfig
+from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
+from recon_cli.export.reduce import of_size
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import FORMATS
 from recon_cli.stages import export
-from recon_cli.stages.lighter import of_size
 
 
 @pytest.fixture(scope="module")

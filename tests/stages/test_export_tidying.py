@@ -9,12 +9,12 @@ import torch
 from foreign import truth
 from tiny_scene import make_inputs
 
-from recon_cli.config import ExportConfig, ImportConfig
+from recon_cli.config.stages import ExportConfig, ImportConfig
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.scene.splats import Splats, joined
-from recon_cli.stages import export, imported
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages import export, import_scene
 
 CONTEXT = StageContext(backend="numba")
 
@@ -36,7 +36,7 @@ def given(tmp_path_factory):
                                                0.05)])
     write_ply(folder / "scene.ply", planted)
     (folder / "train").mkdir()
-    imported.run(ImportConfig(), StageInputs(inputs.folders, (folder / "scene.ply",)),
+    import_scene.run(ImportConfig(), StageInputs(inputs.folders, (folder / "scene.ply",)),
                  folder / "train", CONTEXT)
     return StageInputs({**inputs.folders, "train": folder / "train"}), order >= len(truth())
 
@@ -90,7 +90,7 @@ def test_islands_go_without_views_and_floaters_are_refused(tmp_path):
     write_ply(tmp_path / "scene.ply", joined([
         floating(wall, 0.06), floating([(1.5, 1.5, 1.5), (1.5, 1.55, 1.5)], 0.05)])[0])
     (tmp_path / "train").mkdir()
-    imported.run(ImportConfig(max_size=96), StageInputs({}, (tmp_path / "scene.ply",)),
+    import_scene.run(ImportConfig(max_size=96), StageInputs({}, (tmp_path / "scene.ply",)),
                  tmp_path / "train", CONTEXT)
     inputs = StageInputs({"train": tmp_path / "train"})
     summary = exported(inputs, tmp_path, drop_islands=True)
@@ -106,7 +106,7 @@ def test_a_scene_in_another_frame_is_not_cleaned_by_the_views(given, tmp_path):
     away.means += torch.tensor([1.0, 1.0, 0.0])
     write_ply(tmp_path / "away.ply", away)
     (tmp_path / "train").mkdir()
-    imported.run(ImportConfig(), StageInputs(
+    import_scene.run(ImportConfig(), StageInputs(
         {name: inputs.folders[name] for name in ("ingest", "sfm")}, (tmp_path / "away.ply",)),
         tmp_path / "train", CONTEXT)
     with pytest.raises(StageError, match="goes by the views"):

@@ -11,14 +11,11 @@ import pytest
 import torch
 from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, pruned, run, without
 
-from recon_cli.config import ExportConfig, PruneConfig, RunConfig
-from recon_cli.errors import (
-    FormatError,
-    StageError,
-    TrainingError,
-)
+from recon_cli.config.stages import ExportConfig, PruneConfig, RunConfig
+from recon_cli.errors import FormatError, StageError, TrainingError
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.stages import course, export, fitting, prune, train
+from recon_cli.stages import export, prune, train
+from recon_cli.train import prune_run, runner
 from recon_cli.train.state import save_state
 
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
@@ -41,7 +38,7 @@ def stopping_after(steps, monkeypatch):
         if state.iteration >= steps:
             raise Killed
 
-    monkeypatch.setattr(fitting, "save_state", save_then_die)
+    monkeypatch.setattr(runner, "save_state", save_then_die)
 
 
 def test_training_leaves_a_scene_its_states_and_a_log(inputs):
@@ -82,7 +79,7 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
     def press(done, total):
         recorded.append((done, total))
 
-    original = fitting.fit_together
+    original = runner.fit_together
 
     def fit_and_press(state, task, until, *, on_step, **others):
         def step(now):
@@ -92,7 +89,7 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
         original(state, task, until, on_step=step, **others)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "fit_together", fit_and_press)
+        patch.setattr(runner, "fit_together", fit_and_press)
         with pytest.raises(KeyboardInterrupt):
             run(train, CONFIG, inputs, tmp_path / "out", replace(CONTEXT, record=press))
     assert recorded[-1] == (10, 160)
@@ -115,7 +112,7 @@ def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(input
 def test_a_killed_recovery_ends_with_the_same_bytes(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         stopping_after(119, patch)
-        patch.setattr(course, "read_config", lambda _: RUN)  # checkpoints every 7 steps
+        patch.setattr(prune_run, "read_config", lambda _: RUN)  # checkpoints every 7 steps
         with pytest.raises(Killed):
             run(prune, PRUNE, inputs, tmp_path / "out")
     run(prune, PRUNE, inputs, tmp_path / "out")
@@ -188,7 +185,7 @@ def test_a_checkpoint_cut_short_is_refused_with_what_to_type(inputs, tmp_path, m
 
 def test_large_checkpoints_take_no_more_than_a_tenth_of_the_time():
     now = [0.0]
-    pace = fitting.Pace(lambda: now[0])
+    pace = runner.Pace(lambda: now[0])
 
     def save(seconds):
         with pace.saving():

@@ -8,10 +8,11 @@ from safetensors.torch import load_file
 from scenes import random_splats, with_harmonics
 from tiny_scene import make_inputs
 
-from recon_cli.config import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
+from recon_cli.config.stages import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.stages import evaluate, export, fitting, prune, train
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages import evaluate, export, prune, train
+from recon_cli.train import runner
 from recon_cli.train.state import save_state
 
 CONTEXT = StageContext()
@@ -59,7 +60,7 @@ def test_a_killed_training_of_a_low_degree_ends_with_the_same_bytes(
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "save_state", save_then_die)
+        patch.setattr(runner, "save_state", save_then_die)
         with pytest.raises(Killed):
             train.run(config_of(degree), inputs, tmp_path, CONTEXT)
     train.run(config_of(degree), inputs, tmp_path, CONTEXT)

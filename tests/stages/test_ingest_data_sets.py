@@ -18,9 +18,9 @@ from posed_sets import (
     write_image,
 )
 
-from recon_cli.config import IngestConfig
+from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.poses import POSES, read_poses
+from recon_cli.io.posed import POSES, read_poses
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 from ingest_media import blocks, files, listed, take, walk, write_photos, write_video
 from PIL import Image
 
-from recon_cli.capture import frames as store
 from recon_cli.errors import InputError
+from recon_cli.io import frames as store
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from dng import Shot, linear, write_shot
 from ingest_media import blocks, listed, take, write_photos
 from PIL import Image
 
-from recon_cli.config import IngestConfig
+from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 
 

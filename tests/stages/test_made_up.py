@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
+from recon_cli.export.synthetic_cameras import ASSUMED_DB, Likeness, made_up_scene
 from recon_cli.scene.splats import SH_C0, Splats
-from recon_cli.stages.context import StageContext
-from recon_cli.stages.made_up import ASSUMED_DB, Likeness, made_up_scene
 
 CONTEXT = StageContext(backend="numba")
 

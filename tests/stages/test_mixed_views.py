@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from tiny_scene import TWO, make_inputs, write_masks
 
-from recon_cli.config import EvaluateConfig, PruneConfig, RunConfig
+from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation import psnr, reference_views
 from recon_cli.io.images import read_image
-from recon_cli.metrics import psnr
-from recon_cli.stages import evaluate, fitting, prune, train
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages import evaluate, prune, train
+from recon_cli.train import runner
 from recon_cli.train.memory import estimate
 
 CONFIG = RunConfig(
@@ -90,14 +91,14 @@ def test_the_largest_view_decides_the_memory_and_masks_are_counted(tmp_path, mon
         asked.append(values)
         return estimate(**values)
 
-    monkeypatch.setattr(fitting, "estimate", recorded)
+    monkeypatch.setattr(runner, "estimate", recorded)
     inputs = make_inputs(tmp_path, TWO[::-1])  # the smaller one comes first
     write_masks(inputs, {"000001.png": np.ones((44, 30), bool)})
-    scene = fitting.load_scene(inputs, validation=0.1)
-    fitting.load_task(scene, CONFIG, StageContext())
+    scene = reference_views.load_scene(inputs, validation=0.1)
+    runner.load_task(scene, CONFIG, StageContext())
     assert (asked[0]["width"], asked[0]["height"], asked[0]["masks"]) == (48, 36, 1)
 
 
 def test_views_of_one_size_are_summarised_without_a_list():
     camera = TWO[0].at(np.eye(4))
-    assert fitting.size_summary([camera, camera]) == {"width": 48, "height": 36}
+    assert reference_views.size_summary([camera, camera]) == {"width": 48, "height": 36}

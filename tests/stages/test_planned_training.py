@@ -9,12 +9,12 @@ from dataclasses import replace
 import pytest
 from tiny_scene import Shape, make_inputs
 
-from recon_cli.config import PruneConfig, TrainConfig
+from recon_cli.config.stages import PruneConfig, TrainConfig
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.io.ply import read_ply
-from recon_cli.stages import fitting, planning, prune, train
-from recon_cli.stages.context import StageContext, StageInputs
-from recon_cli.train import fit
+from recon_cli.stages import prune, train
+from recon_cli.train import fit, planning, runner
 from recon_cli.train.memory import estimate
 from recon_cli.train.state import save_state
 
@@ -49,7 +49,7 @@ def killed_after(steps, monkeypatch):
         if state.iteration >= steps:
             raise Killed
 
-    monkeypatch.setattr(fitting, "save_state", save_then_die)
+    monkeypatch.setattr(runner, "save_state", save_then_die)
 
 
 def same_bytes(one, other):
@@ -100,7 +100,7 @@ def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monke
 
 def test_memory_that_is_short_lowers_the_cap_and_says_so(inputs, tmp_path, monkeypatch, caplog):
     needed = estimate(views=9, width=48, height=36, gaussians=5500, fused=True)
-    monkeypatch.setattr(fitting, "free_memory_bytes", lambda: needed.total)
+    monkeypatch.setattr(runner, "free_memory_bytes", lambda: needed.total)
     monkeypatch.setattr(planning.plan, "wanted", lambda *_: 9000)
     summary = run(TrainConfig(iterations=2), inputs, tmp_path / "out")
     assert summary["max_gaussians"] == pytest.approx(5500, abs=10)

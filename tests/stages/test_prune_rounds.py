@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from tiny_scene import make_inputs
 
-from recon_cli.config import PRUNE_SCORES, PruneConfig, RunConfig, TrainConfig
+from recon_cli.config.stages import PRUNE_SCORES, PruneConfig, RunConfig, TrainConfig
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import use_threads
-from recon_cli.stages import course, fitting, prune, rounds, train
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.stages import prune, train
+from recon_cli.train import prune_loop, prune_run, runner
 from recon_cli.train.state import save_state
 
 CONFIG = TrainConfig(
@@ -78,7 +79,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     config, inputs, whole, tmp_path, monkeypatch
 ):
     """Each time one write of a state or of the list succeeds more than the time before."""
-    monkeypatch.setattr(course, "read_config", lambda _: RUN)  # a checkpoint every 3 steps
+    monkeypatch.setattr(prune_run, "read_config", lambda _: RUN)  # a checkpoint every 3 steps
     expected, summary = whole[config]
     kills = 0
     while True:
@@ -92,9 +93,10 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
                 raise Killed
 
         with monkeypatch.context() as patch:
-            for module in (course, fitting, rounds):
+            for module in (prune_run, runner, prune_loop):
                 patch.setattr(module, "save_state", lambda *a: count_and_die(save_state, *a))
-            patch.setattr(course, "write_bytes", lambda *a: count_and_die(fitting.write_bytes, *a))
+            patch.setattr(
+                prune_run, "write_bytes", lambda *a: count_and_die(runner.write_bytes, *a))
             try:
                 resumed = run(config, inputs, tmp_path / "out")
                 break
@@ -110,7 +112,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
 def test_ctrl_c_while_scores_are_gathered_costs_no_byte_either(
     inputs, whole, tmp_path, monkeypatch
 ):
-    original = fitting.fit_together
+    original = runner.fit_together
 
     def interrupted(state, task, until, *, importance, **others):
         if importance is not None and state.iteration > 125:
@@ -118,7 +120,7 @@ def test_ctrl_c_while_scores_are_gathered_costs_no_byte_either(
         original(state, task, until, importance=importance, **others)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "fit_together", interrupted)
+        patch.setattr(runner, "fit_together", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(THREE, inputs, tmp_path / "out")
     run(THREE, inputs, tmp_path / "out")
@@ -194,7 +196,7 @@ def test_where_every_removal_costs_too_much_nothing_goes(inputs, tmp_path, caplo
 
 
 def test_a_loss_of_psnr_without_validation_views_is_refused(inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(course, "read_config", lambda _: replace(RUN, validation=0.0))
+    monkeypatch.setattr(prune_run, "read_config", lambda _: replace(RUN, validation=0.0))
     with pytest.raises(TrainingError, match="validation views") as caught:
         run(SEARCH, inputs, tmp_path / "out")
     assert "--validation" in caught.value.hint

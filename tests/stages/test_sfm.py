@@ -10,13 +10,13 @@ import psutil
 import pytest
 from sfm_inputs import every_nth, run, write_inputs
 
-from recon_cli.atomic import clear_leftovers
-from recon_cli.capture.frames import read_png
+from recon_cli.context import StageContext
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images, read_scene
-from recon_cli.mapping import database
-from recon_cli.mapping.ledger import STEPS
-from recon_cli.stages.context import StageContext
+from recon_cli.io.frames import read_png
+from recon_cli.sfm import database
+from recon_cli.sfm.step_log import STEPS
+from recon_cli.workspace.atomic import clear_leftovers
 
 STEP, COUNT = 4, 12  # every 4th frame of the sample: few, and each still overlaps the next
 BLANK = "000099.png"  # a grey frame, held out, that can find no camera
@@ -28,9 +28,9 @@ MODEL = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 RUN = """
 import sys
 from pathlib import Path
-from recon_cli.config import SfmConfig
+from recon_cli.config.stages import SfmConfig
 from recon_cli.stages import sfm
-from recon_cli.stages.context import StageContext, StageInputs
+from recon_cli.context import StageContext, StageInputs
 base = Path(sys.argv[1])
 sfm.run(SfmConfig(max_features=int(sys.argv[3])),
         StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"}), Path(sys.argv[2]),
@@ -42,7 +42,7 @@ def workers():
     """The mapping processes that this test process has started."""
     return [
         child for child in psutil.Process().children(recursive=True)
-        if "recon_cli.mapping.worker" in " ".join(child.cmdline())
+        if "recon_cli.sfm.worker" in " ".join(child.cmdline())
     ]
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from sfm_inputs import run, texture, write_inputs
 
-from recon_cli.capture.frames import Frame, FrameList, Group
 from recon_cli.errors import SfmError
-from recon_cli.mapping.trajectory import jumps
+from recon_cli.io.frames import Frame, FrameList, Group
+from recon_cli.sfm.outlier_cameras import jumps
 from recon_cli.stages import sfm
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from sfm_inputs import run, texture, turning, write_inputs
 
+from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, SfmError
-from recon_cli.mapping import database
+from recon_cli.sfm import database
 from recon_cli.stages import sfm
-from recon_cli.stages.context import StageContext
 
 
 def test_a_grey_video_is_said_to_show_no_texture(tmp_path):

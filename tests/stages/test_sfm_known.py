@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sfm_inputs import every_nth, run, texture, write_inputs
 
-from recon_cli.capture.frames import Frame, FrameList, Group, read_png, write_png
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images, read_scene
-from recon_cli.io.poses import KnownPoses
-from recon_cli.scene.lens import Lens
+from recon_cli.io.frames import Frame, FrameList, Group, read_png, write_png
+from recon_cli.io.posed import KnownPoses
+from recon_cli.scene.camera import Lens
 
 STEP, COUNT = 4, 9  # every 4th frame of the sample
 LENS = Lens("PINHOLE", 600, 340, (300.0, 300.0, 300.0, 170.0))  # what the room was rendered with

@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 from tiny_scene import make_inputs
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext
 from recon_cli.errors import TrainingError
+from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.scene.camera import Camera
-from recon_cli.stages.context import StageContext
-from recon_cli.stages.fitting import load_scene, load_task
+from recon_cli.train.runner import load_task
 
 
 def in_units(scene, factor):

@@ -13,10 +13,11 @@ import torch
 from tiny_scene import make_inputs
 from tiny_stages import CONTEXT, mean_colour_psnr, run
 
-from recon_cli.config import EvaluateConfig, PruneConfig, RunConfig
+from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
+from recon_cli.context import StageInputs
 from recon_cli.io.ply import read_ply
-from recon_cli.stages import evaluate, fitting, prune, train
-from recon_cli.stages.context import StageInputs
+from recon_cli.stages import evaluate, prune, train
+from recon_cli.train import runner
 from recon_cli.train.state import save_state
 
 pytest.importorskip("triton", reason="triton is not installed")
@@ -47,10 +48,10 @@ def test_every_stage_runs_and_a_killed_training_ends_with_the_same_bytes(tmp_pat
     for name in ("plan.json", "config.json"):
         (tmp_path / "again" / name).write_bytes((tmp_path / "train" / name).read_bytes())
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "save_state", save_then_die)
+        patch.setattr(runner, "save_state", save_then_die)
         with pytest.raises(Killed):
             run(train, CONFIG, inputs, tmp_path / "again", ON_TRITON)
-    assert (tmp_path / "again" / fitting.CHECKPOINT).exists()
+    assert (tmp_path / "again" / runner.CHECKPOINT).exists()
     run(train, CONFIG, inputs, tmp_path / "again", ON_TRITON)
     for name in FILES:
         ours, theirs = (tmp_path / folder / name for folder in ("train", "again"))

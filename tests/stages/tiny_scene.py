@@ -11,11 +11,11 @@ import pycolmap
 import torch
 from scenes import random_splats
 
-from recon_cli.atomic import write_json
+from recon_cli.context import StageInputs
 from recon_cli.io.images import write_png
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
-from recon_cli.stages.context import StageInputs
+from recon_cli.workspace.atomic import write_json
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
 VIEWS = 12

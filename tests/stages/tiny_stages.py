@@ -8,11 +8,11 @@ import shutil
 import numpy as np
 from tiny_scene import make_inputs
 
-from recon_cli.config import PruneConfig, RunConfig
+from recon_cli.config.stages import PruneConfig, RunConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation import psnr
 from recon_cli.io.images import read_image
-from recon_cli.metrics import psnr
 from recon_cli.stages import prune, train
-from recon_cli.stages.context import StageContext, StageInputs
 
 CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import random_splats
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.train.optimizer import SplatOptimizer
 
 # float32 in another order of operations, over 20 steps: a few units in the last place.

@@ -6,7 +6,7 @@ import sys
 import torch
 from safetensors.torch import save_file
 
-from recon_cli.train.processes import Processes
+from recon_cli.train.distributed.process_group import Processes
 
 
 def numbers(rank):

@@ -5,11 +5,10 @@ import os
 import sys
 from pathlib import Path
 
-from recon_cli import launch
-from recon_cli.train import together
+from recon_cli.train.distributed import data_parallel, launch
 from recon_cli.train.state import save_state
 
-FOLDER, TAKE_PART, COUNT = Path(sys.argv[1]), together._take_part, itertools.count()
+FOLDER, TAKE_PART, COUNT = Path(sys.argv[1]), data_parallel._take_part, itertools.count()
 
 
 def take_part(given):
@@ -20,5 +19,5 @@ def take_part(given):
         save_state(FOLDER / name, given.state)
 
 
-together._take_part = take_part
+data_parallel._take_part = take_part
 sys.exit(launch.follow())

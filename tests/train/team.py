@@ -14,9 +14,9 @@ from pathlib import Path
 from unittest import mock
 
 import recon_cli
-from recon_cli.train.processes import Processes
+from recon_cli.train.distributed.data_parallel import dismiss, fit_together
+from recon_cli.train.distributed.process_group import Processes
 from recon_cli.train.state import save_state
-from recon_cli.train.together import dismiss, fit_together
 
 HERE = Path(__file__).parent
 ROOT = Path(recon_cli.__file__).parents[1]

@@ -11,17 +11,17 @@ from scenes import camera_at, random_splats
 from tiny_task import STRATEGIES, same
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from recon_cli.context import Ranks
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
-from recon_cli.train import ahead
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train import async_trainer
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.fit import Task, fit
 from recon_cli.train.importance import Importance
-from recon_cli.train.ranks import Ranks
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
-from recon_cli.train.step import TrainView
-from recon_cli.train.stepping import Stepper
+from recon_cli.train.stepper import Stepper
 
 triton_step = pytest.importorskip(
     "recon_cli.render.triton.step", reason="triton is not installed")
@@ -285,7 +285,7 @@ def test_steps_of_several_views_go_ahead_to_the_same_bits(monkeypatch):
 def test_a_step_never_waits_for_the_device(views):
     config = dataclasses.replace(CONFIG, batch_views=views)
     state, task = first(config=config), task_of(config=config)
-    steps = ahead.Ahead(state, task, lambda _: False)
+    steps = async_trainer.Ahead(state, task, lambda _: False)
     steps._start()
     with NoWaiting():
         steps._start()
@@ -299,13 +299,13 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
         state, task = first(backend, config), task_of(backend, config)
         state.exposure = Exposure(3) if exposure else None
         task = dataclasses.replace(task, ranks=ranks) if ranks else task
-        found = ahead.advancing(state, task, importance, lambda _: False)
+        found = async_trainer.advancing(state, task, importance, lambda _: False)
         return type(found.__self__)
 
-    assert chosen() is ahead.Ahead
+    assert chosen() is async_trainer.Ahead
     assert chosen("numba") is Stepper
     assert chosen(importance=Importance.zeros(COUNT, torch.device("cpu"))) is Stepper
     assert chosen(exposure=True) is Stepper
-    assert chosen(batch_views=2) is ahead.Ahead
+    assert chosen(batch_views=2) is async_trainer.Ahead
     assert chosen(densify="mcmc") is Stepper
     assert chosen(ranks=Ranks(0, 2)) is Stepper

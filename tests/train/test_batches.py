@@ -9,7 +9,7 @@ from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, t
 
 from recon_cli.train.fit import fit
 from recon_cli.train.poses import Poses
-from recon_cli.train.stepping import Stepper
+from recon_cli.train.stepper import Stepper
 
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 every_strategy = pytest.mark.parametrize("name", STRATEGIES)

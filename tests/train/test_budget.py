@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import joined, one_splat
 
-from recon_cli.train.budget import BudgetRule, decayed, densify, drawn
+from recon_cli.train.densify.budget import BudgetRule, decayed, densify, drawn
 
 RULE = BudgetRule(target=4, min_opacity=0.005, decay=1.0)
 

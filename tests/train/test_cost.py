@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tiny_task import first_state, same, tiny_task
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.train.cost import CostModel, LevelCost, calibrate, counts
 from recon_cli.train.fit import fit
 from recon_cli.train.schedule import Schedule

@@ -7,11 +7,11 @@ import torch
 from scenes import random_splats, with_harmonics
 from tiny_task import STRATEGIES, first_state, same, saved_and_loaded, tiny_task
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.scene.splats import with_rows
-from recon_cli.train import budget, mcmc, reference
+from recon_cli.train.densify import budget, mcmc, reference
+from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.fit import fit
-from recon_cli.train.gathered import Gathered
 
 N, COLORED = 40, 13
 

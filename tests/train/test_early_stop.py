@@ -5,11 +5,10 @@ from dataclasses import replace
 import pytest
 from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, tiny_task
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.train import fit as fitting
-from recon_cli.train.early_stop import next_iteration
 from recon_cli.train.fit import fit
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.schedule import Schedule, next_iteration
 
 PLAN = Schedule(RunConfig(iterations=1000))
 

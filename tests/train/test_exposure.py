@@ -5,14 +5,15 @@ import pytest
 import torch
 from scenes import camera_at, random_splats
 
-from recon_cli.config import TrainConfig
+from recon_cli.config.stages import TrainConfig
 from recon_cli.io.images import painted
 from recon_cli.render import render
-from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba.thread_pool import crew
+from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import Exposure
+from recon_cli.train.gradient import gradient_step
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView, gradient_step
 
 # Gradients of float32 against float64, relative in the 2-norm, as in test_step.
 TOLERANCE = 1e-5

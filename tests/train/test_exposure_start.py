@@ -10,8 +10,8 @@ import pytest
 from recon_cli.io.depth_points import points_from_depth
 from recon_cli.io.layouts import read_posed
 from recon_cli.scene.camera import Camera
-from recon_cli.train.exposure_start import estimated
-from recon_cli.train.step import TrainView
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.exposure import estimated
 
 WIDTH, HEIGHT = 120, 90
 CAMERA = Camera(WIDTH, HEIGHT, 100.0, 100.0, WIDTH / 2, HEIGHT / 2, np.eye(4))

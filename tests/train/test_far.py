@@ -6,8 +6,8 @@ import torch
 
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
-from recon_cli.train.far import faces, far_content, fibonacci_sphere, splats_of
-from recon_cli.train.step import TrainView
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.background import faces, far_content, fibonacci_sphere, splats_of
 
 SKY = (40, 90, 200)
 EXTENT = 1.0

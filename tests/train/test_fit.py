@@ -15,14 +15,15 @@ from tiny_task import (
     tiny_task,
 )
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.io.images import painted
 from recon_cli.render import available_backends, render
-from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba.thread_pool import crew
+from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit import fit, validation_psnr
+from recon_cli.train.gradient import gradient_step
 from recon_cli.train.state import load_state, save_state
-from recon_cli.train.step import TrainView, gradient_step
 
 RUNS = [(status.name, device) for status in available_backends() if not status.missing
         for device in status.devices]
@@ -267,7 +268,7 @@ def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monke
     before = state.splats.map(lambda tensor: tensor.detach().clone())
     compute = gradient_step(backend)
     monkeypatch.setattr(
-        "recon_cli.train.stepping.gradient_step",
+        "recon_cli.train.stepper.gradient_step",
         lambda *_: lambda *given, **named: (float("nan"), compute(*given, **named)[1]))
     run(state, task, 2)
     assert (state.iteration, state.skipped, state.optimizer.count) == (2, 2, 0)

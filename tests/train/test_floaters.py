@@ -7,11 +7,11 @@ import pytest
 import torch
 from scenes import random_splats
 
+from recon_cli.export.floaters import floaters, harms, sightings
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats, joined
-from recon_cli.train.floaters import floaters, harms, sightings
-from recon_cli.train.step import TrainView
+from recon_cli.scene.train_view import TrainView
 
 
 def camera(x, *, side=32):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from wall_scene import CONFIG, scene
 
-from recon_cli.train.gates import examine
+from recon_cli.train.feature_trials import examine
 
 
 def reasons(needs):

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from tiny_task import CONFIG, first_state, same, tiny_task
 
-from recon_cli.train.handing import Fit, packed, unpacked
+from recon_cli.context import Ranks
+from recon_cli.train.distributed.serialize import Fit, packed, unpacked
 from recon_cli.train.importance import Importance
+from recon_cli.train.initialize import _parts
 from recon_cli.train.pruning import Recovery
-from recon_cli.train.ranks import Ranks
-from recon_cli.train.start import _parts
 
 
 def test_a_fit_is_the_same_after_it_was_handed_over():

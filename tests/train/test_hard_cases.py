@@ -10,11 +10,11 @@ from wall_scene import CONFIG, scene
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.feature_trials import examine
 from recon_cli.train.fit import fit
-from recon_cli.train.gates import examine
+from recon_cli.train.initialize import first_state
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.start import first_state
-from recon_cli.train.step import TrainView
 
 STEPS = 200
 PLAIN = replace(

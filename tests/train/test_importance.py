@@ -5,16 +5,12 @@ import pytest
 import torch
 from scenes import camera_at, joined, one_splat, random_splats
 
-from recon_cli.config import PRUNE_SCORES, RunConfig
+from recon_cli.config.stages import PRUNE_SCORES, RunConfig
 from recon_cli.render import render
-from recon_cli.train.importance import (
-    Importance,
-    importance_of,
-    lightgaussian_score,
-    paper_score,
-)
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.gradient import gradient_step
+from recon_cli.train.importance import Importance, importance_of, lightgaussian_score, paper_score
 from recon_cli.train.optimizer import SplatOptimizer
-from recon_cli.train.step import TrainView, gradient_step
 
 CPU = torch.device("cpu")
 

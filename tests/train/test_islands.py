@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from recon_cli.export.cleanup import islands
 from recon_cli.scene.splats import Splats, joined
-from recon_cli.train.islands import islands
 
 
 def gaussians(places, *, scales=(0.06, 0.06, 0.06), opacity=0.9):

@@ -5,7 +5,7 @@ import torch
 from scenes import camera_at, joined, one_splat, random_splats
 
 from recon_cli.render import render
-from recon_cli.train.mcmc import add_noise, relocate
+from recon_cli.train.densify.mcmc import add_noise, relocate
 
 # Two Gaussians in one place look like the one that they replace to this much of a colour: the
 # rule is exact on the axis and near it elsewhere. Measured .006 at opacity .6.

@@ -15,8 +15,8 @@ from adam_runs import (
 )
 from scenes import joined, random_splats
 
-from recon_cli.config import RunConfig
-from recon_cli.render.numba.crew import crew
+from recon_cli.config.stages import RunConfig
+from recon_cli.render.numba.thread_pool import crew
 from recon_cli.scene.splats import Splats
 from recon_cli.train.optimizer import SplatOptimizer
 

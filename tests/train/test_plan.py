@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scenes import camera_at
 
-from recon_cli.config import RunConfig, TrainConfig
+from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.errors import ConfigError
+from recon_cli.scene.train_view import TrainView
 from recon_cli.train import plan
 from recon_cli.train.cost import CostModel, LevelCost
 from recon_cli.train.plan import QUALITIES, Facts, make_plan
-from recon_cli.train.step import TrainView
 
 FACTS = Facts(detail=60_000, views=40, points=9000, room=10**9)
 FREE = LevelCost(1, 0.0, 0.0)

@@ -7,12 +7,13 @@ import torch
 from scenes import random_splats
 from scipy.spatial.transform import Rotation
 
-from recon_cli.config import TrainConfig
+from recon_cli.config.stages import TrainConfig
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.gradient import gradient_step
 from recon_cli.train.poses import Poses, moved
 from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView, gradient_step
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 8, 80, 60, 70.0
 TURN, MOVE = np.radians(1.0), 0.01  # of the disturbance, in rad and world units

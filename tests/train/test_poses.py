@@ -5,14 +5,15 @@ import pytest
 import torch
 from scenes import camera_at, leaves, one_splat, random_splats
 
-from recon_cli.config import TrainConfig
+from recon_cli.config.stages import TrainConfig
 from recon_cli.render import render
-from recon_cli.render.numba.crew import crew
+from recon_cli.render.numba.thread_pool import crew
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.gradient import gradient_step
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.poses import Poses, camera_gradient, moved, worth_a_trial
 from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView, gradient_step
 
 BLACK = torch.zeros(3, dtype=torch.float64)
 CONFIG = TrainConfig(iterations=10, max_gaussians=6000)

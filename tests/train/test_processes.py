@@ -9,10 +9,9 @@ from safetensors.torch import load_file
 from team import PATIENCE, team
 from tiny_task import first_state, tiny_task
 
+from recon_cli.context import ALONE
 from recon_cli.errors import LostError
-from recon_cli.train.cost import CostModel, LevelCost
-from recon_cli.train.exchange import with_exchange
-from recon_cli.train.ranks import ALONE
+from recon_cli.train.cost import CostModel, LevelCost, with_exchange
 
 
 def test_a_leader_that_is_gone_is_followed_without_a_word(tmp_path):

@@ -7,7 +7,8 @@ import pytest
 import torch
 from scenes import camera_at, random_splats
 
-from recon_cli.config import PRUNE_SCORES, RunConfig
+from recon_cli.config.stages import PRUNE_SCORES, RunConfig
+from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit import Task, fit
 from recon_cli.train.importance import importance_of
 from recon_cli.train.pruning import (
@@ -23,7 +24,6 @@ from recon_cli.train.pruning import (
 )
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import new_state
-from recon_cli.train.step import TrainView
 
 CONFIG = RunConfig(iterations=100, max_gaussians=40)
 

@@ -11,8 +11,8 @@ from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, t
 from recon_cli.errors import TrainingError
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
+from recon_cli.train.initialize import _parts
 from recon_cli.train.pruning import Recovery
-from recon_cli.train.start import _parts
 
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 every_strategy = pytest.mark.parametrize("name", STRATEGIES)

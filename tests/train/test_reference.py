@@ -7,8 +7,8 @@ import torch
 from scenes import joined, one_splat
 
 from recon_cli.render import Statistics
-from recon_cli.train.gathered import Gathered
-from recon_cli.train.reference import DensifyRule, densify, lowered_opacities
+from recon_cli.train.densify.reference import DensifyRule, densify, lowered_opacities
+from recon_cli.train.densify.statistics import Gathered
 
 RULE = DensifyRule(gradient=1.0, clone_scale=0.1, min_opacity=0.005, large_scale=1.0, most=100)
 

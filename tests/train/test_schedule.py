@@ -2,7 +2,7 @@
 
 import pytest
 
-from recon_cli.config import RunConfig, TrainConfig
+from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.errors import ConfigError
 from recon_cli.train.schedule import Schedule
 

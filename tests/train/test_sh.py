@@ -8,7 +8,7 @@ import torch
 from oracle import color_towards
 from scenes import camera_at, joined, one_splat, random_splats, with_harmonics
 
-from recon_cli.config import TrainConfig
+from recon_cli.config.stages import TrainConfig
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, with_rows

@@ -7,10 +7,11 @@ from adam_runs import CONFIG, gradients_of
 from scenes import camera_at, random_splats
 
 from recon_cli.render import render
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.gradient import gradient_step
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import camera_gradient
-from recon_cli.train.step import TrainView, gradient_step
 
 pytest.importorskip("triton", reason="triton is not installed")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

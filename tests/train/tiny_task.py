@@ -3,12 +3,12 @@
 import torch
 from scenes import camera_at, random_splats, with_harmonics
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.render import render
+from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit import Task
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
-from recon_cli.train.step import TrainView
 
 CONFIG = RunConfig(
     iterations=60, densify="reference", densify_every=10, densify_gradient=1e-5, max_gaussians=90,

@@ -3,15 +3,15 @@
 import numpy as np
 import torch
 
-from recon_cli.config import RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.train.far import fibonacci_sphere
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.background import fibonacci_sphere
+from recon_cli.train.feature_trials import Candidate
 from recon_cli.train.fit import Task
-from recon_cli.train.gates import Candidate
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.step import TrainView
 
 CONFIG = RunConfig(iterations=500, max_gaussians=2000, sh_degree=0, images="original")
 EXTENT = 0.5

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from scenes import random_splats
 
-from recon_cli.stages.lighter import cropped
-from recon_cli.viewer.box import Box, box_around
+from recon_cli.export.reduce import cropped
+from recon_cli.viewer.crop_box import Box, box_around
 
 
 def test_what_is_shown_is_what_export_keeps_of_the_same_words():

@@ -14,13 +14,13 @@ from tiny_stages import CONFIG, run
 from viewing import complaints, nodes, until
 
 from recon_cli.cli import main
+from recon_cli.context import StageContext
 from recon_cli.io.ply import read_ply
 from recon_cli.stages import train
-from recon_cli.stages.context import StageContext
 from recon_cli.viewer import live
 from recon_cli.viewer.live import SHARE, LiveView
 from recon_cli.viewer.server import HOST, serving
-from recon_cli.workspace import Workspace
+from recon_cli.workspace.layout import Workspace
 
 SHORT = dataclasses.replace(CONFIG, iterations=60)
 

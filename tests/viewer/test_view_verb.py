@@ -15,15 +15,15 @@ import pytest
 import torch
 
 from recon_cli.cli import main
+from recon_cli.commands import view
 from recon_cli.io.splats.registry import FORMATS
-from recon_cli.viewer import command
 from recon_cli.viewer.content import of_file
 
 
 @pytest.fixture
 def ended(monkeypatch):
     """Ends the viewer as soon as it is there."""
-    monkeypatch.setattr(command, "wait", lambda: None)
+    monkeypatch.setattr(view, "wait", lambda: None)
 
 
 @pytest.mark.usefixtures("ended")
@@ -31,7 +31,7 @@ def test_it_prints_its_address_and_opens_no_browser_where_there_is_no_terminal(
     room, capsys, monkeypatch
 ):
     opened = []
-    monkeypatch.setattr(command.webbrowser, "open", opened.append)
+    monkeypatch.setattr(view.webbrowser, "open", opened.append)
     assert main(["view", "-w", str(room)]) == 0
     address = re.search(r"http://127\.0\.0\.1:\d+", capsys.readouterr().out)[0]
     assert not opened

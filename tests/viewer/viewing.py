@@ -11,12 +11,12 @@ from typing import Any, TypeVar
 
 from browser import Watched
 
-from recon_cli.pipeline import Job
-from recon_cli.viewer import run
-from recon_cli.viewer.beside import Pictures
+from recon_cli.pipeline.plan import Job
+from recon_cli.viewer import server as run
 from recon_cli.viewer.content import Content, of_workspace
+from recon_cli.viewer.photo_pairs import Pictures
 from recon_cli.viewer.server import HOST, Server
-from recon_cli.workspace import Workspace
+from recon_cli.workspace.layout import Workspace
 
 T = TypeVar("T")
 # What the page's own libraries say of themselves; nothing of it is ours to mend.

@@ -14,22 +14,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.atomic import replacing
 from recon_cli.errors import FormatError
 from recon_cli.io.ply_table import Element, read_header, read_tables
-from recon_cli.io.splats.morton import morton_order
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
     as_splats,
     from_smallest_three,
     logits_of_bytes,
+    morton_order,
     opacity_bytes,
     refuse_above,
     smallest_three,
     writable,
 )
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
+from recon_cli.workspace.atomic import replacing
 
 _CHUNK = 256
 _AXES, _COLORS = ("x", "y", "z"), ("r", "g", "b")

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.atomic import write_bytes
 from recon_cli.errors import InputError
-from recon_cli.io.splats.writable import arrays, sigmoid
+from recon_cli.io.splats.values import arrays, sigmoid
 from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.workspace.atomic import write_bytes
 
 MIN_OPACITY = 0.5  # what is fainter is rarely a surface
 _ROW = np.dtype([(name, "<f4") for name in "xyz"]

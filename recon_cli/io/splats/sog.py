@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from recon_cli.atomic import write_bytes
 from recon_cli.io.splats.codebooks import codebook, nearest
 from recon_cli.io.splats.sog_archive import Archive, packed
 from recon_cli.io.splats.sog_fields import (
@@ -38,8 +37,9 @@ from recon_cli.io.splats.sog_fields import (
     unpack_quats,
 )
 from recon_cli.io.splats.sog_meta import Meta, read_meta
-from recon_cli.io.splats.writable import arrays, colored_rows, logit, sigmoid
+from recon_cli.io.splats.values import arrays, colored_rows, logit, sigmoid
 from recon_cli.scene.splats import TERMS, Splats
+from recon_cli.workspace.atomic import write_bytes
 
 _LEAST_OPACITY = 1e-6  # what PlayCanvas takes a byte of 0 for; a logit has to be finite
 

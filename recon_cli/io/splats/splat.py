@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.atomic import write_bytes
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.values import (
     Floats,
@@ -22,10 +21,11 @@ from recon_cli.io.splats.values import (
     nearest_bytes,
     opacity_bytes,
     refuse_above,
+    refuse_not_finite,
     writable,
 )
-from recon_cli.io.splats.writable import refuse_not_finite
 from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.workspace.atomic import write_bytes
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _LEAST = np.finfo(np.float32).tiny  # stands for a scale of 0, which has no logarithm

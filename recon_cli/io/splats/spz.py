@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.atomic import write_bytes
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.spz_container import SpzHeader, pack, unpack
 from recon_cli.io.splats.values import (
@@ -32,6 +31,7 @@ from recon_cli.io.splats.values import (
     writable,
 )
 from recon_cli.scene.splats import TERMS, Splats
+from recon_cli.workspace.atomic import write_bytes
 
 _FRACTIONAL_BITS = (8, 12)  # fewest and most that are written; 12 is Niantic's
 _MOST = (1 << 23) - 1  # of a position, in fractions

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.contract import EXACT, Approximation, RenderOutput, Statistics
-from recon_cli.render.numba.frame import Lease, Parameters, flat
+from recon_cli.render.numba.view_pass import Lease, Parameters, flat
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.numba.kernel import inlined
-from recon_cli.render.numba.lane_functions import (
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import (
     floor,
     lane_numbers,
     maximum,
@@ -13,9 +14,8 @@ from recon_cli.render.numba.lane_functions import (
     select,
     square_root,
 )
-from recon_cli.render.numba.lane_memory import load, store
-from recon_cli.render.numba.lanes import LANES
-from recon_cli.render.numba.layout import (
+from recon_cli.render.numba.simd_memory import load, store
+from recon_cli.render.numba.soa import (
     BATCH,
     BLUE,
     DEPTH,

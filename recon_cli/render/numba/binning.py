@@ -13,8 +13,9 @@ import math
 import numpy as np
 
 from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.lane_memory import fetch_add
-from recon_cli.render.numba.layout import (
+from recon_cli.render.numba.simd_memory import fetch_add
+from recon_cli.render.numba.soa import (
+    BLOCK,
     EXTENT_X,
     EXTENT_Y,
     FAR,
@@ -28,7 +29,6 @@ from recon_cli.render.numba.layout import (
     U_Y,
     V_Y,
 )
-from recon_cli.render.numba.planes import BLOCK
 
 _MARGIN = np.float32(1e-3)  # pixels
 _U = np.uint64  # an index that is never negative needs no test for counting from the end

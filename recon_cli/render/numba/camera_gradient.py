@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.render.numba.crew import crew
-from recon_cli.render.numba.frame import flat
 from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.lane_memory import fetch_add
+from recon_cli.render.numba.simd_memory import fetch_add
+from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.view_pass import flat
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.harmonics_rotation import generators
+from recon_cli.scene.harmonics import generators
 from recon_cli.scene.splats import Splats
 
 _BLOCK = 1 << 11  # Gaussians whose sums belong together, whichever thread takes them

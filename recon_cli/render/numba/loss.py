@@ -15,18 +15,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.render.numba.crew import SCRATCH_FLOATS, crew
 from recon_cli.render.numba.kernel import inlined, kernel
-from recon_cli.render.numba.lane_functions import (
-    absolute,
-    fill,
-    fma,
-    lane_numbers,
-    select,
-    total,
-)
-from recon_cli.render.numba.lane_memory import fetch_add, load, load_bytes, spread, store
-from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import absolute, fill, fma, lane_numbers, select, total
+from recon_cli.render.numba.simd_memory import fetch_add, load, load_bytes, spread, store
+from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, crew
 
 RADIUS = 5
 CHANNELS = 3

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from recon_cli.render.numba.crew import crew
 from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.lane_functions import absolute, fill, fma, select, square_root
-from recon_cli.render.numba.lane_memory import fetch_add, load, store
-from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import absolute, fill, fma, select, square_root
+from recon_cli.render.numba.simd_memory import fetch_add, load, store
+from recon_cli.render.numba.thread_pool import crew
 
 BLOCK = 1 << 14  # numbers that a thread takes at a time
 _VANISHED = np.float32(1e-37)  # moments under this are dropped: denormal numbers are slow

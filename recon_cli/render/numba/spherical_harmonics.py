@@ -1,7 +1,7 @@
 """Real spherical harmonics of degree 1 to 3, LANES directions at a time.
 
 Basis, signs and order are those of INRIA's 3DGS (after Sloan 2013, "Efficient Spherical Harmonic
-Evaluation"), as in recon_cli.render.spherical_harmonics.
+Evaluation"), as in recon_cli.render.torch.projection.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.numba.kernel import inlined
-from recon_cli.render.numba.lane_memory import load, store
-from recon_cli.render.numba.lanes import LANES
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_memory import load, store
 
 C0 = np.float32(0.28209479177387814)
 _C1 = np.float32(0.4886025119029199)

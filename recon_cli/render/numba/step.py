@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render.contract import Statistics
-from recon_cli.render.numba.frame import Frame, Parameters, flat
 from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
+from recon_cli.render.numba.view_pass import Frame, Parameters, flat
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 

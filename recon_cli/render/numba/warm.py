@@ -16,10 +16,10 @@ import torch
 
 from recon_cli.render.numba.backend import render
 from recon_cli.render.numba.camera_gradient import pull_of_scene
-from recon_cli.render.numba.crew import crew
 from recon_cli.render.numba.kernel import cache_folder
 from recon_cli.render.numba.optimizer import step
 from recon_cli.render.numba.step import PhotometricStep
+from recon_cli.render.numba.thread_pool import crew
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 

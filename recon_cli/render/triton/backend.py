@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.contract import RenderOutput, Statistics
-from recon_cli.render.triton.lists import listed, project
+from recon_cli.render.triton.ellipse import view_numbers
 from recon_cli.render.triton.passes import Picture, Wanted, composited, decomposed, unprojected
-from recon_cli.render.triton.view import view_numbers
+from recon_cli.render.triton.tile_lists import listed, project
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import TERMS, Splats
 

@@ -9,12 +9,10 @@ import triton
 from torch import Tensor
 
 from recon_cli.render.contract import Statistics
-from recon_cli.render.triton.fragments import PIXELS, SUMS
-from recon_cli.render.triton.lists import Lists
+from recon_cli.render.triton.compositing import CHUNK, PIXELS, SUMS, composite, decompose, tally
+from recon_cli.render.triton.project_backward import unproject
 from recon_cli.render.triton.projection import BLOCK
-from recon_cli.render.triton.projection_gradient import unproject
-from recon_cli.render.triton.raster_backward import decompose
-from recon_cli.render.triton.raster_forward import CHUNK, composite, tally
+from recon_cli.render.triton.tile_lists import Lists
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import TERMS, Splats
 

@@ -11,7 +11,14 @@ import triton
 import triton.language as tl
 
 from recon_cli.render.contract import DILATION, NEAR
+from recon_cli.render.triton.compositing import FLOATS, LOG2_ALPHA_MIN, LOG2E, SIDE, UNIT
 from recon_cli.render.triton.ellipse import (
+    CX,
+    CY,
+    FX,
+    FY,
+    HEIGHT,
+    WIDTH,
     direction,
     image_axes,
     position,
@@ -20,15 +27,7 @@ from recon_cli.render.triton.ellipse import (
     standard_deviations,
     unit_quaternion,
 )
-from recon_cli.render.triton.fragments import (
-    FLOATS,
-    LOG2_ALPHA_MIN,
-    LOG2E,
-    SIDE,
-    UNIT,
-)
 from recon_cli.render.triton.harmonics import colors
-from recon_cli.render.triton.view import CX, CY, FX, FY, HEIGHT, WIDTH
 
 BLOCK = 128  # Gaussians a program
 SHAPES = 8  # floats a Gaussian that only binning reads

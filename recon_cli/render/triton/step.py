@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.contract import Statistics
-from recon_cli.render.triton.graphs import Graphs
-from recon_cli.render.triton.ledger import Account, Ledger, admitted, noted
-from recon_cli.render.triton.lists import listed, project
+from recon_cli.render.triton.cuda_graphs import Graphs
+from recon_cli.render.triton.ellipse import view_numbers
 from recon_cli.render.triton.loss import loss_and_gradient
 from recon_cli.render.triton.passes import Wanted, composited, decomposed, unprojected
-from recon_cli.render.triton.view import view_numbers
+from recon_cli.render.triton.step_status import Account, Ledger, admitted, noted
+from recon_cli.render.triton.tile_lists import listed, project
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import TERMS, Splats
 

@@ -12,7 +12,7 @@ from splat_cases import N, damaged, edge_splats, greatest, read_or_refused, rota
 
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.compressed_ply import read_compressed_ply, write_compressed_ply
-from recon_cli.io.splats.morton import morton_order
+from recon_cli.io.splats.values import morton_order
 from recon_cli.scene.splats import SH_C0, with_rows
 
 

@@ -11,19 +11,11 @@ import torch
 from scenes import camera_at, with_harmonics
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.splats.glb import (
-    Y_DOWN,
-    Y_UP,
-    Z_UP,
-    nearest_axes,
-    read_glb,
-    write_glb,
-)
+from recon_cli.io.splats.glb import Y_DOWN, Y_UP, Z_UP, nearest_axes, read_glb, write_glb
 from recon_cli.io.splats.glb_container import contained
 from recon_cli.render.registry import render
 from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.splats import SH_C0
-from recon_cli.scene.transformed import transformed
+from recon_cli.scene.splats import SH_C0, transformed
 
 EXT = "KHR_gaussian_splatting"
 EXACT = 1e-6

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from splat_cases import damaged, read_or_refused
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.html import read_html, write_html
-from recon_cli.io.splats.html_page import first_look
+from recon_cli.io.splats.html import first_look, read_html, write_html
 from recon_cli.io.splats.spz import read_spz, spz_bytes
 from recon_cli.scene.camera import Camera
 

@@ -17,7 +17,7 @@ from recon_cli.io.splats.html import read_html, write_html
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.transformed import transformed
+from recon_cli.scene.splats import transformed
 
 WIDTH, HEIGHT = 240, 180
 Y_DOWN = np.array([0.0, -1, 0])

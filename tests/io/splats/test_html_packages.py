@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from recon_cli.io.splats import html_page
-from recon_cli.io.splats.html_page import LICENCES, MODULES
+from recon_cli.io.splats import html
+from recon_cli.io.splats.html import LICENCES, MODULES
 
-WEB = Path(html_page.__file__).parent / "web"
+WEB = Path(html.__file__).parent / "web"
 OURS = {"README.md", "harmonics.js", "page.html", "viewer.js"}
 TABLE = {row[0]: row[1:] for row in re.findall(
     r"^\| (\S+) \| (@?[\w/]+ [\d.]+) \| (\S+) \| ([0-9a-f]{64}) \|$",

@@ -1,0 +1,255 @@
+"""The contact sheet: one picture of what was kept of a capture, what was dropped, and why.
+
+Its size is bounded whatever the length of the capture: of what does not fit, an even sample of each
+kind is shown. It is stored with 256 colours, a quarter of a byte a pixel (measured on four
+captures), or with fewer where that takes too much.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from recon_cli.capture.selection_record import MEANINGS, Candidate, Reason, counts
+from recon_cli.workspace import atomic
+
+SHEET = "contact.png"
+MAX_PIXELS = 4_500_000  # 2000x2250; 1.1 MB as a rule
+MAX_BYTES = 3_000_000
+# Tried until the file is small enough; the last takes half a byte a pixel whatever is in it.
+PALETTES = (256, 64, 16)
+MAX_WIDTH = 2000  # pixels; two sheets beside each other on a large screen
+THUMB_PIXELS = 14_000  # 158x89 at 16:9
+# Kept frames get at most this share of the cells, so that dropped ones can be seen.
+KEPT_SHARE = 0.65
+BORDER, GAP, LINE, TEXT = 4, 6, 15, 12  # pixels
+CELL_WIDTH = 118  # at least, for the caption
+HELD_OUT = "held out"
+
+Colour = tuple[int, int, int]
+PAPER, INK, FAINT = (255, 255, 255), (20, 20, 20), (110, 110, 110)
+# Okabe and Ito (2008): eight colours that people with any colour vision tell apart.
+COLOURS: dict[str, Colour] = {
+    Reason.KEPT: (0, 158, 115), HELD_OUT: (0, 114, 178), Reason.BLURRED: (213, 94, 0),
+    Reason.CLIPPED: (20, 20, 20), Reason.DUPLICATE: (204, 121, 167), Reason.CLOSE: (190, 190, 190),
+    Reason.DAMAGED: (240, 228, 66)}
+
+MOST_OBLONG = 4  # width to height of a cell; a longer picture, a panorama say, leaves paper free
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Sizes in pixels of a thumbnail and of the cell that it stands in, and how many fit."""
+
+    thumb: tuple[int, int]
+    cell: tuple[int, int]
+    most: int
+    columns: int
+
+
+class ContactSheet:
+    """Collects the thumbnails of a capture and draws them in order.
+
+    Args:
+        title: what the capture is called.
+        candidates: all of one capture, in order.
+        width: of the frames, in pixels.
+        height: of the frames, in pixels.
+    """
+
+    def __init__(
+        self, title: str, candidates: Sequence[Candidate], width: int, height: int
+    ) -> None:
+        self._title, self._candidates = title, candidates
+        self._several = len({one.source for one in candidates}) > 1
+        self._layout = _layout(width, height)
+        self._shown = _sample(candidates, self._layout.most)
+        self._thumbs: dict[int, Image.Image] = {}
+
+    @property
+    def wanted(self) -> frozenset[int]:
+        """Indices of the candidates whose pixels the sheet shows."""
+        return frozenset(candidate.index for candidate in self._shown)
+
+    def add(self, index: int, rgb: NDArray[np.uint8]) -> None:
+        """Takes the pixels [H, W, 3] of a candidate; those that are not shown are ignored."""
+        if index in self.wanted:
+            self._thumbs[index] = _thumbnail(rgb, self._layout.thumb)
+
+    def write(self, path: Path, held_out: Collection[str]) -> None:
+        """Draws the sheet as a PNG, whole or not at all.
+
+        Args:
+            path: the file.
+            held_out: names of the stored frames that are held out.
+        """
+        width, height = self._layout.cell
+        columns = min(self._layout.columns, max(1, len(self._shown)))
+        head = _wrapped(self._heading(held_out), max(columns * width, 4 * width))
+        top = GAP + sum(LINE for _ in head) + GAP
+        rows = math.ceil(len(self._shown) / columns)
+        canvas = Image.new(
+            "RGB", (max(columns, 4) * width + GAP, top + rows * height + GAP), PAPER)
+        draw = ImageDraw.Draw(canvas)
+        for line, words in enumerate(head):
+            _write_words(draw, words, GAP, GAP + line * LINE)
+        for place, candidate in enumerate(self._shown):
+            row, column = divmod(place, columns)
+            kind = _kind(candidate, held_out)
+            self._draw_cell(canvas, draw, candidate, kind, GAP + column * width, top + row * height)
+        atomic.write_bytes(path, _encoded(canvas))
+
+    def _draw_cell(
+        self, canvas: Image.Image, draw: ImageDraw.ImageDraw, candidate: Candidate, kind: str,
+        x: int, y: int,
+    ) -> None:
+        thumb_width, thumb_height = self._layout.thumb
+        right, bottom = x + thumb_width + 2 * BORDER, y + thumb_height + 2 * BORDER
+        draw.rectangle((x, y, right - 1, bottom - 1), COLOURS[kind])
+        thumb = self._thumbs.get(candidate.index)
+        if thumb is None:
+            draw.rectangle(
+                (x + BORDER, y + BORDER, right - BORDER - 1, bottom - BORDER - 1), PAPER)
+        else:
+            canvas.paste(thumb, (x + BORDER, y + BORDER))
+        font, width = ImageFont.load_default(TEXT), self._layout.cell[0] - GAP
+        like = "" if candidate.like is None else f" #{candidate.like}"
+        draw.text((x, bottom), _cut(f"#{candidate.index} {kind}{like}", font, width), INK, font)
+        draw.text((x, bottom + LINE), _cut(self._detail(candidate), font, width), FAINT, font)
+
+    def _detail(self, candidate: Candidate) -> str:
+        """Returns the second line of a caption: how sharp a frame is, and the file of a photo."""
+        sharp = "" if candidate.sharpness is None else f"{candidate.sharpness:.0f}"
+        return f"{sharp} {candidate.source}".strip() if self._several else f"sharp {sharp}"
+
+    def _heading(self, held_out: Collection[str]) -> list[tuple[str, Colour | None]]:
+        """Returns the counts and the legend: texts, some with a swatch before them."""
+        found = counts(self._candidates)
+        kept = found.pop(Reason.KEPT, 0)
+        held = sum(_kind(candidate, held_out) == HELD_OUT for candidate in self._candidates)
+        dropped = sum(found.values())
+        shown = sum(candidate.reason is not Reason.KEPT for candidate in self._shown)
+        words: list[tuple[str, Colour | None]] = [
+            (f"{self._title}: {kept} of {kept + dropped} frames kept, {held} of them held out "
+             f"for the score; {dropped} dropped.", None),
+            (f"Shown in order: {len(self._shown) - shown} kept, {shown} dropped; below each: "
+             f"sharpness{', file' if self._several else ''}.", None),
+            (f"{kept - held} kept for training", COLOURS[Reason.KEPT]),
+            (f"{held} held out", COLOURS[HELD_OUT])]
+        return words + [
+            (f"{count} {reason}: {MEANINGS[Reason(reason)]}", COLOURS[reason])
+            for reason, count in found.items()]
+
+
+def _kind(candidate: Candidate, held_out: Collection[str]) -> str:
+    """Returns what a border stands for: a reason, or that a kept frame is held out."""
+    held = candidate.reason is Reason.KEPT and candidate.name in held_out
+    return HELD_OUT if held else candidate.reason.value
+
+
+def _encoded(canvas: Image.Image) -> bytes:
+    """Returns a PNG of at most `MAX_BYTES`."""
+    data = b""
+    for colours in PALETTES:
+        stored = io.BytesIO()
+        canvas.quantize(
+            colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE,
+        ).save(stored, "PNG", optimize=True)
+        data = stored.getvalue()
+        if len(data) <= MAX_BYTES:
+            break
+    return data
+
+
+def _thumbnail(
+    rgb: NDArray[np.uint8],  # [H, W, 3]
+    size: tuple[int, int],
+) -> Image.Image:
+    """Returns a picture reduced into `size`, in its own shape: photos may lie and stand."""
+    height, width = rgb.shape[:2]
+    scale = min(size[0] / width, size[1] / height)
+    fitted = max(1, round(width * scale)), max(1, round(height * scale))
+    thumb = Image.new("RGB", size, PAPER)
+    small = Image.fromarray(cv2.resize(rgb, fitted, interpolation=cv2.INTER_AREA))
+    thumb.paste(small, ((size[0] - fitted[0]) // 2, (size[1] - fitted[1]) // 2))
+    return thumb
+
+
+def _layout(width: int, height: int) -> _Layout:
+    width, height = max(width, height // MOST_OBLONG), max(height, width // MOST_OBLONG)
+    scale = math.sqrt(THUMB_PIXELS / (width * height))
+    thumb = max(8, round(width * scale)), max(8, round(height * scale))
+    cell = (
+        max(CELL_WIDTH, thumb[0] + 2 * BORDER) + GAP, thumb[1] + 2 * BORDER + 2 * LINE + GAP)
+    columns = max(1, (MAX_WIDTH - GAP) // cell[0])
+    # The heading takes part of the budget: some lines of the full width.
+    pixels = MAX_PIXELS - (columns * cell[0] + GAP) * (8 * LINE + 3 * GAP)
+    rows = max(1, pixels // ((columns * cell[0] + GAP) * cell[1]))
+    return _Layout(thumb, cell, columns * rows, columns)
+
+
+def _sample(candidates: Sequence[Candidate], most: int) -> list[Candidate]:
+    """Returns at most `most` candidates in order, every reason among them."""
+    by_reason = {
+        reason: [one for one in candidates if one.reason is reason] for reason in Reason}
+    kept = by_reason.pop(Reason.KEPT)
+    dropped = sum(map(len, by_reason.values()))
+    room = {Reason.KEPT: min(len(kept), max(int(KEPT_SHARE * most), most - dropped))}
+    left = most - room[Reason.KEPT]
+    # The rarest reason first: what it does not need goes to the others.
+    for place, reason in enumerate(sorted(by_reason, key=lambda one: len(by_reason[one]))):
+        room[reason] = min(len(by_reason[reason]), left // (len(by_reason) - place))
+        left -= room[reason]
+    shown: list[Candidate] = []
+    for reason, members in {Reason.KEPT: kept, **by_reason}.items():
+        count = room[reason]
+        shown += [members[(2 * i + 1) * len(members) // (2 * count)] for i in range(count)]
+    return sorted(shown, key=lambda one: one.index)
+
+
+def _wrapped(
+    words: Sequence[tuple[str, Colour | None]], width: int
+) -> list[list[tuple[str, Colour | None]]]:
+    """Returns texts in lines that are no wider than `width` where that can be."""
+    font = ImageFont.load_default(TEXT)
+    lines: list[list[tuple[str, Colour | None]]] = [[]]
+    used = 0.0
+    for text, colour in words:
+        needed = font.getlength(text) + 2 * LINE + GAP
+        if lines[-1] and used + needed > width:
+            lines.append([])
+            used = 0.0
+        lines[-1].append((text, colour))
+        used += needed
+    return lines
+
+
+def _write_words(
+    draw: ImageDraw.ImageDraw, words: Sequence[tuple[str, Colour | None]], x: float, y: float
+) -> None:
+    font = ImageFont.load_default(TEXT)
+    for text, colour in words:
+        if colour is not None:
+            draw.rectangle((x, y + 2, x + LINE - 4, y + LINE - 3), colour)
+            x += LINE + 2
+        draw.text((x, y), text, INK, font)
+        x += font.getlength(text) + LINE
+
+
+def _cut(
+    text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float
+) -> str:
+    """Returns a text shortened to fit a width."""
+    if font.getlength(text) <= width:
+        return text
+    while text and font.getlength(text + "…") > width:
+        text = text[:-1]
+    return text + "…"

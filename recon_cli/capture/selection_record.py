@@ -1,0 +1,110 @@
+"""The record of a choice: every frame that could have been taken, and why it was or was not."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.workspace import atomic
+
+CHOICE = "choice.json"
+
+
+class Reason(StrEnum):
+    """What became of a frame, in the words that a person reads."""
+
+    KEPT = "kept"
+    DAMAGED = "damaged"
+    CLIPPED = "clipped"
+    BLURRED = "blurred"
+    DUPLICATE = "duplicate"
+    CLOSE = "close"
+
+
+MEANINGS = {
+    Reason.KEPT: "kept",
+    Reason.DAMAGED: "damaged or unreadable",
+    Reason.CLIPPED: "mostly black, blown out or flat",
+    Reason.BLURRED: "less sharp than those around it",
+    Reason.DUPLICATE: "same view as a kept one",
+    Reason.CLOSE: "too close to a kept one",
+}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One frame of a capture.
+
+    Attributes:
+        source: name of the file that it came from.
+        index: its place in that video, or among the photos of that folder.
+        reason: what became of it.
+        sharpness: variance of its Laplacian; None where it could not be read.
+        name: of the stored frame, None where it was not kept.
+        like: index of the kept frame that stands for a duplicate or lies nearest to one too close.
+    """
+
+    source: str
+    index: int
+    reason: Reason
+    sharpness: float | None
+    name: str | None = None
+    like: int | None = None
+
+
+def of_video(
+    source: str,
+    sharpness: NDArray[np.float64],  # [F]
+    refused: Sequence[Reason | None],  # [F]
+    way: NDArray[np.float64],  # [F]
+    names: dict[int, str],
+    *,
+    same: float,
+) -> tuple[Candidate, ...]:
+    """Returns the record of a choice among the frames of a video.
+
+    Args:
+        source: name of the video.
+        sharpness: of each frame.
+        refused: why a frame could not be taken, None where it could.
+        way: travelled up to each frame, in widths of the image.
+        names: of the stored frames by index; at least one.
+        same: ways that differ by no more than this are the same view.
+    """
+    kept = np.array(sorted(names))
+    found = []
+    for index, reason in enumerate(refused):
+        nearest, like = int(kept[np.argmin(np.abs(way[kept] - way[index]))]), None
+        if index in names:
+            became = Reason.KEPT
+        elif reason is not None:
+            became = reason
+        else:
+            like = nearest
+            still = abs(way[nearest] - way[index]) <= same
+            became = Reason.DUPLICATE if still else Reason.CLOSE
+        found.append(Candidate(
+            source, index, became, round(float(sharpness[index]), 2), names.get(index), like))
+    return tuple(found)
+
+
+def counts(candidates: Sequence[Candidate]) -> dict[str, int]:
+    """Returns how many candidates each reason has, in the order of `Reason`, without zeros."""
+    found = Counter(candidate.reason for candidate in candidates)
+    return {reason.value: found[reason] for reason in Reason if found[reason]}
+
+
+def write_choice(path: Path, candidates: Sequence[Candidate]) -> None:
+    """Writes the record of a choice as JSON."""
+    atomic.write_json(path, {
+        "counts": counts(candidates),
+        "meanings": {reason.value: text for reason, text in MEANINGS.items()},
+        "candidates": [dataclasses.asdict(candidate) for candidate in candidates],
+    })

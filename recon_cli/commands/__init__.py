@@ -1,0 +1,1 @@
+"""Commands: one file a verb, from click options to one call. Loaded only when typed."""

@@ -1,0 +1,130 @@
+"""The verb `recon view`: what can be asked of it. Torch and viser are imported when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from recon_cli.commands import options
+from recon_cli.commands.options import Call, pass_call
+from recon_cli.config import settings
+from recon_cli.config.stages import ComputeConfig
+from recon_cli.context import Watcher
+from recon_cli.errors import InputError
+from recon_cli.pipeline.plan import Job
+from recon_cli.progress import TqdmProgress
+from recon_cli.workspace.layout import Workspace
+
+
+@click.command("view")
+@click.argument("item", metavar="[ITEM]", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
+    help="The model to begin with; auto takes the pruned one where there is a fresh one.")
+@click.option(
+    "--host", default="127.0.0.1", metavar="ADDRESS", show_default=True,
+    help="Address to listen on; 0.0.0.0 lets everyone look who reaches this machine.")
+@click.option(
+    "--port", type=click.IntRange(1, 65535), metavar="N",
+    help="Port to listen on.  [default: 8080, or the next free one]")
+@click.option(
+    "--open/--no-open", "opening", default=None,
+    help="Open the page in the browser.  [default: --open in a terminal with a desktop]")
+@options.of(ComputeConfig)
+@options.common()
+@pass_call
+def view(
+    call: Call, item: Path | None, model: str, host: str, port: int | None, opening: bool | None
+) -> None:
+    """Look at the trained scene in the browser.
+
+    ITEM is a workspace in place of -w, or a file of Gaussians (.ply, .spz, .sog, .splat, .glb).
+    Ctrl-C ends it.
+    """
+    workspace = _workspace(call, item)
+    if item is not None and workspace is None and model != "auto":
+        raise click.UsageError("--model has no effect on a file.")
+    from recon_cli.viewer.content import of_file, of_workspace
+    from recon_cli.viewer.photo_pairs import Pictures
+    from recon_cli.viewer.server import showing
+
+    if workspace is None:
+        assert item is not None
+        content, pictures = of_file(item), None
+    else:
+        call.workspace = workspace
+        explicit = options.explicit(call)
+        compute = settings.build(ComputeConfig, settings.merged([explicit, call.settings]))
+        job = Job(Workspace(workspace), explicit, compute, TqdmProgress())
+        content = of_workspace(job, model)
+        pictures = Pictures(job, content.max_size)
+    try:
+        with showing(content, pictures, host, port) as (_, address):
+            click.echo(f"The scene is at {address} (Ctrl-C ends it)")
+            if _at_a_desktop() if opening is None else opening:
+                webbrowser.open(address)
+            wait()
+    except KeyboardInterrupt:  # how a viewer is meant to end
+        click.echo("closed", err=True)
+
+
+@contextmanager
+def looking_on(call: Call) -> Iterator[Watcher]:
+    """Yields a watcher that shows a training in the browser, on this machine alone.
+
+    Raises:
+        ConfigError: no port is free.
+    """
+    from recon_cli.viewer.live import LiveView
+    from recon_cli.viewer.server import HOST, serving
+
+    with serving(HOST, None, label="recon train") as (server, address):
+        live = LiveView(server, Workspace(call.workspace))
+        click.echo(f"The training can be watched at {address}")
+        try:
+            yield live
+        finally:
+            live.close()
+    click.echo("The page is closed; `recon view` shows the finished scene.", err=True)
+
+
+def _workspace(call: Call, item: Path | None) -> Path | None:
+    """Returns the workspace that is meant, None where a file is.
+
+    Raises:
+        InputError: there is no such file or workspace.
+    """
+    if item is None:
+        return call.workspace
+    given = click.get_current_context().get_parameter_source("workspace")
+    if given == click.core.ParameterSource.COMMANDLINE:
+        raise click.UsageError("ITEM and -w exclude each other.")
+    if not item.exists():
+        raise InputError(f"{item} does not exist.", hint="Check the path.")
+    if not item.is_dir():
+        return None
+    if not Workspace(item).holds_results:
+        raise InputError(
+            f"{item} is neither a workspace nor a file of Gaussians.",
+            hint="Give a folder that `recon train` was run in, or a file of Gaussians.")
+    return item
+
+
+def _at_a_desktop() -> bool:
+    """Returns whether a browser would come up beside this terminal and not in it."""
+    desktop = sys.platform in ("darwin", "win32") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and desktop
+
+
+def wait() -> None:
+    """Waits for Ctrl-C."""
+    while True:
+        time.sleep(3600)

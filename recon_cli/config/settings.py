@@ -1,0 +1,170 @@
+"""Where values come from: defaults, recon.toml, --config, the command line; a later layer wins."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import shlex
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from recon_cli.config.fields import StageConfig, field_type, member_types, option_info
+from recon_cli.config.stages import (
+    ComputeConfig,
+    DenoiseConfig,
+    EvaluateConfig,
+    ExportConfig,
+    ImportConfig,
+    IngestConfig,
+    PruneConfig,
+    SfmConfig,
+    TrainConfig,
+)
+from recon_cli.errors import ConfigError
+
+SECTIONS: dict[str, type[StageConfig]] = {
+    "ingest": IngestConfig,
+    "denoise": DenoiseConfig,
+    "sfm": SfmConfig,
+    "train": TrainConfig,
+    "prune": PruneConfig,
+    "evaluate": EvaluateConfig,
+    "export": ExportConfig,
+    "import": ImportConfig,
+    "compute": ComputeConfig,
+}
+
+FILE = "recon.toml"  # in the workspace
+Settings = dict[str, dict[str, Any]]  # section -> field -> value, only what was set
+C = TypeVar("C", bound=StageConfig)
+AUTOMATIC = "automatic"  # how None is written in --set
+_TRUTH = {"true": True, "false": False}
+
+
+def read_settings(path: Path) -> Settings:
+    """Returns what a recon.toml sets, with every section and field name checked.
+
+    Raises:
+        ConfigError: the file is missing or no TOML, or names a section or field that does not
+            exist.
+    """
+    try:
+        with path.open("rb") as file:
+            settings = tomllib.load(file)
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror}.",
+            hint="Check the path after --config.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}.", hint="Mend that line.") from error
+    for section, values in settings.items():
+        check_section(section, where=str(path))
+        if not isinstance(values, dict):
+            raise ConfigError(
+                f"{path} sets {section} to {values!r}, but it is a section.",
+                hint=f"Write [{section}] on a line of its own and its fields below.")
+        for name in values:
+            check_field(section, name, where=str(path))
+    return settings
+
+
+def parse_assignment(text: str) -> Settings:
+    """Returns what `section.field=value` sets, the value typed as the field is.
+
+    Raises:
+        ConfigError: the text has another form, names no field, or the value has the wrong type.
+    """
+    name, equals, value = text.partition("=")
+    section, dot, field = name.strip().partition(".")
+    if not equals or not dot:
+        raise ConfigError(
+            f"--set takes section.field=value, but got {text!r}.",
+            hint="For example --set train.iterations=1000.")
+    check_section(section, where="--set")
+    check_field(section, field, where="--set")
+    return {section: {field: _typed(section, field, value.strip())}}
+
+
+def _typed(section: str, name: str, text: str) -> Any:
+    kind, optional = field_type(SECTIONS[section], name)
+    if optional and text == AUTOMATIC:
+        return None
+    try:
+        if member_types(kind):
+            words = zip(shlex.split(text), member_types(kind), strict=True)
+            return tuple(member(word) for word, member in words)
+        return _TRUTH[text] if kind is bool else kind(text)
+    except (KeyError, ValueError) as error:
+        needed = "true or false" if kind is bool else f"a value of type {kind.__name__}"
+        if member_types(kind):
+            names = ", ".join(member.__name__ for member in member_types(kind))
+            needed = f"{len(member_types(kind))} values ({names}) with spaces between"
+        raise ConfigError(
+            f"{section}.{name} is {text!r}, but it must be {needed}.",
+            hint="Change it in --set.") from error
+
+
+def check_section(section: str, *, where: str) -> None:
+    """Raises ConfigError unless there is such a section; `where` is named in the message."""
+    if section not in SECTIONS:
+        raise ConfigError(
+            f"{where} holds the section {section}, which does not exist.",
+            hint=_suggestion(section, list(SECTIONS), "The sections are"))
+
+
+def check_field(section: str, name: str, *, where: str) -> None:
+    """Raises ConfigError unless `section` has a field `name`; `where` is named in the message."""
+    names = [item.name for item in dataclasses.fields(SECTIONS[section])]
+    if name not in names:
+        raise ConfigError(
+            f"{where} sets {section}.{name}, which does not exist.",
+            hint=_suggestion(name, names, f"[{section}] knows"))
+
+
+def _suggestion(word: str, known: list[str], lead: str) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"Did you mean {close[0]}?" if close else f"{lead} {', '.join(known)}."
+
+
+def merged(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
+    """Returns the settings of all layers; a later layer wins, field by field."""
+    result: Settings = {section: {} for section in SECTIONS}
+    for layer in layers:
+        for section, values in layer.items():
+            result[section].update(values)
+    return result
+
+
+def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
+    """Returns the frozen instance of one config class that `settings` describe."""
+    return config(**settings.get(section_of(config), {}))
+
+
+def section_of(config: type[StageConfig]) -> str:
+    """Returns the section that sets the fields of a config class."""
+    return next(name for name, kind in SECTIONS.items() if kind is config)
+
+
+def check(settings: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raises ConfigError where a value has the wrong type or range, in whichever section."""
+    for config in SECTIONS.values():
+        build(config, settings)
+
+
+def to_toml(configs: Mapping[str, StageConfig]) -> str:
+    """Returns the configs as TOML that `read_settings` accepts; unset fields become comments."""
+    lines: list[str] = []
+    for section, config in configs.items():
+        lines.append(f"[{section}]")
+        for item in dataclasses.fields(config):
+            value, info = getattr(config, item.name), option_info(item)
+            if value is None:
+                lines.append(f"# {item.name} = {AUTOMATIC}: {info.automatic}")
+            else:
+                # TOML writes strings, numbers and truth values as JSON does.
+                lines.append(f"{item.name} = {json.dumps(value, ensure_ascii=False)}")
+        lines.append("")
+    return "\n".join(lines)

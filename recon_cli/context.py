@@ -1,0 +1,173 @@
+"""What a stage is given beside its config: where to read, how to report, what to compute on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from recon_cli.progress import NullProgress, Progress
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from recon_cli.scene.camera import Camera
+    from recon_cli.scene.splats import Splats
+    from recon_cli.scene.train_view import TrainView
+
+class Watcher(Protocol):
+    """Is told how a training goes. It may read what it is given and change nothing.
+
+    Its methods are called between steps, so what takes long belongs elsewhere; they raise nothing.
+    """
+
+    def begin(
+        self, label: str, until: int, cameras: Sequence[Camera], splats: Splats
+    ) -> None:
+        """Hears of a training that begins or goes on.
+
+        Args:
+            label: what is trained, as the progress bar calls it.
+            until: steps at its end.
+            cameras: of the training views.
+            splats: to begin with.
+        """
+
+    def step(self, iteration: int, splats: Splats) -> None:
+        """Is called after each step with the Gaussians as they are; the next step changes them."""
+
+    def report(self, iteration: int, validation_psnr_db: float | None) -> None:
+        """Hears the mean PSNR of the validation views, None where there are none."""
+
+
+class Nobody:
+    """Looks away."""
+
+    def begin(self, label: str, until: int, cameras: Sequence[Camera], splats: Splats) -> None:
+        """Ignores the training."""
+
+    def step(self, iteration: int, splats: Splats) -> None:
+        """Ignores the step."""
+
+    def report(self, iteration: int, validation_psnr_db: float | None) -> None:
+        """Ignores the report."""
+
+
+@dataclass(eq=False)
+class Ranks:
+    """This process among those that train together; by itself there is but one.
+
+    Attributes:
+        rank: of this process, 0 to count - 1. The first one leads: it writes and decides.
+        count: of the processes.
+        local: how many of them share this machine.
+        lacks_gpu: some have a GPU of their own, and some have none.
+        views: the training views that all of them hold by now.
+    """
+
+    rank: int = 0
+    count: int = 1
+    local: int = 1
+    lacks_gpu: bool = False
+    views: Sequence[TrainView] = field(default=(), repr=False)
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes and decides."""
+        return self.rank == 0
+
+    @property
+    def alone(self) -> bool:
+        """Whether there is nobody else."""
+        return self.count == 1
+
+    def most_of(self, views: int) -> int:
+        """Returns the most views that one process looks at in a step of so many."""
+        return -(-views // self.count)
+
+    def threads_of(self, cores: int) -> int:
+        """Returns this process's share of the cores of its machine, at least one."""
+        return max(1, cores // self.local)
+
+    def add(self, tensors: Sequence[Tensor]) -> None:
+        """Replaces tensors by their sums over all processes, the same bits in each."""
+
+    def raise_to_most(self, tensor: Tensor) -> None:
+        """Replaces the values of a tensor by the greatest of all processes."""
+
+    def told(self, number: int) -> int:
+        """Returns the number that the leader gives; the others' own does not matter."""
+        return number
+
+    def spread(self, tensor: Tensor) -> None:
+        """Replaces the values of a tensor by those of the leader's."""
+
+    def leave(self) -> None:
+        """Ends the connection: whoever waits for this process hears that it is gone."""
+
+
+ALONE = Ranks()
+
+
+Summary = dict[str, Any]  # JSON values only; goes into the manifest
+
+logger = logging.getLogger("recon")
+
+
+def _ignore(done: int, total: int) -> None:
+    """Keeps no record of progress."""
+
+
+@dataclass(frozen=True)
+class StageInputs:
+    """What a stage may read.
+
+    Attributes:
+        folders: finished folder of each stage named in `needs`, and of those in `uses` that are
+            fresh, by stage name.
+        sources: the user's own files; only ingest has any.
+    """
+
+    folders: Mapping[str, Path] = field(default_factory=dict)
+    sources: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """How a stage reports and where it computes.
+
+    Attributes:
+        progress: opens progress bars.
+        device: "cpu" or "cuda", already resolved.
+        backend: name of a rasterizer, already resolved.
+        threads: CPU threads to use.
+        record: called with (done, total) whenever that much would survive a crash;
+            `recon status` shows it as partial (412/600).
+        watcher: looks on while Gaussians are trained.
+        ranks: the processes that train together, which this one leads.
+    """
+
+    progress: Progress = field(default_factory=NullProgress)
+    device: str = "cpu"
+    backend: str = "torch"
+    threads: int = 1
+    record: Callable[[int, int], None] = _ignore
+    watcher: Watcher = field(default_factory=Nobody)
+    ranks: Ranks = ALONE
+
+    def notice(self, text: str) -> None:
+        """Tells the user something that is no error but must not be missed, in one line.
+
+        It may hold file names, and those may hold whatever moves a terminal's cursor.
+        """
+        logger.warning("%s", "".join(
+            one if one.isprintable() else repr(one)[1:-1] for one in text))
+
+    def notice_idle(self, views: int) -> None:
+        """Tells the user where steps of so many views leave processes without one."""
+        idle = self.ranks.count - views
+        if idle > 0:
+            self.notice(f"{idle} of the {self.ranks.count} processes have nothing to do: a step "
+                        f"takes --batch-views {views}")

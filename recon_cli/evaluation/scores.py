@@ -1,0 +1,139 @@
+"""Tables of scores: models side by side, views, data sets."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon_cli.evaluation.tables import Table
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """The scores of one view.
+
+    Attributes:
+        name: of the view.
+        psnr_db: peak signal-to-noise ratio in dB.
+        psnr_8bit_db: of the render rounded to 8 bits.
+        ssim: structural similarity by scikit-image.
+        ssim_padded: by INRIA's convention.
+        lpips: perceptual distance, lower is better; None where it was not measured.
+        pixels_scored: share of the pixels that a mask leaves; None without a mask.
+    """
+
+    name: str
+    psnr_db: float
+    psnr_8bit_db: float
+    ssim: float
+    ssim_padded: float
+    lpips: float | None = None
+    pixels_scored: float | None = None
+
+
+@dataclass(frozen=True)
+class ModelScore:
+    """The scores of one model over all held-out views.
+
+    Attributes:
+        label: how tables call it.
+        views: per view, by name.
+        gaussians: count.
+        bytes: size of its file.
+        render_ms: median milliseconds a view.
+        train_seconds: seconds of training that led to it; None where nobody knows.
+    """
+
+    label: str
+    views: tuple[ViewScore, ...]
+    gaussians: int
+    bytes: int
+    render_ms: float
+    train_seconds: float | None
+
+    @property
+    def psnr_db(self) -> float:
+        """Mean over the views of the PSNR in dB."""
+        return self._mean(lambda view: view.psnr_db)
+
+    @property
+    def psnr_8bit_db(self) -> float:
+        """Mean over the views of the PSNR of 8-bit pictures in dB."""
+        return self._mean(lambda view: view.psnr_8bit_db)
+
+    @property
+    def ssim(self) -> float:
+        """Mean over the views of the SSIM by scikit-image."""
+        return self._mean(lambda view: view.ssim)
+
+    @property
+    def ssim_padded(self) -> float:
+        """Mean over the views of the SSIM by INRIA's convention."""
+        return self._mean(lambda view: view.ssim_padded)
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean over the views of the perceptual distance; None where it was not measured."""
+        values = [view.lpips for view in self.views if view.lpips is not None]
+        return float(np.mean(values)) if len(values) == len(self.views) else None
+
+    def _mean(self, of: Callable[[ViewScore], float]) -> float:
+        return float(np.mean([of(view) for view in self.views]))
+
+
+_VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips")
+
+
+def model_table(scores: Sequence[ModelScore]) -> Table:
+    """Returns the models side by side; LPIPS has a column where one has it."""
+    perceptual = any(score.lpips is not None for score in scores)
+    headings = ("model", "PSNR dB", "8-bit", "SSIM", "SSIM 0-pad", *["LPIPS"] * perceptual,
+                "Gaussians", "MB", "ms/view", "train s")
+    return Table(headings, tuple((
+        score.label, f"{score.psnr_db:.2f}", f"{score.psnr_8bit_db:.2f}", f"{score.ssim:.4f}",
+        f"{score.ssim_padded:.4f}", *[_or_dash(score.lpips, ".4f")] * perceptual,
+        f"{score.gaussians:,}", f"{score.bytes / 1e6:.1f}", f"{score.render_ms:.0f}",
+        _or_dash(score.train_seconds, ".0f")) for score in scores))
+
+
+def view_table(scores: Sequence[ModelScore]) -> Table:
+    """Returns each view with the scores of all models, which have the same views."""
+    labels = [score.label for score in scores]
+    headings = ("view", *(f"{what} {label}" for what in ("PSNR dB", "SSIM") for label in labels))
+    return Table(headings, tuple((
+        views[0].name, *(f"{view.psnr_db:.2f}" for view in views),
+        *(f"{view.ssim:.4f}" for view in views))
+        for views in zip(*(score.views for score in scores), strict=True)))
+
+
+def paper_table(sets: Mapping[str, tuple[ModelScore, ModelScore]]) -> Table:
+    """Returns a row for each data set: 3DGS against ours, as the paper's tables I and II have it.
+
+    Args:
+        sets: (3DGS, ours) by the name of the data set.
+    """
+    return Table(
+        ("data set", "PSNR 3DGS", "PSNR ours", "SSIM 3DGS", "SSIM ours"),
+        tuple((name, f"{base.psnr_db:.2f}", f"{ours.psnr_db:.2f}", f"{base.ssim:.4f}",
+               f"{ours.ssim:.4f}") for name, (base, ours) in sets.items()))
+
+
+def csv_table(scores: Mapping[str, ModelScore]) -> str:
+    """Returns one row for each model and view, and one with the mean, as CSV."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["model", "view", *_VIEW_FIELDS])
+    for key, score in scores.items():
+        for name, source in [*((view.name, view) for view in score.views), ("mean", score)]:
+            writer.writerow([key, name, *(
+                "" if value is None else f"{value:.6f}"
+                for value in (getattr(source, field) for field in _VIEW_FIELDS))])
+    return file.getvalue()
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

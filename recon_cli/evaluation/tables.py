@@ -1,0 +1,105 @@
+"""Tables as plain text for a terminal and as Markdown for a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_TEX = str.maketrans({
+    "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"})
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells; the first column holds names, the others numbers.
+
+    Attributes:
+        headings: of the columns.
+        rows: each as long as the headings.
+    """
+
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def text(self, *, rule: bool = False) -> str:
+        """Returns aligned columns for a terminal; with a line below the headings if `rule`."""
+        rows = [self.headings, *self.rows]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(self.headings))]
+        lines = ["  ".join(
+            cell.rjust(width) if place else cell.ljust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))).rstrip()
+            for row in rows]
+        if rule:
+            lines.insert(1, "-" * max(map(len, lines)))
+        return "\n".join(lines)
+
+    def markdown(self) -> str:
+        """Returns the table in Markdown."""
+        lines = [self.headings, ("---", *["---:"] * (len(self.headings) - 1)), *self.rows]
+        return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+    def latex(self) -> str:
+        """Returns the table in LaTeX; needs booktabs."""
+        def line(cells: Sequence[str]) -> str:
+            return " & ".join(cell.translate(_TEX) for cell in cells) + r" \\" + "\n"
+
+        columns = "l" + "r" * (len(self.headings) - 1)
+        return (f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{line(self.headings)}\\midrule\n"
+                f"{''.join(map(line, self.rows))}\\bottomrule\n\\end{{tabular}}\n")
+
+
+@dataclass(frozen=True)
+class TitledTable:
+    """A table with a title.
+
+    Attributes:
+        title: what it is about.
+        header: of the columns.
+        rows: cells, as many in each as the header has; the first is text, the others figures.
+    """
+
+    title: str
+    header: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+    def text(self) -> str:
+        """Returns aligned columns under the title."""
+        return f"{self.title}\n{self._table.text()}"
+
+    def markdown(self) -> str:
+        """Returns a pipe table under a heading."""
+        return f"### {self.title}\n\n{self._table.markdown()}".rstrip()
+
+    @property
+    def _table(self) -> Table:
+        return Table(self.header, tuple(self.rows))
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Returns a figure with that many significant digits, "-" for one that is not known."""
+    if value is None:
+        return "-"
+    if value == 0 or 1e-3 <= abs(value) < 10.0**digits:
+        return f"{value:.{digits}g}"
+    return f"{value:.0f}" if 1e-3 <= abs(value) < 1e6 else f"{value:.{digits - 1}e}"
+
+
+def percent(value: float | None) -> str:
+    """Returns a share in percent, "-" for one that is not known."""
+    return "-" if value is None else f"{100 * value:.3g}%"
+
+
+def format_duration(seconds: float) -> str:
+    """Returns seconds as a person says them: 8.2 s, 4 min 10 s, 1 h 05 min."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def format_megabytes(size: int) -> str:
+    """Returns a number of bytes in MB."""
+    return f"{size / 1e6:.1f} MB"

@@ -1,0 +1,262 @@
+"""What the machine could do at best, and how much of it a pair of Gaussian and pixel needs."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+
+from recon_cli import machine
+from recon_cli.render import registry
+from recon_cli.render.numba.kernel import kernel
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import fill, fma
+from recon_cli.render.numba.simd_memory import store
+
+# OpenMP's threads of the candidate before spin on for some milliseconds after their last work.
+_SETTLE_SECONDS = 0.03
+
+Samples = dict[str, list[float]]  # name of a part -> its milliseconds, round by round
+
+
+@dataclass(frozen=True)
+class Timing:
+    """A measured time.
+
+    Attributes:
+        ms: median over the rounds.
+        iqr_ms: from the first to the third quartile; 0 for a single round.
+    """
+
+    ms: float
+    iqr_ms: float
+
+
+def timing_of(samples: Sequence[float]) -> Timing:
+    """Returns the median and the interquartile range of some milliseconds."""
+    if not samples:
+        raise ValueError("no samples")
+    if len(samples) == 1:
+        return Timing(samples[0], 0.0)
+    first, middle, third = statistics.quantiles(samples, n=4, method="inclusive")
+    return Timing(middle, third - first)
+
+
+class Stopwatch:
+    """Books the time between marks; waits for the device at each of them."""
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        self.ms: dict[str, float] = {}
+        self._last = self._now()
+
+    def mark(self, name: str) -> None:
+        """Books what has passed since the last mark under `name`."""
+        now = self._now()
+        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now - self._last)
+        self._last = now
+
+    def _now(self) -> float:
+        if self._device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def alternate(
+    works: Mapping[str, Callable[[], Mapping[str, float]]],
+    rounds: int,
+    on_round: Callable[[], None],
+) -> dict[str, Samples]:
+    """Runs all candidates in turn, A B A B, and returns the samples of each.
+
+    A slow minute then falls on all candidates alike. One round ahead is not counted: it compiles
+    and warms the caches.
+
+    Args:
+        works: by name; each returns the milliseconds of its parts.
+        rounds: counted runs of each.
+        on_round: called after each round, that ahead included.
+    """
+    found: dict[str, Samples] = {name: {} for name in works}
+    for number in range(rounds + 1):
+        for name, work in works.items():
+            time.sleep(_SETTLE_SECONDS)
+            parts = work()
+            if number:
+                for part, ms in parts.items():
+                    found[name].setdefault(part, []).append(ms)
+        on_round()
+    return found
+
+
+@dataclass(frozen=True)
+class Host:
+    """A machine and its programs.
+
+    Attributes:
+        cpu: model name.
+        cores: that this process may use.
+        threads: that the work was given.
+        lanes: float32 in a vector of the kernels.
+        peak_gflops: float32 multiply-adds of one thread, measured; an addition and a
+            multiplication count as two.
+        device: "cpu", or the GPU's model name.
+        versions: of Python and the packages.
+    """
+
+    cpu: str
+    cores: int
+    threads: int
+    lanes: int
+    peak_gflops: float
+    device: str
+    versions: dict[str, str]
+
+    @property
+    def line(self) -> str:
+        """One line for the head of a table."""
+        place = "" if self.device == "cpu" else f", {self.device}"
+        return (
+            f"{self.cpu}{place}, {self.threads} of {self.cores} cores, {self.lanes} lanes, peak "
+            f"{self.peak_gflops:.0f} GFLOP/s a core, torch {self.versions['torch']}, "
+            f"numpy {self.versions['numpy']}, Python {self.versions['python']}")
+
+
+def examine(threads: int, device: str) -> Host:
+    """Returns this machine with its measured peak."""
+    name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
+    return Host(
+        machine.cpu_model(), machine.usable_threads(), threads, LANES, measured_peak(), name,
+        machine.versions())
+
+
+_SAMPLE_SECONDS = 0.001  # a forward pass takes some twenty
+
+
+def added_memory(work: Callable[[], object], device: str) -> int:
+    """Returns the most bytes above those at the start that `work` held.
+
+    On a CPU this is resident memory, sampled every millisecond, which misses short peaks and
+    counts what an allocator keeps; on a GPU it is what torch allocated.
+    """
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        work()
+        torch.cuda.synchronize()
+        return torch.cuda.max_memory_allocated() - before
+    process, done = psutil.Process(), threading.Event()
+    start = peak = process.memory_info().rss
+
+    def watch() -> None:
+        nonlocal peak
+        while not done.wait(_SAMPLE_SECONDS):
+            peak = max(peak, process.memory_info().rss)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        work()
+    finally:
+        done.set()
+        thread.join()
+    added: int = max(peak, process.memory_info().rss) - start
+    return added
+
+
+# torch is there anyway; its import is not counted
+_SCRIPT = """
+import torch, time
+start = time.perf_counter()
+from recon_cli.render import registry
+registry.prepare("numba", lambda: None)
+print(time.perf_counter() - start)
+"""
+
+
+def warm_start(rounds: int) -> Timing:
+    """Returns the time from importing the backend to kernels that are ready, in new processes."""
+    registry.prepare("numba", lambda: None)  # fills the cache
+    seconds = []
+    for _ in range(rounds):
+        done = subprocess.run(
+            [sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=True)
+        seconds.append(float(done.stdout.split()[-1]))
+    return timing_of([1e3 * value for value in seconds])
+
+
+# Operations of an evaluated pair, counted in the inner loops of the compositing kernels: a
+# multiply-add is two, a division one; comparisons, selections, integer operations, loads, and what
+# is the same for all pixels of a row are none. The first number of each line is of the forward
+# pass, the second of the backward pass.
+_COUNT = {
+    "u along the row": (2, 2),
+    "log2 alpha = log2 o - u^2 - v^2": (4, 4),
+    "2^x: reduction 3, polynomial of degree 5 by Estrin 11": (14, 14),
+    "weight alpha T": (1, 1),
+    "T (1 - alpha), T / (1 - alpha)": (2, 2),
+    "red, green, blue, depth composited, or their gradients summed": (8, 8),
+    "g . c": (0, 7),
+    "slope g . c - R, and R moved on": (0, 3),
+    "s = alpha T slope": (0, 1),
+    "moments 1, u, v, uu, uv, vv of s": (0, 11),
+    "statistics: size of s along x and y, s^2, hits": (0, 8),
+}
+FLOPS_FORWARD = sum(forward for forward, _ in _COUNT.values())
+FLOPS_BACKWARD = sum(backward for _, backward in _COUNT.values())
+
+_CHAINS = 12  # independent: two units times a latency of 4 to 6 cycles
+_ITERATIONS = 2_000_000  # 3 ms on a core with AVX-512
+_ATTEMPTS = 9
+
+
+def counted() -> list[tuple[str, int, int]]:
+    """Returns the count line by line: what, operations forward, operations backward."""
+    return [(what, *numbers) for what, numbers in _COUNT.items()]
+
+
+@kernel
+def _multiply_add(iterations: Any, out: Any) -> None:
+    x: Any = fill(0.999)
+    c: Any = fill(1.0)
+    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11 = c, c, c, c, c, c, c, c, c, c, c, c
+    for _ in range(iterations):
+        s0, s1, s2, s3 = fma(s0, x, c), fma(s1, x, c), fma(s2, x, c), fma(s3, x, c)
+        s4, s5, s6, s7 = fma(s4, x, c), fma(s5, x, c), fma(s6, x, c), fma(s7, x, c)
+        s8, s9, s10, s11 = fma(s8, x, c), fma(s9, x, c), fma(s10, x, c), fma(s11, x, c)
+    store(out, 0, s0 + s1 + s2 + s3 + s4 + s5 + s6 + s7 + s8 + s9 + s10 + s11)
+
+
+def measured_peak() -> float:
+    """Returns the float32 GFLOP/s of one thread in multiply-adds alone, the best of several."""
+    out = np.empty(LANES, np.float32)
+    _multiply_add(1, out)  # compiles
+    seconds = []
+    for _ in range(_ATTEMPTS):
+        start = time.perf_counter()
+        _multiply_add(_ITERATIONS, out)
+        seconds.append(time.perf_counter() - start)
+    return 2e-9 * _ITERATIONS * _CHAINS * LANES / min(seconds)
+
+
+def rate(pairs: int | None, ms: float | None) -> float | None:
+    """Returns Gpairs/s; None where the pairs or their time are not known."""
+    return None if pairs is None or not ms else pairs / ms / 1e6
+
+
+def peak_fraction(
+    gpairs_per_s: float | None, flops: int, peak_gflops: float | None, threads: int
+) -> float | None:
+    """Returns which part of the peak of `threads` threads the arithmetic of the pairs takes."""
+    if gpairs_per_s is None or peak_gflops is None:
+        return None
+    return gpairs_per_s * flops / (peak_gflops * threads)

@@ -1,0 +1,130 @@
+"""Looks into a backend while it renders: the time of each stage, and the pairs evaluated.
+
+A probe changes nothing that is computed. A backend without one is timed from outside only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from recon_cli.experiments.host import Stopwatch
+from recon_cli.render.contract import RenderOutput
+from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.torch import blocks, tiles
+
+COMPOSITE, DECOMPOSE = "composite", "decompose"  # the stages whose pairs are counted
+
+
+class Probe:
+    """What is seen of a backend while `watching`.
+
+    Attributes:
+        ms: milliseconds by stage since `collect` was last called.
+    """
+
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Measures within the block. This one sees nothing."""
+        yield
+
+    def collect(self) -> dict[str, float]:
+        """Returns the milliseconds since the last call and starts anew."""
+        found, self.ms = self.ms, {}
+        return found
+
+    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:  # noqa: ARG002
+        """Returns pairs forward and backward of an output that has been through both passes."""
+        return None
+
+    def _add(self, name: str, ms: float) -> None:
+        self.ms[name] = self.ms.get(name, 0.0) + ms
+
+
+class NumbaProbe(Probe):
+    """Listens to the crew, which runs every parallel kernel."""
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Measures kernels within the block."""
+        crew.observer = lambda name, seconds: self._add(name, 1e3 * seconds)
+        try:
+            yield
+        finally:
+            crew.observer = None
+
+    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:
+        """Returns what the kernels counted: a row of a tile counts all its pixels."""
+        frame = output.rgb.grad_fn.lease.frame  # type: ignore[union-attr]
+        return frame.pairs_forward, frame.pairs_backward
+
+
+class TorchProbe(Probe):
+    """Stands between the torch backend and its own functions."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__()
+        self._device = device
+        self._pairs = [0, 0]  # forward, backward
+        self._backward = False
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Measures projection, binning and compositing within the block."""
+        with ExitStack() as stack:
+            for place, name, label in (
+                (tiles, "project", "project"), (tiles, "bin_to_tiles", "bin_to_tiles"),
+                (tiles._Rasterize, "forward", COMPOSITE),
+                (tiles._Rasterize, "backward", DECOMPOSE),
+            ):
+                stack.enter_context(_replaced(
+                    place, name, self._timed(label, getattr(place, name))))
+            stack.enter_context(_replaced(
+                tiles, "alphas", self._counted(blocks.alphas)))
+            yield
+
+    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:  # noqa: ARG002
+        """Returns what the blocks held: every pixel of a tile for every instance."""
+        return self._pairs[0], self._pairs[1]
+
+    def _timed(self, label: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any) -> Any:
+            if label in (COMPOSITE, DECOMPOSE):
+                self._backward = label == DECOMPOSE
+                self._pairs[self._backward] = 0
+            watch = Stopwatch(self._device)
+            result = work(*args)
+            watch.mark(label)
+            self._add(label, watch.ms[label])
+            return result
+
+        return run
+
+    def _counted(self, alphas: Callable[..., Any]) -> Callable[..., Any]:
+        def run(table: Any, block: Any, *rest: Any) -> Any:
+            self._pairs[self._backward] += block.rows.numel() * blocks.PIXELS
+            return alphas(table, block, *rest)
+
+        return run
+
+
+@contextmanager
+def _replaced(place: Any, name: str, function: Callable[..., Any]) -> Iterator[None]:
+    """Puts another function under a name of a module, or of a class as a static method."""
+    original = vars(place)[name]
+    setattr(place, name, staticmethod(function) if isinstance(place, type) else function)
+    try:
+        yield
+    finally:
+        setattr(place, name, original)
+
+
+def probe_for(backend: str, device: str) -> Probe:
+    """Returns the probe of a backend."""
+    if backend == "numba":
+        return NumbaProbe()
+    return TorchProbe(device) if backend == "torch" else Probe()

@@ -1,0 +1,138 @@
+"""Scenes to train on: workspaces with cameras, and data sets with poses that are made into one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from recon_cli.config.settings import Settings, build, merged
+from recon_cli.config.stages import ComputeConfig, IngestConfig, RunConfig, SfmConfig
+from recon_cli.context import StageInputs
+from recon_cli.errors import ConfigError, InputError, ReconstructionError
+from recon_cli.evaluation.reference_views import held_out_names, load_scene
+from recon_cli.io.layouts import recognise, refuse_incomplete
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.plan import Job, Target
+from recon_cli.progress import Progress
+from recon_cli.scene.scene import Scene
+from recon_cli.workspace.digests import digest_file, sha256_json
+from recon_cli.workspace.layout import Workspace
+
+_READ = ("images", "denoised", "masks", "sparse")  # below sfm/undistorted, what training reads
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """The finished folders of a scene.
+
+    Attributes:
+        name: for tables and files.
+        inputs: folders of ingest and sfm.
+    """
+
+    name: str
+    inputs: StageInputs
+
+    def load(self, config: RunConfig) -> Scene:
+        """Returns the views, split as for a run with these options, and the points."""
+        return load_scene(self.inputs, validation=config.validation)
+
+    @cached_property
+    def digest(self) -> str:
+        """What the scene holds, whatever its folder is called: images, masks, cameras, split."""
+        undistorted = self.inputs.folders["sfm"] / "undistorted"
+        files = [path for part in _READ for path in sorted((undistorted / part).rglob("*"))
+                 if path.is_file()]
+        return sha256_json({
+            "files": {str(path.relative_to(undistorted)): digest_file(path).sha256
+                      for path in files},
+            "held_out": sorted(held_out_names(self.inputs.folders["ingest"]))})
+
+
+def checked(paths: Sequence[Path]) -> dict[str, Path]:
+    """Returns the paths by the names of their scenes, once each can be one.
+
+    Raises:
+        ConfigError: there is none, or two have one name.
+        InputError: a path is neither a workspace nor a data set with poses.
+        StageError: a workspace has no fresh cameras.
+    """
+    if not paths:
+        raise ConfigError(
+            "No scene was given.",
+            hint="Give workspaces with cameras or data sets with poses after --scenes.")
+    found: dict[str, Path] = {}
+    for path in paths:
+        name = path.resolve().name
+        if name in found:
+            raise ConfigError(
+                f"{found[name]} and {path} are both called {name}.",
+                hint="Rename one of the folders: tables tell scenes by their names.")
+        found[name] = path
+        if Workspace(path).holds_results:
+            plan.require_fresh(Job(Workspace(path)), ("ingest", "sfm"))
+        else:
+            _refuse_unposed(path)
+    return found
+
+
+def _refuse_unposed(path: Path) -> None:
+    if not path.exists():
+        raise InputError(f"{path} does not exist.", hint="Check the path.")
+    refuse_incomplete(path)
+    if recognise(path) is None:
+        raise InputError(
+            f"{path} is neither a workspace with cameras nor a data set with poses.",
+            hint=f"Run `recon ingest {path} -w WORKSPACE` and `recon sfm -w WORKSPACE`, and give "
+                 "that workspace.")
+
+
+def opened(
+    name: str, path: Path, scratch: Path, settings: Settings, compute: ComputeConfig,
+    progress: Progress,
+) -> Place:
+    """Returns the folders of a scene; a data set is read and mapped with the poses it has.
+
+    Args:
+        name: of the scene.
+        path: a workspace, which is only read, or a data set.
+        scratch: folder for the workspaces of data sets; what is fresh in it is not made again.
+        settings: options of ingest, denoise and sfm for data sets.
+        compute: threads.
+        progress: opens bars.
+
+    Raises:
+        ReconError: whatever the stages raise.
+    """
+    root = path
+    if not Workspace(path).holds_results:
+        root = scratch / name
+        values = merged([settings, {"sfm": {"poses": "keep"}}])
+        stages = {part: values[part] for part in ("ingest", "denoise", "sfm")}
+        job = Job(Workspace(root), stages, compute, progress)
+        plan.run(job, "ingest and sfm", [
+            Target("ingest", build(IngestConfig, stages), (path,)),
+            Target("sfm", build(SfmConfig, stages))])
+    workspace = Workspace(root)
+    return Place(name, StageInputs({
+        stage: workspace.folder(stage) for stage in ("ingest", "sfm")}))
+
+
+def refuse_unscored(place: Place, scene: Scene, *, test: bool) -> None:
+    """Raises ReconstructionError or ConfigError unless a scene has views that can be scored.
+
+    Args:
+        place: for the message.
+        scene: its views.
+        test: the held-out views are scored; otherwise the validation views.
+    """
+    if test and not scene.test:
+        raise ReconstructionError(
+            f"No held-out view of {place.name} has a camera.",
+            hint="Run `recon ingest` with a --holdout such as every:8.")
+    if not test and not scene.validation:
+        raise ConfigError(
+            f"{place.name} has no validation views.",
+            hint="Use --set train.validation=0.1, or give a scene with more views.")

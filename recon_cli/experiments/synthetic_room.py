@@ -1,0 +1,197 @@
+"""The approximations that are tried: what each leaves out, and how it is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon_cli.render import registry
+from recon_cli.render.contract import ALPHA_MIN, EXACT, Approximation, Renderer, RenderOutput
+from recon_cli.render.numba import backend as numba_backend
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+
+_ROOM = np.array([6.0, 4.0, 3.0])  # metres; z is up
+_BOXES = 12  # pieces of furniture
+_AREA = 2 * (24 + 18 + 12) + _BOXES * 2.4  # square metres of walls and furniture, about
+_COVERAGE = 0.45  # standard deviation over spacing: what trained scenes have, within a factor of 2
+_THINNESS = 0.15  # of the axis across the wall: trained Gaussians lie flat on surfaces
+
+
+@dataclass(frozen=True)
+class SceneSize:
+    """How much there is to draw.
+
+    Attributes:
+        gaussians: in the room.
+        width: of the image in pixels.
+        height: of the image in pixels.
+    """
+
+    gaussians: int
+    width: int
+    height: int
+
+
+SIZES = {"room": SceneSize(100_000, 640, 360), "small": SceneSize(10_000, 320, 180)}
+QUICK = SceneSize(1_500, 160, 90)
+
+
+@dataclass(frozen=True, eq=False)
+class BenchScene:
+    """What every candidate renders.
+
+    Attributes:
+        splats: N Gaussians, float32.
+        camera: inside the room.
+        background: [3].
+        sh_degree: 0 to 3.
+        weights: [H, W, 3] seeded normal numbers; the loss whose gradients are compared is their
+            sum with the image.
+    """
+
+    splats: Splats
+    camera: Camera
+    background: Tensor
+    sh_degree: int
+    weights: Tensor
+
+
+def build_scene(size: SceneSize, sh_degree: int, device: str, *, seed: int = 0) -> BenchScene:
+    """Returns the room of a size on a device, the same values for the same seed."""
+    splats, camera = room(size.gaussians, size.width, size.height, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    weights = torch.randn(size.height, size.width, 3, generator=generator)
+    return BenchScene(
+        splats.map(lambda tensor: tensor.to(device)), camera, torch.zeros(3, device=device),
+        sh_degree, weights.to(device))
+
+
+def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Camera]:
+    """Returns N Gaussians on the walls of a room and on boxes in it, and a camera inside.
+
+    Flat Gaussians at a spacing that follows their number, of all opacities and with
+    view-dependent colours: dense lists a tile, many layers behind each other, and needles at
+    grazing angles, as in a trained indoor scene.
+
+    Args:
+        n: Gaussians; a third of them on the boxes.
+        width: of the camera's image in pixels.
+        height: of the camera's image in pixels.
+        seed: of every random number.
+    """
+    rng = np.random.default_rng(seed)
+    wall = rng.integers(0, 6, n)
+    means = rng.random((n, 3)) * _ROOM
+    means[np.arange(n), wall // 2] = np.where(wall % 2, _ROOM[wall // 2], 0)
+    corners = rng.random((_BOXES, 3)) * (_ROOM - 1)
+    edges = 0.3 + 0.7 * rng.random((_BOXES, 3))
+    third = n // 3
+    box, inside = rng.integers(0, _BOXES, third), rng.random((third, 3))
+    inside[np.arange(third), wall[:third] // 2] = wall[:third] % 2
+    means[:third] = corners[box] + inside * edges[box]
+    scales = _COVERAGE * np.sqrt(_AREA / n) * np.exp(rng.normal(0, 0.5, (n, 3)))
+    scales[np.arange(n), wall // 2] *= _THINNESS
+    values = {
+        "means": means, "quats": rng.normal([1, 0, 0, 0], [1e-9, 0.1, 0.1, 0.1], (n, 4)),
+        "log_scales": np.log(scales), "logit_opacities": rng.normal(0.5, 2.0, n),
+        "sh_dc": np.sin(means * [3, 5, 7]), "sh_rest": rng.normal(0, 0.05, (n, 15, 3)),
+    }
+    splats = Splats(**{k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()})
+    return splats, _camera(width, height)
+
+
+def _camera(width: int, height: int) -> Camera:
+    """Returns a camera at eye height that looks into the far corner, slightly down."""
+    forward = np.array([3.5, 2.0, -0.4]) / np.linalg.norm([3.5, 2.0, -0.4])
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [right, np.cross(forward, right), forward]
+    viewmat[:3, 3] = -viewmat[:3, :3] @ [1.0, 1.0, 1.6]
+    focal = 0.85 * width
+    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to be cheaper, or more careful, than the contract.
+
+    Attributes:
+        name: what the tables show.
+        approximation: of the rasterizer.
+        sh_degree: the harmonics are cut at this degree; None keeps those of the scene.
+        half_colors: the SH coefficients are rounded to float16 first. The kernels have no float16
+            arithmetic, so this shows an error and can save no time.
+    """
+
+    name: str
+    approximation: Approximation = field(default=EXACT)
+    sh_degree: int | None = None
+    half_colors: bool = False
+
+    @property
+    def saves_time(self) -> bool:
+        """Whether a difference in time means anything."""
+        return not self.half_colors
+
+
+CONTRACT = Variant("contract")
+_ALL = (
+    Variant("tiles by the 3-sigma square", Approximation(square=True)),
+    *(Variant(f"stop at T < {value:g}", Approximation(transmittance_min=value))
+      for value in (1e-2, 1e-3, 1e-5)),
+    Variant("no early stop", Approximation(transmittance_min=0.0)),
+    *(Variant(f"alpha >= {name}", Approximation(alpha_min=factor * ALPHA_MIN))
+      for name, factor in (("4/255", 4.0), ("2/255", 2.0), ("1/510", 0.5), ("1/2550", 0.1))),
+    *(Variant(f"SH degree {degree}", sh_degree=degree) for degree in (0, 1, 2)),
+    Variant("float16 colours", half_colors=True),
+)
+
+
+def variants_for(backend: str, sh_degree: int) -> list[Variant]:
+    """Returns the approximations that a backend can draw of a scene with this SH degree."""
+    return [
+        one for one in _ALL
+        if (one.approximation == EXACT or backend == "numba")
+        and (one.sh_degree is None or one.sh_degree < sh_degree)]
+
+
+def renderer_of(variant: Variant, backend: str) -> Renderer:
+    """Returns a backend's render function with the variant's approximation built in."""
+    if variant.approximation == EXACT:
+        draw = registry.renderer(backend)
+    else:
+        def draw(
+            splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
+            mask: Tensor | None = None,
+        ) -> RenderOutput:
+            return numba_backend.render(
+                splats, camera, background, sh_degree, scores, mask, variant.approximation)
+
+    def render(
+        splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
+        mask: Tensor | None = None,
+    ) -> RenderOutput:
+        if variant.half_colors:
+            splats = _rounded(splats)
+        return draw(splats, camera, background, _cut(variant, sh_degree), scores, mask)
+
+    return render
+
+
+def _cut(variant: Variant, sh_degree: int) -> int:
+    return sh_degree if variant.sh_degree is None else variant.sh_degree
+
+
+def _rounded(splats: Splats) -> Splats:
+    """Returns splats with colours rounded to float16; gradients pass as through the identity."""
+    def through(sh: Tensor) -> Tensor:
+        return sh + (sh.detach().half().to(sh.dtype) - sh.detach())
+
+    return Splats(
+        splats.means, splats.quats, splats.log_scales, splats.logit_opacities,
+        through(splats.sh_dc), through(splats.sh_rest))

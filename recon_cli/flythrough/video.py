@@ -1,0 +1,125 @@
+"""Frames as H.264 or AV1 in an .mp4, through PyAV.
+
+Colours are stored as BT.709 of limited range and said to be so: without that, players guess by the
+size of the picture.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+from av.codec import Codec
+from av.codec.codec import UnknownCodecError
+from av.video.codeccontext import VideoCodecContext
+from av.video.reformatter import ColorRange, Colorspace
+from av.video.stream import VideoStream
+
+from recon_cli.errors import ConfigError
+from recon_cli.io.images import read_image
+from recon_cli.workspace.atomic import replacing
+
+ENCODERS = {"h264": ("libx264",), "av1": ("libsvtav1", "libaom-av1")}  # the first that is there
+_BT709 = 1  # in FFmpeg's lists of primaries, transfer functions and matrices alike
+os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 tells its settings on stderr; 1 leaves errors
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How frames become a video.
+
+    Attributes:
+        codec: h264 or av1.
+        crf: quality, smaller is better.
+        width: in pixels, even.
+        height: in pixels, even.
+        fps: frames a second.
+    """
+
+    codec: str
+    crf: int
+    width: int
+    height: int
+    fps: float
+
+    @property
+    def rate(self) -> Fraction:
+        """Frames a second; the denominator is small, or that of NTSC."""
+        return Fraction(self.fps).limit_denominator(1001)
+
+    def encoder(self) -> str:
+        """Returns the name of an encoder.
+
+        Raises:
+            ConfigError: this build of PyAV has none for the codec.
+        """
+        for name in ENCODERS[self.codec]:
+            try:
+                return str(Codec(name, "w").name)
+            except UnknownCodecError:
+                continue
+        others = ", ".join(codec for codec in ENCODERS if codec != self.codec)
+        raise ConfigError(
+            f"PyAV {av.__version__} as it is installed cannot encode {self.codec}: there is no "
+            f"{' or '.join(ENCODERS[self.codec])}.",
+            hint=f"Give another --codec ({others}), or install PyAV with pip.")
+
+
+def refuse_what_cannot_be_encoded(encoding: Encoding) -> None:
+    """Raises ConfigError where there is no encoder, or it does not take this size or rate."""
+    encoder = encoding.encoder()
+    context = VideoCodecContext.create(encoder, "w")
+    assert isinstance(context, VideoCodecContext)
+    _set_up(context, encoding)
+    context.time_base = 1 / encoding.rate
+    try:
+        context.open()
+    except av.error.FFmpegError as error:
+        raise ConfigError(
+            f"{encoder} does not make a video of {encoding.width}x{encoding.height} pixels at "
+            f"{encoding.fps:g} fps.", hint="Give another --size, --fps or --codec.") from error
+
+
+def _set_up(context: VideoCodecContext, encoding: Encoding) -> None:
+    context.width, context.height = encoding.width, encoding.height
+    context.pix_fmt = "yuv420p"
+    context.framerate = encoding.rate
+    context.options = {"crf": str(encoding.crf)}
+    context.color_primaries = context.color_trc = context.colorspace = _BT709
+    context.color_range = ColorRange.MPEG
+
+
+def encode(
+    pictures: Sequence[Path], path: Path, encoding: Encoding, *, threads: int,
+    on_frame: Callable[[], None],
+) -> None:
+    """Writes pictures as a video, whole or not at all.
+
+    Args:
+        pictures: RGB or gray files, in order.
+        path: of the .mp4.
+        encoding: that `refuse_what_cannot_be_encoded` let pass.
+        threads: of the encoder.
+        on_frame: called after each picture.
+
+    Raises:
+        OSError: the file cannot be written.
+        FormatError: a picture cannot be read.
+    """
+    with replacing(path) as temporary, av.open(
+            str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream(encoding.encoder(), rate=encoding.rate)
+        assert isinstance(stream, VideoStream)
+        _set_up(stream.codec_context, encoding)
+        stream.codec_context.thread_count = threads
+        for picture in pictures:
+            image = read_image(picture, encoding.width, encoding.height)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24").reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG)))
+            on_frame()
+        container.mux(stream.encode(None))

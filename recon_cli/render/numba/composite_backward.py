@@ -1,0 +1,217 @@
+"""Gradients of compositing, back to front.
+
+With g the gradient of the loss at a pixel, c the colour of a Gaussian and R the loss's slope along
+what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
+
+    R <- g . background at the last fragment,  R <- R + alpha (g . c - R) after each,
+    dL/dc = alpha T g,  s = alpha dL/dalpha = alpha T (g . c - R),  T <- T / (1 - alpha).
+
+s is zero where alpha was clamped. Gradients with respect to mean and covariance are moments of s in
+the whitened coordinates (u, v), which are of order one even for needles.
+
+An instance is the outer loop: its sums stay in registers while its rows pass by, and go to a slot
+of its own at the end. No two instances share a slot, so no atomics and the same bits every time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon_cli.render.numba.batches import (
+    BATCH_FLOATS,
+    END_ROW,
+    FIRST_ROW,
+    L_BLUE,
+    L_DEPTH,
+    L_GREEN,
+    L_RED,
+    L_U_X,
+    L_U_Y,
+    L_V_Y,
+    LOCAL,
+    load_batch,
+)
+from recon_cli.render.numba.composite_forward import log2_alpha
+from recon_cli.render.numba.kernel import kernel
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import (
+    absolute,
+    exp2,
+    fill,
+    fma,
+    lane_numbers,
+    largest,
+    minimum,
+    select,
+    totals,
+)
+from recon_cli.render.numba.simd_memory import fetch_add, load, spread, store
+from recon_cli.render.numba.soa import (
+    BATCH,
+    LOG2_ALPHA_MAX,
+    SLOT,
+    TILE_HEIGHT,
+    TILE_PIXELS,
+    TILE_WIDTH,
+)
+
+_T, _R, _LAST, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH = (i * TILE_PIXELS for i in range(7))
+_BEHIND_RED, _BEHIND_GREEN, _BEHIND_BLUE = (i * TILE_PIXELS for i in range(7, 10))
+_COUNTS = 10 * TILE_PIXELS  # 1 where a pixel counts in the scores, 0 elsewhere
+_BATCH = 11 * TILE_PIXELS
+BACKWARD_FLOATS = _BATCH + BATCH_FLOATS
+
+
+@kernel
+def decompose(counter, tile_start, members, slots, records, width, height, tiles_x, cutoff,
+              background, final, last, grad_rgb, grad_alpha, grad_depth, details, scores, counting,
+              sums, evaluated, scratch):
+    """Sums the gradients of every instance over the pixels of its tile.
+
+    Args:
+        counter: [1] shared; tiles already taken.
+        tile_start: [tiles + 1] where the instances of each tile begin.
+        members: [E] Gaussian of each instance, by tile and depth.
+        slots: [E] slot of each instance.
+        records: [M * 16].
+        width: of the image in pixels.
+        height: of the image in pixels.
+        tiles_x: tiles in a row.
+        cutoff: log2 of the least alpha of a fragment.
+        background: [3].
+        final: [tiles * TILE_PIXELS] T at the end, of the forward pass.
+        last: [tiles * TILE_PIXELS] number of the last instance that contributed.
+        grad_rgb: [H * W * 3] dL/drgb.
+        grad_alpha: [H * W] dL/dalpha, or empty for zeros.
+        grad_depth: [H * W] dL/ddepth, or empty for zeros.
+        details: also sum |s u|, |s y|, s^2 and the number of fragments.
+        scores: also sum what leaving one out would change.
+        counting: [H * W] which pixels count in that, or empty for all.
+        sums: [E * 16] out by slot, see layout.
+        evaluated: [1] pairs of an instance and a pixel are added.
+        scratch: of the thread.
+    """
+    has_alpha, has_depth = len(grad_alpha) > 0, len(grad_depth) > 0
+    tiles = len(tile_start) - 1
+    column = lane_numbers()
+    batch = scratch[_BATCH:]
+    limits = np.zeros(TILE_HEIGHT, np.float32)
+    zero = fill(0.0)
+    pairs = 0
+    while True:
+        tile = fetch_add(counter, 0, 1)
+        if tile >= tiles:
+            break
+        left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
+        begin = tile_start[tile]
+        deepest = np.float32(0)
+        for r in range(TILE_HEIGHT):
+            at = r * TILE_WIDTH
+            y = top + r
+            latest = load(last, tile * TILE_PIXELS + at)
+            limits[r] = largest(latest)
+            deepest = max(deepest, limits[r])
+            store(scratch, _T + at, load(final, tile * TILE_PIXELS + at))
+            store(scratch, _LAST + at, latest)
+            for i in range(TILE_WIDTH):
+                if y < height and left + i < width:
+                    p = y * width + left + i
+                    red, green, blue = grad_rgb[3 * p], grad_rgb[3 * p + 1], grad_rgb[3 * p + 2]
+                    scratch[_G_RED + at + i] = red
+                    scratch[_G_GREEN + at + i] = green
+                    scratch[_G_BLUE + at + i] = blue
+                    behind = red * background[0] + green * background[1] + blue * background[2]
+                    if has_alpha:  # coverage is 1 - T at the end: a colour of -1 behind all
+                        behind -= grad_alpha[p]
+                    scratch[_R + at + i] = behind
+                    if scores:
+                        counts = len(counting) == 0 or counting[p]
+                        scratch[_COUNTS + at + i] = np.float32(1 if counts else 0)
+                    if has_depth:
+                        scratch[_G_DEPTH + at + i] = grad_depth[p]
+                else:
+                    for plane in (_G_RED, _G_GREEN, _G_BLUE, _R, _G_DEPTH, _COUNTS):
+                        scratch[plane + at + i] = np.float32(0)
+            if scores:
+                store(scratch, _BEHIND_RED + at, spread(background, 0))
+                store(scratch, _BEHIND_GREEN + at, spread(background, 1))
+                store(scratch, _BEHIND_BLUE + at, spread(background, 2))
+        end = begin + np.int64(deepest)
+        for e in range(end, tile_start[tile + 1]):
+            for i in range(0, SLOT, LANES):
+                store(sums, np.int64(slots[e]) * SLOT + i, zero)
+        while end > begin:
+            first = max(begin, end - BATCH)
+            load_batch(batch, records, members, first, end - first, left, top)
+            for k in range(end - first - 1, -1, -1):
+                number = np.float32(first + k - begin + 1)
+                r0, r1 = np.int64(batch[FIRST_ROW + k]), np.int64(batch[END_ROW + k])
+                while r0 < r1 and limits[r0] < number:
+                    r0 += 1
+                while r1 > r0 and limits[r1 - 1] < number:
+                    r1 -= 1
+                g_red, g_green, g_blue, g_depth = zero, zero, zero, zero
+                s_0, s_u, s_v, s_uu, s_uv, s_vv = zero, zero, zero, zero, zero, zero
+                abs_x, abs_y, squared, hits, loo = zero, zero, zero, zero, zero
+                i = k * LOCAL
+                for r in range(r0, r1):
+                    at = r * TILE_WIDTH
+                    u, v, power = log2_alpha(batch, i, column, fill(np.float32(r)))
+                    a = exp2(minimum(power, LOG2_ALPHA_MAX))
+                    part = (power >= cutoff) & (load(scratch, _LAST + at) >= number)
+                    a = select(part, a, 0.0)
+                    T = load(scratch, _T + at) / (1.0 - a)
+                    store(scratch, _T + at, T)
+                    weight = a * T
+                    red, green = load(scratch, _G_RED + at), load(scratch, _G_GREEN + at)
+                    blue = load(scratch, _G_BLUE + at)
+                    shade = fma(red, spread(batch, i + L_RED),
+                                fma(green, spread(batch, i + L_GREEN),
+                                    blue * spread(batch, i + L_BLUE)))
+                    if has_depth:
+                        z = load(scratch, _G_DEPTH + at)
+                        shade = fma(z, spread(batch, i + L_DEPTH), shade)
+                        g_depth = fma(weight, z, g_depth)
+                    R = load(scratch, _R + at)
+                    slope = shade - R
+                    store(scratch, _R + at, fma(a, slope, R))
+                    g_red, g_green = fma(weight, red, g_red), fma(weight, green, g_green)
+                    g_blue = fma(weight, blue, g_blue)
+                    s = select(power <= LOG2_ALPHA_MAX, weight * slope, 0.0)
+                    su, sv = s * u, s * v
+                    s_0, s_u, s_v = s_0 + s, s_u + su, s_v + sv
+                    s_uu, s_uv, s_vv = fma(su, u, s_uu), fma(su, v, s_uv), fma(sv, v, s_vv)
+                    if details:
+                        abs_x = abs_x + absolute(su)
+                        abs_y = abs_y + absolute(fma(
+                            su, spread(batch, i + L_U_Y), sv * spread(batch, i + L_V_Y)))
+                        squared = fma(s, s, squared)
+                        hits = hits + select(part, 1.0, zero)
+                    if scores:
+                        behind = load(scratch, _BEHIND_RED + at)
+                        away = spread(batch, i + L_RED) - behind
+                        store(scratch, _BEHIND_RED + at, fma(a, away, behind))
+                        error = away * away
+                        behind = load(scratch, _BEHIND_GREEN + at)
+                        away = spread(batch, i + L_GREEN) - behind
+                        store(scratch, _BEHIND_GREEN + at, fma(a, away, behind))
+                        error = fma(away, away, error)
+                        behind = load(scratch, _BEHIND_BLUE + at)
+                        away = spread(batch, i + L_BLUE) - behind
+                        store(scratch, _BEHIND_BLUE + at, fma(a, away, behind))
+                        error = fma(away, away, error)
+                        loo = fma(weight * weight * load(scratch, _COUNTS + at), error, loo)
+                pairs += (r1 - r0) * TILE_WIDTH
+                to = np.int64(slots[first + k]) * SLOT
+                abs_x = abs_x * spread(batch, i + L_U_X)
+                if LANES == 16:
+                    store(sums, to, totals((
+                        g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu, s_uv, s_vv,
+                        abs_x, abs_y, squared, hits, loo, zero)))
+                else:
+                    store(sums, to, totals((
+                        g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu)))
+                    store(sums, to + 8, totals((
+                        s_uv, s_vv, abs_x, abs_y, squared, hits, loo, zero)))
+            end = first
+    fetch_add(evaluated, 0, pairs)

@@ -1,0 +1,212 @@
+"""Rows of higher SH coefficients in memory, and planes of them in scratch.
+
+Rows are `stride` numbers long, 9, 24 or 45, and only the first Gaussians have one; none of these is
+a multiple of LANES. Nothing is read or written behind the last row.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from recon_cli.render.numba.kernel import inlined
+from recon_cli.render.numba.simd import LANES
+from recon_cli.render.numba.simd_functions import (
+    absolute,
+    fill,
+    maximum,
+    minimum,
+    select,
+    square_root,
+)
+from recon_cli.render.numba.simd_memory import copy, load, store, transpose
+
+TILE_WIDTH = LANES  # one vector is one row of pixels of a tile
+TILE_HEIGHT = 16
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+
+RECORD = 16  # floats a Gaussian
+MEAN_X, MEAN_Y = 0, 1  # pixels
+U_X, U_Y, V_Y = 2, 3, 4
+LOG2_OPACITY = 5
+RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
+# The ellipse alpha = 1/255 in its bounding box, for culling: at an offset dx the ellipse covers
+# SLOPE_Y dx -+ HALF_Y sqrt(1 - (dx / EXTENT_X)^2), and the same with x and y exchanged.
+# With x and y exchanged the slope is b / c = -U_Y / U_X and the half EXTENT_Y V_Y / U_X.
+EXTENT_X, EXTENT_Y = 10, 11
+SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
+# What float32 drops of the mean: at 640 pixels it is 3e-5, and decides who reaches alpha = 1/255.
+MEAN_X_LOW, MEAN_Y_LOW = 14, 15
+
+FAR = 1e9  # pixels; the half of an ellipse that only its box cuts
+
+BATCH = 32  # instances of a tile that are prepared at a time
+
+# What the backward pass sums over the pixels of an instance, one slot of 16 numbers for each;
+# s = alpha dL/dalpha.
+SLOT = 16
+(GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_DEPTH, S, S_U, S_V, S_UU, S_UV, S_VV,
+ ABS_X, ABS_Y, S_SQUARED, COUNT, LEAVE_ONE_OUT) = range(15)
+
+LOG2_E = math.log2(math.e)
+LOG2_ALPHA_MAX = math.log2(0.99)
+
+
+BLOCK = 1024  # Gaussians that a thread takes at a time
+_F = np.float32
+
+
+class Viewpoint(NamedTuple):
+    """A camera as kernels take it: world to camera R x + t, pixels, limits of x/z and y/z."""
+
+    R: np.ndarray  # [9] float64
+    t: np.ndarray  # [3] float64
+    center: np.ndarray  # [3] float64
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    tan_left: float
+    tan_right: float
+    tan_top: float
+    tan_bottom: float
+
+
+# planes of a group of LANES Gaussians in scratch
+(P_X, P_Y, P_Z, P_MEAN_X, P_MEAN_Y, P_QW, P_QX, P_QY, P_QZ, P_S0, P_S1, P_S2, P_LOGIT,
+ P_DX, P_DY, P_DZ, P_MEAN_X_LOW, P_MEAN_Y_LOW, P_DC) = range(19)
+P_REST = P_DC + 3
+P_BASIS = P_REST + 45
+OUT = P_BASIS + 15
+SQUARE = OUT + RECORD  # LANES planes in which blocks are turned
+PROJECTION_FLOATS = (SQUARE + LANES) * LANES
+
+
+@inlined
+def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest, stride,
+           terms, view, depths):
+    """Fills the planes of `scratch` with Gaussians ids[first : first + count], `depths` too."""
+    R = view.R
+    for k in range(LANES):
+        i = np.int64(ids[first + min(k, count - 1)])
+        x, y, z = (np.float64(means[3 * i]), np.float64(means[3 * i + 1]),
+                   np.float64(means[3 * i + 2]))
+        # in float64: an error of the mean in pixels is an error of every alpha
+        to_x = R[0] * x + R[1] * y + R[2] * z + view.t[0]
+        to_y = R[3] * x + R[4] * y + R[5] * z + view.t[1]
+        to_z = R[6] * x + R[7] * y + R[8] * z + view.t[2]
+        scratch[P_X * LANES + k] = to_x
+        scratch[P_Y * LANES + k] = to_y
+        scratch[P_Z * LANES + k] = to_z
+        if k < count:
+            depths[first + k] = to_z
+        mean_x, mean_y = view.fx * to_x / to_z + view.cx, view.fy * to_y / to_z + view.cy
+        scratch[P_MEAN_X * LANES + k] = mean_x
+        scratch[P_MEAN_Y * LANES + k] = mean_y
+        scratch[P_MEAN_X_LOW * LANES + k] = mean_x - scratch[P_MEAN_X * LANES + k]
+        scratch[P_MEAN_Y_LOW * LANES + k] = mean_y - scratch[P_MEAN_Y * LANES + k]
+        scratch[P_DX * LANES + k] = x - view.center[0]
+        scratch[P_DY * LANES + k] = y - view.center[1]
+        scratch[P_DZ * LANES + k] = z - view.center[2]
+        for c in range(4):
+            scratch[(P_QW + c) * LANES + k] = quats[4 * i + c]
+        for c in range(3):
+            scratch[(P_S0 + c) * LANES + k] = log_scales[3 * i + c]
+            scratch[(P_DC + c) * LANES + k] = sh_dc[3 * i + c]
+        scratch[P_LOGIT * LANES + k] = logits[i]
+    if terms > 0:
+        rows_to_planes(sh_rest, stride, ids, first, count, terms, scratch, P_REST, SQUARE)
+
+
+@inlined
+def unit_quaternion(scratch):
+    """Returns w, x, y, z of length 1, one over the length, and where there is one.
+
+    Divided by the largest entry first: the squares of small entries would vanish. A quaternion
+    of zeros stands for no rotation and has no gradient.
+    """
+    w, x = load(scratch, P_QW * LANES), load(scratch, P_QX * LANES)
+    y, z = load(scratch, P_QY * LANES), load(scratch, P_QZ * LANES)
+    top = maximum(maximum(absolute(w), absolute(x)), maximum(absolute(y), absolute(z)))
+    given = top > 1e-30
+    top = select(given, top, 1.0)
+    per_top = 1.0 / top
+    w, x, y, z = w * per_top, x * per_top, y * per_top, z * per_top
+    w = select(given, w, 1.0)
+    per_length = 1.0 / square_root(w * w + x * x + y * y + z * z)
+    return (w * per_length, x * per_length, y * per_length, z * per_length,
+            select(given, per_length * per_top, 0.0))
+
+
+@inlined
+def image_axes(scratch, view):
+    """Returns the rows of J W, [6], and the clamped x/z and y/z.
+
+    The linearisation blows up at grazing angles: x/z and y/z are held within the image widened by
+    15% on each side (INRIA's 3DGS).
+    """
+    per_z = 1.0 / load(scratch, P_Z * LANES)
+    u, v = load(scratch, P_X * LANES) * per_z, load(scratch, P_Y * LANES) * per_z
+    u = minimum(maximum(u, _F(view.tan_left)), _F(view.tan_right))
+    v = minimum(maximum(v, _F(view.tan_top)), _F(view.tan_bottom))
+    R = view.R
+    x, y = _F(view.fx) * per_z, _F(view.fy) * per_z
+    return (x * (_F(R[0]) - u * _F(R[6])), x * (_F(R[1]) - u * _F(R[7])),
+            x * (_F(R[2]) - u * _F(R[8])), y * (_F(R[3]) - v * _F(R[6])),
+            y * (_F(R[4]) - v * _F(R[7])), y * (_F(R[5]) - v * _F(R[8])), u, v)
+
+
+@inlined
+def terms_of_group(ids, first, sh_rest, stride, terms):
+    """Returns how many higher SH terms a group uses: none where no Gaussian of it has any.
+
+    ids ascend, and the Gaussians that have coefficients come first.
+    """
+    return terms if stride * np.int64(ids[first]) < len(sh_rest) else 0
+
+
+@inlined
+def rows_to_planes(sh_rest, stride, ids, first, count, terms, scratch, plane, spare):
+    """Fills planes from `plane` on with coefficients, zeros where a Gaussian has none.
+
+    LANES planes from `spare` on are overwritten.
+    """
+    if stride < LANES:  # a vector would reach beyond the row, and behind the last one there is none
+        for k in range(LANES):
+            row = stride * np.int64(ids[first + min(k, count - 1)])
+            for c in range(3 * terms):
+                scratch[(plane + c) * LANES + k] = (
+                    sh_rest[row + c] if row < len(sh_rest) else np.float32(0))
+        return
+    for block in range(0, 3 * terms, LANES):
+        at = min(block, stride - LANES)
+        for k in range(LANES):
+            row = stride * np.int64(ids[first + min(k, count - 1)])
+            if row < len(sh_rest):
+                copy(sh_rest, row + at, scratch, (spare + k) * LANES)
+            else:
+                store(scratch, (spare + k) * LANES, fill(0.0))
+        transpose(scratch, spare * LANES, scratch, (plane + at) * LANES)
+
+
+@inlined
+def planes_to_rows(scratch, plane, spare, terms, ids, first, count, slot_start, sh_rest, stride):
+    """Writes planes from `plane` on to the rows of those that were seen and have coefficients."""
+    if stride < LANES:
+        for k in range(count):
+            row = stride * np.int64(ids[first + k])
+            if row < len(sh_rest) and slot_start[first + k + 1] > slot_start[first + k]:
+                for c in range(3 * terms):
+                    sh_rest[row + c] = scratch[(plane + c) * LANES + k]
+        return
+    for block in range(0, 3 * terms, LANES):
+        at = min(block, stride - LANES)
+        transpose(scratch, (plane + at) * LANES, scratch, spare * LANES)
+        for k in range(count):
+            row = stride * np.int64(ids[first + k])
+            if row < len(sh_rest) and slot_start[first + k + 1] > slot_start[first + k]:
+                copy(scratch, (spare + k) * LANES, sh_rest, row + at)

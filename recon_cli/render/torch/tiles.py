@@ -1,0 +1,260 @@
+"""The torch backend: a vectorized tile rasterizer for any device, in float32 or float64.
+
+Tiles are taken in groups of similar length and composited in blocks; see `torch_blocks`. The
+backward pass walks the blocks back to front and evaluates them again, so that memory does not
+grow with the pairs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon_cli.render.contract import ALPHA_MAX, TILE, RenderOutput, Statistics
+from recon_cli.render.torch.binning import Instances, bin_to_tiles
+from recon_cli.render.torch.blocks import (
+    CHANNELS,
+    DEPTH,
+    PIXELS,
+    Block,
+    Scratch,
+    TileLists,
+    alphas,
+    build_table,
+    composite,
+    gradients_of,
+    pixel_monomials,
+    spread_of,
+    whitened_moments,
+    whitening_of,
+)
+from recon_cli.render.torch.projection import Projection, project
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+
+
+def render(
+    splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
+    mask: Tensor | None = None,
+) -> RenderOutput:
+    """Renders by the contract; see `recon_cli.render.registry.render`."""
+    projection = project(splats, camera, sh_degree)
+    with torch.no_grad():
+        instances = bin_to_tiles(projection, camera.width, camera.height)
+        statistics = Statistics.zeros(splats.means)
+        statistics.broken = projection.broken
+        a, b, c = projection.cov2d.unbind(-1)
+        longest = (a + c) / 2 + (((a - c) / 2) ** 2 + b * b).sqrt()
+        statistics.radii[projection.ids] = 3 * longest.sqrt()
+    # log sigmoid keeps its gradient where the sigmoid has rounded to 1
+    log_opacities = torch.nn.functional.logsigmoid(splats.logit_opacities[projection.ids])
+    channels = torch.cat([projection.colors, projection.depths[:, None]], dim=-1)
+    rgb, depth, alpha = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        projection.means2d, projection.directions, projection.log_scales, log_opacities, channels,
+        background, projection, instances, (camera.height, camera.width), statistics, scores,
+        mask)
+    return RenderOutput(rgb, alpha, depth, statistics)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Composites instances and carries gradients back to the projected Gaussians."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means2d: Tensor, directions: Tensor, log_scales: Tensor, log_opacities: Tensor,
+        channels: Tensor, background: Tensor, projection: Projection, instances: Instances,
+        size: tuple[int, int], statistics: Statistics, scores: bool, mask: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
+        image = means2d.new_zeros(len(instances.counts), PIXELS, CHANNELS)
+        # a pixel beyond the image is stopped from the start: it counts in no statistic
+        transmittance = _to_tiles(means2d.new_ones(*size, 1), instances)[..., 0]
+        monomials, scratch = pixel_monomials(means2d)[:3], Scratch(means2d)
+        counting = None
+        if scores and mask is not None:
+            counting = _to_tiles(mask.to(means2d)[..., None], instances)[..., 0]
+        tally = _Tally(instances, means2d, counting) if scores else None
+        lists = TileLists.of(instances)
+
+        def composite_group(tiles: Tensor) -> list[Block]:
+            blocks = []
+            for block in lists.walk(tiles, transmittance):
+                affine = whitening_of(table, block, instances.tiles_x)
+                alpha = alphas(table, block, affine, monomials, scratch)
+                odds, after, live = composite(alpha, block.before, scratch)
+                transmittance[block.tiles] = after[:, -1]
+                weights = odds.mul_(live)
+                image[block.tiles] += weights.transpose(1, 2) @ table.channels[block.rows]
+                blocks.append(block)
+                if tally:
+                    tally.add(block, weights)
+            return blocks
+
+        groups = [composite_group(tiles) for tiles in lists.groups()]
+        if tally:
+            tally.write(projection.ids, statistics)
+        ctx.save_for_backward(
+            means2d, directions, log_scales, log_opacities, channels, background, image)
+        ctx.rest = projection, instances, statistics, scores, counting, groups
+        left = 1 - image[..., 4:]
+        rgb = _to_image(image[..., :3] + left * background, instances, size)
+        depth = _to_image(image[..., 3:4], instances, size)[..., 0]
+        return rgb, depth, _to_image(image[..., 4:], instances, size)[..., 0]
+
+    @staticmethod
+    def backward(
+        ctx: Any, grad_rgb: Tensor, grad_depth: Tensor, grad_alpha: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        means2d, directions, log_scales, log_opacities, channels, background, image = (
+            ctx.saved_tensors)
+        projection, instances, statistics, scores, counting, groups = ctx.rest
+        table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
+        monomials, scratch = pixel_monomials(means2d), Scratch(means2d)
+        grads = torch.cat([grad_rgb, grad_depth[..., None], grad_alpha[..., None]], dim=-1)
+        grads = _to_tiles(grads, instances)
+        left = 1 - image[..., 4:]
+        grad_background = (grads[..., :3] * left).sum((0, 1))
+        # What is not covered shows the background: fold it into the channel of ones.
+        grads[..., 4] -= grads[..., :3] @ background
+        behind = means2d.new_zeros(len(instances.counts), PIXELS)  # sum of w (g . f) behind
+        composited = left * background if scores else None  # colour behind, not divided by T
+        features = means2d.new_zeros(len(instances.gaussians) + 1, CHANNELS + 6)
+        scored = means2d.new_zeros(len(instances.gaussians) + 1, 5) if scores else None
+        upper = means2d.new_ones(DEPTH, DEPTH).triu(1)
+
+        def descend_group(blocks: list[Block]) -> None:
+            for block in reversed(blocks):
+                n, k = block.rows.shape
+                affine = whitening_of(table, block, instances.tiles_x)
+                alpha = alphas(table, block, affine, monomials[:3], scratch)
+                odds, after, live = composite(alpha, block.before, scratch)
+                grad = grads[block.tiles]
+                used = table.channels[block.rows]
+                if composited is not None and scored is not None:
+                    scored[block.positions, 4] = _leave_one_out(
+                        used, odds, live, composited, block, upper[:k, :k], counting)
+                shade = torch.bmm(
+                    used, grad.transpose(1, 2), out=scratch.take("q", alpha.shape)).mul_(live)
+                weighted = torch.mul(shade, odds, out=after)  # w (g . f)
+                triangle = upper[:k, :k].expand(n, k, k)
+                later = torch.baddbmm(
+                    behind[block.tiles, None], triangle, weighted,
+                    out=scratch.take("later", alpha.shape))
+                behind[block.tiles] += weighted.sum(1)
+                # dL/dalpha = T g.f - (sum behind) / (1 - alpha); zero where alpha was clamped
+                unclamped = torch.threshold_(alpha.neg_(), -ALPHA_MAX, 0.0)
+                slope = later.sub_(shade).mul_(unclamped.div_(1 + unclamped))  # alpha dL/dalpha
+                features[block.positions, :CHANNELS] = odds.mul_(live) @ grad
+                moments = slope.view(n * k, PIXELS) @ monomials.T
+                features[block.positions, CHANNELS:] = whitened_moments(
+                    moments.view(n, k, 6), affine).to(means2d.dtype)
+                if scored is not None:
+                    scored[block.positions, :4] = spread_of(
+                        slope, odds, affine, monomials[:3], scratch)
+
+        for blocks in groups:
+            descend_group(blocks)
+        per_gaussian = _reduce(features, instances)
+        if scored is not None:
+            _write_scores(_reduce(scored, instances), per_gaussian, projection.ids, statistics)
+        shape = [gradient.to(means2d.dtype) for gradient in gradients_of(
+            per_gaussian[:, 5:10], table.whitening[:-1], directions, log_scales)]
+        statistics.means2d_grad[projection.ids] = shape[0]
+        return (*shape, per_gaussian[:, 10], per_gaussian[:, :4], grad_background,
+                None, None, None, None, None, None)
+
+
+def _leave_one_out(
+    used: Tensor, odds: Tensor, live: Tensor, composited: Tensor, block: Block, upper: Tensor,
+    counting: Tensor | None,
+) -> Tensor:
+    """Returns the block's part [n, K] of loo and moves `composited` in front of the block.
+
+    alpha T (c - B) = odds (T_after c - T_after B), and T_after B is what is composited behind.
+    """
+    total = torch.zeros_like(used[..., 0])
+    part = (live > 0).to(odds.dtype)
+    if counting is not None:
+        part *= counting[block.tiles, None]
+    for channel in range(3):
+        own = used[..., channel : channel + 1] * live
+        weighted = own * odds
+        later = torch.matmul(upper, weighted) + composited[block.tiles, None, :, channel]
+        composited[block.tiles, :, channel] += weighted.sum(1)
+        # `later` still counts what lies behind a stopped pixel; there the Gaussian is no part
+        total += (((own - later) * odds) ** 2 * part).sum(-1)
+    return total
+
+
+def _write_scores(
+    scored: Tensor, per_gaussian: Tensor, ids: Tensor, statistics: Statistics
+) -> None:
+    """Writes the statistics of the backward pass from the sums [M, 5] of `spread_of` and loo."""
+    statistics.absolute_grad[ids] = scored[:, :2]
+    squares, count = scored[:, 2].double(), scored[:, 3].double().clamp_min(1)
+    variance = squares - per_gaussian[:, 10].double().square() / count
+    statistics.variance[ids] = variance.clamp_min(0).to(scored.dtype)
+    statistics.loo[ids] = scored[:, 4]
+
+
+class _Tally:
+    """Counts hits and blend weights of the instances while they are composited.
+
+    Args:
+        instances: of the view.
+        like: of the dtype and device to count in.
+        counting: [tiles, 256] 1 at the pixels that count and 0 elsewhere; None where all do.
+    """
+
+    def __init__(self, instances: Instances, like: Tensor, counting: Tensor | None) -> None:
+        self._instances, self._counting = instances, counting
+        self._hits, self._sum, self._max = (
+            like.new_zeros(len(instances.gaussians) + 1) for _ in range(3))
+
+    def add(self, block: Block, weights: Tensor) -> None:
+        """Takes the blend weights [n, K, 256] of a block."""
+        if self._counting is not None:
+            weights = weights * self._counting[block.tiles, None]
+        self._hits[block.positions] = (weights > 0).sum(-1).to(weights.dtype)
+        self._sum[block.positions] = weights.sum(-1)
+        self._max[block.positions] = weights.amax(-1)
+
+    def write(self, ids: Tensor, statistics: Statistics) -> None:
+        """Writes the totals of each Gaussian into `statistics`."""
+        hits = _reduce(self._hits[:, None].double(), self._instances)[:, 0]
+        statistics.hits[ids] = hits.round().long()
+        sums = _reduce(self._sum[:, None].double(), self._instances)[:, 0]
+        statistics.blend_sum[ids] = sums.to(statistics.blend_sum.dtype)
+        statistics.blend_max[ids] = _reduce(self._max[:, None], self._instances, "max")[:, 0]
+
+
+def _reduce(values: Tensor, instances: Instances, how: str = "sum") -> Tensor:
+    """Returns values [E+1, C] of the instances in tile order reduced by Gaussian, [M, C].
+
+    Every instance has a slot of its own in the order by Gaussian, and each run of slots is summed
+    in order: no atomics, the same bits every time.
+    """
+    by_gaussian = torch.empty_like(values[:-1])
+    by_gaussian[instances.slots] = values[:-1]
+    return torch.segment_reduce(
+        by_gaussian, how, lengths=instances.per_gaussian, axis=0, unsafe=True, initial=0)
+
+
+def _to_image(tiles: Tensor, instances: Instances, size: tuple[int, int]) -> Tensor:
+    """Returns [H, W, C] from [tiles, 256, C]."""
+    shape = (instances.tiles_y, instances.tiles_x, TILE, TILE, tiles.shape[-1])
+    image = tiles.reshape(shape).transpose(1, 2)
+    image = image.reshape(instances.tiles_y * TILE, instances.tiles_x * TILE, -1)
+    return image[: size[0], : size[1]].contiguous()
+
+
+def _to_tiles(image: Tensor, instances: Instances) -> Tensor:
+    """Returns [tiles, 256, C] from [H, W, C]; pixels beyond the image are zero."""
+    below = instances.tiles_y * TILE - image.shape[0]
+    beside = instances.tiles_x * TILE - image.shape[1]
+    image = torch.nn.functional.pad(image, (0, 0, 0, beside, 0, below))
+    shape = (instances.tiles_y, TILE, instances.tiles_x, TILE, image.shape[-1])
+    return image.reshape(shape).transpose(1, 2).reshape(-1, PIXELS, image.shape[-1]).contiguous()

@@ -1,0 +1,268 @@
+"""Gradients of compositing, back to front.
+
+With g the gradient of the loss at a pixel, c the colour of a Gaussian and R the loss's slope along
+what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
+
+    R <- g . background at the last fragment,  R <- R + alpha (g . c - R) after each,
+    dL/dc = alpha T g,  s = alpha dL/dalpha = alpha T (g . c - R),  T <- T / (1 - alpha).
+
+s is zero where alpha was clamped. Every instance has a slot of its own for its sums over the tile,
+slots of a Gaussian lie side by side, and are added in order: no atomics, and the same bits every
+time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import triton
+import triton.language as tl
+
+from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+
+PIXELS = TILE * TILE
+RECORD = 8  # floats a Gaussian: U_X, U_Y, V_Y, log2 o, red, green, blue, depth
+SUMS = 16  # floats an instance, see `raster_backward.decompose`
+
+LOG2_E = math.log2(math.e)
+# Kernels see globals only as constants of this type.
+SIDE = tl.constexpr(TILE)
+AREA = tl.constexpr(PIXELS)
+FLOATS = tl.constexpr(RECORD)
+SLOT = tl.constexpr(SUMS)
+LOG2_ALPHA_MIN = tl.constexpr(math.log2(ALPHA_MIN))
+LOG2_ALPHA_MAX = tl.constexpr(math.log2(ALPHA_MAX))
+LOG2E = tl.constexpr(LOG2_E)
+UNIT = tl.constexpr(math.sqrt(LOG2_E / 2))
+T_MIN = tl.constexpr(TRANSMITTANCE_MIN)
+
+
+@triton.jit
+def log2_alpha(record, offset, column, row):
+    """Returns u, v and log2 alpha at pixels [256]: the same bits in both passes."""
+    u = tl.fma(tl.load(record), column, tl.fma(tl.load(record + 1), row, tl.load(offset)))
+    v = tl.fma(tl.load(record + 2), row, tl.load(offset + 1))
+    power = tl.fma(-v, v, tl.fma(-u, u, tl.load(record + 3)))
+    return u, v, power
+
+
+@triton.jit
+def alpha_of(power):
+    """Returns alpha of log2 alpha; 0 where that is no fragment."""
+    return tl.where(power >= LOG2_ALPHA_MIN, tl.exp2(tl.minimum(power, LOG2_ALPHA_MAX)), 0.0)
+
+
+CHUNK = 16  # instances between two looks at whether a pixel is alive
+
+
+@triton.jit
+def composite(order, first, members, offsets, records, background, width, height, tiles_x,
+              rgb, alpha, depth, final, last, slots, counting, hits, weights, peaks,
+              SCORES: tl.constexpr, MASKED: tl.constexpr, CHUNK: tl.constexpr):
+    """Composites one tile.
+
+    Args:
+        order: [tiles] int32, longest list first, so that no long one is left over at the end.
+        first: [tiles + 1] int32, where the instances of each tile begin.
+        members: [E] int32, Gaussian of each instance, by tile and depth.
+        offsets: [E, 2] u and v at the tile's first pixel.
+        records: [M, FLOATS].
+        background: [3].
+        width: of the image in pixels.
+        height: of the image in pixels.
+        tiles_x: tiles in a row.
+        rgb: [H, W, 3] out.
+        alpha: [H, W] out.
+        depth: [H, W] out.
+        final: [tiles, AREA] out, transmittance behind the last fragment.
+        last: [tiles, AREA] int32 out, number in the tile of the last fragment, from 1.
+        slots: [E] int64, where the scores of an instance go.
+        counting: [H, W] uint8, pixels that count in the scores.
+        hits: [E] int32 out.
+        weights: [E] out, sum of alpha T.
+        peaks: [E] out, greatest alpha T.
+        SCORES: also take the scores.
+        MASKED: of the pixels in `counting` alone.
+        CHUNK: see above.
+    """
+    tile = tl.load(order + tl.program_id(0))
+    begin, end = tl.load(first + tile), tl.load(first + tile + 1)
+    pixel = tl.arange(0, AREA)
+    x, y = tile % tiles_x * SIDE + pixel % SIDE, tile // tiles_x * SIDE + pixel // SIDE
+    column, row = (pixel % SIDE).to(tl.float32), (pixel // SIDE).to(tl.float32)
+    inside = (x < width) & (y < height)
+    at = y * width + x
+    # a pixel beyond the image is stopped from the start
+    T = tl.where(inside, 1.0, 0.0)
+    kept = T
+    red, green, blue, z = T * 0.0, T * 0.0, T * 0.0, T * 0.0
+    latest = pixel * 0
+    counts = inside
+    if MASKED:
+        counts = inside & (tl.load(counting + at, mask=inside, other=0) != 0)
+    e = begin
+    while (e < end) & (tl.max(T) >= T_MIN):
+        stop = tl.minimum(e + CHUNK, end)
+        while e < stop:
+            record = records + tl.load(members + e).to(tl.int64) * FLOATS
+            _, _, power = log2_alpha(record, offsets + 2 * e.to(tl.int64), column, row)
+            a = alpha_of(power)
+            weight = T * a
+            T = T * (1.0 - a)
+            live = T >= T_MIN
+            weight = tl.where(live, weight, 0.0)
+            kept = tl.where(live, T, kept)
+            red = tl.fma(weight, tl.load(record + 4), red)
+            green = tl.fma(weight, tl.load(record + 5), green)
+            blue = tl.fma(weight, tl.load(record + 6), blue)
+            z = tl.fma(weight, tl.load(record + 7), z)
+            hit = weight > 0.0
+            latest = tl.where(hit, e - begin + 1, latest)
+            if SCORES:
+                slot = tl.load(slots + e)
+                counted = tl.where(counts, weight, 0.0)
+                tl.store(hits + slot, tl.sum((counted > 0.0).to(tl.int32)))
+                tl.store(weights + slot, tl.sum(counted))
+                tl.store(peaks + slot, tl.max(counted))
+            e += 1
+    tl.store(final + tile * AREA + pixel, kept)
+    tl.store(last + tile * AREA + pixel, latest)
+    tl.store(rgb + 3 * at, tl.fma(kept, tl.load(background), red), mask=inside)
+    tl.store(rgb + 3 * at + 1, tl.fma(kept, tl.load(background + 1), green), mask=inside)
+    tl.store(rgb + 3 * at + 2, tl.fma(kept, tl.load(background + 2), blue), mask=inside)
+    tl.store(alpha + at, 1.0 - kept, mask=inside)
+    tl.store(depth + at, z, mask=inside)
+
+
+@triton.jit(do_not_specialize=("count",))
+def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
+          BLOCK: tl.constexpr):
+    """Sums hits and weights and takes the greatest peak over the slots of each Gaussian.
+
+    Args:
+        starts: [M + 1] int32, first slot of each Gaussian.
+        hits: [E] int32.
+        weights: [E].
+        peaks: [E].
+        count: M.
+        total_hits: [M] int64 out.
+        blend_sum: [M] out.
+        blend_max: [M] out.
+        BLOCK: Gaussians a program.
+    """
+    j = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = j < count
+    slot, end = tl.load(starts + j, mask=here, other=0), tl.load(starts + j + 1, mask=here, other=0)
+    number, total, peak = slot.to(tl.int64) * 0, slot.to(tl.float64) * 0, slot.to(tl.float32) * 0
+    while tl.max(end - slot) > 0:
+        more = slot < end
+        number += tl.load(hits + slot, mask=more, other=0).to(tl.int64)
+        total += tl.load(weights + slot, mask=more, other=0.0).to(tl.float64)
+        peak = tl.maximum(peak, tl.load(peaks + slot, mask=more, other=0.0))
+        slot += 1
+    tl.store(total_hits + j, number, mask=here)
+    tl.store(blend_sum + j, total.to(tl.float32), mask=here)
+    tl.store(blend_max + j, peak, mask=here)
+
+
+@triton.jit
+def decompose(order, first, members, offsets, records, background, width, height, tiles_x,
+              final, last, grad_rgb, grad_alpha, grad_depth, slots, counting, sums,
+              PLAIN: tl.constexpr, DETAILS: tl.constexpr, SCORES: tl.constexpr,
+              MASKED: tl.constexpr):
+    """Sums the gradients of every instance of a tile over its pixels.
+
+    Args:
+        order: [tiles] int32, as in the forward pass; so are the next eight and the last ones.
+        first: [tiles + 1] int32.
+        members: [E] int32.
+        offsets: [E, 2].
+        records: [M, FLOATS].
+        background: [3].
+        width: of the image in pixels.
+        height: of the image in pixels.
+        tiles_x: tiles in a row.
+        final: [tiles, AREA] transmittance behind the last fragment.
+        last: [tiles, AREA] int32, number of the last fragment.
+        grad_rgb: [H, W, 3] dL/drgb.
+        grad_alpha: [H, W] dL/dalpha; not read with PLAIN, nor is the next.
+        grad_depth: [H, W] dL/ddepth.
+        slots: [E] int64.
+        counting: [H, W] uint8.
+        sums: [E, SLOT] out by slot, zeros before: dL/d(red, green, blue, depth), then the sums of
+            s times 1, u, v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back,
+            without its factor), of s^2, the fragments, and what leaving the instance out would
+            change.
+        PLAIN: the loss depends on colours alone.
+        DETAILS: also |s y|, s^2 and the fragments.
+        SCORES: also the last of these.
+        MASKED: that one of the pixels in `counting` alone.
+    """
+    tile = tl.load(order + tl.program_id(0))
+    begin = tl.load(first + tile)
+    pixel = tl.arange(0, AREA)
+    x, y = tile % tiles_x * SIDE + pixel % SIDE, tile // tiles_x * SIDE + pixel // SIDE
+    column, row = (pixel % SIDE).to(tl.float32), (pixel // SIDE).to(tl.float32)
+    inside = (x < width) & (y < height)
+    at = y * width + x
+    T = tl.load(final + tile * AREA + pixel)
+    latest = tl.load(last + tile * AREA + pixel)
+    g_red = tl.load(grad_rgb + 3 * at, mask=inside, other=0.0)
+    g_green = tl.load(grad_rgb + 3 * at + 1, mask=inside, other=0.0)
+    g_blue = tl.load(grad_rgb + 3 * at + 2, mask=inside, other=0.0)
+    g_depth = T * 0.0
+    if PLAIN == 0:
+        g_depth = tl.load(grad_depth + at, mask=inside, other=0.0)
+    behind_red, behind_green = T * 0.0 + tl.load(background), T * 0.0 + tl.load(background + 1)
+    behind_blue = T * 0.0 + tl.load(background + 2)
+    # coverage is 1 - T at the end: a colour of -1 behind everything
+    R = g_red * behind_red + g_green * behind_green + g_blue * behind_blue
+    if PLAIN == 0:
+        R -= tl.load(grad_alpha + at, mask=inside, other=0.0)
+    counts = inside
+    if MASKED:
+        counts = inside & (tl.load(counting + at, mask=inside, other=0) != 0)
+    e = begin + tl.max(latest)  # what no pixel reached stays zero
+    while e > begin:
+        e -= 1
+        record = records + tl.load(members + e).to(tl.int64) * FLOATS
+        u, v, power = log2_alpha(record, offsets + 2 * e.to(tl.int64), column, row)
+        part = (power >= LOG2_ALPHA_MIN) & (latest > e - begin)
+        a = tl.where(part, alpha_of(power), 0.0)
+        T = T / (1.0 - a)
+        weight = a * T
+        red, green, blue = tl.load(record + 4), tl.load(record + 5), tl.load(record + 6)
+        shade = g_blue * blue
+        if PLAIN == 0:
+            shade = tl.fma(g_blue, blue, g_depth * tl.load(record + 7))
+        shade = tl.fma(g_red, red, tl.fma(g_green, green, shade))
+        slope = shade - R
+        R = tl.fma(a, slope, R)
+        s = tl.where(power <= LOG2_ALPHA_MAX, weight * slope, 0.0)
+        su, sv = s * u, s * v
+        to = sums + tl.load(slots + e).to(tl.int64) * SLOT
+        tl.store(to, tl.sum(weight * g_red))
+        tl.store(to + 1, tl.sum(weight * g_green))
+        tl.store(to + 2, tl.sum(weight * g_blue))
+        if PLAIN == 0:
+            tl.store(to + 3, tl.sum(weight * g_depth))
+        tl.store(to + 4, tl.sum(s))
+        tl.store(to + 5, tl.sum(su))
+        tl.store(to + 6, tl.sum(sv))
+        tl.store(to + 7, tl.sum(su * u))
+        tl.store(to + 8, tl.sum(su * v))
+        tl.store(to + 9, tl.sum(sv * v))
+        if DETAILS:
+            u_x, u_y, v_y = tl.load(record), tl.load(record + 1), tl.load(record + 2)
+            tl.store(to + 10, tl.sum(tl.abs(su)) * u_x)
+            tl.store(to + 11, tl.sum(tl.abs(tl.fma(su, u_y, sv * v_y))))
+            tl.store(to + 12, tl.sum(s * s))
+            tl.store(to + 13, tl.sum(part.to(tl.float32)))
+        if SCORES:
+            away_red, away_green, away_blue = (
+                red - behind_red, green - behind_green, blue - behind_blue)
+            behind_red = tl.fma(a, away_red, behind_red)
+            behind_green = tl.fma(a, away_green, behind_green)
+            behind_blue = tl.fma(a, away_blue, behind_blue)
+            error = away_red * away_red + away_green * away_green + away_blue * away_blue
+            tl.store(to + 14, tl.sum(tl.where(counts, weight * weight * error, 0.0)))

@@ -1,0 +1,222 @@
+"""From sums over instances to gradients of raw parameters: the projection's chain rule, reversed.
+
+With V = J W R S and Sigma' = V V^T + 0.3 I, L^T L the inverse of Sigma', M = sum s (u, v)(u, v)^T
+and P = L V, which is of order one: dL/dV = L^T M P and dL/dlog s = diag(P^T M P). By way of
+dL/dSigma' the gradient of a needle would cancel by the square of its length in pixels. What the
+forward pass computed is computed again: that is cheaper than to keep it.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from recon_cli.render.triton.compositing import FLOATS, LOG2E, SLOT, UNIT
+from recon_cli.render.triton.ellipse import (
+    BOTTOM,
+    FX,
+    FY,
+    LEFT,
+    RIGHT,
+    TOP,
+    direction,
+    image_axes,
+    number,
+    position,
+    projected_axes,
+    rotation,
+    standard_deviations,
+    unit_quaternion,
+)
+from recon_cli.render.triton.harmonics import C0, basis, slope
+from recon_cli.render.triton.projection import LOW_PASS
+
+AT_ONCE = tl.constexpr(4)  # slots; a Gaussian as large as the image has thousands
+WHITE = tl.constexpr(1.0 / UNIT.value)  # u and v hold sqrt(log2(e) / 2)
+
+
+@triton.jit(do_not_specialize=("count", "colored"))
+def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, records, starts,
+              sums, counted, g_means, g_quats, g_log_scales, g_logits, g_sh_dc, g_sh_rest,
+              means2d_grad, absolute_grad, variance, loo, STRIDE: tl.constexpr, TERMS: tl.constexpr,
+              GATED: tl.constexpr, PLAIN: tl.constexpr, DETAILS: tl.constexpr,
+              SCORES: tl.constexpr, BLOCK: tl.constexpr):
+    """Writes the gradients of all Gaussians, zero for those that no pixel shows.
+
+    Args:
+        means: [N, 3], as are the next six in the forward pass.
+        quats: [N, 4].
+        log_scales: [N, 3].
+        logits: [N].
+        sh_rest: [M, STRIDE / 3, 3].
+        view: see `view.view_numbers`.
+        count: N.
+        colored: M.
+        records: [N, FLOATS].
+        starts: [N + 1] int32, first slot of each Gaussian.
+        sums: [E, SLOT], see `raster_backward.decompose`.
+        counted: [1] int32; with GATED, everything that is written is zero where this is.
+        g_means: [N, 3] out, and so on for every parameter.
+        g_quats: [N, 4] out.
+        g_log_scales: [N, 3] out.
+        g_logits: [N] out.
+        g_sh_dc: [N, 3] out.
+        g_sh_rest: [M, STRIDE / 3, 3] out; not written at degree 0.
+        means2d_grad: [N, 2] out, see `Statistics`; so the next three.
+        absolute_grad: [N, 2] out with DETAILS.
+        variance: [N] out with DETAILS.
+        loo: [N] out with SCORES.
+        STRIDE: numbers in a row of sh_rest.
+        TERMS: coefficients a channel that are in use.
+        GATED: see `counted`.
+        PLAIN: `sums` hold nothing of depths.
+        DETAILS: `sums` hold what the statistics are made of.
+        SCORES: `sums` hold what leaving each out would change.
+        BLOCK: Gaussians a program.
+    """
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = i < count
+    slot, end = tl.load(starts + i, mask=here, other=0), tl.load(starts + i + 1, mask=here, other=0)
+    if GATED:
+        end = tl.where(tl.load(counted) != 0, end, slot)
+    drawn = slot < end
+    zero = slot.to(tl.float32) * 0.0
+    red, green, blue, depth, s, s_u, s_v = zero, zero, zero, zero, zero, zero, zero
+    s_uu, s_uv, s_vv, abs_x, abs_y, squared, hits, left_out = (
+        zero, zero, zero, zero, zero, zero, zero, zero)
+    while tl.max(end - slot) > 0:
+        # several at once: their loads wait together, and the order of the sums stays
+        for _ in tl.static_range(AT_ONCE):
+            more, at = slot < end, sums + slot.to(tl.int64) * SLOT
+            red += tl.load(at, mask=more, other=0.0)
+            green += tl.load(at + 1, mask=more, other=0.0)
+            blue += tl.load(at + 2, mask=more, other=0.0)
+            if PLAIN == 0:
+                depth += tl.load(at + 3, mask=more, other=0.0)
+            s += tl.load(at + 4, mask=more, other=0.0)
+            s_u += tl.load(at + 5, mask=more, other=0.0)
+            s_v += tl.load(at + 6, mask=more, other=0.0)
+            s_uu += tl.load(at + 7, mask=more, other=0.0)
+            s_uv += tl.load(at + 8, mask=more, other=0.0)
+            s_vv += tl.load(at + 9, mask=more, other=0.0)
+            if DETAILS:
+                abs_x += tl.load(at + 10, mask=more, other=0.0)
+                abs_y += tl.load(at + 11, mask=more, other=0.0)
+                squared += tl.load(at + 12, mask=more, other=0.0)
+                hits += tl.load(at + 13, mask=more, other=0.0)
+            if SCORES:
+                left_out += tl.load(at + 14, mask=more, other=0.0)
+            slot += 1
+    record = records + i * FLOATS
+    red = tl.where(tl.load(record + 4, mask=drawn, other=0.0) > 0.0, red, 0.0)
+    green = tl.where(tl.load(record + 5, mask=drawn, other=0.0) > 0.0, green, 0.0)
+    blue = tl.where(tl.load(record + 6, mask=drawn, other=0.0) > 0.0, blue, 0.0)
+    tl.store(g_sh_dc + 3 * i, red * C0, mask=here)
+    tl.store(g_sh_dc + 3 * i + 1, green * C0, mask=here)
+    tl.store(g_sh_dc + 3 * i + 2, blue * C0, mask=here)
+    pull_x, pull_y, pull_z = zero, zero, zero
+    if TERMS > 0:
+        x, y, z, per_length = direction(means, view, i, drawn)
+        has, row = drawn & (i < colored), STRIDE * i
+        writes = here & (i < colored)
+        for k in tl.static_range(TERMS):
+            value = basis(k, x, y, z)
+            tl.store(g_sh_rest + row + 3 * k, value * red, mask=writes)
+            tl.store(g_sh_rest + row + 3 * k + 1, value * green, mask=writes)
+            tl.store(g_sh_rest + row + 3 * k + 2, value * blue, mask=writes)
+            pull = (red * tl.load(sh_rest + row + 3 * k, mask=has, other=0.0)
+                    + green * tl.load(sh_rest + row + 3 * k + 1, mask=has, other=0.0)
+                    + blue * tl.load(sh_rest + row + 3 * k + 2, mask=has, other=0.0))
+            to_x, to_y, to_z = slope(k, x, y, z)
+            pull_x += pull * to_x
+            pull_y += pull * to_y
+            pull_z += pull * to_z
+        for k in tl.static_range(3 * TERMS, STRIDE):  # degrees that are not in use
+            tl.store(g_sh_rest + row + k, zero, mask=writes)
+        along = pull_x * x + pull_y * y + pull_z * z  # the direction has length 1
+        pull_x = (pull_x - along * x) * per_length
+        pull_y = (pull_y - along * y) * per_length
+        pull_z = (pull_z - along * z) * per_length
+
+    u_x = tl.load(record, mask=drawn, other=0.0) * WHITE
+    u_y = tl.load(record + 1, mask=drawn, other=0.0) * WHITE
+    v_y = tl.load(record + 2, mask=drawn, other=0.0) * WHITE
+    s_u, s_v = s_u * WHITE, s_v * WHITE
+    s_uu, s_uv, s_vv = s_uu * (WHITE * WHITE), s_uv * (WHITE * WHITE), s_vv * (WHITE * WHITE)
+    # dL/dmean' = sum s y, y = Sigma'^-1 d = L^T (u, v)
+    d_x, d_y = u_x * s_u, u_y * s_u + v_y * s_v
+    tl.store(means2d_grad + 2 * i, d_x, mask=here)
+    tl.store(means2d_grad + 2 * i + 1, d_y, mask=here)
+    if DETAILS:
+        tl.store(absolute_grad + 2 * i, abs_x * (WHITE * WHITE), mask=here)
+        tl.store(absolute_grad + 2 * i + 1, abs_y * (WHITE * WHITE), mask=here)
+        spread = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
+        tl.store(variance + i, tl.maximum(spread, 0.0).to(tl.float32), mask=here)
+    if SCORES:
+        tl.store(loo + i, left_out, mask=here)
+    odds = tl.exp2(tl.minimum(-tl.load(logits + i, mask=drawn, other=0.0) * LOG2E, 126.0))
+    tl.store(g_logits + i, s * (odds / (1.0 + odds)), mask=here)  # o dL/do (1 - o)
+
+    to_x, to_y, to_z = position(means, view, i, drawn)
+    to_z = tl.where(drawn, to_z, 1.0)
+    per_z = (1.0 / to_z).to(tl.float32)
+    u, v = (to_x / to_z).to(tl.float32), (to_y / to_z).to(tl.float32)
+    a0, a1, a2, b0, b1, b2 = image_axes(view, u, v, per_z)
+    w, x, y, z, per_norm = unit_quaternion(quats, i, drawn)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(w, x, y, z)
+    t0, t1, t2 = standard_deviations(log_scales, i, drawn)
+    v00, v01, v02 = projected_axes(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    v10, v11, v12 = projected_axes(b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    v00, v01, v02, v10, v11, v12 = v00 * t0, v01 * t1, v02 * t2, v10 * t0, v11 * t1, v12 * t2
+    # P = U_X (c vx - b vy) / c cancels; c vx - b vy = .3 vx + vy x (vx x vy) does not
+    w0, w1, w2 = v01 * v12 - v02 * v11, v02 * v10 - v00 * v12, v00 * v11 - v01 * v10
+    scale = u_x * v_y * v_y
+    p0 = scale * (v00 * LOW_PASS + (v11 * w2 - v12 * w1))
+    p1 = scale * (v01 * LOW_PASS + (v12 * w0 - v10 * w2))
+    p2 = scale * (v02 * LOW_PASS + (v10 * w1 - v11 * w0))
+    q0, q1, q2 = v_y * v10, v_y * v11, v_y * v12
+    m0, n0 = s_uu * p0 + s_uv * q0, s_uv * p0 + s_vv * q0
+    m1, n1 = s_uu * p1 + s_uv * q1, s_uv * p1 + s_vv * q1
+    m2, n2 = s_uu * p2 + s_uv * q2, s_uv * p2 + s_vv * q2
+    g0, g1, g2 = m0 * p0 + n0 * q0, m1 * p1 + n1 * q1, m2 * p2 + n2 * q2
+    tl.store(g_log_scales + 3 * i, g0, mask=here)
+    tl.store(g_log_scales + 3 * i + 1, g1, mask=here)
+    tl.store(g_log_scales + 3 * i + 2, g2, mask=here)
+    # gradients of the two rows of J W R
+    e0, e1, e2 = t0 * u_x * m0, t1 * u_x * m1, t2 * u_x * m2
+    f0, f1 = t0 * (u_y * m0 + v_y * n0), t1 * (u_y * m1 + v_y * n1)
+    f2 = t2 * (u_y * m2 + v_y * n2)
+    d00, d01, d02 = a0 * e0 + b0 * f0, a0 * e1 + b0 * f1, a0 * e2 + b0 * f2  # dL/dR
+    d10, d11, d12 = a1 * e0 + b1 * f0, a1 * e1 + b1 * f1, a1 * e2 + b1 * f2
+    d20, d21, d22 = a2 * e0 + b2 * f0, a2 * e1 + b2 * f1, a2 * e2 + b2 * f2
+    gw = 2.0 * (x * (d21 - d12) + y * (d02 - d20) + z * (d10 - d01))
+    gx = 2.0 * (y * (d01 + d10) + z * (d02 + d20) - 2.0 * x * (d11 + d22) + w * (d21 - d12))
+    gy = 2.0 * (x * (d01 + d10) + z * (d12 + d21) - 2.0 * y * (d00 + d22) + w * (d02 - d20))
+    gz = 2.0 * (x * (d02 + d20) + y * (d12 + d21) - 2.0 * z * (d00 + d11) + w * (d10 - d01))
+    along = gw * w + gx * x + gy * y + gz * z
+    tl.store(g_quats + 4 * i, (gw - along * w) * per_norm, mask=here)
+    tl.store(g_quats + 4 * i + 1, (gx - along * x) * per_norm, mask=here)
+    tl.store(g_quats + 4 * i + 2, (gy - along * y) * per_norm, mask=here)
+    tl.store(g_quats + 4 * i + 3, (gz - along * z) * per_norm, mask=here)
+
+    # the axes of the image: a = fx / z (R0 - u R2), b = fy / z (R1 - v R2)
+    h0, h1, h2 = (e0 * r00 + e1 * r01 + e2 * r02, e0 * r10 + e1 * r11 + e2 * r12,
+                  e0 * r20 + e1 * r21 + e2 * r22)
+    i0, i1, i2 = (f0 * r00 + f1 * r01 + f2 * r02, f0 * r10 + f1 * r11 + f2 * r12,
+                  f0 * r20 + f1 * r21 + f2 * r22)
+    m20, m21, m22 = number(view, 6), number(view, 7), number(view, 8)
+    fx, fy = number(view, FX), number(view, FY)
+    d_u = -fx * per_z * (h0 * m20 + h1 * m21 + h2 * m22)
+    d_v = -fy * per_z * (i0 * m20 + i1 * m21 + i2 * m22)
+    held_u = (u >= number(view, LEFT)) & (u <= number(view, RIGHT))
+    held_v = (v >= number(view, TOP)) & (v <= number(view, BOTTOM))
+    d_u = tl.where(held_u, d_u, 0.0) + fx * d_x
+    d_v = tl.where(held_v, d_v, 0.0) + fy * d_y
+    d_z = depth - per_z * (g0 + g1 + g2 + u * d_u + v * d_v)  # both rows go with 1 / z
+    d_u, d_v = d_u * per_z, d_v * per_z
+    tl.store(g_means + 3 * i, pull_x + number(view, 0) * d_u + number(view, 3) * d_v + m20 * d_z,
+             mask=here)
+    tl.store(g_means + 3 * i + 1,
+             pull_y + number(view, 1) * d_u + number(view, 4) * d_v + m21 * d_z, mask=here)
+    tl.store(g_means + 3 * i + 2,
+             pull_z + number(view, 2) * d_u + number(view, 5) * d_v + m22 * d_z, mask=here)

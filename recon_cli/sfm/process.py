@@ -1,0 +1,245 @@
+"""Starts the mapping process, shows how far it is, and makes errors of its ways to fail.
+
+Native code can abort, hang or fill the memory; in a process of its own it takes nothing with it.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from recon_cli.errors import SfmError
+from recon_cli.progress import Bar, Progress
+from recon_cli.sfm import database
+from recon_cli.sfm import job as protocol
+from recon_cli.sfm.job import LOCK, Job
+
+_DOING = {
+    "features": ("finding features", "frame"),
+    "matches": ("matching frames", "pair"),
+    "mapping": ("placing cameras", "frame"),
+    "undistorted": ("undistorting frames", "frame"),
+}
+_STEP = {"mapping": "model"}  # the step that a phase belongs to, where the names differ
+
+
+class Monitor:
+    """Shows one bar a phase and records what would survive a crash.
+
+    Args:
+        job: what the process does.
+        progress: opens the bars.
+        record: called with (done, total); each step counts as many units as there are frames.
+    """
+
+    def __init__(
+        self, job: Job, progress: Progress, record: Callable[[int, int], None]
+    ) -> None:
+        self._job = job
+        self._progress = progress
+        self._record = record
+        self._phase: protocol.Phase | None = None
+        self._count = 0
+        self._durable = 0
+        self._bar: Bar | None = None
+        self._open = ExitStack()
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._open.close()
+
+    @property
+    def doing(self) -> str:
+        """What the process is at, in words."""
+        if self._phase is None:
+            return "starting"
+        text, unit = _DOING[self._phase.name]
+        return f"{text} ({self._count} of {self._phase.total} {unit}s done)"
+
+    def show(self, event: protocol.Event | None) -> None:
+        """Takes notice of an event, or of what lies on the disk when there is none."""
+        if isinstance(event, protocol.Phase):
+            self._begin(event)
+        elif isinstance(event, protocol.Done):
+            self._reach(event.count)
+        else:
+            self._reach(self._counted())
+
+    def _begin(self, phase: protocol.Phase) -> None:
+        self._open.close()
+        text, unit = _DOING[phase.name]
+        self._phase, self._count = phase, phase.done
+        self._bar = self._open.enter_context(
+            self._progress.bar(text, phase.total, unit=unit, done=phase.done))
+        self._note_durable()
+
+    def _reach(self, count: int) -> None:
+        if self._bar is not None and count > self._count:
+            self._bar.advance(count - self._count)
+            self._count = count
+            self._note_durable()
+
+    def _counted(self) -> int:
+        """Returns how many results of the current phase lie on the disk."""
+        phase = self._phase
+        if phase is None:
+            return 0
+        if phase.name in ("features", "matches"):
+            return database.progress(self._job.database, phase.name)
+        if phase.name == "undistorted":
+            # os.walk, not rglob: the process removes folders as it goes, and walk passes over them.
+            files = sum(
+                name.endswith(".png")
+                for _, _, files in os.walk(self._job.undistorting) for name in files)
+            return min(files, phase.total)  # masks lie there twice for a moment
+        return 0
+
+    def _note_durable(self) -> None:
+        """Records finished steps, and images or pairs that the database keeps."""
+        assert self._phase is not None
+        frames, steps = len(self._job.names), self._job.steps
+        step = steps.index(_STEP.get(self._phase.name, self._phase.name))
+        kept = self._phase.name in ("features", "matches")
+        share = min(1.0, self._count / max(1, self._phase.total)) if kept else 0.0
+        # A further rung of the ladder matches again: what was reached before stays reached.
+        self._durable = max(self._durable, round((step + share) * frames))
+        self._record(self._durable, len(steps) * frames)
+
+
+LOG = "log.txt"
+POLL_SECONDS = 0.25
+_LOG_TAIL = 64 * 1024  # bytes
+_GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
+
+
+def run_job(
+    job: Job,
+    *,
+    progress: Progress,
+    record: Callable[[int, int], None],
+) -> None:
+    """Runs a job in a process of its own; its results stand in the ledger.
+
+    Args:
+        job: what to do, and after how many minutes the process is killed.
+        progress: for a bar a phase.
+        record: called with (done, total) of what would survive a crash.
+
+    Raises:
+        SfmError: there is no model to trust, the time is up, or the process died.
+        FormatError: a frame cannot be read.
+        WorkspaceError: another process works in the same folder.
+        OSError: as met in the process: the disk is full or not writable.
+    """
+    max_minutes = job.max_minutes
+    deadline = time.monotonic() + 60 * max_minutes
+    file = job.out / "job.json"
+    job.write(file)
+    try:
+        with _started(job, file) as child, Monitor(job, progress, record) as monitor:
+            for event in _events(child):
+                if isinstance(event, protocol.Failed):
+                    raise event.error
+                if time.monotonic() > deadline:
+                    raise _too_late(max_minutes, monitor)
+                monitor.show(event)
+            try:
+                code = child.wait(timeout=max(1.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired as error:  # native code may hang on its way out
+                raise _too_late(max_minutes, monitor) from error
+            if code != 0:
+                raise _crashed(job.out / LOG, code, monitor)
+    finally:
+        for leftover in (file, job.out / LOCK):
+            leftover.unlink(missing_ok=True)
+
+
+@contextmanager
+def _started(job: Job, file: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Yields the running process and kills it on leaving, however that happens."""
+    threads = str(job.threads)
+    # In the stage's folder, for `python -m` looks for modules in the current one first.
+    with (job.out / LOG).open("ab") as log, subprocess.Popen(
+        [sys.executable, "-m", "recon_cli.sfm.worker", str(file)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, cwd=job.out,
+        env={**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads},
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def _events(child: subprocess.Popen[bytes]) -> Iterator[protocol.Event | None]:
+    """Yields what the process says until it falls silent, and None whenever a while has passed."""
+    lines: queue.Queue[bytes | None] = queue.Queue()
+    assert child.stdout is not None
+    stream = child.stdout
+
+    def read() -> None:
+        for line in stream:
+            lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        try:
+            line = lines.get(timeout=POLL_SECONDS)
+        except queue.Empty:
+            yield None
+            continue
+        if line is None:
+            return
+        yield protocol.parse(line)
+
+
+def _too_late(max_minutes: float, monitor: Monitor) -> SfmError:
+    return SfmError(
+        f"The cameras were not found within {max_minutes:g} minutes: it was {monitor.doing}.",
+        hint="Allow more time with --max-minutes (features and matches found so far are kept), or "
+        "make it quicker with fewer frames (recon ingest --frames N) or --max-features 1024.")
+
+
+def _crashed(log: Path, code: int, monitor: Monitor) -> SfmError:
+    how = f"was ended by {_signal_name(-code)}" if code < 0 else f"stopped with exit code {code}"
+    hint = "Run it again: features and matches found so far are kept."
+    if code == -signal.SIGKILL:
+        hint = (
+            "The system may have been short of memory; try --max-features 1024 or fewer frames "
+            "(recon ingest --frames N).")
+    return SfmError(
+        f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
+        f"{gist(log)}", hint=hint)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def gist(log: Path) -> str:
+    """Returns the last line of a log that tells of an error, else its last line."""
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - _LOG_TAIL))
+        text = file.read().decode(errors="replace")
+    lines = [line.strip() for line in text.splitlines()]
+    lines = [line for line in lines if line and not line.startswith("@")]  # native stack frames
+    telling = [
+        line for line in lines
+        if line.startswith(("E2", "F2")) or re.search(r"\b\w*Error\b|\*\*\* SIG|Fatal", line)
+    ]
+    last = (telling or lines or ["nothing."])[-1]
+    return _GLOG.sub("", last)

@@ -1,1 +1,0 @@
-"""`recon prune --sweep`: what every score costs at every ratio, against controls."""

@@ -1,0 +1,201 @@
+"""Steps that the host starts on a device without waiting for the one before to end.
+
+Host and device meet where something must be decided: at each densification, each report, and
+whenever somebody wants to see the state. What went wrong in between the device has written down:
+a loss that was not finite moved nothing, and a step that its buffers had no room for stopped it and
+all that follow. Those are taken back here and taken again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon_cli.render import Statistics
+from recon_cli.scene.camera import Camera
+from recon_cli.train.densify import STRATEGIES
+from recon_cli.train.densify.statistics import Gathered
+from recon_cli.train.gradient import DeferredStep, gradient_step
+from recon_cli.train.importance import Importance
+from recon_cli.train.state import TrainState
+from recon_cli.train.stepper import Stepper, control, next_view, skip
+
+if TYPE_CHECKING:
+    from recon_cli.train.fit import Task
+
+_FARTHEST = 100  # steps between two meetings, so that Ctrl-C and a progress bar need not wait
+
+
+@dataclass(frozen=True, eq=False)
+class _Before:
+    """What the host knew before a step.
+
+    Attributes:
+        iteration: steps done.
+        queue: views to come.
+        generator: state of the source of random choices.
+    """
+
+    iteration: int
+    queue: list[int]
+    generator: torch.Tensor
+
+
+def advancing(
+    state: TrainState, task: Task, importance: Importance | None, looks: Callable[[int], bool]
+) -> Callable[[], float]:
+    """Returns a function that takes a step or several and returns the loss of the last one.
+
+    Args:
+        state: changed in place.
+        task: views and plan.
+        importance: as in `Stepper`.
+        looks: whether somebody wants to see the state after a step.
+    """
+    plain = importance is None and state.exposure is None and state.poses is None
+    quiet = not STRATEGIES[task.schedule.config.densify].each_step
+    if task.backend == "triton" and task.ranks.alone and plain and quiet:
+        return Ahead(state, task, looks).advance
+    return Stepper(state, task, importance).step
+
+
+class Ahead:
+    """Takes the steps of one call of `fit.fit` ahead of the device.
+
+    Args:
+        state: changed in place.
+        task: views and plan.
+        looks: whether somebody wants to see the state after a step.
+    """
+
+    def __init__(self, state: TrainState, task: Task, looks: Callable[[int], bool]) -> None:
+        self._state, self._task, self._looks = state, task, looks
+        self._compute = cast(DeferredStep, gradient_step(task.backend, task.device))
+        self._variance = STRATEGIES[task.schedule.config.densify].variance
+        self._trail: list[_Before] = []
+        self._batch = _Batch(self._compute, task.schedule.config.batch_views)
+
+    def advance(self) -> float:
+        """Takes steps up to the next at which the host is needed, and returns its loss.
+
+        Raises:
+            TrainingError: too many losses were not finite, or no Gaussian is left.
+        """
+        state, task = self._state, self._task
+        while True:
+            self._start()
+            if not self._meets(state.iteration):
+                continue
+            loss, skipped, happened = self._batch.close()
+            if happened is not None:
+                self._take_back(happened)
+            self._trail.clear()
+            skip(state, task, skipped)
+            if happened is not None:
+                continue
+            if np.isfinite(loss):  # as in `Stepper.step`
+                control(state, task)
+            return loss
+
+    def _start(self) -> None:
+        """Starts one step."""
+        state, schedule = self._state, self._task.schedule
+        self._trail.append(_Before(
+            state.iteration, list(state.queue), state.generator.get_state()))
+        iteration = state.iteration + 1
+        gathers, moves_sh = schedule.gathers(iteration), schedule.moves_sh(iteration)
+        self._batch.begin(state)
+        for _ in range(schedule.config.batch_views):
+            view = self._task.pyramid.view(
+                next_view(state, self._task), schedule.level(iteration))
+            statistics = self._compute.start(
+                state.optimizer, view, schedule.sh_degree(iteration),
+                schedule.config.ssim_weight, variance=gathers and self._variance)
+            self._batch.add(
+                state, statistics if gathers else None, view.camera, moves_sh=moves_sh)
+        counted = self._batch.end(state, gathers=gathers, moves_sh=moves_sh)
+        state.optimizer.step(
+            schedule.means_rate(iteration), sh_rest=moves_sh,
+            factor=schedule.rate_factor(iteration), counted=counted)
+        state.iteration = iteration
+
+    def _meets(self, iteration: int) -> bool:
+        schedule = self._task.schedule
+        return (self._looks(iteration) or len(self._trail) >= _FARTHEST
+                or schedule.densifies(iteration) or schedule.resets(iteration)
+                or iteration == schedule.review)
+
+    def _take_back(self, happened: int) -> None:
+        """Returns to the state after the first steps of the trail; the others changed nothing."""
+        before = self._trail[happened]
+        self._state.iteration, self._state.queue = before.iteration, before.queue
+        self._state.generator.set_state(before.generator)
+
+
+class _Batch:
+    """The views of one step taken together on the device, as `Stepper` does on the host.
+
+    Args:
+        compute: of the views.
+        views: of a step.
+    """
+
+    def __init__(self, compute: DeferredStep, views: int) -> None:
+        self._compute, self._views = compute, views
+        like = compute.ledger.numbers
+        # of several views: losses of this step, and steps that came to nothing
+        self._loss, self._skipped = like.new_zeros(()), like.new_zeros(())
+
+    def begin(self, state: TrainState) -> None:
+        """Begins a step."""
+        if self._views == 1:
+            return
+        self._gathered = Gathered.zeros(len(state.splats), state.splats.means.device)
+        self._seen = torch.zeros_like(self._compute.counted)
+        self._before = self._compute.ledger.skipped.clone()
+        self._loss.zero_()
+
+    def add(
+        self, state: TrainState, statistics: Statistics | None, camera: Camera, *, moves_sh: bool
+    ) -> None:
+        """Takes what one view left; `statistics` are None where nobody gathers them."""
+        several = self._views > 1
+        if statistics is not None:
+            gathered = self._gathered if several else state.gathered
+            gathered.add(statistics, camera.width, camera.height)
+        if several:
+            state.optimizer.keep(1 / self._views, sh_rest=moves_sh)
+            self._seen |= self._compute.counted
+            self._loss += self._compute.ledger.loss
+
+    def end(self, state: TrainState, *, gathers: bool, moves_sh: bool) -> Tensor:
+        """Leaves the mean gradient, and returns [1] int32 whether the step counts."""
+        if self._views == 1:
+            return self._compute.counted
+        ledger = self._compute.ledger
+        going, sound = ledger.going, ledger.skipped == self._before
+        state.optimizer.kept(sh_rest=moves_sh)
+        if gathers:  # of a step that is taken again nothing may stay
+            state.gathered.join(self._gathered.times(going))
+        self._skipped += going & ~sound
+        return self._seen * (going & sound)
+
+    def close(self) -> tuple[float, int, int | None]:
+        """Waits for the device.
+
+        Returns:
+            The loss of the last step, the steps that came to nothing for theirs, and how many steps
+            happened before one was stopped; None where all did.
+        """
+        account = self._compute.close()
+        happened = None if account.stopped is None else account.stopped // self._views
+        if self._views == 1:
+            return account.loss, account.skipped, happened
+        loss, skipped = torch.stack([self._loss / self._views, self._skipped]).tolist()
+        self._skipped.zero_()
+        return loss, int(skipped), happened

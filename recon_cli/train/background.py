@@ -1,0 +1,159 @@
+"""What lies far outside, behind windows: Gaussians on a sphere so large that it has no parallax.
+
+Structure from motion finds few points out there, so training would paint the view on the panes,
+where it moves wrongly with the camera. Directions in which several views see no point of the scene
+get a Gaussian each, in the colour that these views show. They are ordinary Gaussians: every
+viewer draws them, and densification splits them where there is detail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.pyramid import reduced
+
+_RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
+_DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart
+_VIEWS = 50  # looked at, at most
+_LEVEL = 4  # images are reduced by this for the search
+# a surface covers this many times the median distance of its points in the image around each,
+# within these reduced pixels: between dense points a window stays open, sparse ones close a wall
+_COVER = 3.0
+_COVER_RANGE = 1, 4
+_SAMPLES = 500  # points that this median is taken over
+_AGREE = 2  # views that must see nothing in front
+_SHARE = 0.1  # of the views that look there: elsewhere a surface lacks points in some views only
+_FACING = 5  # directions that must be free in a view that sees some of it; 50 square degrees
+_FILL_DEGREES = 12.0  # directions this close to a far one become far: frames and trees hide some
+_OPACITY = 0.5
+_SPACING = 0.6  # of the distance between directions: the standard deviation
+
+
+@dataclass(frozen=True, eq=False)
+class FarContent:
+    """Directions in which nothing near was found.
+
+    Attributes:
+        positions: [K, 3] float64 on the sphere, world units.
+        colors: [K, 3] float64 in [0, 1].
+        scale: standard deviation that closes the gaps between them, world units.
+        share: of all looked-at pixels' directions that are far, 0 to 1.
+    """
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.float64]
+    scale: float
+    share: float
+
+
+def far_content(
+    views: Sequence[TrainView], points: NDArray[np.float64], extent: float
+) -> FarContent:
+    """Returns the directions in which the views see no point of the scene.
+
+    Args:
+        views: training views.
+        points: [P, 3] of the scene, world units; the more, the better they cover its surfaces.
+        extent: of the scene, world units.
+    """
+    centers = np.stack([view.camera.center for view in views])
+    directions = fibonacci_sphere(_DIRECTIONS)
+    sphere = centers.mean(axis=0) + _RADIUS * extent * directions
+    seen, empty, total = np.zeros(len(sphere)), np.zeros(len(sphere)), np.zeros((len(sphere), 3))
+    for view in views[::max(1, -(-len(views) // _VIEWS))]:
+        small = reduced(view, _LEVEL)
+        covered = _covered(small, points)
+        rows, column, line = _projected(small, sphere)
+        seen[rows] += 1
+        free = ~covered[line, column]
+        if small.mask is not None:
+            free &= small.mask[line, column]
+        empty[rows[free]] += 1
+        total[rows[free]] += small.image[line[free], column[free]] / 255
+    far = (empty >= _AGREE) & (empty >= _SHARE * seen)
+    share = float(far.sum() / max(1, (seen > 0).sum()))
+    colors = total / np.maximum(empty, 1)[:, None]
+    far, colors = _filled(directions, far, colors)
+    spacing = _RADIUS * extent * np.sqrt(4 * np.pi / _DIRECTIONS)
+    return FarContent(sphere[far], colors[far], float(_SPACING * spacing), share)
+
+
+def faces(view: TrainView, content: FarContent, points: NDArray[np.float64]) -> bool:
+    """Tells whether a view sees some of what lies far outside, past the points [P, 3]."""
+    small = reduced(view, _LEVEL)
+    _, column, line = _projected(small, content.positions)
+    return int((~_covered(small, points)[line, column]).sum()) >= _FACING
+
+
+def fibonacci_sphere(n: int) -> NDArray[np.float64]:
+    """Returns n unit vectors spread evenly, [n, 3] (Swinbank and Purser 2006)."""
+    i = np.arange(n) + 0.5
+    z = 1 - 2 * i / n
+    around = np.pi * (1 + 5**0.5) * i
+    flat = np.sqrt(1 - z * z)
+    return np.stack([flat * np.cos(around), flat * np.sin(around), z], axis=1)
+
+
+def _projected(
+    view: TrainView, points: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Returns the rows of the points inside the image, and the columns and lines they fall on."""
+    camera = view.camera
+    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
+    ahead = np.maximum(z, 1e-9)
+    u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
+    rows = np.flatnonzero(
+        (z > 1e-9) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height))
+    return rows, u[rows].astype(np.int64), v[rows].astype(np.int64)
+
+
+def _covered(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Returns where a point lies near, [H, W]."""
+    _, column, line = _projected(view, points)
+    hit = np.zeros((view.camera.height, view.camera.width), np.uint8)
+    hit[line, column] = 1
+    pixels = np.argwhere(hit)
+    if len(pixels) < 2:
+        return hit > 0
+    some = pixels[::max(1, len(pixels) // _SAMPLES)]
+    distance = cKDTree(pixels).query(some, k=2)[0][:, 1]
+    radius = int(np.clip(round(_COVER * float(np.median(distance)) / 2), *_COVER_RANGE))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return np.asarray(cv2.dilate(hit, disc) > 0)
+
+
+def _filled(
+    directions: NDArray[np.float64], far: NDArray[np.bool_], colors: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Returns the far directions with their surroundings, coloured by their neighbours."""
+    if not far.any():
+        return far, colors
+    tree = cKDTree(directions[far])
+    count = min(6, int(far.sum()))
+    distance, nearest = tree.query(directions, k=list(range(1, count + 1)))
+    weight = 1 / np.maximum(distance, 1e-6) ** 2
+    blended = (colors[far][nearest] * weight[..., None]).sum(1) / weight.sum(1, keepdims=True)
+    around = ~far & (distance[:, 0] < 2 * np.sin(np.radians(_FILL_DEGREES) / 2))
+    return far | around, np.where(around[:, None], blended, colors)
+
+
+def splats_of(content: FarContent, sh_rest: int) -> Splats:
+    """Returns one round Gaussian a direction, with `sh_rest` rows of higher coefficients."""
+    n = len(content.positions)
+    return Splats(
+        means=torch.tensor(content.positions, dtype=torch.float32),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        log_scales=torch.full((n, 3), float(np.log(content.scale))),
+        logit_opacities=torch.logit(torch.full((n,), _OPACITY)),
+        sh_dc=(torch.tensor(content.colors, dtype=torch.float32) - 0.5) / SH_C0,
+        sh_rest=torch.zeros(n, sh_rest, 3),
+    )

@@ -1,0 +1,1 @@
+"""Data-parallel training: several processes that torchrun started train one model."""

@@ -1,0 +1,174 @@
+"""A fit by several processes: what the leader says, and what the others do.
+
+The leader says before every step at which iteration it begins, which also tells of a jump. Words
+that are no iteration are below zero. Whatever ends the fit between two steps, the leader says so,
+and the others wait for the next fit; in the middle of a step nothing can be said, and it leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+
+import torch
+from torch import Tensor
+
+from recon_cli.context import Ranks
+from recon_cli.errors import LostError, TrainingError
+from recon_cli.render import registry
+from recon_cli.train.cost import EXCHANGE, join_exchange
+from recon_cli.train.distributed.serialize import Fit, hand_out, packed, receive, unpacked
+from recon_cli.train.fit import Report, Task, fit
+from recon_cli.train.importance import Importance
+from recon_cli.train.state import TrainState, tensors_of
+from recon_cli.train.stepper import Stepper
+
+_DONE, _FIT = 0, 1  # between fits, and EXCHANGE
+_STOP, _END, _COMPARE = -1, -2, -3  # in a fit
+
+
+def fit_together(
+    state: TrainState,
+    task: Task,
+    until: int,
+    *,
+    on_step: Callable[[TrainState], None],
+    on_report: Callable[[Report], None],
+    importance: Importance | None = None,
+    threads: int = 1,
+    looks: Callable[[int], bool] = lambda _: True,
+) -> None:
+    """Runs `state` on like `fit`, with the help of all processes that `task.ranks` leads.
+
+    Args:
+        state: changed in place.
+        task: views and plan.
+        until: total number of steps.
+        on_step: as `fit` has it.
+        on_report: as `fit` has it.
+        importance: as `fit` has it; gets the scores of all processes.
+        threads: of each process.
+        looks: as `fit` has it; several processes see the state after every step.
+
+    Raises:
+        TrainingError: as `fit`, or the processes no longer hold the same Gaussians.
+        LostError: a process is gone.
+    """
+    ranks = task.ranks
+    if ranks.alone or state.iteration >= until:
+        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance,
+            looks=looks)
+        return
+    arrays = packed(Fit(state, task, importance, threads))
+    between = False  # of two steps: the others wait for a word
+
+    def go_on() -> None:
+        nonlocal between
+        ranks.told(state.iteration)
+        between = False
+
+    def stepped(now: TrainState) -> None:
+        nonlocal between
+        between = True
+        if task.schedule.densifies(now.iteration):
+            _say_and_compare(now, ranks)
+        on_step(now)
+        if now.iteration < until:
+            go_on()
+
+    def reported(report: Report) -> None:
+        nonlocal between
+        between = True
+        _say_and_compare(state, ranks)
+        on_report(report)
+
+    try:
+        ranks.told(_FIT)
+        hand_out(arrays, ranks)
+        ranks.views = task.train
+        del arrays
+        go_on()
+        fit(state, task, until, on_step=stepped, on_report=reported, importance=importance)
+        ranks.told(_END)
+        if importance is not None:
+            importance.over(ranks)
+    except BaseException as error:
+        # what a step raises about the training, it raises in every process
+        alike = between or isinstance(error, TrainingError)
+        if alike and not isinstance(error, LostError):
+            ranks.told(_STOP)
+        else:
+            ranks.leave()
+        raise
+
+
+def dismiss(ranks: Ranks) -> None:
+    """Tells the other processes that there is nothing more to do, and leaves them."""
+    with suppress(LostError):  # who is gone need not be told
+        ranks.told(_DONE)
+    ranks.leave()
+
+
+def follow(ranks: Ranks) -> None:
+    """Takes part in what the leader begins until it says that it is done.
+
+    Raises:
+        LostError: the leader is gone.
+    """
+    ready: set[str] = set()
+    while (word := ranks.told(_DONE)) != _DONE:
+        if word == EXCHANGE:
+            join_exchange(ranks)
+            continue
+        given = unpacked(receive(ranks), ranks)
+        if given.task.backend not in ready:
+            registry.use_threads(given.task.backend, given.threads)
+            registry.prepare(given.task.backend, lambda: None)
+            ready.add(given.task.backend)
+        _take_part(given)
+        del given  # the next one needs the room
+    ranks.leave()
+
+
+def _take_part(given: Fit) -> None:
+    """Takes the steps that the leader takes."""
+    state, ranks = given.state, given.task.ranks
+    stepper = Stepper(state, given.task, given.importance)
+    while (word := ranks.told(_STOP)) not in (_STOP, _END):
+        try:
+            if word == _COMPARE:
+                _compare(state, ranks)
+            else:
+                state.iteration = word
+                stepper.step()
+        except LostError:
+            raise
+        except TrainingError:
+            if ranks.told(_STOP) != _STOP:  # the leader met nothing of the kind
+                raise
+            return
+    if word == _END and given.importance is not None:
+        given.importance.over(ranks)
+
+
+def _say_and_compare(state: TrainState, ranks: Ranks) -> None:
+    ranks.told(_COMPARE)
+    _compare(state, ranks)
+
+
+def _compare(state: TrainState, ranks: Ranks) -> None:
+    """Raises TrainingError, in every process, unless all hold the same state."""
+    digests = torch.tensor([_digest(tensor) for tensor in tensors_of(state).values()])
+    most = torch.stack([digests, ~digests])
+    ranks.raise_to_most(most)
+    if not torch.equal(most[0], ~most[1]):
+        raise TrainingError(
+            f"The processes hold different Gaussians after step {state.iteration}.",
+            hint="Use machines of one kind, with the same versions of recon and torch; or train "
+            "with one process.")
+
+
+def _digest(tensor: Tensor) -> int:
+    """Returns the sum of a tensor's bits, in words: cheap, and what differs soon differs widely."""
+    flat = tensor.contiguous().reshape(-1)
+    return int((flat if flat.dtype == torch.uint8 else flat.view(torch.int32)).sum())

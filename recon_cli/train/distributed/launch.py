@@ -1,0 +1,74 @@
+"""Processes that torchrun started: the first one runs the command line, the others train along.
+
+torchrun tells each its place in the environment. Who was not started by it pays nothing here.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from recon_cli.context import ALONE, Ranks
+from recon_cli.errors import LostError
+
+# RANK and WORLD_SIZE alone are set by other programs as well, for purposes of their own.
+_MARK = "TORCHELASTIC_RUN_ID"
+
+logger = logging.getLogger("recon")
+
+
+def follows() -> bool:
+    """Tells whether this process is one of the others."""
+    return _are_several() and os.environ["RANK"] != "0"
+
+
+def _are_several() -> bool:
+    return _MARK in os.environ and os.environ.get("WORLD_SIZE", "1") != "1"
+
+
+@contextmanager
+def leading() -> Iterator[Ranks]:
+    """Yields the processes that this one leads, and lets them go in the end.
+
+    Raises:
+        BackendError: they cannot be connected.
+    """
+    if not _are_several():
+        yield ALONE
+        return
+    # to be seen where they never all come: under somebody else's torchrun
+    logger.info("one of %s processes that torchrun started: waiting for the others",
+                os.environ["WORLD_SIZE"])
+    from recon_cli.train.distributed.data_parallel import dismiss
+    from recon_cli.train.distributed.process_group import Processes
+
+    ranks = Processes.join()
+    del os.environ[_MARK]  # what this process starts itself is alone
+    try:
+        yield ranks
+    finally:
+        dismiss(ranks)
+
+
+def follow() -> int:
+    """Trains along until the leader is done; returns the exit code.
+
+    Ctrl-C is the leader's: it saves the state first. Where the leader is gone there is nothing to
+    say that it did not say itself.
+
+    Raises:
+        BackendError: the processes cannot be connected.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logger.setLevel(logging.WARNING)
+    from recon_cli.train.distributed.data_parallel import follow
+    from recon_cli.train.distributed.process_group import Processes
+
+    try:
+        follow(Processes.join())
+    except LostError as error:
+        return error.exit_code
+    return 0

@@ -1,0 +1,336 @@
+"""Which optional parts of the model this scene needs: each is off unless a short trial shows it.
+
+A part has a cheap sign that must speak for it first (most scenes try nothing), then two short runs
+at a reduced size that differ in this part alone are scored on views that neither trained on
+(`trials`). What was switched on is part of the trials that follow.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon_cli.config.stages import RunConfig
+from recon_cli.evaluation.quality import corrected_psnr
+from recon_cli.render import render
+from recon_cli.scene.splats import Splats
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.background import FarContent, faces, far_content
+from recon_cli.train.exposure import Estimate, estimated
+from recon_cli.train.fit import Task, fit
+from recon_cli.train.initialize import first_state
+from recon_cli.train.poses import worth_a_trial
+from recon_cli.train.pyramid import reduced
+from recon_cli.train.schedule import Schedule
+
+# A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
+# alone were .07 +- .06 dB apart (17 views, 500 steps at 200 pixels): the errors decide as well.
+THRESHOLD_DB = 0.05
+_ERRORS = 1.65  # standard errors, a chance of about one in twenty
+LEAST_VIEWS = 8  # whose mean has a standard error that can be told; fewer, and the split is own
+_SPLIT = 6  # each sixth training view is held out by an own split, or sooner each third or more
+_DENSEST = 3  # of few views; what is left must still hang together
+
+Arm = Callable[[], Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a trial found.
+
+    Attributes:
+        name: of the part.
+        on: it pays.
+        mean_db: mean gain over the views in dB; None where nothing was tried.
+        standard_error_db: of that mean.
+        reason: one sentence for the log.
+        seconds: spent.
+    """
+
+    name: str
+    on: bool
+    mean_db: float | None
+    standard_error_db: float | None
+    reason: str
+    seconds: float
+
+
+def skipped(name: str, reason: str) -> Decision:
+    """Returns the decision against a part that nothing speaks for, untried."""
+    return Decision(name, False, None, None, reason, 0.0)
+
+
+def decide(
+    name: str, arms: tuple[Arm, Arm], *, threshold_db: float = THRESHOLD_DB,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Decision:
+    """Returns whether the second arm is better than the first.
+
+    On, if the mean gain is above the threshold and above 1.65 standard errors of it. The standard
+    error is that of paired differences: views differ by decibels, arms on one view by tenths.
+
+    Args:
+        name: of the part.
+        arms: without and with it; each trains and returns the scores of the same views in the same
+            order, in dB.
+        threshold_db: smallest gain that counts.
+        clock: tells seconds.
+
+    Raises:
+        ValueError: the arms score different numbers of views, or fewer than two.
+    """
+    start = clock()
+    without, with_it = (np.asarray(arm(), np.float64) for arm in arms)
+    if without.shape != with_it.shape or len(without) < 2:
+        raise ValueError(f"arms with {without.shape} and {with_it.shape} scores")
+    gains = with_it - without
+    mean = float(gains.mean())
+    error = float(gains.std(ddof=1)) / math.sqrt(len(gains))
+    needed = max(threshold_db, _ERRORS * error)
+    on = mean > needed  # False for what is not a number
+    reason = (f"{mean:+.2f} dB +- {error:.2f} over {len(gains)} views, "
+              f"{'more' if on else 'not more'} than the {needed:.2f} dB that count")
+    return Decision(name, on, mean, error, reason, clock() - start)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which views a trial trains on and which it scores, as indices.
+
+    Attributes:
+        train: into the training views.
+        held_out: into the validation views, or into the training views where `own`.
+        own: the validation views were too few; the final run trains on the held-out ones again.
+    """
+
+    train: tuple[int, ...]
+    held_out: tuple[int, ...]
+    own: bool
+
+
+def split(training: int, validation: int) -> Split | None:
+    """Returns the views of a trial; None where there are too few for any.
+
+    The validation views, where they are LEAST_VIEWS or more. Otherwise each sixth training view
+    (down to each third, where they would be fewer than LEAST_VIEWS), from the middle of the first
+    interval on; the final run then trains on all of them.
+
+    Args:
+        training: number of training views, in the order of the capture.
+        validation: number of validation views.
+    """
+    if validation >= LEAST_VIEWS:
+        return Split(tuple(range(training)), tuple(range(validation)), own=False)
+    step = max(_DENSEST, min(_SPLIT, training // LEAST_VIEWS))
+    held_out = tuple(range(step // 2, training, step))
+    if len(held_out) < LEAST_VIEWS:
+        return None
+    train = tuple(i for i in range(training) if i not in held_out)
+    return Split(train, held_out, own=True)
+
+
+
+
+LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
+# One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
+_STEPS = 400
+_POINTS = 5000
+_CAP = 10_000
+_FAR_SHARE = 0.003  # of the directions; the window of one room is .012, that of another .045
+PARTS = ("far", "exposure", "poses", "images")
+# Gain from which higher harmonics are worth 45 of 59 parameters. Trials gave .24 dB on photos of a
+# glossy thing (.59 dB in the whole run) and .08 to .12 dB in two rooms (.07 dB in the whole run),
+# where a tenth more Gaussians give as much for less.
+_HARMONICS_DB = 0.15
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a scene needs beyond plain Gaussians.
+
+    Attributes:
+        config: with every optional part on or off.
+        decisions: why, one for each part that was left automatic.
+    """
+
+    config: RunConfig
+    decisions: tuple[Decision, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Spent on trials."""
+        return sum(decision.seconds for decision in self.decisions)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A scene as gates look at it.
+
+    Attributes:
+        task: views at the training size, and the plan.
+        points: [P, 3] sparse points in world units.
+        colors: [P, 3] uint8.
+        harmonics: the degree of the colours is left to a trial.
+        twins: reads the training and validation views from the denoised images, where the task
+            holds the originals; None where both are the same.
+    """
+
+    task: Task
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    twins: Callable[[], tuple[list[TrainView], list[TrainView]]] | None
+    harmonics: bool = False
+
+
+def examine(scene: Candidate) -> Needs:
+    """Returns what a scene needs; parts that the options switch on or off are not tried."""
+    config = scene.task.schedule.config
+    bench = _Bench(scene)
+    decisions: list[Decision] = []
+
+    def settled(part: str, sign: str | None, against: str) -> None:
+        """Puts a part into `config`, by the options, a missing sign, or a trial."""
+        nonlocal config
+        if getattr(config, part) != "auto":
+            return
+        decision = (skipped(part, against) if sign is None
+                    else bench.tried(part, config, sign))
+        decisions.append(decision)
+        config = _with(config, part, _word(part, on=decision.on))
+
+    if config.images == "auto" and scene.twins is None:
+        config = replace(config, images="original")
+    elif config.images == "auto":
+        settled("images", "denoised", "")
+    settled("far", "on" if bench.far.share >= _FAR_SHARE else None,
+            f"points cover {100 * (1 - bench.far.share):.1f}% of what the views see")
+    settled("exposure", "on" if bench.drift.drifts else None,
+            f"brightness of the same points differs by {100 * bench.drift.spread:.1f}% only")
+    task = scene.task
+    error = None if task.camera_error is None else task.camera_error * task.train[0].camera.fx
+    settled("poses", "on" if worth_a_trial(error) else None,
+            "the reprojection error is not known" if error is None
+            else f"the reprojection error is {error:.2f} px of a training image")
+    if scene.harmonics:
+        config = replace(config, sh_degree=bench.degree(config, decisions))
+    return Needs(config, tuple(decisions))
+
+
+def _word(part: str, *, on: bool) -> str:
+    if part == "images":
+        return "denoised" if on else "original"
+    return "on" if on else "off"
+
+
+def _with(config: RunConfig, part: str, value: str) -> RunConfig:
+    changes: dict[str, Any] = {part: value}
+    return replace(config, **changes)
+
+
+class _Bench:
+    """Short runs on the views of a scene."""
+
+    def __init__(self, scene: Candidate) -> None:
+        self._scene, task = scene, scene.task
+        needs_far = task.schedule.config.far != "off"
+        self.far = (far_content(task.train, scene.points, task.extent) if needs_far
+                    else FarContent(np.zeros((0, 3)), np.zeros((0, 3)), 1.0, 0.0))
+        drifting = task.schedule.config.exposure != "off"
+        self.drift = (estimated(task.train, scene.points) if drifting
+                      else Estimate(np.zeros((len(task.train), 3)), 0.0, 0))
+        self._scores: dict[tuple[object, ...], list[float]] = {}
+
+    def tried(self, part: str, config: RunConfig, value: str) -> Decision:
+        """Returns whether a part pays on top of what is on already."""
+        if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
+            return skipped(part, "there are too few views to try it on")
+        arms = (_with(config, part, one) for one in (_word(part, on=False), value))
+        without, with_it = arms
+        telling = self._telling(part)
+        if len(telling) < 2:
+            return skipped(part, "too few of the views to score see any of it")
+
+        def told(config: RunConfig) -> list[float]:
+            scores = self._run(config)
+            return [scores[i] for i in telling]
+
+        return decide(part, (lambda: told(without), lambda: told(with_it)))
+
+    def degree(self, config: RunConfig, decisions: list[Decision]) -> int:
+        """Returns the lowest degree of the colours that the highest does not beat by enough."""
+        if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
+            return config.sh_degree
+        for low in (0, 1):
+            if not self._gains(config, low, decisions):
+                return low
+        return config.sh_degree
+
+    def _gains(self, config: RunConfig, low: int, decisions: list[Decision]) -> bool:
+        """Tells whether all degrees are better than some, and adds the decision."""
+        few = replace(config, sh_degree=low)
+        decisions.append(decide(
+            f"harmonics above degree {low}", (lambda: self._run(few), lambda: self._run(config)),
+            threshold_db=_HARMONICS_DB))
+        return decisions[-1].on
+
+    def _telling(self, part: str) -> list[int]:
+        """Returns which held-out views can tell whether a part pays; the others only add noise."""
+        _, views = self._views()
+        if part != "far":
+            return list(range(len(views)))
+        return [i for i, view in enumerate(views) if faces(view, self.far, self._scene.points)]
+
+    def _views(self) -> tuple[tuple[int, ...], list[TrainView]]:
+        """Returns the rows of the views to train on, and the views to score, as they are."""
+        task = self._scene.task
+        chosen = split(len(task.train), len(task.validation))
+        assert chosen is not None
+        held_out = task.train if chosen.own else task.validation
+        return chosen.train, [held_out[i] for i in chosen.held_out]
+
+    def _run(self, config: RunConfig) -> list[float]:
+        """Returns the corrected PSNR in dB of each held-out view after a short run."""
+        for part in PARTS:
+            if getattr(config, part) == "auto":
+                config = _with(config, part, _word(part, on=False))
+        key = (config.sh_degree, *(getattr(config, part) for part in PARTS))
+        if key not in self._scores:
+            self._scores[key] = self._trained(replace(
+                config, iterations=_STEPS, max_gaussians=min(config.max_gaussians, _CAP),
+                early_stop=False, batch_views=1))
+        return self._scores[key]
+
+    def _trained(self, config: RunConfig) -> list[float]:
+        scene, task = self._scene, self._scene.task
+        train = task.train
+        if scene.twins is not None and config.images == "denoised":
+            train, _ = scene.twins()
+        rows, held_out = self._views()  # scored against the task's own, whatever was trained on
+        schedule = Schedule(config, dataclasses.replace(Schedule(config).recipe, levels=()))
+        small = Task([reduced(train[i], LEVEL) for i in rows], [], schedule, task.extent,
+                     task.backend, task.device, camera_error=task.camera_error)
+        # reduced views would be reduced once more in the search for what lies far outside
+        state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
+        fit(state, small, _STEPS, on_step=lambda _: None, on_report=lambda _: None,
+            looks=lambda _: False)
+        return [_score(state.splats, reduced(view, LEVEL), config, task) for view in held_out]
+
+
+def _score(splats: Splats, view: TrainView, config: RunConfig, task: Task) -> float:
+    with torch.no_grad():
+        image = render(splats, view.camera, torch.zeros(3, device=task.device), config.sh_degree,
+                       backend=task.backend).rgb
+    return corrected_psnr(image.cpu().numpy(), view.image, view.mask)
+
+
+def described(decisions: Sequence[Decision]) -> list[dict[str, object]]:
+    """Returns the decisions as JSON values."""
+    return [dataclasses.asdict(decision) for decision in decisions]

@@ -1,0 +1,227 @@
+"""One view's loss and gradients, by whichever backend runs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon_cli.render import Statistics, render
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.losses import photometric_loss
+from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.poses import camera_gradient
+
+if TYPE_CHECKING:
+    from recon_cli.render.triton.step_status import Account, Ledger
+
+
+
+
+class GradientStep(Protocol):
+    """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of one view in an optimizer.
+
+    Pixels that the view's mask ignores have no error and no gradient.
+    """
+
+    @property
+    def log_gain_gradient(self) -> NDArray[np.float64]:
+        """Gradient [3] of the logarithm of the gain, of the last view that was given one."""
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera of the last view.
+
+        As `poses.camera_gradient`; to be asked before the optimizer uses the gradients up, and only
+        where the view saw a Gaussian.
+        """
+
+    def __call__(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
+    ) -> tuple[float, Statistics | None]:
+        """Returns the loss and the statistics of the view; None where it sees no Gaussian.
+
+        The statistics are valid until the next call. Their `variance` is computed where it is
+        asked for. The rendered channels are multiplied by `gain` [3] before they are compared;
+        None stands for ones. With `scores` there are hits and blend weights too, and with `loo`
+        loo, over the pixels that the view's mask counts.
+        """
+
+
+class DeferredStep(GradientStep, Protocol):
+    """A gradient step that can also be started without waiting for what comes of it."""
+
+    @property
+    def counted(self) -> Tensor:
+        """[1] int32 on the device: zero where the last view came to nothing."""
+
+    @property
+    def ledger(self) -> Ledger:
+        """What the device writes down of each view."""
+
+    def start(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False,
+    ) -> Statistics:
+        """Starts the work on one view and returns its statistics, zeros where it counts nothing."""
+
+    def close(self) -> Account:
+        """Waits for the work, and tells what became of the views since it was last called."""
+
+
+def gradient_step(backend: str, device: torch.device | str = "cpu") -> GradientStep:
+    """Returns the way from a view to its gradients that is fastest with a backend."""
+    if backend == "numba":
+        return _FusedStep()
+    if backend == "triton":
+        return _DeviceStep(torch.device(device))
+    return _AutogradStep(backend)
+
+
+class _FusedStep:
+    """The numba backend's own loss and gradients, in buffers that are used again."""
+
+    def __init__(self) -> None:
+        from recon_cli.render.numba.step import PhotometricStep
+
+        self._compute = PhotometricStep()
+        self._background = torch.zeros(3)
+
+    @property
+    def log_gain_gradient(self) -> NDArray[np.float64]:
+        """Gradient [3] of the logarithm of the gain."""
+        return self._compute.log_gain_gradient
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        from recon_cli.render.numba.camera_gradient import pull_of_scene
+
+        return -pull_of_scene(optimizer.splats, optimizer.gradients, camera, sh_degree)
+
+    def __call__(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
+    ) -> tuple[float, Statistics | None]:
+        """Returns the loss and the statistics of the view."""
+        loss = self._compute(
+            optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
+            sh_degree, ssim_weight, mask=view.mask, gain=gain, details=variance,
+            scores=scores, loo=loo)
+        return loss, self._compute.statistics if self._compute.instances else None
+
+
+class _DeviceStep:
+    """The triton backend's own loss and gradients; nothing but `close` waits for the device."""
+
+    def __init__(self, device: torch.device) -> None:
+        from recon_cli.render.triton.step import PhotometricStep
+
+        self._compute = PhotometricStep(device)
+        self.log_gain_gradient = np.zeros(3)
+
+    @property
+    def counted(self) -> Tensor:
+        """[1] int32, zero where the last view came to nothing."""
+        return self._compute.counted
+
+    @property
+    def ledger(self) -> Ledger:
+        """What the device writes down of each view."""
+        return self._compute.ledger
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        return camera_gradient(optimizer.splats, optimizer.gradients, camera, sh_degree)
+
+    def start(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
+    ) -> Statistics:
+        """Starts the work on one view and returns its statistics."""
+        from recon_cli.render.triton.step import Photograph
+
+        splats = optimizer.splats.map(lambda tensor: tensor.detach())
+        photograph = Photograph(
+            torch.from_numpy(view.image),
+            None if view.mask is None else torch.from_numpy(view.mask),
+            None if gain is None else torch.from_numpy(gain).to(splats.means.device))
+        self._compute(
+            splats, optimizer.gradients, view.camera, photograph, sh_degree, ssim_weight,
+            details=variance, scores=scores, loo=loo)
+        return self._compute.statistics
+
+    def close(self) -> Account:
+        """Waits for the work, and tells what became of it."""
+        return self._compute.close()
+
+    def __call__(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
+    ) -> tuple[float, Statistics | None]:
+        """Returns the loss and the statistics of the view."""
+        while True:
+            statistics = self.start(
+                optimizer, view, sh_degree, ssim_weight, variance=variance, gain=gain,
+                scores=scores, loo=loo)
+            account = self.close()
+            if account.stopped is None:  # else there is room for it now
+                break
+        if gain is not None:
+            self.log_gain_gradient = self._compute.log_gain_gradient.cpu().numpy()
+        return account.loss, statistics if account.seen else None
+
+
+class _AutogradStep:
+    """Any backend that is differentiable by autograd."""
+
+    def __init__(self, backend: str) -> None:
+        self._backend = backend
+        self.log_gain_gradient = np.zeros(3)
+
+    def camera_gradient(
+        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
+    ) -> NDArray[np.float64]:
+        """Returns the gradient [6] of a turn and a move of the camera."""
+        gradients = optimizer.splats.map(
+            lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
+        return camera_gradient(optimizer.splats, gradients, camera, sh_degree)
+
+    def __call__(
+        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
+        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
+        loo: bool = False,
+    ) -> tuple[float, Statistics | None]:
+        """Returns the loss and the statistics of the view."""
+        splats = optimizer.splats
+        device, counting = splats.means.device, view.counting(splats.means.device)
+        output = render(
+            splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
+            scores=variance or scores or loo, mask=counting)
+        rgb = output.rgb
+        log_gain = None
+        if gain is not None:
+            log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
+            rgb = rgb * log_gain.exp()
+        loss = photometric_loss(rgb, view.pixels(device), ssim_weight, mask=counting)
+        value = float(loss.detach())
+        if not (loss.requires_grad and output.statistics.radii.any()):
+            return value, None
+        if np.isfinite(value):
+            loss.backward()  # type: ignore[no-untyped-call]
+            if log_gain is not None and log_gain.grad is not None:
+                self.log_gain_gradient = log_gain.grad.cpu().double().numpy()
+        return value, output.statistics

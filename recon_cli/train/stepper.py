@@ -1,0 +1,205 @@
+"""One optimization step: some views' gradients, their mean, and what follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon_cli.errors import TrainingError
+from recon_cli.render import Statistics
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.densify import STRATEGIES
+from recon_cli.train.densify.statistics import Gathered
+from recon_cli.train.gradient import gradient_step
+from recon_cli.train.importance import Importance
+from recon_cli.train.sh import color_spread, needed, reduced, visibility
+from recon_cli.train.state import TrainState
+
+if TYPE_CHECKING:
+    from recon_cli.train.fit import Task
+
+_SKIPPED = 0.02  # share of the run's steps that may come to nothing
+_SKIPPED_FLOOR = 5
+_COLOR_VIEWS = 30  # from which colours are compared
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the B views of a step say beside their gradients.
+
+    Attributes:
+        loss: [B].
+        seen: [B] 1 where the view saw a Gaussian.
+        turn: [B, 6] gradients of the cameras.
+        gain: [B, 3] gradients of the log-gains.
+    """
+
+    loss: NDArray[np.float64]
+    seen: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    gain: NDArray[np.float64]
+
+    @staticmethod
+    def nothing(views: int) -> _Found:
+        """Returns what no view said."""
+        return _Found(np.zeros(views), np.zeros(views), np.zeros((views, 6)), np.zeros((views, 3)))
+
+
+class Stepper:
+    """Takes the steps of one call of `fit.fit`.
+
+    Args:
+        state: changed in place.
+        task: views and plan.
+        importance: gets the scores of the views that this process looks at; None for nobody.
+    """
+
+    def __init__(self, state: TrainState, task: Task, importance: Importance | None) -> None:
+        self._state, self._task, self._importance = state, task, importance
+        self._compute = gradient_step(task.backend, task.device)
+        self._strategy = STRATEGIES[task.schedule.config.densify]
+
+    def step(self) -> float:
+        """Takes a step and returns its loss, the mean over its views.
+
+        Raises:
+            TrainingError: too many losses were not finite, or no Gaussian is left.
+        """
+        state, task = self._state, self._task
+        iteration = state.iteration + 1
+        batch = [next_view(state, task) for _ in range(task.schedule.config.batch_views)]
+        found = self._gather(batch, iteration)
+        state.iteration = iteration
+        loss = float(found.loss.mean())
+        if not np.isfinite(loss):
+            state.optimizer.discard()
+            skip(state, task)
+            return loss
+        if found.seen.any():
+            self._move(batch, found, iteration)
+        control(state, task)
+        return loss
+
+    def _gather(self, batch: list[int], iteration: int) -> _Found:
+        """Looks at this process's share of the views and leaves their mean gradient."""
+        state, ranks = self._state, self._task.ranks
+        moves_sh = self._task.schedule.moves_sh(iteration)
+        found, gathers = _Found.nothing(len(batch)), self._task.schedule.gathers(iteration)
+        several = len(batch) > 1 or not ranks.alone
+        # in a sum of its own, so that who looked at which view changes no bit
+        gathered = state.gathered if not several else Gathered.zeros(
+            len(state.splats), self._task.device)
+        for place in range(ranks.rank, len(batch), ranks.count):
+            view = self._view(batch[place], iteration)
+            statistics = self._look(view, batch[place], place, found, iteration)
+            if statistics is None:
+                continue
+            if gathers:
+                gathered.add(statistics, view.camera.width, view.camera.height)
+            if several:
+                state.optimizer.keep(1 / len(batch), sh_rest=moves_sh)
+        if several:
+            ranks.add(state.optimizer.kept(sh_rest=moves_sh))
+        if not ranks.alone:
+            ranks.add([torch.from_numpy(values) for values in vars(found).values()])
+            if gathers:
+                gathered.over(ranks)
+        if several and gathers:
+            state.gathered.join(gathered)
+        return found
+
+    def _view(self, index: int, iteration: int) -> TrainView:
+        view = self._task.pyramid.view(index, self._task.schedule.level(iteration))
+        if self._state.poses is None:
+            return view
+        return replace(view, camera=self._state.poses.camera(index, view.camera))
+
+    def _look(
+        self, view: TrainView, index: int, place: int, found: _Found, iteration: int
+    ) -> Statistics | None:
+        """Leaves the gradients of one view; None where they are no part of the step."""
+        state, importance = self._state, self._importance
+        schedule = self._task.schedule
+        degree = schedule.sh_degree(iteration)
+        found.loss[place], statistics = self._compute(
+            state.optimizer, view, degree, schedule.config.ssim_weight,
+            variance=schedule.gathers(iteration) and self._strategy.variance,
+            gain=None if state.exposure is None else state.exposure.gain(index),
+            scores=importance is not None and importance.weighs,
+            loo=importance is not None and importance.leaves_out)
+        if statistics is None or not np.isfinite(found.loss[place]):
+            return None
+        found.seen[place] = 1
+        if importance is not None:
+            importance.add(statistics)
+        if state.poses is not None:
+            found.turn[place] = self._compute.camera_gradient(
+                state.optimizer, view.camera, degree)
+        if state.exposure is not None:
+            found.gain[place] = self._compute.log_gain_gradient
+        return statistics
+
+    def _move(self, batch: list[int], found: _Found, iteration: int) -> None:
+        """Moves all parameters against their gradients."""
+        state, schedule = self._state, self._task.schedule
+        for place, index in enumerate(batch):
+            if not found.seen[place]:
+                continue
+            if state.poses is not None:
+                state.poses.step(index, found.turn[place], schedule.share(iteration))
+            if state.exposure is not None:
+                state.exposure.step(index, found.gain[place], schedule.share(iteration))
+        state.optimizer.regularize(schedule.recipe.regularize)
+        state.optimizer.step(
+            schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
+            factor=schedule.rate_factor(iteration))
+
+
+def next_view(state: TrainState, task: Task) -> int:
+    """Returns the view whose turn it is; every epoch has an order of its own."""
+    if not state.queue:
+        state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
+    return state.queue.pop()
+
+
+def control(state: TrainState, task: Task) -> None:
+    """Adds and deletes Gaussians, and takes harmonics away, where the schedule says so."""
+    STRATEGIES[task.schedule.config.densify].control(state, task)
+    if state.iteration == task.schedule.review:
+        drop_harmonics(state, task)
+
+
+def drop_harmonics(state: TrainState, task: Task) -> None:
+    """Takes the harmonics from Gaussians that look alike from all training views.
+
+    (Papantonakis et al. 2024; `train.sh`.) Over a sample of the views.
+    """
+    threshold = task.schedule.config.sh_uniform
+    if threshold <= 0 or len(state.splats.sh_rest) == 0:
+        return
+    every = max(1, -(-len(task.train) // _COLOR_VIEWS))
+    cameras = [view.camera for view in task.train[::every]]
+    splats = state.splats.map(lambda tensor: tensor.detach())
+    spread = color_spread(splats, cameras, visibility(splats, cameras))
+    few, order = reduced(splats, needed(spread, threshold=threshold), colors=spread.mean)
+    state.optimizer.replace(few, order)
+    state.gathered = Gathered.zeros(len(few), few.means.device)
+
+
+def skip(state: TrainState, task: Task, steps: int = 1) -> None:
+    """Counts steps whose loss is not finite; the parameters stayed as they were.
+
+    Raises:
+        TrainingError: there were too many.
+    """
+    state.skipped += steps
+    most = max(_SKIPPED_FLOOR, int(_SKIPPED * task.schedule.config.iterations))
+    if state.skipped > most:
+        raise TrainingError(
+            f"The loss is not finite at step {state.iteration}, as at {state.skipped - 1} steps "
+            f"before it; {most} are borne with.",
+            hint="Lower the learning rates, or run `recon train --again` with another --seed.")

@@ -1,0 +1,75 @@
+"""A view's photo and our own render of it, side by side, and thumbnails for all of them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon_cli.context import StageContext
+from recon_cli.evaluation import leaves_enough, psnr
+from recon_cli.io.images import eight_bit, fitted_camera, fitted_size, read_image, read_masked_image
+from recon_cli.pipeline.execute import Job, rendering
+from recon_cli.render import render
+from recon_cli.scene.scene import View
+from recon_cli.scene.splats import Splats
+
+_THUMBNAIL = 160  # pixels, longest side
+
+
+class Pictures:
+    """Photos and renders of the views, made when they are asked for, by one thread at a time.
+
+    Args:
+        job: device, backend and threads to render with.
+        max_size: longest side in pixels.
+    """
+
+    def __init__(self, job: Job, max_size: int) -> None:
+        self._job, self._max_size = job, max_size
+        self._thumbnails: dict[str, NDArray[np.uint8]] = {}
+
+    @cached_property
+    def _ctx(self) -> StageContext:
+        return rendering(self._job.compute, self._job.progress)
+
+    def photo(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """Returns a photo [H, W, 3] at the size of training, painted under its mask [H, W].
+
+        Raises:
+            FormatError: it cannot be read.
+        """
+        camera = fitted_camera(view.camera, self._max_size)
+        return read_masked_image(view.original, view.mask, camera.width, camera.height)
+
+    def rendered(self, view: View, splats: Splats) -> tuple[NDArray[np.uint8], float | None]:
+        """Returns recon's own picture [H, W, 3] of a view, and its PSNR in dB as of `recon eval`.
+
+        The PSNR is None where a mask leaves too little of the view.
+
+        Raises:
+            BackendError: the rasterizer that was asked for is not here.
+            FormatError: the photo cannot be read.
+        """
+        truth, mask = self.photo(view)
+        camera, device = fitted_camera(view.camera, self._max_size), self._ctx.device
+        with torch.no_grad():
+            rgb = render(
+                splats.map(lambda tensor: tensor.to(device)), camera,
+                torch.zeros(3, device=device), splats.sh_degree, backend=self._ctx.backend).rgb
+        image: NDArray[np.float32] = rgb.cpu().numpy()
+        enough = mask is None or leaves_enough(mask)
+        return eight_bit(image), psnr(image, truth, mask) if enough else None
+
+    def thumbnail(self, view: View) -> NDArray[np.uint8]:
+        """Returns a small picture of a view.
+
+        Raises:
+            FormatError: the photo cannot be read.
+        """
+        if view.name not in self._thumbnails:
+            size = fitted_size(view.camera.width, view.camera.height, _THUMBNAIL)
+            self._thumbnails[view.name] = read_image(view.original, *size)
+        return self._thumbnails[view.name]

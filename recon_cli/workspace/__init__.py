@@ -1,0 +1,1 @@
+"""The folder that holds every result: layout, manifests, digests, lock, atomic writes."""

@@ -1,0 +1,285 @@
+"""The folder that holds every result: its layout, and how a result replaces the one before.
+
+A stage writes into `.partial/<stage>/`. When it is done, its files are flushed, its manifest is
+written last, and two renames put it in place: the old result to `.old/`, the new one to where the
+old one was. Killed between any two of these steps, the next writer finds either the old or the new
+result and completes what was begun.
+"""
+
+from __future__ import annotations
+
+import errno
+import fnmatch
+import logging
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from recon_cli.errors import ManifestError, ReconError, WorkspaceError
+from recon_cli.workspace import lock, manifest
+from recon_cli.workspace.atomic import clear_leftovers, sync_folder
+from recon_cli.workspace.digests import FileDigest, digest_file, sha256_json
+from recon_cli.workspace.manifest import Basis, Manifest, Unfinished, how_far
+
+LOG = "recon.log"
+SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
+
+logger = logging.getLogger("recon")
+
+
+class Workspace:
+    """Results by stage name below one folder.
+
+    Args:
+        root: need not exist; `writing` makes it.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.absolute()
+
+    @property
+    def holds_results(self) -> bool:
+        """Whether a capture was read in here."""
+        return (self.root / "ingest" / "manifest.json").is_file()
+
+    def folder(self, stage: str) -> Path:
+        """Returns where a stage's finished result lies or will lie."""
+        return self.root / stage
+
+    def partial(self, stage: str) -> Path:
+        """Returns where a stage writes before it is finished."""
+        return self.root / ".partial" / stage
+
+    def _old(self, stage: str) -> Path:
+        return self.root / ".old" / stage
+
+    def _record(self, stage: str) -> Path:
+        return self.partial(stage).with_suffix(".json")
+
+    @contextmanager
+    def writing(self, verb: str) -> Iterator[None]:
+        """Holds the workspace for `verb`, after mending what a crash left half done.
+
+        Raises:
+            WorkspaceError: another process holds it, or it cannot be made.
+        """
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise WorkspaceError(
+                f"The workspace {self.root} cannot be made: {error.strerror}.",
+                hint="Give another folder with -w.") from error
+        with lock.held(self.root, verb):
+            self.recover()
+            yield
+
+    def manifest(self, stage: str) -> Manifest | None:
+        """Returns the manifest of a stage's result, or None where there is none.
+
+        Raises:
+            ManifestError: there is one that cannot be trusted.
+        """
+        folder = self.folder(stage)
+        return Manifest.read(folder) if (folder / manifest.NAME).exists() else None
+
+    def unfinished(self, stage: str) -> Unfinished | None:
+        """Returns how far an interrupted run of a stage came, or None."""
+        return Unfinished.read(self._record(stage)) if self.partial(stage).is_dir() else None
+
+    def begin(self, basis: Basis) -> tuple[Path, Unfinished]:
+        """Returns the folder for a stage to write in, and how far an identical run came before.
+
+        Files of an interrupted run are kept only if that run had the very same basis.
+
+        Raises:
+            WorkspaceError: the place of the result is taken by a folder that is no result.
+        """
+        self._refuse_foreign(basis.stage)
+        partial, earlier = self.partial(basis.stage), self.unfinished(basis.stage)
+        if earlier and earlier.basis.fingerprint == basis.fingerprint:
+            logger.info("%s: resuming (%s)", basis.stage, how_far(earlier.done, earlier.total))
+            clear_leftovers(partial)
+        else:
+            if earlier:
+                logger.info("%s: unfinished work for other settings is discarded", basis.stage)
+            self.discard(basis.stage)
+            earlier = Unfinished(basis)
+            partial.mkdir(parents=True)
+            earlier.write(self._record(basis.stage))
+        return partial, earlier
+
+    def record(self, unfinished: Unfinished) -> None:
+        """Notes how much of a run would survive a crash."""
+        unfinished.write(self._record(unfinished.basis.stage))
+
+    def discard(self, stage: str) -> None:
+        """Removes unfinished work of a stage."""
+        # The record goes first: without it the rest counts for nothing.
+        remove(self._record(stage))
+        remove(self.partial(stage))
+
+    def seal(self, stage: str) -> dict[str, FileDigest]:
+        """Flushes what a stage wrote and returns the digest of every file, by relative path."""
+        folder = self.partial(stage)
+        outputs = {}
+        for path in sorted(folder.rglob("*")):
+            _flush(path)
+            if path.is_file():
+                outputs[path.relative_to(folder).as_posix()] = digest_file(path)
+        return outputs
+
+    def commit(self, finished: Manifest) -> None:
+        """Puts the sealed files of a stage in the place of its old result."""
+        stage = finished.basis.stage
+        finished.write(self.partial(stage))
+        sync_folder(self.partial(stage))
+        self._swap(stage)
+
+    def _swap(self, stage: str) -> None:
+        """Renames the old result away and the new one into place; any prefix can be resumed."""
+        self._refuse_foreign(stage)
+        folder, old, partial = self.folder(stage), self._old(stage), self.partial(stage)
+        if folder.exists():
+            old.parent.mkdir(exist_ok=True)
+            remove(old)
+            folder.rename(old)
+            sync_folder(old.parent)
+        partial.rename(folder)
+        sync_folder(self.root)
+        sync_folder(partial.parent)
+        remove(self._record(stage))
+        remove(old)
+
+    def recover(self) -> None:
+        """Completes or undoes what a crash interrupted, stage by stage."""
+        for partial in _folders(self.root / ".partial"):
+            if _complete(partial):
+                logger.info("%s: finishing what a crash interrupted", partial.name)
+                self._swap(partial.name)
+        for old in _folders(self.root / ".old"):
+            if not self.folder(old.name).exists() and _complete(old):
+                logger.info("%s: restoring the result from before a crash", old.name)
+                old.rename(self.folder(old.name))
+                sync_folder(self.root)
+            else:
+                remove(old)
+
+    def remove(self, stage: str) -> None:
+        """Removes a stage's result; after a crash on the way it is there or gone, never half.
+
+        Raises:
+            WorkspaceError: what lies there is no result.
+        """
+        self._refuse_foreign(stage)
+        folder, old = self.folder(stage), self._old(stage)
+        if folder.exists():
+            old.parent.mkdir(exist_ok=True)
+            remove(old)
+            folder.rename(old)
+            remove(old)
+
+    def scraps(self) -> list[Path]:
+        """Returns what serves no finished result: unfinished work, old results, other seeds."""
+        return [path for parent in (".partial", ".old", SEEDS)
+                for path in sorted(self.root.glob(f"{parent}/*"))]
+
+    def _refuse_foreign(self, stage: str) -> None:
+        """Refuses to replace a folder that is not ours: -w may point anywhere."""
+        folder = self.folder(stage)
+        if folder.exists() and not (folder / manifest.NAME).exists():
+            raise WorkspaceError(
+                f"{folder} is in the way: it holds no {manifest.NAME}, so recon did not make it.",
+                hint="Move or delete it, or give another workspace with -w.")
+
+
+def combined(outputs: Mapping[str, FileDigest], volatile: Sequence[str]) -> str:
+    """Returns the digest over all outputs but those whose path matches a pattern of `volatile`."""
+    return sha256_json({
+        name: file.sha256 for name, file in outputs.items() if not matches(name, volatile)})
+
+
+def matches(name: str, patterns: Sequence[str]) -> bool:
+    """Returns whether a relative path matches one of some shell patterns."""
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def changed_outputs(folder: Path, finished: Manifest, volatile: Sequence[str]) -> list[str]:
+    """Returns in words which outputs are no longer what the stage wrote."""
+    changes = []
+    for name, known in finished.outputs.items():
+        path = folder / name
+        if matches(name, volatile):
+            continue
+        if not path.is_file():
+            changes.append(f"output {name} is missing")
+        elif digest_file(path, known).sha256 != known.sha256:
+            changes.append(f"output {name} was changed by hand")
+    return manifest.counted(changes)
+
+
+def size_of(path: Path) -> int:
+    """Returns the bytes in a file or in all files below a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.lstat().st_size for file in files if not file.is_dir())
+
+
+@contextmanager
+def disk_errors(root: Path, doing: str) -> Iterator[None]:
+    """Turns a full or read-only disk into an error that says so.
+
+    Raises:
+        WorkspaceError: the block failed for want of space or of permission in the workspace.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise _explained(error, root, doing) from error
+
+
+def _explained(error: OSError, root: Path, doing: str) -> ReconError | OSError:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        place = next(path for path in (root, *root.parents) if path.exists())
+        free = shutil.disk_usage(place).free / 1e6
+        return WorkspaceError(
+            f"The disk is full while {doing}: {free:.0f} MB free at {root}.",
+            hint="Free some space and run the same command again; finished work is kept.")
+    if error.errno == errno.EFBIG:  # a limit of the process, or of a file system such as FAT32
+        return WorkspaceError(
+            f"A file is larger than {root} can hold, while {doing}.",
+            hint="Give a workspace on another disk with -w, or raise `ulimit -f`.")
+    inside = error.filename is None or Path(os.fsdecode(error.filename)).is_relative_to(root)
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and inside:
+        return WorkspaceError(
+            f"The workspace is not writable while {doing}: {error}.",
+            hint=f"Check the permissions of {root}, or give another workspace with -w.")
+    return error
+
+
+def _folders(parent: Path) -> list[Path]:
+    return sorted(path for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
+
+
+def _complete(folder: Path) -> bool:
+    """Returns whether a folder holds a manifest that can be trusted: it is written last."""
+    try:
+        return (folder / manifest.NAME).exists() and bool(Manifest.read(folder))
+    except ManifestError:
+        return False
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def remove(path: Path) -> None:
+    """Removes a file or a folder, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,249 @@
+"""What a result was made from and how it came about: the record in each stage's folder.
+
+A result is identified by its basis (stage, version, options, inputs, upstream outputs). Whatever
+else a manifest says is for people and takes no part in any decision.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recon_cli.errors import FormatError, ManifestError
+from recon_cli.workspace.atomic import read_json, write_json
+from recon_cli.workspace.digests import FileDigest, Source, sha256_json
+
+NAME = "manifest.json"
+SCHEMA = 1
+_SHOWN = 3  # changes of one kind that a reason names; the rest is counted
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Everything that decides what comes out of a stage.
+
+    Attributes:
+        stage: its name.
+        version: of the stage's code.
+        config: the hashed options.
+        sources: the user's own files; only ingest has any.
+        upstream: digest of what each earlier stage wrote; None where a stage is left out.
+    """
+
+    stage: str
+    version: int
+    config: Mapping[str, Any]
+    sources: tuple[Source, ...]
+    upstream: Mapping[str, str | None]
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over all of it; of the sources only the contents count."""
+        return sha256_json({
+            "stage": self.stage,
+            "version": self.version,
+            "config": self.config,
+            "sources": [source.contents() for source in self.sources],
+            "upstream": self.upstream,
+        })
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns plain values that `from_json` takes."""
+        return {
+            "stage": self.stage,
+            "version": self.version,
+            "config": dict(self.config),
+            "inputs": [dataclasses.asdict(source) for source in self.sources],
+            "upstream": dict(self.upstream),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Basis:
+        """Returns the basis that `to_json` described."""
+        sources = tuple(
+            Source(item["path"], _digests(item["files"])) for item in value["inputs"])
+        return cls(
+            value["stage"], value["version"], value["config"], sources, value["upstream"])
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """How a result came about. Recorded for people, never hashed.
+
+    Attributes:
+        seconds: of work, resumed runs added up.
+        peak_memory_bytes: of the process and its children together.
+        summary: what the stage says about its result.
+        versions: of Python, recon and the packages that matter.
+        device: "cpu" or "cuda"; None for stages that do not render.
+        backend: rasterizer; None for stages that do not render.
+        threads: CPU threads.
+        finished: ISO 8601 with time zone.
+    """
+
+    seconds: float
+    peak_memory_bytes: int
+    summary: Mapping[str, Any]
+    versions: Mapping[str, str]
+    device: str | None
+    backend: str | None
+    threads: int
+    finished: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A finished result.
+
+    Attributes:
+        basis: what it was made from.
+        outputs: digest of every file, by path relative to the stage's folder.
+        digest: of the outputs that later stages may depend on.
+        run: how it came about.
+    """
+
+    basis: Basis
+    outputs: Mapping[str, FileDigest]
+    digest: str
+    run: RunRecord
+
+    def write(self, folder: Path) -> None:
+        """Writes the manifest into a stage's folder, whole or not at all."""
+        content = {
+            "schema": SCHEMA,
+            **self.basis.to_json(),
+            "fingerprint": self.basis.fingerprint,
+            "outputs": {name: dataclasses.asdict(file) for name, file in self.outputs.items()},
+            "digest": self.digest,
+            **dataclasses.asdict(self.run),
+        }
+        write_json(folder / NAME, {**content, "self": sha256_json(content)})
+
+    @classmethod
+    def read(cls, folder: Path) -> Manifest:
+        """Returns the manifest in a stage's folder.
+
+        Raises:
+            ManifestError: it is truncated, was edited, or has another schema.
+        """
+        path = folder / NAME
+        hint = (f"Run the stage again with --again, or delete {folder}.")
+        try:
+            content = read_json(path)
+        except FormatError as error:
+            raise ManifestError(error.message, hint=hint) from error
+        schema = content.get("schema") if isinstance(content, dict) else None
+        if schema != SCHEMA:
+            raise ManifestError(
+                f"{path} has schema {schema}, but this recon reads schema {SCHEMA}.", hint=hint)
+        if content.pop("self", None) != sha256_json(content):
+            raise ManifestError(
+                f"{path} does not match its own checksum: it was edited or damaged.", hint=hint)
+        run = {field.name: content[field.name] for field in dataclasses.fields(RunRecord)}
+        return cls(
+            Basis.from_json(content), _digests(content["outputs"]), content["digest"],
+            RunRecord(**run))
+
+
+def how_far(done: int, total: int) -> str:
+    """Returns how far a run came, in a few words; `total` is 0 before anything was saved."""
+    return f"{done}/{total}" if total else "just begun"
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """How far an interrupted run came; lies beside its folder in .partial."""
+
+    basis: Basis
+    done: int = 0
+    total: int = 0
+    seconds: float = 0.0
+
+    def write(self, path: Path) -> None:
+        """Writes the record, whole or not at all."""
+        write_json(path, {
+            "fingerprint": self.basis.fingerprint, **self.basis.to_json(),
+            "done": self.done, "total": self.total, "seconds": self.seconds,
+        })
+
+    @classmethod
+    def read(cls, path: Path) -> Unfinished | None:
+        """Returns the record, or None where there is none that can be read."""
+        try:
+            value = read_json(path)
+            return cls(
+                Basis.from_json(value), value["done"], value["total"], value["seconds"])
+        except (FormatError, KeyError, TypeError, AttributeError):
+            return None
+
+
+def differences(old: Basis, new: Basis, *, section: str) -> list[str]:
+    """Returns in words what `new` has that `old` was not made from; empty where they agree.
+
+    Args:
+        old: of a result.
+        new: that a run would have now.
+        section: of recon.toml, which sets the options.
+    """
+    reasons = []
+    if old.version != new.version:
+        reasons.append(f"stage version {old.version} -> {new.version}")
+    for name in [*new.config, *(name for name in old.config if name not in new.config)]:
+        before, after = old.config.get(name), new.config.get(name)
+        if name not in old.config:
+            reasons.append(f"{section}.{name} is new")
+        elif name not in new.config:
+            reasons.append(f"{section}.{name} is no more")
+        elif before != after:
+            reasons.append(f"{section}.{name} changed: {_shown(before)} -> {_shown(after)}")
+    reasons += _source_changes(old.sources, new.sources)
+    for name in {**new.upstream, **old.upstream}:
+        had, has = old.upstream.get(name), new.upstream.get(name)
+        if had and has and had != has:
+            reasons.append(f"{name}'s output changed")
+        elif has and not had:
+            reasons.append(f"{name} was not there")
+        elif had and not has:
+            reasons.append(f"{name} is no longer there or no longer fresh")
+    return reasons
+
+
+def counted(texts: list[str]) -> list[str]:
+    """Returns the first few texts and how many more there are."""
+    more = len(texts) - _SHOWN
+    return texts if more <= 0 else [*texts[:_SHOWN], f"and {more} more like that"]
+
+
+def _source_changes(old: tuple[Source, ...], new: tuple[Source, ...]) -> list[str]:
+    if [source.contents() for source in old] == [source.contents() for source in new]:
+        return []
+    if [source.path for source in old] != [source.path for source in new]:
+        return [f"the input changed: {_paths(old)} -> {_paths(new)}"]
+    changes = []
+    for before, after in zip(old, new, strict=True):
+        single = [Path(after.path).name] == list(after.files)
+        folder = "" if single else f"{Path(after.path).name}/"
+        for name in sorted({*before.files, *after.files}):
+            had, has = before.files.get(name), after.files.get(name)
+            if not had or not has:
+                changes.append(f"the input {folder}{name} is {'gone' if had else 'new'}")
+            elif had.sha256 != has.sha256:
+                changes.append(f"the input {folder}{name} changed")
+    return counted(changes)
+
+
+def _paths(sources: tuple[Source, ...]) -> str:
+    return ", ".join(Path(source.path).name for source in sources)
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "automatic"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _digests(value: Mapping[str, Mapping[str, Any]]) -> dict[str, FileDigest]:
+    return {name: FileDigest(**file) for name, file in value.items()}

@@ -1,0 +1,306 @@
+"""The command line in process: exit codes, what is said where, which files are written."""
+
+import errno
+import json
+import logging
+from pathlib import Path
+
+import fake_stages
+import pytest
+from fake_stages import NAMES
+
+from recon_cli import __version__, cli
+from recon_cli.cli import main
+from recon_cli.commands import shared
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.plan import StageStatus
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(autouse=True)
+def _fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    fake_stages.actions.clear()
+    fake_stages.ran.clear()
+    for module in (cli, shared):
+        monkeypatch.setattr(module, "STAGES", fake_stages.TABLE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("RECON_WORKSPACE", raising=False)
+    (tmp_path / "room.mp4").write_text("a video")
+
+
+Said = pytest.CaptureFixture[str]
+
+
+def config_of(stage: str, workspace: str = "workspace") -> dict[str, object]:
+    return json.loads((Path(workspace) / stage / "manifest.json").read_text())["config"]
+
+
+def test_each_verb_runs_its_stage_and_says_what_came_of_it(capsys: Said) -> None:
+    for words in (["ingest", "room.mp4"], ["denoise"], ["sfm"], ["train"], ["prune"], ["eval"],
+                  ["export"]):
+        assert main(words) == 0
+    assert fake_stages.ran == NAMES
+    out = capsys.readouterr().out
+    assert "train: steps 6, length 1.5 (" in out
+    assert "the table of evaluate" in out
+    assert main(["train"]) == 0
+    assert capsys.readouterr().out == "train is up to date\n"
+    assert main(["train", "--again"]) == 0
+    assert fake_stages.ran[len(NAMES):] == ["train"]
+
+
+def test_run_does_everything_and_ends_with_the_table(capsys: Said) -> None:
+    assert main(["run", "room.mp4", "--set", "train.iterations=9"]) == 0
+    assert fake_stages.ran == NAMES
+    assert config_of("train")["iterations"] == 9
+    assert config_of("prune")["at"] == "mid"
+    assert capsys.readouterr().out.endswith("the table of evaluate\n\n")
+    assert main(["run", "--set", "train.iterations=9"]) == 0
+    assert fake_stages.ran == NAMES
+
+
+def test_run_can_leave_pruning_out() -> None:
+    assert main(["run", "room.mp4", "--no-prune"]) == 0
+    assert fake_stages.ran == [name for name in NAMES if name != "prune"]
+
+
+def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
+    capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "SAMPLE", Path("room.mp4").absolute())
+    monkeypatch.setenv("RECON_WORKSPACE", "elsewhere")
+    assert main(["demo", "--set", "train.iterations=10"]) == 0
+    assert fake_stages.ran == NAMES
+    train = config_of("train", "demo")
+    assert train["iterations"] == 10  # what is typed wins
+    out = capsys.readouterr().out
+    assert "the table of evaluate" in out
+    assert str(Path("demo/export/splats.ply")) in out
+    assert not Path("elsewhere").exists()
+
+
+def test_the_bundled_video_is_there(sample_video: Path) -> None:
+    assert sample_video == cli.SAMPLE
+    assert cli.SAMPLE.exists()
+
+
+def test_train_prune_branches_off_in_the_middle() -> None:
+    assert main(["ingest", "room.mp4"]) == 0
+    assert main(["train", "--prune", "--ratio", "0.25", "--iterations", "10"]) == 0
+    assert fake_stages.ran == ["ingest", "denoise", "sfm", "train", "prune"]
+    assert config_of("train")["iterations"] == 10
+    prune = config_of("prune")
+    assert (prune["at"], prune["ratio"]) == ("mid", 0.25)
+
+
+def test_pruning_options_without_prune_are_a_usage_error(capsys: Said) -> None:
+    assert main(["train", "--ratio", "0.25"]) == 2
+    assert "--ratio has no effect without --prune" in capsys.readouterr().err
+
+
+def test_the_layers_win_in_order_defaults_toml_config_options() -> None:
+    main(["ingest", "room.mp4"])
+    Path("workspace/recon.toml").write_text("[train]\niterations = 1\nseed = 1\nsh_degree = 1\n")
+    Path("mine.toml").write_text("[train]\niterations = 2\nseed = 2\n")
+    assert main(["train", "--config", "mine.toml", "--iterations", "4"]) == 0
+    train = config_of("train")
+    assert (train["iterations"], train["seed"], train["sh_degree"]) == (4, 2, 1)
+
+
+def test_print_config_prints_what_config_takes(capsys: Said) -> None:
+    for verb in ("ingest", "denoise", "sfm", "train", "prune", "eval", "export", "run"):
+        assert main([verb, "--print-config"]) == 0
+        first = capsys.readouterr().out
+        Path("printed.toml").write_text(first)
+        assert main([verb, "--print-config", "--config", "printed.toml"]) == 0
+        assert capsys.readouterr().out == first
+    assert main(["train", "--prune", "--ratio", "0.25", "--print-config"]) == 0
+    out = capsys.readouterr().out
+    assert "ratio = 0.25" in out
+    assert 'at = "mid"' in out
+    assert not Path("workspace").exists()
+
+
+def test_the_workspace_is_the_option_or_the_variable_or_a_folder_here(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    main(["ingest", "room.mp4"])
+    monkeypatch.setenv("RECON_WORKSPACE", "two")
+    main(["ingest", "room.mp4"])
+    main(["ingest", "room.mp4", "-w", "three"])
+    assert all(Path(name, "ingest", "manifest.json").exists()
+               for name in ("workspace", "two", "three"))
+
+
+def test_status_shows_state_reason_and_summary(capsys: Said) -> None:
+    main(["run", "room.mp4"])
+    Path("workspace/recon.toml").write_text("[train]\niterations = 7\n")
+    capsys.readouterr()
+    assert main(["status"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1 + len(NAMES)
+    assert "fresh" in lines[1]
+    assert "steps 6, length 1.5" in lines[1]
+    assert "train.iterations changed: automatic -> 7" in lines[4]
+
+
+def test_status_as_json_has_stable_keys(capsys: Said) -> None:
+    main(["ingest", "room.mp4"])
+    capsys.readouterr()
+    assert main(["status", "--json"]) == 0
+    value = json.loads(capsys.readouterr().out)
+    assert list(value) == ["workspace", "stages"]
+    assert [stage["name"] for stage in value["stages"]] == NAMES
+    assert list(value["stages"][0]) == [
+        "name", "state", "reasons", "done", "total", "seconds", "summary", "notices"]
+    assert value["stages"][0]["state"] == "fresh"
+    assert value["stages"][1]["state"] == "missing"
+
+
+def test_status_needs_no_workspace_and_makes_none(capsys: Said) -> None:
+    assert main(["status", "-w", "none"]) == 0
+    assert "there is no workspace" in capsys.readouterr().err
+    assert not Path("none").exists()
+
+
+def test_status_says_that_an_input_is_gone(capsys: Said) -> None:
+    main(["ingest", "room.mp4"])
+    Path("room.mp4").unlink()
+    assert main(["status"]) == 0
+    assert "room.mp4 is gone" in capsys.readouterr().err
+
+
+def test_a_missing_stage_is_4_and_names_the_command(capsys: Said) -> None:
+    assert main(["train"]) == 4
+    assert capsys.readouterr().err == (
+        "error: train needs ingest, which is missing.\n"
+        "hint: Run `recon ingest VIDEO` first.\n")
+
+
+def test_a_missing_input_is_3(capsys: Said) -> None:
+    assert main(["ingest", "none.mp4"]) == 3
+    assert "none.mp4 does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [
+    ["trian"], ["train", "--iteratons", "3"], ["train", "--iterations", "many"],
+    ["run", "--set", "train.iteratons=3"], ["ingest"], ["train", "--config", "none.toml"], [],
+])
+def test_usage_errors_are_2_and_leave_no_traceback(words: list[str], capsys: Said) -> None:
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert "error: " in said or "Usage: " in said
+
+
+def test_an_unknown_key_in_recon_toml_is_2(capsys: Said) -> None:
+    Path("workspace").mkdir()
+    Path("workspace/recon.toml").write_text("[train]\niteration = 3\n")
+    assert main(["status"]) == 2
+    assert "Did you mean iterations?" in capsys.readouterr().err
+
+
+def test_a_broken_manifest_is_7(capsys: Said) -> None:
+    main(["ingest", "room.mp4"])
+    Path("workspace/ingest/manifest.json").write_text("{")
+    assert main(["status"]) == 7
+    assert "--again" in capsys.readouterr().err
+    assert main(["ingest", "room.mp4", "--again"]) == 0
+    assert main(["status"]) == 0
+
+
+def test_a_message_with_a_name_that_is_no_utf8_is_logged() -> None:
+    fake_stages.actions["ingest"] = lambda: logging.getLogger("recon").warning("b\udcff.jpg")
+    assert main(["ingest", "room.mp4"]) == 0
+    assert "b\\udcff.jpg" in Path("workspace/recon.log").read_text()
+
+
+def _raise(error: BaseException) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(("error", "code", "said"), [
+    (KeyboardInterrupt(), 130, "interrupted; run the same command again to resume"),
+    (OSError(errno.ENOSPC, "No space left"), 7, "MB free"),
+    (OSError(errno.EFBIG, "File too large"), 7, "larger than"),
+    (PermissionError(errno.EACCES, "Permission denied"), 7, "not writable"),
+    (ZeroDivisionError("by zero"), 1, "error: ZeroDivisionError: by zero"),
+])
+def test_what_a_stage_raises_becomes_an_exit_code(
+    error: BaseException, code: int, said: str, capsys: Said
+) -> None:
+    fake_stages.actions["ingest"] = lambda: _raise(error)
+    assert main(["ingest", "room.mp4"]) == code
+    err = capsys.readouterr().err
+    assert said in err
+    assert "Traceback" not in err
+    assert "Traceback" in Path("workspace/recon.log").read_text()
+    del fake_stages.actions["ingest"]
+    assert main(["ingest", "room.mp4"]) == 0
+
+
+def test_verbose_shows_the_traceback(capsys: Said) -> None:
+    fake_stages.actions["ingest"] = lambda: _raise(ZeroDivisionError("by zero"))
+    assert main(["ingest", "room.mp4", "-v"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_clean_keeps_every_finished_result_fresh(
+    capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recon_cli.pipeline.clean._WORTH_BYTES", 1)
+    main(["run", "room.mp4"])
+    fake_stages.actions["train"] = lambda: _raise(KeyboardInterrupt())
+    main(["train", "--iterations", "9"])
+    assert Path("workspace/.partial/train").is_dir()
+    capsys.readouterr()
+    assert main(["clean", "--dry-run"]) == 0
+    assert "would be freed" in capsys.readouterr().out
+    assert Path("workspace/.partial/train").is_dir()
+    assert main(["clean"]) == 0
+    assert "database.db" in capsys.readouterr().out
+    assert not Path("workspace/.partial/train").exists()
+    assert not Path("workspace/sfm/database.db").exists()
+    assert states() == ["fresh"] * len(NAMES)
+
+
+def test_clean_keeps_small_logs() -> None:
+    main(["run", "room.mp4"])
+    assert main(["clean"]) == 0
+    assert Path("workspace/train/log.jsonl").exists()
+
+
+def test_clean_removes_the_results_of_named_stages(capsys: Said) -> None:
+    main(["run", "room.mp4"])
+    capsys.readouterr()
+    assert main(["clean", "train", "prune"]) == 0
+    assert "MB freed" in capsys.readouterr().out
+    assert not Path("workspace/train").exists()
+    assert [states()[NAMES.index(name)] for name in ("sfm", "train", "prune")] == [
+        "fresh", "missing", "missing"]
+
+
+def states() -> list[str]:
+    job = fake_stages.job_at(Path("workspace"))
+    found: tuple[StageStatus, ...] = plan.status(job)
+    return [one.state for one in found]
+
+
+def test_doctor_prints_text_and_json(capsys: Said) -> None:
+    assert main(["doctor"]) == 0
+    assert "torch" in capsys.readouterr().out
+    assert main(["doctor", "--json"]) == 0
+    assert {"versions", "backends", "cores", "writable"} <= json.loads(
+        capsys.readouterr().out).keys()
+
+
+def test_the_version_is_printed(capsys: Said) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"recon, version {__version__}\n"
+
+
+@pytest.mark.parametrize("verb", list(cli.cli.commands))
+def test_every_verb_has_help(verb: str, capsys: Said) -> None:
+    assert main([verb, "--help"]) == 0
+    assert "Usage: recon" in capsys.readouterr().out

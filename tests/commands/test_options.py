@@ -1,0 +1,145 @@
+"""Every option explains itself, and reaches the settings with its type."""
+
+import dataclasses
+from pathlib import Path
+
+import click
+import pytest
+
+from recon_cli.cli import cli
+from recon_cli.commands import options
+from recon_cli.commands.options import Call
+from recon_cli.config.fields import StageConfig, option, option_info
+from recon_cli.config.settings import SECTIONS
+from recon_cli.config.stages import (
+    ComputeConfig,
+    DenoiseConfig,
+    ExportConfig,
+    PruneConfig,
+    TrainConfig,
+)
+
+EVERY_OPTION = [
+    pytest.param(parameter, id=f"{verb} {parameter.opts[0]}")
+    for verb, command in [*cli.commands.items(), *cli.commands["bench"].commands.items()]
+    for parameter in command.params if isinstance(parameter, click.Option)
+]
+EVERY_FIELD = [
+    pytest.param(config, item, id=f"{section}.{item.name}")
+    for section, config in SECTIONS.items() for item in dataclasses.fields(config)
+]
+
+
+def parsed(config: type[StageConfig], *words: str) -> dict[str, object]:
+    """Returns what a command with the options of `config` collects."""
+    @click.command()
+    @options.of(config)
+    def command() -> None:
+        """Does nothing."""
+
+    call = Call()
+    command.main(list(words), obj=call, standalone_mode=False)
+    section = next(name for name, kind in SECTIONS.items() if kind is config)
+    return call.settings.get(section, {})
+
+
+@pytest.mark.parametrize("parameter", EVERY_OPTION)
+def test_every_option_has_help_and_shows_its_default(parameter: click.Option) -> None:
+    record = parameter.get_help_record(click.Context(click.Command("any")))
+    assert record
+    assert "default: " in record[1]
+    assert parameter.help
+    assert not parameter.help.startswith("[")
+
+
+@pytest.mark.parametrize(("config", "item"), EVERY_FIELD)
+def test_every_field_says_what_it_is_and_what_happens_without_it(
+    config: type[StageConfig], item: "dataclasses.Field[object]"
+) -> None:
+    info = option_info(item)
+    assert info.help.endswith(".")
+    if item.default is None:
+        assert info.automatic in options.described(item)
+        assert info.automatic
+    if info.unit:
+        assert info.unit in options.described(item)
+    assert config().hashed().keys() <= {one.name for one in dataclasses.fields(config)}
+
+
+@pytest.mark.parametrize("verb", ["ingest", "denoise", "sfm", "train", "prune", "eval", "export"])
+def test_every_verb_of_a_stage_has_the_common_options(verb: str) -> None:
+    names = {name for parameter in cli.commands[verb].params for name in parameter.opts}
+    assert {"-w", "--config", "-v", "--again", "--print-config"} <= names
+
+
+def test_only_what_was_typed_reaches_the_settings() -> None:
+    assert parsed(TrainConfig) == {}
+    assert parsed(TrainConfig, "--iterations", "5", "--validation", "0") == {
+        "iterations": 5, "validation": 0.0}
+    assert parsed(PruneConfig, "--recovery", "5", "--score", "loo") == {
+        "recovery": 5, "score": "loo"}
+    assert parsed(ComputeConfig, "--threads", "2") == {"threads": 2}
+
+
+@pytest.mark.parametrize("words", [
+    ("--iterations", "0"), ("--iterations", "1.5"), ("--validation", "0.7"),
+    ("--images", "some"), ("--iteration", "5", "--nonsense"),
+])
+def test_a_value_out_of_type_range_or_choice_is_a_usage_error(words: tuple[str, ...]) -> None:
+    with pytest.raises(click.UsageError):
+        parsed(TrainConfig, *words)
+
+
+def test_a_field_with_flags_gets_one_flag_for_each_other_choice() -> None:
+    assert parsed(DenoiseConfig, "--force") == {"mode": "force"}
+    assert parsed(DenoiseConfig, "--off") == {"mode": "off"}
+    with pytest.raises(click.UsageError, match="exclude each other"):
+        parsed(DenoiseConfig, "--off", "--force")
+    with pytest.raises(click.UsageError):
+        parsed(DenoiseConfig, "--auto")
+
+
+def test_a_truth_value_gets_a_pair_of_flags(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Switched(StageConfig):
+        """Has a switch."""
+
+        fine: bool = option(True, "Whether it is fine.")
+
+    monkeypatch.setitem(SECTIONS, "switched", Switched)
+    assert parsed(Switched) == {}
+    assert parsed(Switched, "--no-fine") == {"fine": False}
+    assert parsed(Switched, "--fine") == {"fine": True}
+
+
+def test_a_field_of_several_values_is_one_option() -> None:
+    assert parsed(ExportConfig, "--scale-between", "a.png:1,2", "-1,2,-3", "2.5") == {
+        "scale_between": ("a.png:1,2", "-1,2,-3", 2.5)}
+    with pytest.raises(click.UsageError):
+        parsed(ExportConfig, "--scale-between", "a.png", "b.png", "far")
+    with pytest.raises(click.UsageError):
+        parsed(ExportConfig, "--scale-between", "a.png", "b.png")
+
+
+def test_a_matrix_is_read_from_its_file_when_it_is_typed(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("[[2, 0, 0, 0.5], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]")
+    numbers = [2, 0, 0, 0.5, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
+    assert parsed(ExportConfig, "--transform", str(path)) == {"transform": numbers}
+    assert ExportConfig(transform=numbers).hashed()["transform"] == numbers  # not the file's name
+
+
+def test_an_axis_may_begin_with_a_dash() -> None:
+    assert parsed(ExportConfig, "--up", "-y") == {"up": "-y"}
+
+
+def test_some_fields_can_be_left_out() -> None:
+    @click.command()
+    @options.of(PruneConfig, without=("at",), lead="With --prune: ")
+    def command() -> None:
+        """Does nothing."""
+
+    names = [parameter.opts[0] for parameter in command.params]
+    assert "--at" not in names
+    assert "--ratio" in names
+    assert all(one.help.startswith("With --prune: ") for one in command.params)

@@ -1,0 +1,242 @@
+"""Scores in closed form, and tables that hold them."""
+
+import csv
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from recon_cli.evaluation import (
+    ModelScore,
+    ViewScore,
+    csv_table,
+    leaves_enough,
+    model_table,
+    paired_bootstrap,
+    paper_table,
+    psnr,
+    ssim,
+    view_table,
+)
+from recon_cli.evaluation.lpips import perceptual
+from recon_cli.evaluation.tables import Table
+from recon_cli.io.images import eight_bit
+from recon_cli.train.losses import photometric_loss
+
+TRUTH = np.random.default_rng(0).integers(0, 256, (32, 40, 3), dtype=np.uint8)
+
+
+def as_image(pixels):
+    return (pixels / 255.0).astype(np.float32)
+
+
+def test_psnr_of_a_constant_error_is_its_closed_form():
+    truth = np.full((8, 8, 3), 100, np.uint8)
+    image = np.full((8, 8, 3), 100 / 255 + 0.1, np.float32)
+    assert psnr(image, truth) == pytest.approx(20.0, abs=1e-4)
+
+
+def test_colours_beyond_one_are_clamped_before_they_are_scored():
+    truth = np.full((8, 8, 3), 255, np.uint8)
+    assert psnr(np.full((8, 8, 3), 7.0, np.float32), truth) == 100.0
+
+
+def test_a_perfect_image_scores_one_and_stays_finite():
+    assert ssim(as_image(TRUTH), TRUTH) == pytest.approx(1.0, abs=1e-6)
+    assert np.isfinite(psnr(as_image(TRUTH), TRUTH))
+
+
+def test_noise_lowers_both_scores():
+    rng = np.random.default_rng(1)
+    noisy = as_image(TRUTH) + rng.normal(0, 0.1, TRUTH.shape).astype(np.float32)
+    assert ssim(noisy, TRUTH) < 0.99
+    assert 19 < psnr(noisy, TRUTH) < 22
+
+
+def test_an_image_smaller_than_the_window_is_refused():
+    with pytest.raises(ValueError, match="11 pixels"):
+        ssim(as_image(TRUTH[:5]), TRUTH[:5])
+
+
+def some_mask():
+    mask = np.ones((32, 40), bool)
+    mask[8:20, 10:25] = False
+    return mask
+
+
+def test_the_psnr_of_a_masked_view_is_over_the_pixels_that_count():
+    truth = np.full((32, 40, 3), 100, np.uint8)
+    image = np.full((32, 40, 3), 100 / 255 + 0.1, np.float32)
+    image[~some_mask()] = 1.0
+    assert psnr(image, truth, some_mask()) == pytest.approx(20.0, abs=1e-4)
+
+
+def test_a_mask_where_all_counts_changes_no_score():
+    noisy = as_image(TRUTH) + np.random.default_rng(1).normal(0, 0.1, TRUTH.shape)
+    noisy = noisy.astype(np.float32)
+    whole = np.ones((32, 40), bool)
+    assert psnr(noisy, TRUTH, whole) == pytest.approx(psnr(noisy, TRUTH), rel=1e-12)
+    assert ssim(noisy, TRUTH, whole) == pytest.approx(ssim(noisy, TRUTH), rel=1e-12)
+
+
+def test_a_render_that_is_wrong_under_the_mask_alone_scores_one():
+    image = as_image(TRUTH)
+    image[~some_mask()] = np.nan
+    assert ssim(image, TRUTH, some_mask()) == pytest.approx(1.0, abs=1e-6)
+    assert psnr(image, TRUTH, some_mask()) == 100.0
+
+
+def test_the_ssim_of_a_masked_view_is_the_mean_of_the_map_where_pixels_count():
+    noisy = as_image(TRUTH) + np.random.default_rng(1).normal(0, 0.1, TRUTH.shape)
+    mask = np.zeros((32, 40), bool)
+    mask[5:27, 5:18] = True  # the left part: what lies right of it must not be scored
+    composite = np.where(mask[..., None], noisy.clip(0, 1), TRUTH / 255.0).astype(np.float32)
+    _, similarity = structural_similarity(
+        composite.astype(np.float64), TRUTH / 255.0, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, data_range=1.0, channel_axis=-1, full=True)
+    assert ssim(noisy.astype(np.float32), TRUTH, mask) == pytest.approx(
+        similarity[5:27, 5:18].mean(), abs=1e-6)
+
+
+def test_a_mask_must_leave_a_window_off_the_border():
+    mask = np.zeros((32, 40), bool)
+    mask[:5] = True  # 200 pixels, all of them cropped
+    assert not leaves_enough(mask)
+    with pytest.raises(ValueError, match="off the border"):
+        ssim(as_image(TRUTH), TRUTH, mask)
+    mask[10:21, 10:21] = True
+    assert leaves_enough(mask)
+
+
+def test_ssim_with_zeros_around_is_what_the_loss_of_the_reference_computes():
+    rng = np.random.default_rng(1)
+    noisy = (as_image(TRUTH) + rng.normal(0, 0.1, TRUTH.shape)).clip(0, 1).astype(np.float32)
+    loss = photometric_loss(
+        torch.from_numpy(noisy).double(), torch.from_numpy(TRUTH / 255.0), ssim_weight=1.0)
+    assert ssim(noisy, TRUTH, padded=True) == pytest.approx(1 - float(loss), abs=1e-6)
+    assert abs(ssim(noisy, TRUTH, padded=True) - ssim(noisy, TRUTH)) > 1e-4  # they do differ
+
+
+def test_with_zeros_around_the_border_counts():
+    image = as_image(TRUTH)
+    image[0] = 1 - image[0]
+    assert ssim(image, TRUTH, padded=True) < 0.99
+    mask = np.ones((32, 40), bool)
+    mask[0] = False
+    assert ssim(image, TRUTH, mask, padded=True) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_picture_of_8_bits_is_scored_as_the_file_holds_it():
+    truth = np.full((16, 16, 3), 100, np.uint8)
+    image = np.full((16, 16, 3), 100.4 / 255, np.float32)
+    assert psnr(eight_bit(image), truth) == 100.0
+    assert psnr(image, truth) == pytest.approx(-20 * np.log10(0.4 / 255), abs=1e-3)
+
+
+def view(name, psnr_db, ssim, lpips=None):
+    return ViewScore(name, psnr_db, psnr_db - 0.01, ssim, ssim + 0.01, lpips)
+
+
+def scores():
+    views = (view("a.png", 30.0, 0.9), view("b.png", 32.0, 0.8))
+    return {"base": ModelScore("3DGS", views, 1234, 5_000_000, 12.0, 60.0),
+            "pruned": ModelScore("ours", views, 600, 2_000_000, 6.0, None)}
+
+
+def test_means_are_over_views():
+    assert scores()["base"].psnr_db == 31.0
+    assert scores()["base"].psnr_8bit_db == 30.99
+    assert scores()["base"].ssim == pytest.approx(0.85)
+    assert scores()["base"].ssim_padded == pytest.approx(0.86)
+
+
+def test_lpips_has_no_mean_where_a_view_has_none():
+    half = ModelScore("x", (view("a", 30, 0.9, 0.1), view("b", 30, 0.9)), 1, 1, 1, 1)
+    whole = ModelScore("x", (view("a", 30, 0.9, 0.1), view("b", 30, 0.9, 0.3)), 1, 1, 1, 1)
+    assert half.lpips is None
+    assert whole.lpips == pytest.approx(0.2)
+    assert "LPIPS" in model_table([half, whole]).headings
+    assert "LPIPS" not in model_table([half]).headings
+
+
+def test_every_table_holds_the_same_figures():
+    table = model_table(list(scores().values()))
+    assert table.rows[0] == (
+        "3DGS", "31.00", "30.99", "0.8500", "0.8600", "1,234", "5.0", "12", "60")
+    assert table.rows[1][-1] == "-"
+    assert view_table(list(scores().values())).rows[0] == (
+        "a.png", "30.00", "30.00", "0.9000", "0.9000")
+    rows = list(csv.DictReader(csv_table(scores()).splitlines()))
+    assert [row["view"] for row in rows] == ["a.png", "b.png", "mean"] * 2
+    assert float(rows[2]["psnr_db"]) == 31.0
+    assert float(rows[2]["ssim_padded"]) == pytest.approx(0.86)
+    assert rows[0]["lpips"] == ""
+
+
+def test_the_table_of_the_paper_sets_3dgs_against_ours_by_data_set():
+    base, pruned = scores().values()
+    table = paper_table({"room0": (base, pruned)})
+    assert table.headings == ("data set", "PSNR 3DGS", "PSNR ours", "SSIM 3DGS", "SSIM ours")
+    assert table.rows == (("room0", "31.00", "31.00", "0.8500", "0.8500"),)
+
+
+def test_a_table_says_the_same_in_every_form():
+    table = Table(("a_b", "50%"), (("x", "1"), ("yy", "22")))
+    assert table.text() == "a_b  50%\nx      1\nyy    22"
+    assert table.text(rule=True).splitlines()[1] == "-" * 8
+    assert table.markdown() == "| a_b | 50% |\n| --- | ---: |\n| x | 1 |\n| yy | 22 |\n"
+    assert table.latex() == (
+        "\\begin{tabular}{lr}\n\\toprule\na\\_b & 50\\% \\\\\n\\midrule\nx & 1 \\\\\n"
+        "yy & 22 \\\\\n\\bottomrule\n\\end{tabular}\n")
+
+
+def test_a_constant_difference_has_an_interval_of_no_width():
+    found = paired_bootstrap([30, 32, 29.5], [29, 31, 28.5])
+    assert (found.mean, found.low, found.high) == (1.0, 1.0, 1.0)
+
+
+def test_the_interval_of_a_paired_difference_is_that_of_a_normal_mean():
+    rng = np.random.default_rng(0)
+    theirs = rng.normal(30, 3, 200)
+    ours = theirs + rng.normal(0.2, 0.5, 200)
+    found = paired_bootstrap(ours, theirs)
+    half = 1.96 * (ours - theirs).std() / np.sqrt(200)
+    assert found.low == pytest.approx(found.mean - half, abs=0.01)
+    assert found.high == pytest.approx(found.mean + half, abs=0.01)
+    assert paired_bootstrap([1.0], [0.5]).low is None
+
+
+def test_lpips_is_left_out_with_its_reason_where_package_or_weights_are_missing(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    distance, reason = perceptual()
+    assert distance is None
+    assert "recon-cli[lpips]" in reason
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    distance, reason = perceptual()
+    assert distance is None
+    assert str(tmp_path) in reason
+
+
+def test_lpips_gets_both_pictures_between_minus_one_and_one(monkeypatch, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"x")
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+
+    class Network:
+        def __init__(self, net, verbose):
+            assert (net, verbose) == ("alex", False)
+
+        def eval(self):
+            return lambda a, b: (a.min(), b.max(), torch.tensor(a.shape))[0] + b.max() / 4
+
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=Network))
+    distance, reason = perceptual()
+    assert reason == ""
+    image, truth = np.zeros((16, 20, 3), np.float32), np.full((16, 20, 3), 255, np.uint8)
+    assert distance(image, truth) == pytest.approx(-1 + 1 / 4)

@@ -1,0 +1,159 @@
+"""`recon bench` in process: the errors that it finds are bounded, times are never asserted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from recon_cli.cli import main
+from recon_cli.experiments import bench_compare
+from recon_cli.experiments.accuracy import Answer, accuracy, answer, oracle
+from recon_cli.experiments.bench_result import FIGURES
+from recon_cli.experiments.probes import probe_for
+from recon_cli.experiments.synthetic_room import (
+    CONTRACT,
+    SceneSize,
+    build_scene,
+    renderer_of,
+    variants_for,
+)
+from recon_cli.render import registry
+from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.torch import tiles
+
+Said = pytest.CaptureFixture[str]
+TINY = SceneSize(200, 48, 32)
+# The bounds of tests/render in float32; a fragment on the edge of a threshold may flip, which
+# costs up to 1/255 of a colour difference at one pixel.
+IMAGE_RMS, GRADIENT = 1e-5, 1e-3
+
+
+def test_quick_writes_the_promised_keys_and_the_errors_are_small(
+    tmp_path: Path, capsys: Said
+) -> None:
+    figures, text = tmp_path / "bench.json", tmp_path / "page.md"
+    text.write_text(f"mine\n{bench_compare.BEGIN}\n{bench_compare.END}\nmine too\n")
+    words = ["bench", "--quick", "--rounds", "1", "--threads", "1", "--device", "cpu",
+             "--gaussians", "300", "--size", "64x48"]
+    assert main([*words, "--json", str(figures), "--markdown", str(text)]) == 0
+    out = capsys.readouterr().out
+    record = json.loads(figures.read_text())
+    scene = record["scenes"]["room"]
+    assert list(scene["backends"]) == ["numba", "torch"]
+    for one in scene["backends"].values():
+        assert one.keys() >= set(FIGURES)
+        assert all(one[name] > 0 for name in FIGURES if "error" not in name)
+        assert one["image_error_rms"] < IMAGE_RMS
+        assert one["gradient_relative_error"] < GRADIENT
+        assert one["pairs"][0] > 0
+    stages = scene["backends"]["numba"]["stages"]
+    assert {"forward: composite", "backward: decompose", "step: adam"} <= stages.keys()
+    errors = {one["name"]: one["image_error_rms"] for one in scene["variants"]}
+    assert errors["contract"] < IMAGE_RMS < errors["stop at T < 0.001"] < errors["stop at T < 0.01"]
+    assert errors["SH degree 2"] < errors["SH degree 1"] < errors["SH degree 0"]
+    for table in ("Figures", "Stages", "Error against float64", "Approximations on numba"):
+        assert f"\n\n{table} (room" in out
+        assert f"\n### {table} (room" in text.read_text()
+    assert text.read_text().startswith("mine\n")
+    assert text.read_text().endswith("mine too\n")
+    assert crew.observer is None
+
+
+@pytest.mark.parametrize(("words", "code", "said"), [
+    (["--backend", "cuda"], 6, "no backend 'cuda'"),
+    (["--size", "640"], 2, "WIDTHxHEIGHT"),
+    (["--plot", "front.pdf"], 2, ".png or .svg"),
+    (["--markdown", "plain.md"], 3, "recon bench: begin"),
+    (["--compare", "none.json"], 3, "cannot be read"),
+    (["--compare", "other.json"], 3, "has the schema none"),
+    (["--json", "none/a.json"], 3, "does not exist"),
+    (["--rounds", "0"], 2, "--rounds"),
+])
+def test_what_cannot_be_done_is_refused_before_anything_is_measured(
+    words: list[str], code: int, said: str, tmp_path: Path, capsys: Said,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "recon_cli.experiments.bench_run.measure", lambda *_: pytest.fail("measured"))
+    Path("plain.md").write_text("no marks")
+    Path("other.json").write_text("{}")
+    assert main(["bench", *words]) == code
+    err = capsys.readouterr().err
+    assert said in err
+    assert "hint: " in err or words[0] == "--compare"
+
+
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_a_probe_changes_nothing_and_leaves_nothing_behind(backend: str) -> None:
+    scene = build_scene(TINY, 3, "cpu")
+    draw = registry.renderer(backend)
+    before = tiles.alphas, tiles.project, vars(tiles._Rasterize)["forward"]
+    plain = answer(scene, draw)
+    probe = probe_for(backend, "cpu")
+    with probe.watching():
+        seen = answer(scene, draw)
+    assert torch.equal(plain.image, seen.image)
+    assert all(torch.equal(plain.gradients[name], seen.gradients[name]) for name in seen.gradients)
+    assert {"composite", "decompose"} <= probe.collect().keys()
+    assert probe.collect() == {}
+    assert before == (
+        tiles.alphas, tiles.project, vars(tiles._Rasterize)["forward"])
+    assert crew.observer is None
+
+
+def test_the_room_is_the_same_for_the_same_seed() -> None:
+    one, two = build_scene(TINY, 3, "cpu"), build_scene(TINY, 3, "cpu")
+    other = build_scene(TINY, 3, "cpu", seed=1)
+    assert torch.equal(one.splats.means, two.splats.means)
+    assert torch.equal(one.weights, two.weights)
+    assert not torch.equal(one.splats.means, other.splats.means)
+    assert oracle(one).image.std() > 0.02  # something is to be seen
+
+
+def test_accuracy_of_a_known_difference() -> None:
+    image = torch.zeros(2, 2, 3, dtype=torch.float64)
+    ones = torch.ones(4, dtype=torch.float64)
+    truth = Answer(image, {"means": ones, "quats": 2 * ones, "sh_rest": 0 * ones})
+    assert accuracy(truth, truth).image_error_max == 0
+    wrong = image.clone()
+    wrong[0, 0, 0] = 0.5
+    found = accuracy(Answer(wrong, {
+        "means": ones, "quats": 3 * ones, "sh_rest": ones}), truth)
+    assert found.image_error_max == 0.5
+    assert found.image_error_rms == pytest.approx((0.25 / 12) ** 0.5)
+    assert found.flipped_pixels == 0.25
+    assert found.gradient_worst == "quats"
+    assert found.gradient_relative_error == pytest.approx(0.5)
+    # (1, 1.5) against (1, 1)
+    assert found.gradient_cosine == pytest.approx(2.5 / (3.25 * 2) ** 0.5)
+
+
+def test_what_is_not_a_number_is_infinitely_wrong() -> None:
+    image = torch.zeros(1, 1, 3, dtype=torch.float64)
+    ones = torch.ones(4, dtype=torch.float64)
+    found = accuracy(Answer(image + torch.nan, {"means": ones * torch.nan}),
+                     Answer(image, {"means": ones}))
+    assert found.image_error_max == found.gradient_relative_error == float("inf")
+    assert found.flipped_pixels == 1
+    assert found.gradient_cosine == 0
+
+
+def test_only_numba_draws_the_approximations_of_the_rasterizer() -> None:
+    torch_names = {one.name for one in variants_for("torch", 3)}
+    numba_names = {one.name for one in variants_for("numba", 3)}
+    assert torch_names == {"SH degree 0", "SH degree 1", "SH degree 2", "float16 colours"}
+    assert torch_names < numba_names
+    assert "SH degree 1" not in {one.name for one in variants_for("numba", 1)}
+
+
+def test_float16_colours_err_by_their_rounding_and_keep_their_gradients() -> None:
+    scene = build_scene(TINY, 3, "cpu")
+    half = next(one for one in variants_for("torch", 3) if one.half_colors)
+    exact, rounded = (answer(scene, renderer_of(one, "torch")) for one in (CONTRACT, half))
+    # colours reach a few units, and float16 keeps eleven bits
+    assert 0 < float((exact.image - rounded.image).abs().max()) < 4 * 2.0**-11
+    assert torch.allclose(exact.gradients["sh_dc"], rounded.gradients["sh_dc"], atol=1e-3)

@@ -1,0 +1,313 @@
+"""Tables, ratios, the page and the picture of `recon bench`: pure functions of known inputs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
+from recon_cli.evaluation.tables import TitledTable, number, percent
+from recon_cli.experiments import bench_compare, bench_plot
+from recon_cli.experiments.accuracy import Accuracy
+from recon_cli.experiments.bench_compare import check_comparable, compared, other_machine, ratio
+from recon_cli.experiments.bench_report import head, tables
+from recon_cli.experiments.bench_result import (
+    FIGURES,
+    SCHEMA,
+    BackendResult,
+    Result,
+    SceneResult,
+    Speed,
+    VariantResult,
+    read_record,
+)
+from recon_cli.experiments.bench_run import Request, pixels
+from recon_cli.experiments.host import (
+    FLOPS_BACKWARD,
+    FLOPS_FORWARD,
+    Host,
+    Timing,
+    alternate,
+    counted,
+    peak_fraction,
+    rate,
+    timing_of,
+)
+from recon_cli.machine import cpu_model
+
+EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)
+ROUGH = Accuracy(0.1, 0.01, 0.5, 0.2, "quats", 0.9)
+
+
+def speed(threads: int, ms: float) -> Speed:
+    """A backend whose forward pass takes `ms`, the backward pass twice and the step four times."""
+    stages = {"forward: composite": Timing(ms / 2, 0.0), "forward: rest": Timing(ms / 2, 0.0)}
+    return Speed(
+        threads, Timing(ms, 0.1), Timing(2 * ms, 0.2), Timing(4 * ms, 0.4), 2.0, 1.0, 0.25, None,
+        stages)
+
+
+def backend(ms: float) -> BackendResult:
+    return BackendResult(speed(2, ms), speed(1, 1.5 * ms), EXACT, (4_000_000, 3_000_000), 10**7)
+
+
+def result(numba_ms: float = 10.0, torch_ms: float = 80.0) -> Result:
+    host = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
+    variants = [
+        VariantResult("contract", Timing(30.0, 0.0), EXACT),
+        VariantResult("rough", Timing(20.0, 0.0), ROUGH), VariantResult("untimed", None, ROUGH)]
+    scene = SceneResult(
+        1000, 64, 48, 3, {"numba": backend(numba_ms), "torch": backend(torch_ms)},
+        {"torch": Timing(9.0, 0.0), "fused": Timing(3.0, 0.0)}, "numba", variants)
+    return Result(host, 7, {"room": scene})
+
+
+# ---- medians and rates ----
+
+def test_a_timing_is_median_and_interquartile_range() -> None:
+    assert timing_of([5.0, 1.0, 2.0, 4.0, 3.0]) == Timing(3.0, 2.0)
+    assert timing_of([2.0, 4.0]) == Timing(3.0, 1.0)
+    assert timing_of([7.0]) == Timing(7.0, 0.0)
+    with pytest.raises(ValueError, match="no samples"):
+        timing_of([])
+
+
+def test_candidates_take_turns_and_the_first_round_is_not_counted() -> None:
+    order: list[str] = []
+    rounds: list[int] = []
+
+    def work(name: str):
+        def run() -> dict[str, float]:
+            order.append(name)
+            return {"all": float(len(order))}
+
+        return run
+
+    found = alternate({"a": work("a"), "b": work("b")}, 2, lambda: rounds.append(1))
+    assert order == ["a", "b"] * 3
+    assert found == {"a": {"all": [3.0, 5.0]}, "b": {"all": [4.0, 6.0]}}
+    assert len(rounds) == 3
+
+
+def test_rates_and_fractions_of_the_peak() -> None:
+    assert rate(4_000_000, 2.0) == 2.0
+    assert rate(None, 2.0) is None
+    assert rate(4, None) is None
+    assert peak_fraction(2.0, 25, 100.0, 1) == 0.5
+    assert peak_fraction(2.0, 25, 100.0, 2) == 0.25
+    assert peak_fraction(None, 25, 100.0, 1) is None
+    assert peak_fraction(2.0, 25, None, 1) is None
+
+
+def test_the_operations_of_a_pair_are_the_sum_of_their_table_in_the_docs() -> None:
+    text = (Path(__file__).resolve().parents[2] / "docs" / "bench.md").read_text(encoding="utf-8")
+    for what, forward, backward in [*counted(), ("sum", FLOPS_FORWARD, FLOPS_BACKWARD)]:
+        assert f"| {what} | {forward} | {backward} |" in text
+
+
+# ---- tables ----
+
+def test_numbers_keep_their_digits() -> None:
+    assert [number(x) for x in (None, 0.0, 12.345, 0.01234, 1234.5, 1.234e-6, 5e7)] == [
+        "-", "0", "12.3", "0.0123", "1234", "1.23e-06", "5.00e+07"]
+    assert [percent(x) for x in (None, 0.25, 0.00123)] == ["-", "25%", "0.123%"]
+
+
+def test_a_table_is_aligned_as_text_and_piped_as_markdown() -> None:
+    table = TitledTable("Title", ("what", "n"), [("one", "1"), ("three", "3.5")])
+    assert table.text() == "Title\nwhat     n\none      1\nthree  3.5"
+    assert table.markdown() == (
+        "### Title\n\n| what | n |\n| --- | ---: |\n| one | 1 |\n| three | 3.5 |")
+
+
+def test_the_figures_are_ratios_of_what_was_measured() -> None:
+    found = result()
+    rows = {row[0]: row[1:] for row in tables(found)[0].rows}
+    assert rows["forward + backward, ms"] == ("30", "240")
+    assert rows["torch : this, forward + backward"] == ("8.00x", "1.00x")
+    assert rows["the same with 1 thread"] == ("8.00x", "1.00x")
+    assert rows["1 thread : 2 threads, whole step"] == ("1.50x", "1.50x")
+    assert rows["Gpairs/s a core, forward"] == ("2", "2")
+    assert rows["of the core's peak, forward"] == ("25%", "25%")
+    assert rows["of the core's peak, backward"] == ("-", "-")
+    assert rows["loss torch : fused"] == ("3.00x", "")
+    assert "interquartile range" in head(found)
+    assert "A CPU, 2 of 2 cores" in head(found)
+
+
+def test_every_stage_error_and_approximation_has_a_row() -> None:
+    _, stages, errors, variants = tables(result())
+    assert ("numba forward: composite", "7.5 (0)", "5 (0)", "2", "25%") in stages.rows
+    assert [row[0] for row in errors.rows] == ["numba", "torch"]
+    assert [row[:3] for row in variants.rows] == [
+        ("contract", "30 (0)", "0"), ("rough", "20 (0)", "10"), ("untimed", "-", "-")]
+    assert variants.rows[1][3:] == ("0.1", "0.01", "50%", "0.2", "quats", "0.1")
+
+
+# ---- the JSON file ----
+
+def test_the_record_has_the_promised_keys(tmp_path: Path) -> None:
+    record = json.loads(json.dumps(result().record()))
+    assert (record["schema"], record["version"]) == (SCHEMA, 1)
+    assert record["machine"]["cpu"] == "A CPU"
+    assert record["machine"]["versions"]["torch"] == "2"
+    for one in record["scenes"]["room"]["backends"].values():
+        assert one.keys() >= set(FIGURES)
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(record))
+    assert read_record(path) == record
+
+
+def test_an_error_that_is_not_finite_is_null() -> None:
+    broken = dataclasses.replace(backend(1.0), accuracy=dataclasses.replace(
+        EXACT, image_error_max=float("inf")))
+    assert broken.record()["image_error_max"] is None
+
+
+@pytest.mark.parametrize("text", [
+    "{", "[]", "{}", '{"schema": "recon-bench", "version": 2}', '{"schema": "x", "version": 1}'])
+def test_a_file_of_another_schema_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "other.json"
+    path.write_text(text)
+    with pytest.raises(FormatError):
+        read_record(path)
+
+
+# ---- comparison ----
+
+def test_a_comparison_is_old_over_new_figure_by_figure() -> None:
+    old, new = result(20.0).record(), result(10.0).record()
+    rows = {row[0]: row[1:] for row in compared(old, new).rows}
+    assert rows["room numba forward_ms"] == ("20", "10", "2")
+    assert rows["room torch step_ms"] == ("320", "320", "1")
+    assert rows["room numba peak_fraction_backward"] == ("-", "-", "-")
+    assert len(rows) == 2 * len(FIGURES)
+    assert [ratio(*pair) for pair in ((4.0, 2.0), (None, 2.0), (4.0, None), (4.0, 0.0))] == [
+        2.0, None, None, None]
+
+
+def test_a_backend_that_the_old_file_lacks_has_no_ratio() -> None:
+    old = result().record()
+    del old["scenes"]["room"]["backends"]["torch"]
+    rows = compared(old, result().record()).rows
+    assert {row[0].split()[1] for row in rows} == {"numba"}
+
+
+def test_only_runs_of_the_same_scene_are_compared() -> None:
+    old = result().record()
+    same = {"gaussians": 1000, "width": 64, "height": 48, "sh_degree": 3}
+    check_comparable(old, "room", same, 2)
+    with pytest.raises(ConfigError, match="1000 Gaussians at 64x48") as caught:
+        check_comparable(old, "room", {**same, "gaussians": 5}, 2)
+    assert "--gaussians 1000 --size 64x48 --sh-degree 3 --threads 2" in caught.value.hint
+    with pytest.raises(ConfigError):
+        check_comparable(old, "room", same, 1)
+    with pytest.raises(ConfigError, match="no scene small"):
+        check_comparable(old, "small", same, 2)
+
+
+def test_another_machine_is_named() -> None:
+    old = result().record()
+    assert other_machine(old, old) == ""
+    new = {**old, "machine": {**old["machine"], "cpu": "Another"}}
+    assert other_machine(old, new) == "cpu A CPU there, Another here"
+
+
+def test_the_model_of_the_cpu_is_read_from_cpuinfo(tmp_path: Path) -> None:
+    path = tmp_path / "cpuinfo"
+    path.write_text("processor\t: 0\nmodel name\t: A: CPU\nmodel name\t: B\n")
+    assert cpu_model(path) == "A: CPU"
+    assert cpu_model(tmp_path / "none")
+
+
+# ---- the page ----
+
+PAGE = f"# Title\n\nby hand\n{bench_compare.BEGIN}\nold\n{bench_compare.END}\nby hand too\n"
+
+
+def test_only_what_stands_between_the_marks_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "page.md"
+    path.write_text(PAGE)
+    bench_compare.write_page(path, "\nnew\ntext\n")
+    assert path.read_text() == PAGE.replace("old", "\nnew\ntext\n")
+    bench_compare.write_page(path, "old")
+    assert path.read_text() == PAGE.replace("old", "\nold\n")
+
+
+@pytest.mark.parametrize("text", [
+    "", bench_compare.BEGIN, f"{bench_compare.END}\n{bench_compare.BEGIN}\n", PAGE + PAGE])
+def test_a_page_without_its_marks_is_refused_and_left_alone(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "page.md"
+    path.write_text(text)
+    with pytest.raises(FormatError, match="recon bench: begin"):
+        bench_compare.write_page(path, "new")
+    assert path.read_text() == text
+
+
+def test_a_page_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="cannot be read"):
+        bench_compare.check_page(tmp_path / "none.md")
+
+
+# ---- the picture ----
+
+def test_the_front_holds_what_nothing_else_beats() -> None:
+    points = [(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (2.0, 2.0), (4.0, 1.0)]
+    assert bench_plot.front(points) == [1, 3, 0]
+    assert bench_plot.front([]) == []
+
+
+def test_the_points_are_backends_and_timed_approximations() -> None:
+    points = bench_plot.points_of(next(iter(result().scenes.values())))
+    assert [(p.name, p.ms, p.image_error) for p in points] == [
+        ("numba", 30.0, 1e-7), ("torch", 240.0, 1e-7), ("rough", 20.0, 0.01)]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_the_picture_is_drawn(suffix: str, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    path = tmp_path / f"front{suffix}"
+    bench_plot.draw(result(), path)
+    assert path.stat().st_size > 5000
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_without_matplotlib_the_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_plot.importlib.util, "find_spec", lambda _name: None)
+    with pytest.raises(ConfigError) as caught:
+        bench_plot.check_picture(Path("front.svg"))
+    assert "pip install 'recon-cli[plot]'" in caught.value.hint
+
+
+def test_a_picture_of_another_format_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"\.png or \.svg"):
+        bench_plot.check_picture(Path("front.pdf"))
+
+
+# ---- what is asked ----
+
+def request(**changes: object) -> Request:
+    return dataclasses.replace(
+        Request("room", None, None, 3, (), "cpu", 1, None, False), **changes)
+
+
+def test_a_size_is_two_numbers_of_pixels() -> None:
+    assert pixels("640x360") == (640, 360)
+    for text in ("640", "0x3", "3x0", "-1x2", "1x2x3", "axb", ""):
+        with pytest.raises(ConfigError, match="WIDTHxHEIGHT"):
+            pixels(text)
+    with pytest.raises(ReconError):
+        request(size="large")
+
+
+def test_quick_takes_fewer_rounds_unless_told() -> None:
+    assert request().count > request(quick=True).count
+    assert request(quick=True, rounds=5).count == 5
+
+
+def test_an_output_needs_its_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        request(json_file=tmp_path / "none" / "a.json")

@@ -1,0 +1,131 @@
+"""Tables, words, JSON and the picture of the study: pure functions of known figures."""
+
+import json
+
+import pytest
+
+from recon_cli.config.stages import RunConfig
+from recon_cli.experiments import study_plot, study_report
+from recon_cli.experiments.host import Host
+from recon_cli.experiments.records import Record
+from recon_cli.experiments.study_plot import TABLE_I, published
+from recon_cli.experiments.study_result import (
+    ARMS,
+    COMPARISONS,
+    EQUAL_SECONDS,
+    EQUAL_STEPS,
+    MEAN,
+    PAIRS,
+    Result,
+    SceneResult,
+)
+from recon_cli.experiments.trial import Point
+
+HOST = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
+NOISE = (0.0, 0.3, -0.3)  # of the seeds, the same for all arms
+
+
+def scene(base_db, gains, machine="A CPU"):
+    """Figures that are known: 3DGS has base_db and each arm its gain; seed noise is common.
+
+    The last arm has noise of its own, so that its interval is wide.
+    """
+    runs = {}
+    for comparison in COMPARISONS:
+        runs[comparison] = {}
+        for arm, gain in zip(ARMS, gains, strict=True):
+            own = (0.5, -0.5, 0.0) if arm is ARMS[-1] else (0.0, 0.0, 0.0)
+            runs[comparison][arm.name] = tuple(
+                Record(Point(100, 10.0, 20.0, 5000, 1_240_000, base_db + gain + noise + extra,
+                             (base_db + gain + noise + extra) / 50), machine,
+                       "original images" + (", far" if arm in ARMS[2:] else ""))
+                for noise, extra in zip(NOISE, own, strict=True))
+    return SceneResult(4, 600, 340, "digest", runs)
+
+
+def result(**scenes):
+    return Result(HOST, 3, RunConfig(), "wall", scenes or {
+        "office0": scene(30.0, (0.0, 0.5, 1.0, 0.1)), "home": scene(20.0, (0.0, -0.1, 1.0, 0.1))})
+
+
+def rows(table):
+    return {row[0]: row[1:] for row in table.rows}
+
+
+def test_every_scene_and_the_mean_has_a_row_for_each_arm():
+    found = rows(study_report.scores(result(), EQUAL_STEPS))
+    assert list(found) == [f"{row}, {arm.label}"
+                           for row in ("office0", "home", MEAN) for arm in ARMS]
+    assert found["office0, 3DGS"] == (
+        "30.00", "0.30", "0.6000", "0.0060", "100", "5,000", "1.2", "10.0", "20.0")
+    assert found[f"{MEAN}, paper"][0] == "25.20"
+
+
+def test_a_single_scene_has_no_mean_of_scenes():
+    assert not any(MEAN in row for row in rows(study_report.scores(
+        result(home=scene(20.0, (0.0, 1.0, 1.0, 1.0))), EQUAL_STEPS)))
+
+
+def test_every_pair_has_its_interval():
+    found = rows(study_report.differences(result(), EQUAL_SECONDS))
+    assert len(found) == 3 * len(PAIRS) == 15
+    assert found["office0, paper - 3DGS"][:3] == ("+0.50", "+0.50", "+0.50")
+    assert found["home, paper - 3DGS"][:3] == ("-0.10", "-0.10", "-0.10")
+    # noise 0.5, -0.5, 0 around 0.1: half width 4.3027 x 0.5 / sqrt 3
+    assert found["home, ours pruned - 3DGS"][:3] == ("+0.10", "-1.14", "+1.34")
+    assert found[f"{MEAN}, paper - 3DGS"][:3] == ("+0.20", "+0.20", "+0.20")
+    assert found["home, paper - ours"][0] == "-1.10"
+
+
+def test_the_words_say_whether_an_interval_contains_zero():
+    text = study_report.text(result())
+    assert ("PSNR of paper against 3DGS, all scenes, equal steps: +0.20 dB; the interval "
+            "[+0.20, +0.20] lies above 0: paper is higher.") in text
+    assert ("PSNR of ours pruned against ours, all scenes, equal seconds: -0.90 dB; the interval "
+            "[-2.14, +0.34] contains 0: no difference shown.") in text
+    assert "3 seeds are few" in text
+    assert "several machines" not in text
+    assert ("home: original images (3DGS and paper), original images, far (ours and ours pruned)."
+            in text)
+    one = Result(HOST, 1, RunConfig(), "wall", {"home": SceneResult(1, 9, 9, "", {
+        name: {arm: records[:1] for arm, records in arms.items()}
+        for name, arms in scene(20.0, (0.0, 1.0, 1.0, 1.0)).runs.items()})})
+    assert "one seed shows no interval" in study_report.text(one)
+
+
+def test_runs_of_two_machines_are_told():
+    found = result(home=scene(20.0, (0, 0, 0, 0)), office=scene(20.0, (0, 0, 0, 0), "Another"))
+    assert found.machines == ("A CPU", "Another")
+    assert "several machines" in study_report.text(found)
+
+
+def test_the_figures_of_the_paper_stand_beside_scenes_of_their_names():
+    assert len(TABLE_I) == 8
+    assert published("Office0") is TABLE_I["office0"]
+    assert published("office") is None
+    table = study_report.beside_the_paper(result())
+    assert rows(table) == {"office0": (
+        "38.45", "0.925", "39.05", "0.934", "+0.60", "+0.009",
+        "30.00", "0.600", "30.50", "0.610", "+0.50", "+0.010")}
+    assert study_report.beside_the_paper(result(home=scene(20.0, (0, 0, 0, 0)))) is None
+    assert "no measurement of the same thing" in study_report.markdown(result())
+
+
+def test_the_record_holds_every_seed_and_is_json():
+    record = json.loads(json.dumps(result().record(), allow_nan=False))
+    assert (record["schema"], record["version"]) == ("recon-study", 1)
+    home = record["comparisons"][EQUAL_STEPS]["home"]
+    assert home["arms"]["reference"]["psnr_db"]["by_seed"] == pytest.approx([20.0, 20.3, 19.7])
+    assert home["differences"]["paper - reference"]["psnr_db"]["shown"] == "lower"
+    assert record["arms"][1]["prune"]["ratio"] == 0.6
+    assert record["scenes"]["home"] == {
+        "views": 4, "width": 600, "height": 340, "digest": "digest",
+        "parts": {"reference": "original images", "paper": "original images",
+                  "budget": "original images, far", "budget-pruned": "original images, far"}}
+
+
+def test_the_picture_is_drawn(tmp_path):
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    study_plot.draw(result(), tmp_path / "study.svg")
+    assert (tmp_path / "study.svg").stat().st_size > 5000
+    assert list(tmp_path.iterdir()) == [tmp_path / "study.svg"]

@@ -1,0 +1,268 @@
+"""`recon report` in process: what it writes, where it does not, and what it says is amiss."""
+
+import dataclasses
+import errno
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from made_pages import TABLE, change, page_of, report, section
+
+from recon_cli.cli import main
+from recon_cli.io.images import write_png
+from recon_cli.report import build
+from recon_cli.workspace import atomic
+from recon_cli.workspace.digests import read_source
+from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.manifest import Manifest, Unfinished
+
+STALE = "What is shown here is the old result"
+
+
+def files(workspace):
+    return {path: path.read_bytes() for path in workspace.rglob("*")
+            if path.is_file() and path.name != "report.html"}
+
+
+def test_the_page_is_one_file_and_nothing_else_changes(workspace, capsys):
+    before = files(workspace)
+    assert report(workspace) == 0
+    assert str(workspace / "report.html") in capsys.readouterr().out
+    assert files(workspace) == before
+    assert main(["status", "--json", "-w", str(workspace)]) == 0
+    states = {one["state"] for one in json.loads(capsys.readouterr().out)["stages"]}
+    assert states == {"fresh"}
+
+
+def test_the_page_shows_what_the_stages_say(workspace):
+    page = page_of(workspace)
+    metrics = json.loads((workspace / "evaluate" / "metrics.json").read_text())
+    for model in metrics["models"].values():
+        assert f"{model['psnr_db']:.2f}" in section(page, "scores")
+        for view in model["views"]:
+            assert f"{view['psnr_db']:.2f}" in section(page, "scores")
+    low = metrics["pruned_minus_base"]["psnr_db"]["low"]
+    assert f"{low:+.2f} to " in section(page, "scores")
+    assert "The mapping can be trusted: 12 of 12 frames have a camera." in page
+    assert "splats.spz" in section(page, "exports")
+    settings = section(page, "settings")
+    assert f"room.mp4 -w {workspace}\n" in settings
+    assert "recon train --iterations 60 " in settings
+    assert "Seeds: sfm 0, train 0." in settings
+    assert "Weakest link: 88%." in section(page, "overview")
+    for lacking in ("is stale", "is missing", "is not shown", "are not shown"):
+        assert lacking not in page
+
+
+def test_every_option_of_every_stage_is_there_with_what_was_decided(workspace):
+    settings = section(page_of(workspace), "settings")
+    for row in TABLE:
+        config = json.loads((workspace / row.name / "manifest.json").read_text())["config"]
+        for name in config:
+            assert f'<th scope="row">{name}</th>' in settings
+    decided = json.loads((workspace / "train" / "config.json").read_text())["max_size"]
+    assert f'max_size</th><td class="text">automatic</td><td class="text">{decided}<' in settings
+
+
+def test_an_empty_workspace_is_4_and_names_the_first_command(tmp_path, capsys):
+    assert report(tmp_path / "none") == 4
+    said = capsys.readouterr().err
+    assert "The report needs ingest, which is missing" in said
+    assert "recon ingest VIDEO" in said
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_is_missing_is_said_in_its_place_with_the_command(workspace):
+    for row in TABLE[1:]:
+        shutil.rmtree(workspace / row.name)
+    page = page_of(workspace)
+    for name, stage, command in (
+            ("capture", "sfm", "sfm"), ("training", "train", "train"),
+            ("scores", "evaluate", "eval"), ("views", "evaluate", "eval"),
+            ("exports", "export", "export"), ("pruning", "prune", "prune")):
+        assert f"{stage} is missing" in section(page, name)
+        assert f"<code>recon {command} -w {workspace}</code>" in section(page, name)
+    assert f"recon prune --sweep -w {workspace}" in section(page, "pruning")
+    assert "<svg" not in section(page, "training")
+    assert STALE not in page
+
+
+def test_no_section_shows_figures_of_a_stale_stage_without_saying_so(workspace):
+    (workspace / "recon.toml").write_text("[train]\niterations = 7\n")
+    page = page_of(workspace)
+    for name, stages in {
+            "overview": ("train", "prune", "evaluate", "export"), "training": ("train", "prune"),
+            "views": ("evaluate",), "scores": ("evaluate",), "pruning": ("prune",),
+            "exports": ("export",), "settings": ("train", "prune", "evaluate", "export")}.items():
+        for stage in stages:
+            assert f"<strong>{stage} is stale</strong>" in section(page, name)
+        assert STALE in section(page, name)
+    assert "training (stale)" in section(page, "training")
+    head = page[:page.index('role="tablist"')]
+    # Gaussians, PSNR, SSIM and the time of training; frames and cameras are fresh
+    assert head.count('class="tag">stale') == 4
+    assert "train.iterations changed: 60 -&gt; 7" in page
+
+
+def test_scores_that_were_changed_by_hand_are_stale_and_may_hold_anything(workspace):
+    metrics = workspace / "evaluate" / "metrics.json"
+    change(metrics, lambda value: value["models"]["base"].update(psnr_db=99.0))
+    scores = section(page_of(workspace), "scores")
+    assert "99.00" in scores
+    assert "held out, base (stale)" in section(page_of(workspace), "training")
+    assert "metrics.json was changed by hand" in scores
+    for content in ("{", "[]", '{"models": {"base": {"views": 3}}}',
+                    '{"models": {"base": {"psnr_db": NaN}}}'):
+        metrics.write_text(content)
+        page = page_of(workspace)
+        assert "The scores are not shown: " in section(page, "scores")
+        assert "The scores are not shown: " in section(page, "views")
+
+
+def test_a_log_that_cannot_be_read_is_said_in_its_place(workspace):
+    (workspace / "train" / "log.jsonl").write_text('{"iteration": "many"}\n')
+    training = section(page_of(workspace), "training")
+    assert "The log of train is not shown: log.jsonl does not hold what recon writes." in training
+    assert "after pruning" in training
+
+
+def test_pictures_that_are_gone_are_said_and_the_others_are_shown(workspace):
+    (workspace / "evaluate" / "truth" / "000004.png").unlink()
+    (workspace / "evaluate" / "renders" / "base" / "000008.png").write_bytes(b"no picture")
+    views = section(page_of(workspace), "views")
+    assert "000004.png is not shown: " in views
+    assert "000008.png is not shown: " in views
+    assert views.count('class="shot"') == 1
+    shutil.rmtree(workspace / "evaluate" / "truth")
+    assert "No picture can be shown" in section(page_of(workspace), "views")
+
+
+def test_a_damaged_manifest_is_said_and_a_damaged_first_one_is_7(workspace, capsys):
+    (workspace / "train" / "manifest.json").write_text("{")
+    page = page_of(workspace)
+    assert "train is damaged" in section(page, "training")
+    assert f"recon train --again -w {workspace}" in section(page, "training")
+    assert "<svg" not in section(page, "scores")
+    (workspace / "ingest" / "manifest.json").write_text("{")
+    assert report(workspace) == 7
+    assert "--again" in capsys.readouterr().err
+
+
+def test_an_unfinished_run_is_said(workspace):
+    place = Workspace(workspace)
+    basis = Manifest.read(workspace / "train").basis
+    shutil.rmtree(workspace / "train")
+    place.begin(basis)
+    place.record(Unfinished(basis, 3, 10))
+    training = section(page_of(workspace), "training")
+    assert "train is unfinished</strong>: a run was interrupted at 3 of 10." in training
+    assert "recon train --iterations 60" in training
+
+
+def test_a_damaged_model_leaves_out_the_plan_alone(workspace):
+    (workspace / "sfm" / "undistorted" / "sparse" / "images.bin").write_bytes(b"short")
+    capture = section(page_of(workspace), "capture")
+    assert "The plan is not shown: " in capture
+    assert 'class="plan"' not in capture
+    assert "<figcaption>000000.png</figcaption>" in capture  # thumbnails: there is no sheet
+
+
+def test_contact_sheets_take_the_place_of_thumbnails_and_many_are_counted(workspace):
+    for number in range(6):
+        write_png(workspace / "ingest" / f"{number:02d}_contact.png",
+                  np.full((30, 40, 3), 9, np.uint8))
+    capture = section(page_of(workspace), "capture")
+    assert capture.count('alt="Contact sheet of the capture"') == 4
+    assert "2 more contact sheets lie in ingest/" in capture
+    assert "Some of the frames" not in capture
+
+
+def test_frames_without_a_camera_are_lost_in_the_legend(workspace):
+    def edit(value):
+        value["frames"].append({**value["frames"][-1], "name": "000099.png"})
+
+    change(workspace / "ingest" / "frames.json", edit)
+    capture = section(page_of(workspace), "capture")
+    assert "1 without a camera" in capture
+    assert "000099.png (lost" in capture
+
+
+@pytest.mark.parametrize("place", ["train/report.html", "evaluate/truth/a.html", ".partial/a.html"])
+def test_a_page_in_the_folder_of_a_stage_is_refused(workspace, place, capsys):
+    assert report(workspace, "-o", workspace / place) == 2
+    assert "the folder of a stage" in capsys.readouterr().err
+    assert not (workspace / place).exists()
+
+
+def test_a_page_among_the_inputs_would_be_one_of_them(workspace, tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    manifest = Manifest.read(workspace / "ingest")
+    source = read_source(tmp_path / "photos", without=workspace)
+    dataclasses.replace(manifest, basis=dataclasses.replace(
+        manifest.basis, sources=(source,))).write(workspace / "ingest")
+    assert report(workspace, "-o", tmp_path / "photos" / "report.html") == 2
+    assert "would count as a new input" in capsys.readouterr().err
+    assert list((tmp_path / "photos").iterdir()) == []
+
+
+def test_a_file_name_that_is_no_utf8_is_shown_as_it_can_be(workspace):
+    manifest = Manifest.read(workspace / "ingest")
+    source = dataclasses.replace(manifest.basis.sources[0], path="/gone/b\udcff.mp4")
+    dataclasses.replace(manifest, basis=dataclasses.replace(
+        manifest.basis, sources=(source,))).write(workspace / "ingest")
+    page = page_of(workspace)
+    assert "The input /gone/b\\udcff.mp4 is gone." in section(page, "overview")
+    assert "from a video: b\\udcff.mp4" in page
+
+
+@pytest.mark.parametrize("name", ["room.mp4", "report", "folder.html"])
+def test_what_is_no_page_is_refused_and_left_as_it_was(workspace, tmp_path, name, capsys):
+    (tmp_path / "folder.html").mkdir()
+    (tmp_path / "room.mp4").write_text("a video")
+    assert report(workspace, "-o", tmp_path / name) == 2
+    assert "ends in .html" in capsys.readouterr().err
+    assert (tmp_path / "room.mp4").read_text() == "a video"
+
+
+def test_a_page_goes_where_it_is_told(workspace, tmp_path):
+    assert report(workspace, "-o", tmp_path / "new" / "room.HTML") == 0
+    assert (tmp_path / "new" / "room.HTML").stat().st_size > 10_000
+    assert not (workspace / "report.html").exists()
+
+
+@pytest.mark.parametrize(("number", "said"), [
+    (errno.ENOSPC, "The disk is full"), (errno.EACCES, "not writable"),
+    (errno.EIO, "cannot be written")])
+def test_a_disk_that_fails_leaves_the_old_page(workspace, monkeypatch, number, said, capsys):
+    old = page_of(workspace)
+
+    def fail(_descriptor):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(atomic.os, "fsync", fail)
+    assert report(workspace) == 7
+    assert said in capsys.readouterr().err
+    assert (workspace / "report.html").read_text(encoding="utf-8") == old
+    assert not list(workspace.glob(".report*"))
+
+
+def test_a_place_that_cannot_be_is_an_error_that_says_so(workspace, tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    assert report(workspace, "-o", tmp_path / "file" / "report.html") == 7
+    assert "Give another file with -o" in capsys.readouterr().err
+
+
+def test_the_whole_file_stays_within_its_bounds(workspace, monkeypatch):
+    rng = np.random.default_rng(0)
+    for path in (workspace / "evaluate").rglob("*.png"):
+        write_png(path, rng.integers(0, 256, (300, 400, 3)).astype(np.uint8))
+    page = page_of(workspace)
+    assert "Pictures have the size at which they were scored, 400x300" in page
+    limit = int(0.4 * len(page.encode()))
+    monkeypatch.setattr(build, "MAX_FILE_BYTES", limit)
+    page = page_of(workspace)
+    assert len(page.encode()) <= limit
+    assert "Pictures are scaled down for this page" in page
+    assert "where evaluate left 400x300" in page

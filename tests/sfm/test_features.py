@@ -1,0 +1,201 @@
+import io
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from sfm_inputs import texture
+
+from recon_cli.errors import FormatError
+from recon_cli.io.frames import write_png
+from recon_cli.scene.camera import Lens
+from recon_cli.sfm import database
+from recon_cli.sfm.features import create_database, extract
+from recon_cli.sfm.job import CameraGroup, Job, Reporter
+
+NAMES = ("a.png", "b.png", "c.png")
+
+
+@pytest.fixture
+def job(tmp_path):
+    """Three small frames and a folder to work in."""
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "out").mkdir()
+    for name in NAMES:
+        Image.new("RGB", (64, 48)).save(tmp_path / "frames" / name)
+    return Job(
+        frames=tmp_path / "frames", denoised=tmp_path / "frames", out=tmp_path / "out",
+        groups=(CameraGroup(NAMES, 64, 48),), masks=None, poses=None,
+        pose_use="keep", given_points=False, pairs="auto", max_features=500,
+        min_registered=0.5, accept_weak=False,
+        gravity=True, scale_between=None,
+        max_minutes=1.0, seed=0, threads=1,
+        sharpness={}, times={})
+
+
+def camera(job):
+    with pycolmap.Database.open(job.database) as opened:
+        found, = opened.read_all_cameras()
+    return found
+
+
+def test_all_images_share_one_distorted_camera(job):
+    create_database(job)
+    assert database.is_sound(job.database, NAMES, 1)
+    assert camera(job).model.name == "OPENCV"
+    assert not camera(job).has_prior_focal_length
+
+
+def test_images_are_numbered_by_name(job):
+    create_database(job)
+    with pycolmap.Database.open(job.database) as opened:
+        assert [(i.image_id, i.name) for i in opened.read_all_images()] == [
+            (1, "a.png"), (2, "b.png"), (3, "c.png")]
+
+
+def test_a_known_focal_length_is_the_first_guess(job):
+    create_database(replace(job, groups=(replace(job.groups[0], focal_px=51.5),)))
+    np.testing.assert_array_equal(camera(job).params, [51.5, 51.5, 32, 24, 0, 0, 0, 0])
+    assert camera(job).has_prior_focal_length
+
+
+def test_frames_of_two_cameras_get_a_camera_each(job):
+    groups = (CameraGroup(NAMES[:1], 64, 48), CameraGroup(NAMES[1:], 64, 48, focal_px=51.5))
+    create_database(replace(job, groups=groups))
+    with pycolmap.Database.open(job.database) as opened:
+        assert [image.camera_id for image in opened.read_all_images()] == [1, 2, 2]
+    assert database.is_sound(job.database, NAMES, 2)
+    assert not database.is_sound(job.database, NAMES, 1)
+
+
+def test_known_intrinsics_are_taken_as_they_are(job):
+    lens = Lens("SIMPLE_RADIAL", 64, 48, (50.25, 31.5, 24.5, 0.125))
+    create_database(replace(job, groups=(replace(job.groups[0], lens=lens),)))
+    assert camera(job).model.name == "SIMPLE_RADIAL"
+    np.testing.assert_array_equal(camera(job).params, lens.params)
+
+
+def test_a_frame_that_cannot_be_read_is_named(job):
+    (job.frames / "b.png").write_bytes(b"no picture")
+    with pytest.raises(FormatError, match=r"1 of 3 frames cannot be read .* b\.png"):
+        create_database(job)
+    assert not job.database.exists()
+
+
+def test_a_frame_of_another_size_is_named(job):
+    Image.new("RGB", (48, 64)).save(job.frames / "c.png")
+    with pytest.raises(FormatError, match=r"differ from the first in size: c\.png"):
+        create_database(job)
+
+
+def test_a_database_cut_short_is_not_sound(job):
+    create_database(job)
+    data = job.database.read_bytes()
+    job.database.write_bytes(data[:len(data) // 2])
+    assert not database.is_sound(job.database, NAMES, 1)
+
+
+@pytest.mark.parametrize("data", [b"", b"noise" * 1000])
+def test_a_file_that_is_no_database_is_not_sound(job, data):
+    job.database.write_bytes(data)
+    assert not database.is_sound(job.database, NAMES, 1)
+
+
+def test_a_database_of_other_images_is_not_sound(job):
+    create_database(job)
+    assert not database.is_sound(job.database, (*NAMES, "d.png"), 1)
+    assert not database.is_sound(job.database, NAMES[:2], 1)
+
+
+def test_a_missing_database_is_not_sound(tmp_path):
+    assert not database.is_sound(Path(tmp_path / "none.db"), NAMES, 1)
+
+
+def test_a_broken_database_is_replaced_with_its_side_files(job):
+    job.database.write_bytes(b"noise")
+    side = job.database.with_name("database.db-wal")
+    side.write_bytes(b"noise")
+    create_database(job)
+    assert database.is_sound(job.database, NAMES, 1)
+    assert not side.exists()
+
+
+def textured(job, **changes):
+    """The same job with frames full of keypoints, and its database."""
+    for seed, name in enumerate(NAMES):
+        write_png(job.frames / name, texture(180, 240, seed))
+    group = replace(job.groups[0], width=240, height=180)
+    job = replace(job, groups=(group,), **changes)
+    create_database(job)
+    return job
+
+
+def keypoints(job):
+    with pycolmap.Database.open(job.database) as opened:
+        return {image.name: opened.read_keypoints(image.image_id)
+                for image in opened.read_all_images()}
+
+
+def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
+    job = textured(job, max_features=100)
+    extract(job, Reporter(io.BytesIO()))
+    few = keypoints(job)
+    assert [len(found) for found in few.values()] == [100, 100, 100]
+    database.remove(job.database)
+    create_database(job)
+    extract(replace(job, max_features=5000), Reporter(io.BytesIO()))
+    for name, every in keypoints(job).items():
+        coarsest = np.sort(database.scales(every))[-100:]
+        np.testing.assert_array_equal(np.sort(database.scales(few[name])), coarsest)
+
+
+def test_descriptors_stay_with_their_keypoints(job):
+    job = textured(job, max_features=5000)
+    extract(job, Reporter(io.BytesIO()))
+    before, every = keypoints(job), descriptors(job)
+    database.keep_coarsest(job.database, 60)
+    for name, rows in descriptors(job).items():
+        places = [int(np.flatnonzero((before[name] == point).all(axis=1))[0])
+                  for point in keypoints(job)[name]]
+        np.testing.assert_array_equal(rows, every[name][places])
+
+
+def descriptors(job):
+    with pycolmap.Database.open(job.database) as opened:
+        return {image.name: np.asarray(opened.read_descriptors(image.image_id).data)
+                for image in opened.read_all_images()}
+
+
+def test_nothing_is_found_where_the_mask_is_black(job, tmp_path):
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((180, 240), np.uint8)
+    mask[:, 120:] = 255
+    Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
+    job = textured(job, masks=tmp_path / "masks")
+    extract(job, Reporter(io.BytesIO()))
+    found = keypoints(job)
+    assert len(found["b.png"]) > 20
+    assert found["b.png"][:, 0].min() >= 120
+    assert found["a.png"][:, 0].min() < 120
+
+
+def test_an_extraction_that_goes_on_keeps_the_cameras(job):
+    job = textured(job)
+    one, two = replace(job.groups[0], names=NAMES[:1]), replace(job.groups[0], names=NAMES[1:])
+    job = replace(job, groups=(one, two))
+    create_database(job)
+    extract(job, Reporter(io.BytesIO()))
+    whole = keypoints(job)
+    with sqlite3.connect(job.database) as connection:  # as a kill before the last image leaves it
+        for table in ("keypoints", "descriptors"):
+            connection.execute(f"DELETE FROM {table} WHERE image_id = 3")
+    connection.close()
+    extract(job, Reporter(io.BytesIO()))
+    assert database.is_sound(job.database, NAMES, 2)
+    with pycolmap.Database.open(job.database) as opened:
+        assert [image.camera_id for image in opened.read_all_images()] == [1, 2, 2]
+    for name, found in keypoints(job).items():
+        np.testing.assert_array_equal(found, whole[name])

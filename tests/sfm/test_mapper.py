@@ -1,0 +1,90 @@
+import io
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic import center_error, make_capture, part
+
+from recon_cli.sfm import mapper
+from recon_cli.sfm.job import Reporter
+from recon_cli.sfm.mapper import triangulation_angles
+
+
+def test_the_angle_of_a_point_is_that_of_its_widest_pair_of_rays():
+    """Cameras at x = 0, 1 and 2 see a point one unit before the first: 0, 45 and 63.4 degrees."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=8, height=6, params=[5, 5, 4, 3]))
+    track = pycolmap.Track()
+    for x in range(3):
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(
+                image_id=x + 1, name=f"{x}.png", camera_id=1,
+                points2D=[pycolmap.Point2D(np.zeros(2))]),
+            pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-float(x), 0, 0])))
+        track.add_element(x + 1, 0)
+    model.add_point3D(np.array([0.0, 0, 1]), track)
+    assert triangulation_angles(model) == pytest.approx([np.degrees(np.arctan(2))])
+
+
+def shifted(model, camera):
+    """Moves the principal point of a camera by 5 pixels; the second two are cx and cy."""
+    model.camera(camera).params = model.camera(camera).params + np.array([0, 0, 5, 0, 0, 0, 0, 0])
+
+
+def test_the_last_adjustment_finds_the_principal_point(tmp_path):
+    _, truth = make_capture(tmp_path)
+    model = pycolmap.Reconstruction(truth)
+    shifted(model, 1)
+    mapper.adjust(model)
+    assert model.camera(1).params[2] == pytest.approx(512, abs=0.1)
+    assert center_error(model, truth) < 1e-3
+
+
+def test_a_camera_with_few_images_keeps_its_intrinsics_beside_one_with_many(tmp_path):
+    job, truth = make_capture(tmp_path, frames=12, cameras=2)
+    few = sorted(name for name in job.names if "camera000002" in name)[3:]
+    assert len(few) == 9
+    model = part(truth, set(job.names).difference(few))
+    before = model.camera(2).params.copy()
+    shifted(model, 1)
+    mapper.adjust(model)
+    assert model.camera(1).params[2] == pytest.approx(512, abs=0.1)
+    np.testing.assert_array_equal(model.camera(2).params, before)
+
+
+def test_known_intrinsics_stay_as_they_are(tmp_path):
+    _, truth = make_capture(tmp_path)
+    model = pycolmap.Reconstruction(truth)
+    mapper.adjust(model, constant={1})
+    np.testing.assert_array_equal(model.camera(1).params, truth.camera(1).params)
+
+
+def test_the_global_mapper_finds_the_cameras_and_leaves_the_database_alone(tmp_path):
+    job, truth = make_capture(tmp_path)
+    before = job.database.read_bytes()
+    model, = mapper.globally(job, Reporter(io.BytesIO()))
+    assert model.num_reg_images() == 20
+    assert center_error(model, truth) < 1e-2
+    assert job.database.read_bytes() == before
+    assert list(job.rungs.iterdir()) == []
+
+
+def test_a_model_is_extended_by_the_images_that_fit(tmp_path):
+    job, truth = make_capture(tmp_path)
+    whole = mapper.extended(job, part(truth, job.names[:15]))
+    assert mapper.names(whole) == list(job.names)
+    assert center_error(whole, truth) < 1e-3
+
+
+def test_a_point_that_the_adjustment_lost_is_dropped(tmp_path, monkeypatch):
+    _, model = make_capture(tmp_path)
+    before, lost = model.num_points3D(), min(model.point3D_ids())
+
+    def lose(model, _):
+        model.point3D(lost).xyz = np.array([1e100, 0, 0])
+
+    monkeypatch.setattr(pycolmap, "bundle_adjustment", lose)
+    mapper.adjust(model)
+    assert model.num_points3D() == before - 1
+    assert model.compute_mean_reprojection_error() < 1

@@ -1,0 +1,202 @@
+import json
+
+import numpy as np
+import pytest
+from made_model import MadeModel, along, moved, wall
+
+from recon_cli.errors import SfmError
+from recon_cli.sfm.evidence import gather
+from recon_cli.sfm.verdict import Verdict, check_weak_link, examine
+
+
+def verdict_on(made: MadeModel, folder, **known) -> Verdict:
+    return examine(made.model(), made.write_database(folder / "database.db"), made.names, **known)
+
+
+def walk(**changes) -> MadeModel:
+    """Sixteen cameras half a metre apart along a wall; neighbours see much in common."""
+    return MadeModel(wall(-4, 12, count=2400), along(np.arange(16) * 0.5), **changes)
+
+
+def broken_walk() -> MadeModel:
+    """The second half is turned and shifted with all that it sees but a handful of points."""
+    motion = moved(1, 2, 0, degrees=20)
+    return walk(
+        motions=dict.fromkeys(range(8, 16), motion),
+        landmark=lambda image, point: point if point < 60 else (image >= 8, point))
+
+
+def doubled_place() -> MadeModel:
+    """Two walls 100 m apart that share a poster, laid over each other.
+
+    Nothing else ties the two groups of cameras, so that every match agrees with the model.
+    """
+    poster, first, second = (wall(-1, 0.6, count=400, seed=1), wall(-4, 4, count=1500, seed=2),
+                             wall(-4, 4, count=1500, seed=3))
+    away = np.array([100.0, 0, 0])
+    points = np.concatenate([poster, first, poster + away, second + away])
+    looks = np.arange(len(points))
+    looks[1900:2300] = looks[:400]
+    xs = np.arange(6) * 0.2 - 0.5
+    return MadeModel(
+        points, along([*xs, *(xs + 100)]), looks=looks,
+        motions={index: moved(-100, 0, 0) for index in range(6, 12)},
+        landmark=lambda _, point: int(looks[point]))
+
+
+def test_a_model_that_all_matches_bear_out_is_trusted(tmp_path):
+    verdict = verdict_on(walk(), tmp_path)
+    assert verdict.trusted
+    assert verdict.problems == ()
+    assert verdict.weak_link.share == 1
+    assert verdict.fold.share == 1
+    assert (verdict.astray, verdict.jumps, verdict.unregistered) == ((), (), {})
+    assert [len(part) for part in verdict.model_parts] == [16]
+    check_weak_link(verdict, accept=False)
+
+
+def test_two_good_halves_set_wrongly_to_each_other_are_found(tmp_path):
+    made = broken_walk()
+    verdict = verdict_on(made, tmp_path)
+    assert not verdict.trusted
+    assert verdict.weak_link.share is not None
+    assert verdict.weak_link.share < 0.1
+    assert sorted(verdict.weak_link.sides) == [tuple(made.names[:8]), tuple(made.names[8:])]
+    assert len(verdict.model_parts) == 1, "a few points still tie the halves"
+
+
+def test_a_broken_model_is_refused_with_the_way_out_unless_it_is_accepted(tmp_path):
+    verdict = verdict_on(broken_walk(), tmp_path)
+    with pytest.raises(SfmError, match="The model is broken") as caught:
+        check_weak_link(verdict, accept=False)
+    for way_out in ("--frames", "--pairs exhaustive", "--accept-weak"):
+        assert way_out in caught.value.hint
+    check_weak_link(verdict, accept=True)
+
+
+def test_two_places_laid_over_each_other_are_found_though_every_match_agrees(tmp_path):
+    made = doubled_place()
+    verdict = verdict_on(made, tmp_path)
+    assert verdict.weak_link.share == 1
+    assert verdict.fold.share is not None
+    assert verdict.fold.share < 0.5
+    assert sorted(verdict.fold.sides) == [tuple(made.names[:6]), tuple(made.names[6:])]
+    with pytest.raises(SfmError, match="look alike"):
+        check_weak_link(verdict, accept=False)
+
+
+def test_places_that_look_alike_do_not_speak_against_a_right_model(tmp_path):
+    """The posters' matches outnumber those that tie the middle of a walk and all contradict it."""
+    points = np.concatenate([wall(-4, 24, count=1600), wall(-1, 1, count=1600, seed=1)])
+    away = np.array([20.0, 1, 0])  # higher up too: else it lies on the epipolar lines
+    points = np.concatenate([points, points[1600:] + away])
+    looks = np.arange(len(points))
+    looks[3200:] = looks[1600:3200]
+    made = MadeModel(points, along(np.arange(51) * 0.4), looks=looks)
+    model, database = made.model(), made.write_database(tmp_path / "database.db")
+    evidence = gather(model, database, made.names)
+    middle = (evidence.pairs < 25).sum(axis=1) == 1
+    assert evidence.agreeing[middle].sum() < 0.5 * evidence.matches[middle].sum()
+    verdict = examine(model, database, made.names)
+    assert verdict.trusted, verdict.problems
+
+
+def test_one_wrong_camera_is_named_and_its_neighbours_are_not(tmp_path):
+    made = walk(
+        motions={5: moved(3, 3, 0)},
+        landmark=lambda image, point: point if point < 60 else (image == 5, point))
+    verdict = verdict_on(made, tmp_path)
+    assert [item.name for item in verdict.astray] == [made.names[5]]
+    assert verdict.astray[0].share < 0.1
+    assert verdict.weak_link.share == 1
+    assert not verdict.trusted
+    assert made.names[5] in verdict.problems[0]
+
+
+def test_a_camera_far_off_a_video_s_path_is_a_jump_there_and_back(tmp_path):
+    made = walk(motions={5: moved(0, 30, 0)})
+    verdict = verdict_on(made, tmp_path)
+    names = made.names
+    assert [(jump.before, jump.after) for jump in verdict.jumps] == [
+        (names[4], names[5]), (names[5], names[6])]
+    assert verdict.jumps[0].ratio == pytest.approx(60, rel=0.1)
+    assert not any("leaps" in problem for problem in verdict.problems)
+
+
+def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
+    made = walk(motions={5: moved(0, 3000, 0)})
+    verdict = verdict_on(made, tmp_path)
+    assert not verdict.trusted
+    assert any(f"leaps from {made.names[4]}" in problem for problem in verdict.problems)
+
+
+def test_parts_that_share_no_point_are_a_problem(tmp_path):
+    made = walk(landmark=lambda image, point: (image >= 10, point))
+    verdict = verdict_on(made, tmp_path)
+    assert verdict.model_parts == (tuple(made.names[:10]), tuple(made.names[10:]))
+    assert [len(part) for part in verdict.match_parts] == [16]
+    assert any("2 parts of 10, 6 cameras" in problem for problem in verdict.problems)
+
+
+def test_images_without_a_camera_have_a_reason(tmp_path):
+    """The last two see another wall; the third is blurred, and the fifth just was not placed."""
+    poses = along([*np.arange(10) * 0.5, 100, 101])
+    points = np.concatenate([wall(-4, 9, count=2000), wall(98, 103, count=400)])
+    made = MadeModel(points, poses, unregistered=frozenset({3, 5, 10, 11}))
+    sharpness = dict.fromkeys(made.names, 100.0) | {made.names[3]: 20.0}
+    reasons = verdict_on(made, tmp_path, sharpness=sharpness).unregistered
+    assert list(reasons) == [made.names[index] for index in (3, 5, 10, 11)]
+    assert reasons[made.names[3]] == "blurred: sharpness 20, 100 is usual"
+    assert "matched but not placed" in reasons[made.names[5]]
+    assert "to 8 images" in reasons[made.names[5]]
+    assert "no overlap" in reasons[made.names[10]]
+
+
+def test_two_cameras_are_too_few_to_tell(tmp_path):
+    made = MadeModel(wall(-4, 4, count=20), along([0.0, 0.5]))
+    verdict = verdict_on(made, tmp_path)
+    assert verdict.weak_link.share is None
+    assert "30 verified matches" in verdict.weak_link.reason
+    assert verdict.fold.share is None
+    check_weak_link(verdict, accept=False)
+
+
+def test_a_verdict_comes_back_from_a_file_as_it_was(tmp_path):
+    verdict = verdict_on(broken_walk(), tmp_path)
+    text = json.dumps(verdict.to_json(), allow_nan=False)
+    assert json.loads(text)["trusted"] is False
+    assert Verdict.from_json(json.loads(text)) == verdict
+
+
+def test_the_same_model_gets_the_same_verdict_twice(tmp_path):
+    made = broken_walk()
+    database = made.write_database(tmp_path / "database.db")
+    assert examine(made.model(), database, made.names) == examine(
+        made.model(), database, made.names)
+
+
+def test_the_text_says_first_whether_the_model_can_be_trusted(tmp_path):
+    assert verdict_on(walk(), tmp_path).lines()[0] == (
+        "16 of 16 images have a camera; the model is trusted.")
+    (tmp_path / "database.db").unlink()
+    lines = verdict_on(broken_walk(), tmp_path).lines()
+    assert "not to be trusted" in lines[0]
+    assert "The model is broken" in lines[1]
+
+
+def test_an_image_that_the_database_lacks_is_a_mistake_of_the_program(tmp_path):
+    made = walk()
+    database = made.write_database(tmp_path / "database.db")
+    with pytest.raises(ValueError, match="holds 16 of 17"):
+        examine(made.model(), database, [*made.names, "other.png"])
+    with pytest.raises(ValueError, match="000015"):
+        examine(made.model(), database, made.names[:-1])
+
+
+def test_a_model_without_cameras_cannot_be_told(tmp_path):
+    made = walk(unregistered=frozenset(range(16)))
+    verdict = verdict_on(made, tmp_path)
+    assert (verdict.registered, verdict.model_parts) == (0, ())
+    assert len(verdict.unregistered) == 16
+    assert verdict.weak_link.share is None
+    assert len(verdict.lines()) == 7, "five of the sixteen are listed"

@@ -1,0 +1,165 @@
+"""What import leaves, in which frame, and what the views say of it."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from foreign import truth
+from scenes import random_splats
+from tiny_scene import make_inputs
+
+from recon_cli.config.stages import ImportConfig, PruneConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
+from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.io.splats.registry import FORMATS
+from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.splats import transformed
+from recon_cli.stages import evaluate, import_scene, prune
+from recon_cli.train.runner import read_config
+from recon_cli.workspace.atomic import write_json
+
+TURN = np.array([[0.0, -1, 0], [0.6, 0, 0.8], [-0.8, 0, 0.6]])
+WORLD = Similarity(2.5, TURN, np.array([3.0, -1, 2]))  # from the source's frame to the workspace's
+CONTEXT = StageContext(backend="numba")
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    given = make_inputs(tmp_path / "views")
+    write_json(given.folders["sfm"] / "world.json", {"similarity": WORLD.to_json()})
+    return given
+
+
+def brought_in(path, given, out, **options):
+    out.mkdir()
+    folders = StageInputs(given.folders if given else {}, (path,))
+    return import_scene.run(ImportConfig(**options), folders, out, CONTEXT)
+
+
+def written(path, splats):
+    write_ply(path, splats)
+    return path
+
+
+def test_the_scene_of_the_workspace_is_taken_as_it_is(inputs, tmp_path):
+    path = written(tmp_path / "a.ply", truth())
+    summary = brought_in(path, inputs, tmp_path / "train")
+    assert (tmp_path / "train" / "splats.ply").read_bytes() == path.read_bytes()
+    assert (summary["imported_from"], summary["frame"]) == ("a.ply", "workspace")
+    assert summary["training_psnr_db"] > 40  # nothing but 8 bits apart
+    assert "notices" not in summary
+
+
+def test_a_scene_of_the_source_is_moved_and_its_harmonics_turned(inputs, tmp_path):
+    colored = random_splats(60, seed=0, dtype=torch.float32).with_degree(1).sh_rest
+    whole = truth().with_degree(1)
+    whole.sh_rest = 0.2 * colored
+    path = written(tmp_path / "a.ply", transformed(whole, WORLD.inverse()))
+    summary = brought_in(path, inputs, tmp_path / "train")
+    assert summary["frame"] == "source"
+    back = read_ply(tmp_path / "train" / "splats.ply")
+    assert torch.allclose(back.means, whole.means, atol=1e-4)
+    assert torch.allclose(back.log_scales, whole.log_scales, atol=1e-5)
+    assert torch.allclose(back.sh_rest, whole.sh_rest, atol=1e-5)
+    assert not torch.allclose(read_ply(path).sh_rest, whole.sh_rest, atol=1e-2)
+    assert summary["tried_psnr_db"]["source"] > summary["tried_psnr_db"]["workspace"] + 10
+    assert summary["transform"] == WORLD.to_json()
+
+
+def test_a_scene_in_the_wrong_frame_is_said_to_be_so_wherever_it_is_scored(
+    inputs, tmp_path, caplog
+):
+    path = written(tmp_path / "a.ply", transformed(truth(), WORLD.inverse()))
+    with caplog.at_level(logging.WARNING, "recon"):
+        summary = brought_in(path, inputs, tmp_path / "train", frame="workspace")
+    assert "does not show what the views show" in summary["notices"][0]
+    assert summary["notices"][0] in caplog.text
+    assert summary["training_psnr_db"] < summary["flat_psnr_db"]
+    (tmp_path / "evaluate").mkdir()
+    folders = StageInputs({**inputs.folders, "train": tmp_path / "train"})
+    evaluate.run(evaluate.EvaluateConfig(), folders, tmp_path / "evaluate", CONTEXT)
+    assert "does not show what the views show" in (
+        tmp_path / "evaluate" / "table.txt").read_text()
+
+
+def test_a_scene_that_is_only_a_little_off_is_doubted(inputs, tmp_path):
+    off = Similarity(translation=np.array([0.15, 0.1, 0.0]))
+    path = written(tmp_path / "a.ply", transformed(truth(), off))
+    summary = brought_in(path, inputs, tmp_path / "train", frame="workspace")
+    assert "differs a little" in summary["notices"][0]
+
+
+def test_without_views_nothing_is_moved_and_the_record_says_so(tmp_path):
+    path = written(tmp_path / "a.ply", truth())
+    summary = brought_in(path, None, tmp_path / "train")
+    assert summary["views"] == 0
+    record = json.loads((tmp_path / "train" / "import.json").read_text())
+    assert (record["gaussians"], record["views"], record["z_up"]) == (60, False, False)
+    assert (tmp_path / "train" / "splats.ply").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_comes_in(tmp_path, name):
+    path = tmp_path / f"a.{name}"
+    FORMATS[name].write(path, truth())
+    summary = brought_in(path, None, tmp_path / "train")
+    assert (summary["format"], summary["gaussians"]) == (name, 60)
+    assert len(read_ply(tmp_path / "train" / "splats.ply")) == 60
+    assert read_config(tmp_path / "train").max_gaussians == 60
+
+
+def test_what_holds_no_scene_is_refused(tmp_path):
+    (tmp_path / "a.txt").write_text("text")
+    empty = written(tmp_path / "e.ply", truth().select(torch.zeros(60, dtype=torch.bool)))
+    for path, message in ((tmp_path / "a.txt", "no known format"), (empty, "no Gaussians")):
+        with pytest.raises(FormatError, match=message):
+            brought_in(path, None, tmp_path / f"out-{path.stem}")
+    with pytest.raises(InputError, match="2 files were given"):
+        import_scene.run(ImportConfig(), StageInputs({}, (empty, empty)), tmp_path, CONTEXT)
+
+
+def test_views_without_one_to_look_at_are_refused(inputs, tmp_path):
+    path = inputs.folders["ingest"] / "frames.json"
+    frames = json.loads(path.read_text())
+    for frame in frames["frames"]:
+        frame["held_out"] = True
+    path.write_text(json.dumps(frames))
+    with pytest.raises(ReconstructionError, match="no training view"):
+        brought_in(written(tmp_path / "a.ply", truth()), inputs, tmp_path / "train")
+
+
+def test_an_imported_scene_is_pruned_like_a_trained_one(inputs, tmp_path):
+    brought_in(written(tmp_path / "a.ply", truth()), inputs, tmp_path / "train")
+    folders = StageInputs({**inputs.folders, "train": tmp_path / "train"})
+    (tmp_path / "prune").mkdir()
+    config = PruneConfig(ratio=0.25, recovery=24)
+    summary = prune.run(config, folders, tmp_path / "prune", CONTEXT)
+    assert (summary["gaussians_before"], summary["gaussians"]) == (60, 45)
+    assert summary["iterations"] == summary["recovery_steps"] == 24
+    assert summary["validation_psnr_db_before"] > 40
+    assert summary["validation_psnr_db"] > 35
+    with pytest.raises(ConfigError, match="imported from a"):
+        prune.run(PruneConfig(at="mid"), folders, tmp_path / "prune", CONTEXT)
+
+
+def test_a_score_says_that_the_views_may_have_been_trained_on(inputs, tmp_path):
+    brought_in(written(tmp_path / "a.ply", truth()), inputs, tmp_path / "train")
+    folders = StageInputs({**inputs.folders, "train": tmp_path / "train"})
+    (tmp_path / "evaluate").mkdir()
+    evaluate.run(evaluate.EvaluateConfig(), folders, tmp_path / "evaluate", CONTEXT)
+    metrics = json.loads((tmp_path / "evaluate" / "metrics.json").read_text())
+    assert metrics["imported_from"] == "a.ply"
+    assert metrics["models"]["base"]["train_seconds"] is None
+    table = (tmp_path / "evaluate" / "table.txt").read_text()
+    assert "may have trained on the held-out views" in table
+
+
+def test_a_scene_that_wants_antialiasing_is_said_to(tmp_path):
+    path = written(tmp_path / "a.ply", truth())
+    path.write_bytes(path.read_bytes().replace(
+        b"element", b"comment SplatRenderMode: mip\nelement", 1))
+    (notice,) = brought_in(path, None, tmp_path / "train")["notices"]
+    assert "drawn with antialiasing" in notice

@@ -1,0 +1,300 @@
+"""Results are whole: after a crash at any step, after damage, with two writers, on a full disk."""
+
+import errno
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from recon_cli.errors import InputError, ManifestError, WorkspaceError
+from recon_cli.workspace import lock
+from recon_cli.workspace.digests import digest_file, read_source
+from recon_cli.workspace.layout import Workspace, changed_outputs, combined, disk_errors
+from recon_cli.workspace.manifest import Basis, Manifest, RunRecord, differences
+
+RUN = RunRecord(1.0, 2, {}, {}, None, None, 1, "2020-01-01T00:00:00+00:00")
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+def basis(config: int = 1) -> Basis:
+    return Basis("train", 1, {"iterations": config}, (), {"sfm": "abc"})
+
+
+def finish(workspace: Workspace, text: str, config: int = 1) -> Manifest:
+    """Writes and commits one result."""
+    out, _ = workspace.begin(basis(config))
+    (out / "sub").mkdir(exist_ok=True)
+    (out / "sub" / "data.txt").write_text(text)
+    outputs = workspace.seal("train")
+    manifest = Manifest(basis(config), outputs, combined(outputs, ()), RUN)
+    workspace.commit(manifest)
+    return manifest
+
+
+def content(workspace: Workspace) -> str:
+    return (workspace.folder("train") / "sub" / "data.txt").read_text()
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path / "ws")
+
+
+def test_a_committed_result_is_read_back_as_it_was_written(workspace: Workspace) -> None:
+    with workspace.writing("train"):
+        written = finish(workspace, "one")
+    assert workspace.manifest("train") == written
+    assert list(written.outputs) == ["sub/data.txt"]
+    assert workspace.unfinished("train") is None
+    assert workspace.scraps() == []
+
+
+def test_the_fingerprint_ignores_names_and_times_of_inputs_but_not_their_order(
+    tmp_path: Path,
+) -> None:
+    one, two, three = (tmp_path / name for name in ("a", "b", "c"))
+    one.write_text("x")
+    two.write_text("x")
+    three.write_text("y")
+    os.utime(two, ns=(1, 1))
+
+    def fingerprint(*paths: Path) -> str:
+        sources = tuple(read_source(path, without=tmp_path / "ws") for path in paths)
+        return Basis("ingest", 1, {}, sources, {}).fingerprint
+
+    assert fingerprint(one) == fingerprint(two)
+    assert fingerprint(one, three) != fingerprint(three, one)
+
+
+def test_a_folder_is_read_without_hidden_files_and_without_the_workspace(tmp_path: Path) -> None:
+    for name in ("b.jpg", "sub/a.jpg", ".hidden", ".git/x", "ws/ingest/frame.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(name)
+    assert list(read_source(tmp_path, without=tmp_path / "ws").files) == ["b.jpg", "sub/a.jpg"]
+
+
+def test_a_missing_input_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_source(tmp_path / "none.mp4", without=tmp_path)
+
+
+def test_a_known_digest_is_believed_while_size_and_time_are_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_text("one")
+    known = digest_file(path)
+    path.write_text("two")
+    os.utime(path, ns=(known.mtime_ns, known.mtime_ns))
+    assert digest_file(path, known) == known
+    os.utime(path, ns=(known.mtime_ns + 1, known.mtime_ns + 1))
+    assert digest_file(path, known).sha256 != known.sha256
+
+
+def test_a_renamed_photo_is_named_among_the_reasons(tmp_path: Path) -> None:
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p" / "a.jpg").write_text("1")
+    (tmp_path / "p" / "b.jpg").write_text("2")
+    before = Basis("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
+    (tmp_path / "p" / "a.jpg").rename(tmp_path / "p" / "c.jpg")
+    (tmp_path / "p" / "b.jpg").write_text("changed")
+    after = Basis("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
+    assert differences(before, after, section="ingest") == [
+        "the input p/a.jpg is gone", "the input p/b.jpg changed", "the input p/c.jpg is new"]
+
+
+def test_options_that_another_version_knew_or_did_not_know_are_named() -> None:
+    before = Basis("export", 1, {"gone": None, "kept": 1.5}, (), {})
+    after = Basis("export", 1, {"kept": 2.0, "crop": None}, (), {})
+    assert differences(before, after, section="export") == [
+        "export.kept changed: 1.5 -> 2", "export.crop is new", "export.gone is no more"]
+
+
+def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> None:
+    with workspace.writing("train"):
+        manifest = finish(workspace, "one")
+    data = workspace.folder("train") / "sub" / "data.txt"
+    os.utime(data, ns=(5, 5))
+    assert changed_outputs(workspace.folder("train"), manifest, ()) == []
+    data.write_text("edited")
+    assert changed_outputs(workspace.folder("train"), manifest, ()) == [
+        "output sub/data.txt was changed by hand"]
+    data.unlink()
+    assert changed_outputs(workspace.folder("train"), manifest, ()) == [
+        "output sub/data.txt is missing"]
+    assert changed_outputs(workspace.folder("train"), manifest, ("sub/*",)) == []
+
+
+@pytest.mark.parametrize("damage", ["truncated", "edited", "unsigned", "other schema", "a list"])
+def test_a_manifest_that_cannot_be_trusted_names_the_file_and_the_remedy(
+    workspace: Workspace, damage: str
+) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    path = workspace.folder("train") / "manifest.json"
+    text, value = path.read_text(), json.loads(path.read_text())
+    path.write_text({
+        "truncated": text[: len(text) // 2],
+        "edited": text.replace('"iterations": 1', '"iterations": 2'),
+        "unsigned": json.dumps({key: value[key] for key in value if key != "self"}),
+        "other schema": json.dumps({**value, "schema": 99}),
+        "a list": "[]",
+    }[damage])
+    with pytest.raises(ManifestError) as caught:
+        workspace.manifest("train")
+    assert caught.value.exit_code == 7
+    assert str(path) in caught.value.message
+    assert "--again" in caught.value.hint
+    assert str(path.parent) in caught.value.hint
+
+
+def test_a_crash_at_any_rename_leaves_the_old_or_the_new_result_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = {"rename": os.rename, "replace": os.replace, "rmtree": shutil.rmtree}
+    crashes = 0
+    for step in range(1, 100):
+        workspace = Workspace(tmp_path / str(step))
+        with workspace.writing("train"):
+            finish(workspace, "old", config=1)
+            out, _ = workspace.begin(basis(2))
+            (out / "sub").mkdir()
+            (out / "sub" / "data.txt").write_text("new")
+        calls = 0
+
+        def counted(name: str, *args: object, **options: object) -> object:
+            nonlocal calls
+            calls += 1
+            if calls == step:  # noqa: B023
+                raise Killed(name)
+            return real[name](*args, **options)
+
+        with monkeypatch.context() as patch:
+            for module, name in ((os, "rename"), (os, "replace"), (shutil, "rmtree")):
+                patch.setattr(
+                    module, name, lambda *a, _name=name, **k: counted(_name, *a, **k))
+            try:
+                outputs = workspace.seal("train")
+                workspace.commit(Manifest(basis(2), outputs, combined(outputs, ()), RUN))
+            except Killed:
+                crashes += 1
+        if calls < step:
+            break
+        with workspace.writing("train"):  # the next writer mends
+            manifest = workspace.manifest("train")
+            assert manifest is not None
+            assert changed_outputs(workspace.folder("train"), manifest, ()) == []
+            # Only without its manifest, which the first step puts in place, is the new one lost.
+            assert content(workspace) == ("old" if step == 1 else "new")
+            assert manifest.basis == basis(1 if step == 1 else 2)
+            assert list((workspace.root / ".old").glob("*")) == []
+            finish(workspace, "newer", config=3)
+        assert content(workspace) == "newer"
+    assert crashes == 4  # manifest in place, old away, new in place, old removed
+
+
+def test_a_crash_while_mending_loses_nothing(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "old")
+        (workspace.root / ".old").mkdir()
+        workspace.folder("train").rename(workspace.root / ".old" / "train")
+
+    def killed(*_args: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", killed)
+        with pytest.raises(Killed), workspace.writing("train"):
+            pass
+    with workspace.writing("train"):
+        assert content(workspace) == "old"
+
+
+def test_a_partial_folder_counts_only_for_the_same_basis(workspace: Workspace) -> None:
+    with workspace.writing("train"):
+        out, _ = workspace.begin(basis(1))
+        (out / "kept.txt").write_text("x")
+        (out / ".kept.txt.tmp123.txt").write_text("half")
+        same, earlier = workspace.begin(basis(1))
+        assert [path.name for path in same.iterdir()] == ["kept.txt"]
+        assert earlier.basis.fingerprint == basis(1).fingerprint
+        other, _ = workspace.begin(basis(2))
+        assert list(other.iterdir()) == []
+
+
+def test_a_partial_folder_without_its_record_is_discarded(workspace: Workspace) -> None:
+    with workspace.writing("train"):
+        out, _ = workspace.begin(basis(1))
+        (out / "unknown.txt").write_text("x")
+        (workspace.root / ".partial" / "train.json").write_text("{")
+        again, _ = workspace.begin(basis(1))
+        assert list(again.iterdir()) == []
+
+
+def test_a_folder_that_recon_did_not_make_is_not_replaced(workspace: Workspace) -> None:
+    (workspace.root / "train").mkdir(parents=True)
+    (workspace.root / "train" / "thesis.txt").write_text("years of work")
+    with workspace.writing("train"):
+        with pytest.raises(WorkspaceError, match="in the way"):
+            workspace.begin(basis())
+        with pytest.raises(WorkspaceError, match="in the way"):
+            workspace.remove("train")
+    assert (workspace.root / "train" / "thesis.txt").exists()
+
+
+def test_the_second_writer_is_told_who_the_first_is(workspace: Workspace) -> None:
+    first = workspace.writing("train --prune")
+    with first, pytest.raises(WorkspaceError) as caught, lock.held(workspace.root, "sfm"):
+        pass
+    assert f"process {os.getpid()}" in caught.value.message
+    assert "recon train --prune" in caught.value.message
+
+
+def test_what_a_dead_holder_left_does_not_lock(workspace: Workspace) -> None:
+    workspace.root.mkdir()
+    (workspace.root / lock.LOCK).touch()
+    (workspace.root / lock.HOLDER).write_text('{"pid": 1}')
+    with workspace.writing("train"):
+        assert json.loads((workspace.root / lock.HOLDER).read_text())["pid"] == os.getpid()
+    assert not (workspace.root / lock.HOLDER).exists()
+
+
+def test_a_full_disk_is_said_with_the_space_left(tmp_path: Path) -> None:
+    said = pytest.raises(WorkspaceError, match=r"full while running train: \d+ MB free")
+    with said, disk_errors(tmp_path, "running train"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_workspace_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    said = pytest.raises(WorkspaceError, match="not writable")
+    with said, disk_errors(tmp_path, "running train"):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "train"))
+
+
+def test_a_failure_elsewhere_on_disk_is_not_blamed_on_the_workspace(tmp_path: Path) -> None:
+    with pytest.raises(PermissionError), disk_errors(tmp_path / "ws", "running train"):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "video.mp4"))
+
+
+def test_a_file_where_the_workspace_should_be_is_said(tmp_path: Path) -> None:
+    (tmp_path / "ws").touch()
+    writing = Workspace(tmp_path / "ws").writing("train")
+    with pytest.raises(WorkspaceError, match="cannot be made: File exists"), writing:
+        pass
+
+
+def test_a_place_where_no_workspace_can_be_made_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *_args: object, **_options: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path.parent))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    writing = Workspace(tmp_path / "not" / "mine").writing("train")
+    with pytest.raises(WorkspaceError, match="Permission denied"), writing:
+        pass
