@@ -8,7 +8,7 @@ import termios
 
 SAYS = """
 import logging
-from recon_cli import console
+from recon_cli.commands import console
 from recon_cli.progress import TqdmProgress, bars_aside
 console.show_log(detailed=lambda: False, aside=bars_aside)
 with TqdmProgress().bar("train", 10) as bar:
