@@ -5,13 +5,28 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEV := $(VENV)/.dev
 
-.PHONY: demo test check docs clean
+# Tests by marker: `make test` runs those without any of these.
+HEAVY := integration or browser or compile or slow
+WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
+
+.PHONY: demo test test-rest test-all coverage check docs clean
 
 demo: $(READY)
 	$(BIN)/recon demo
 
 test: $(DEV)
-	$(BIN)/python -m pytest -q --cov=recon_cli --cov-report=term
+	$(PYTEST) -m "not ($(HEAVY))"
+
+# What `make test` leaves out, and the tests by Hypothesis again with all their examples.
+test-rest: $(DEV)
+	HYPOTHESIS_PROFILE=full $(PYTEST) -m "$(HEAVY) or hypothesis"
+
+test-all: $(DEV)
+	HYPOTHESIS_PROFILE=full $(PYTEST) -m ""
+
+coverage: $(DEV)
+	$(PYTEST) --cov=recon_cli --cov-report=term
 
 check: $(DEV)
 	$(BIN)/ruff check .

@@ -11,9 +11,12 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import pytest
-from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, ConsoleMessage, Page
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 ARGUMENTS = [
@@ -22,20 +25,20 @@ ARGUMENTS = [
     "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-# What a software WebGL says of its own speed, which is no fault of the page.
+# What a software WebGL says about its own speed, which is no fault of the page.
 HARMLESS = ("GPU stall due to ReadPixels", "Automatic fallback to software WebGL")
 
 
 @dataclass
-class Watched:
+class WatchedPage:
     """A page, with every complaint on its console and every address that it asked for."""
 
     page: Page
     complaints: list[str] = field(default_factory=list)
     addresses: list[str] = field(default_factory=list)
 
-    def heard(self, message: ConsoleMessage) -> None:
-        """Keeps an error or warning."""
+    def record_message(self, message: ConsoleMessage) -> None:
+        """Records an error or warning."""
         if message.type in {"error", "warning"} and not any(
             text in message.text for text in HARMLESS
         ):
@@ -51,7 +54,7 @@ class Watched:
         assert not outside, outside
 
 
-def chromium() -> str:
+def find_chromium() -> str:
     """Returns the program, or skips the test; in CI its absence is a failure."""
     program = os.environ.get("RECON_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
@@ -63,25 +66,27 @@ def chromium() -> str:
 
 
 @contextmanager
-def browser() -> Iterator[Browser]:
+def launch_browser() -> Iterator[Browser]:
     """Yields a headless Chromium, closed at the end."""
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium(), args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=find_chromium(), args=ARGUMENTS)
         try:
-            yield started
+            yield browser
         finally:
-            started.close()
+            browser.close()
 
 
 @contextmanager
-def watched(started: Browser, *, width: int = 1280, height: int = 800) -> Iterator[Watched]:
+def watch_page(browser: Browser, *, width: int = 1280, height: int = 800) -> Iterator[WatchedPage]:
     """Yields a fresh page of `width x height` CSS pixels, closed at the end."""
-    page = started.new_page(viewport={"width": width, "height": height})
-    kept = Watched(page)
-    page.on("console", kept.heard)
-    page.on("pageerror", lambda error: kept.complaints.append(str(error)))
-    page.on("request", lambda request: kept.addresses.append(request.url))
+    page = browser.new_page(viewport={"width": width, "height": height})
+    watched_page = WatchedPage(page)
+    page.on("console", watched_page.record_message)
+    page.on("pageerror", lambda error: watched_page.complaints.append(str(error)))
+    page.on("request", lambda request: watched_page.addresses.append(request.url))
     try:
-        yield kept
+        yield watched_page
     finally:
         page.close()

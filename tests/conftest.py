@@ -1,23 +1,40 @@
-"""Fixtures that every test may use."""
+"""Fixtures, markers and Hypothesis profiles that every test may use.
+
+torch and playwright are imported by the tests that need them, not here: a run of a few light tests
+starts at once.
+"""
+
+from __future__ import annotations
 
 import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
-import torch
-from browser import Watched, browser, watched
-from playwright.sync_api import Browser
+from examples import load_profile
+
+if TYPE_CHECKING:
+    from browser import WatchedPage
+    from playwright.sync_api import Browser
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels are kept from one run of the tests to the next, but not among the user's own.
 os.environ.setdefault("RECON_CACHE_DIR", str(ROOT / ".pytest_cache" / "recon"))
-# The triton backend is tested without a GPU too, by its interpreter; kernels ask at their import.
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")
+if "PYTEST_XDIST_WORKER" in os.environ:  # as many workers as cores: one thread each
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 # A shell lets what it runs in the background ignore Ctrl-C, and every process below inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+load_profile()
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks every test that opens a page."""
+    for item in items:
+        if "chromium" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.browser)
 
 
 @pytest.fixture(scope="session")
@@ -37,13 +54,17 @@ def sample_video() -> Path:
 
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Browser]:
-    """Headless Chromium, started once for all tests."""
-    with browser() as started:
-        yield started
+    """Headless Chromium, started once for all tests of a worker."""
+    from browser import launch_browser
+
+    with launch_browser() as browser:
+        yield browser
 
 
 @pytest.fixture
-def page(chromium: Browser) -> Iterator[Watched]:
-    """A fresh page that remembers what its console said."""
-    with watched(chromium) as kept:
-        yield kept
+def page(chromium: Browser) -> Iterator[WatchedPage]:
+    """A fresh page that records what its console said."""
+    from browser import watch_page
+
+    with watch_page(chromium) as watched_page:
+        yield watched_page

@@ -22,7 +22,7 @@ import numpy as np
 import psutil
 import torch
 from archive_splats import room
-from browser import Watched, browser, watched
+from browser import WatchedPage, launch_browser, watch_page
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -57,7 +57,7 @@ def in_window(view: dict[str, Any], lens: dict[str, Any], width: int, height: in
         (lens["cy"] - lens["height"] / 2) / fit + height / 2, viewmat)
 
 
-def opened(page: Watched, path: Path) -> float:
+def opened(page: WatchedPage, path: Path) -> float:
     """Opens a page and returns the seconds until it shows the scene."""
     begin = time.perf_counter()
     page.page.goto(path.absolute().as_uri())
@@ -65,7 +65,7 @@ def opened(page: Watched, path: Path) -> float:
     return time.perf_counter() - begin
 
 
-def picture(page: Watched, number: int) -> NDArray[np.float64]:
+def picture(page: WatchedPage, number: int) -> NDArray[np.float64]:
     """Returns what the page shows of a view, [H, W, 3] in [0, 1]."""
     page.page.evaluate(f"recon.show({number})")
     page.page.evaluate("recon.settled()")
@@ -79,7 +79,7 @@ def cpu_seconds() -> float:
     return float(sum(one.user + one.system for one in times))
 
 
-def walked(page: Watched) -> str:
+def walked(page: WatchedPage) -> str:
     """Returns frames a second and CPU seconds a frame while somebody walks."""
     page.page.keyboard.down("w")
     page.page.wait_for_timeout(500)
@@ -102,7 +102,7 @@ def measured(folder: Path, views: int, keep: Path | None) -> str:
     reduced = SIDE / max(lens["width"], lens["height"])
     width, height = (round(lens[name] * reduced) for name in ("width", "height"))
     scores = []
-    with browser() as started, watched(started, width=width, height=height) as page:
+    with launch_browser() as started, watch_page(started, width=width, height=height) as page:
         seconds = opened(page, path)
         page.page.add_style_tag(content="footer { visibility: hidden }")
         count = len(value["views"])

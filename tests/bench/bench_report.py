@@ -30,7 +30,7 @@ from recon_cli.report.views import gallery
 from recon_cli.workspace.layout import Workspace
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from browser import browser, watched
+from browser import launch_browser, watch_page
 
 DISTINCT = 10  # frames that the views of a large capture are made of
 RESERVED = 500_000  # bytes for the rest of the page
@@ -44,14 +44,14 @@ _LOAD = "() => { const t = performance.getEntriesByType('navigation')[0]; return
 def main(workspaces: tuple[Path, ...], times: int, views: int) -> None:
     """Writes the report of each workspace to a temporary folder and opens it."""
     rows = []
-    with tempfile.TemporaryDirectory() as folder, browser() as started:
+    with tempfile.TemporaryDirectory() as folder, launch_browser() as started:
         for workspace in workspaces:
             path = Path(folder) / "report.html"
             begin = time.perf_counter()
             write(Job(Workspace(workspace)), path)
             wrote, opened = time.perf_counter() - begin, []
             for _ in range(times):
-                with watched(started) as page:
+                with watch_page(started) as page:
                     page.page.goto(path.as_uri(), wait_until="load")
                     page.page.wait_for_timeout(50)  # the event is over when its end is noted
                     opened.append(page.page.evaluate(_LOAD))

@@ -20,7 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import click
-from browser import browser, watched
+from browser import launch_browser, watch_page
 
 KINDS = ("without", "nobody", "looked at")
 
@@ -72,7 +72,7 @@ def train(
         if kind == "nobody":
             process.communicate()
         else:
-            with browser() as chromium, watched(chromium) as page:
+            with launch_browser() as chromium, watch_page(chromium) as page:
                 page.page.goto(address[0])
                 process.communicate()
         assert process.returncode == 0

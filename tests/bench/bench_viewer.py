@@ -39,7 +39,7 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from browser import browser, watched
+from browser import launch_browser, watch_page
 
 from recon_cli.evaluation import psnr
 from recon_cli.experiments.synthetic_room import room
@@ -64,7 +64,7 @@ WIDTH, HEIGHT = 1280, 720
 
 def started(chromium: Browser, workspace: Path) -> float:
     """Returns the seconds from the command to two pictures after the Gaussians came."""
-    with watched(chromium, width=WIDTH, height=HEIGHT) as page:
+    with watch_page(chromium, width=WIDTH, height=HEIGHT) as page:
         begin = time.perf_counter()
         process = subprocess.Popen(
             [sys.executable, "-m", "recon_cli", "view", str(workspace)],
@@ -86,7 +86,7 @@ def started(chromium: Browser, workspace: Path) -> float:
 def speed(chromium: Browser, content: Content) -> tuple[float, float]:
     """Returns pictures a second while the mouse turns the camera, and CPU seconds a picture."""
     with (showing(content, None, HOST, None) as (_, address),
-          watched(chromium, width=WIDTH, height=HEIGHT) as page):
+          watch_page(chromium, width=WIDTH, height=HEIGHT) as page):
         page.page.goto(address)
         page.page.wait_for_function(DRAWN)
         page.page.wait_for_timeout(3000)
@@ -128,7 +128,7 @@ def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
     ctx = rendering(job.compute, job.progress)
     found = []
     with (showing(flat, None, HOST, None) as (server, address),
-          watched(chromium, width=WIDTH, height=HEIGHT) as page,
+          watch_page(chromium, width=WIDTH, height=HEIGHT) as page,
           ThreadPoolExecutor(1) as elsewhere):
         page.page.goto(address)
         page.page.wait_for_function(DRAWN)
@@ -167,7 +167,7 @@ def photographed(chromium: Browser, workspace: Path, path: Path) -> None:
     job = Job(Workspace(workspace))
     content = of_workspace(job, "auto")
     with (showing(content, Pictures(job, content.max_size), HOST, None) as (_, address),
-          watched(chromium, width=WIDTH, height=HEIGHT) as page):
+          watch_page(chromium, width=WIDTH, height=HEIGHT) as page):
         page.page.goto(address)
         page.page.wait_for_function(DRAWN)
         # viser warns of a browser without a GPU
@@ -188,7 +188,7 @@ def photographed(chromium: Browser, workspace: Path, path: Path) -> None:
 @click.option("--picture", type=click.Path(path_type=Path))
 def main(workspace: Path, picture: Path | None) -> None:
     """Prints the figures of a workspace."""
-    with browser() as chromium:
+    with launch_browser() as chromium:
         if picture is not None:
             photographed(chromium, workspace, picture)
             return

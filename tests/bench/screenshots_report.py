@@ -20,7 +20,7 @@ from recon_cli.workspace.layout import Workspace
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "tests"))
-from browser import browser, watched  # noqa: E402
+from browser import launch_browser, watch_page  # noqa: E402
 
 PICTURE = ROOT / "docs" / "images" / "report.webp"
 MOST_BYTES = 300_000
@@ -31,12 +31,12 @@ WIDTH, HEIGHT, GAP = 1060, 960, 24
 @click.argument("workspace", type=click.Path(exists=True, path_type=Path))
 def main(workspace: Path) -> None:
     """Writes the picture and says how large it is."""
-    with tempfile.TemporaryDirectory() as folder, browser() as started:
+    with tempfile.TemporaryDirectory() as folder, launch_browser() as started:
         path = Path(folder) / "report.html"
         write(Job(Workspace(workspace)), path)
         shots = []
         for section, scheme in (("views", "light"), ("training", "dark")):
-            with watched(started, width=WIDTH, height=HEIGHT) as page:
+            with watch_page(started, width=WIDTH, height=HEIGHT) as page:
                 page.page.emulate_media(color_scheme=scheme)
                 page.page.goto(path.as_uri())
                 page.page.click(f"#tab-{section}")

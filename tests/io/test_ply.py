@@ -6,6 +6,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import random_splats, with_harmonics
@@ -247,7 +248,7 @@ def test_a_count_that_the_file_cannot_hold_takes_no_memory(tmp_path, splats, for
         tracemalloc.stop()
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=examples(200))
 @given(seed=st.integers(0, 2**63), form=st.sampled_from(FORMS), degree=st.integers(0, 3))
 def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed, form, degree):
     path = tmp_path_factory.getbasetemp() / "fuzz.ply"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import pytest
 import torch
+from interpreter import INTERPRETED
 from oracle import composited
 from scenes import leaves
 from torch import Tensor
@@ -81,8 +81,8 @@ def _cases() -> list[Case]:
             # the torch backend alone takes both
             dtypes = [torch.float32, torch.float64] if status.name == "torch" else [torch.float32]
             found += [Case(status.name, device, dtype) for dtype in dtypes]
-    if not torch.cuda.is_available() and importlib.util.find_spec("triton"):
-        found.append(Case("triton", "cpu", torch.float32))  # by its interpreter
+    if INTERPRETED:
+        found.append(Case("triton", "cpu", torch.float32))
     return found
 
 

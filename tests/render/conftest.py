@@ -4,9 +4,6 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from interpreter import quicken
-
-quicken()
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,7 @@ import math
 import numpy as np
 import torch
 from backends import GREENISH, Case, every_backend_at_size
+from examples import examples
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from oracle import composited
@@ -30,7 +31,6 @@ EXACT = Case("torch", "cpu", torch.float64)
 ROUNDINGS = 40.0
 EPSILON = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 FLOOR = {torch.float32: 1e-5, torch.float64: 1e-11}  # IMAGE_TOLERANCE, and the oracle's own error
-EXAMPLES = 120
 
 
 def number(low: float, high: float):
@@ -130,14 +130,14 @@ def _brightest(splats: Splats) -> float:
     return 1.13 * norm.max().item() + 0.5
 
 
-@settings(max_examples=EXAMPLES, derandomize=True, deadline=None, database=None,
+@settings(max_examples=examples(120), derandomize=True, database=None,
           suppress_health_check=list(HealthCheck))
 @given(scene=scenes())
 def test_any_small_scene_is_finite_and_agrees_with_float64(case, scene):
     check(case, *scene)
 
 
-@settings(max_examples=EXAMPLES, derandomize=True, deadline=None, database=None,
+@settings(max_examples=examples(120), derandomize=True, database=None,
           suppress_health_check=list(HealthCheck))
 @given(scene=scenes(), seed=st.integers(0, 100))
 def test_the_order_of_any_small_scene_does_not_matter(case, scene, seed):

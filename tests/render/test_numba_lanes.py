@@ -5,6 +5,7 @@ import operator
 import numba
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba.core.errors import TypingError
@@ -91,7 +92,7 @@ def test_arithmetic_and_choice_equal_numpy_bit_by_bit_for_special_values(shift):
         assert np.array_equal(np.signbit(row[numbers]), np.signbit(truth[numbers]))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50))
 @given(st.lists(st.floats(width=32), min_size=2 * LANES, max_size=2 * LANES))
 def test_arithmetic_and_choice_equal_numpy_bit_by_bit(values):
     x, y = np.array(values, F32).reshape(2, LANES)
@@ -251,7 +252,7 @@ def number_probe(values, out):
         out[2 * i + 1] = count_bits(values[i])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50))
 @given(st.lists(st.integers(1, 2**64 - 1), min_size=1, max_size=8))
 def test_lowest_bit_and_count_bits_of_any_uint64(values):
     out = np.zeros(2 * len(values), np.int64)

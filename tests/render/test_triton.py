@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from backends import BLACK, GREENISH, Case
+from interpreter import DEVICE
 from scenes import camera_at, random_splats
 
 from recon_cli.render import render
@@ -34,14 +35,13 @@ def pictures(splats, case):
 
 
 def test_the_same_small_scene_gives_the_same_bits_in_any_order_of_its_gaussians():
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    case, splats = Case("triton", device, torch.float32), random_splats(40, seed=2)
+    case, splats = Case("triton", DEVICE, torch.float32), random_splats(40, seed=2)
     first, again = pictures(splats, case), pictures(splats, case)
     assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
     order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
     turned = pictures(splats.select(order), case)
     assert torch.equal(first[0], turned[0])
-    assert torch.equal(first[2][order.to(device)], turned[2])
+    assert torch.equal(first[2][order.to(DEVICE)], turned[2])
 
 
 def test_float64_is_refused():

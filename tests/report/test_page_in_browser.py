@@ -9,9 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from browser import Watched
+from browser import WatchedPage
 from made_pages import change, paint, report
-from playwright.sync_api import Browser
 
 from recon_cli.io.images import write_png
 
@@ -19,25 +18,25 @@ SECTIONS = ("overview", "views", "scores", "training", "pruning", "capture", "ex
 
 
 @pytest.fixture
-def shown(workspace: Path, page: Watched) -> Watched:
+def shown(workspace: Path, page: WatchedPage) -> WatchedPage:
     """The page of the finished workspace, opened from its file."""
     return opened(workspace, page)
 
 
-def opened(workspace: Path, page: Watched, *, at: str = "") -> Watched:
+def opened(workspace: Path, page: WatchedPage, *, at: str = "") -> WatchedPage:
     assert report(workspace) == 0
     page.page.goto((workspace / "report.html").as_uri() + at)
     return page
 
 
-def fraction_dark(page: Watched) -> float:
+def fraction_dark(page: WatchedPage) -> float:
     """The share of the columns of the framed picture that are dark, by its pixels on the screen."""
     data = page.page.locator("#frame").screenshot()
     row = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     return float((row[row.shape[0] // 4] < 128).mean())
 
 
-def names(page: Watched) -> list[str]:
+def names(page: WatchedPage) -> list[str]:
     return page.page.locator(".shot-name").all_inner_texts()
 
 
@@ -77,7 +76,7 @@ def test_a_section_begins_at_its_top_wherever_the_last_one_was_left(shown):
     assert 0 < box["y"] < 120
 
 
-def test_without_a_script_every_section_is_shown(workspace, chromium: Browser):
+def test_without_a_script_every_section_is_shown(workspace, chromium):
     assert report(workspace) == 0
     context = chromium.new_context(java_script_enabled=False)
     plain = context.new_page()

@@ -9,7 +9,7 @@ import json
 from dataclasses import replace
 
 import pytest
-import torch
+from interpreter import DEVICE
 from tiny_scene import make_inputs
 from tiny_stages import CONTEXT, mean_colour_psnr, run
 
@@ -23,7 +23,6 @@ from recon_cli.train.state import save_state
 pytest.importorskip("triton", reason="triton is not installed")
 pytestmark = pytest.mark.slow
 
-DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 ON_TRITON = replace(CONTEXT, backend="triton", device=DEVICE)
 CONFIG = RunConfig(
     iterations=12, densify_every=4, max_gaussians=80, sh_degree=0, far="off", exposure="off",

@@ -1,9 +1,8 @@
 """Runs of every kind of Adam on gradients as training has them, and how they are compared."""
 
-import importlib.util
-
 import pytest
 import torch
+from interpreter import INTERPRETED
 from scenes import random_splats
 
 from recon_cli.config.stages import RunConfig
@@ -14,7 +13,6 @@ STEPS_TOLERANCE = 1e-6
 ROLES = "exp_avg", "exp_avg_sq"
 CONFIG = RunConfig(max_gaussians=50)
 # triton in its interpreter; on a GPU tests/train/test_triton_step.py holds it against torch
-INTERPRETED = bool(importlib.util.find_spec("triton")) and not torch.cuda.is_available()
 BACKENDS = ("torch", "numba", "triton")[:3 if INTERPRETED else 2]
 KERNELS = BACKENDS[1:]  # which move all parameters at once
 every_kind = pytest.mark.parametrize("backend", BACKENDS)

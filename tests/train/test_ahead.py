@@ -1,12 +1,13 @@
 """Steps that the host starts ahead of the device: the same bits, however far ahead, and no waiting.
 
-Where there is no GPU by triton's interpreter, in which a step takes about a second.
+Without a GPU in triton's interpreter, where a step takes about a second.
 """
 
 import dataclasses
 
 import pytest
 import torch
+from interpreter import DEVICE
 from scenes import camera_at, random_splats
 from tiny_task import STRATEGIES, same
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -30,11 +31,10 @@ Graphs = triton_step.Graphs
 CONFIG = dataclasses.replace(STRATEGIES["budget"], densify_every=4, max_gaussians=30, sh_degree=1)
 END, CHECKPOINT = 7, 5  # one densification, after step 4
 COUNT = 16
-GPU = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def device_of(backend):
-    return torch.device(GPU if backend == "triton" else "cpu")
+    return torch.device(DEVICE if backend == "triton" else "cpu")
 
 
 def task_of(backend="triton", config=CONFIG):

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+from interpreter import DEVICE
 
 from recon_cli.train.losses import photometric_loss
 
 loss_module = pytest.importorskip("recon_cli.render.triton.loss", reason="triton is not installed")
-DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 # float32; variances are differences of squares, as in tests/train/test_losses.py
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-6, 1e-5
 

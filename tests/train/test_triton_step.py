@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from adam_runs import CONFIG, gradients_of
+from interpreter import DEVICE
 from scenes import camera_at, random_splats
 
 from recon_cli.render import render
@@ -14,7 +15,6 @@ from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import camera_gradient
 
 pytest.importorskip("triton", reason="triton is not installed")
-DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 CAMERA = camera_at(24, 18)
 DEGREE, WEIGHT = 3, 0.2
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-6, 1e-4

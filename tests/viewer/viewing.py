@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from browser import Watched
+from browser import WatchedPage
 
 from recon_cli.pipeline.plan import Job
 from recon_cli.viewer import server as run
@@ -46,7 +46,7 @@ def view(workspace: Path) -> Iterator[Shown]:
         yield Shown(server, address, content)
 
 
-def until(page: Watched, ask: Callable[[], T]) -> T:
+def until(page: WatchedPage, ask: Callable[[], T]) -> T:
     """Returns what `ask` gives as soon as that is true, and fails where it never is."""
     end = time.monotonic() + PATIENCE
     while not (found := ask()):
@@ -55,7 +55,7 @@ def until(page: Watched, ask: Callable[[], T]) -> T:
     return found
 
 
-def opened(page: Watched, shown: Shown) -> Any:
+def opened(page: WatchedPage, shown: Shown) -> Any:
     """Opens the viewer and returns its client once the panel is there."""
     page.page.set_viewport_size({"width": 640, "height": 480})
     page.page.goto(shown.address)
@@ -63,7 +63,7 @@ def opened(page: Watched, shown: Shown) -> Any:
     return shown.client()
 
 
-def nodes(page: Watched, kind: str) -> dict[str, Any]:
+def nodes(page: WatchedPage, kind: str) -> dict[str, Any]:
     """Returns the visible scene nodes of a kind in the browser, by name."""
     found: dict[str, Any] = page.page.evaluate(
         """kind => Object.fromEntries(Object.entries(window.__viserSceneTree.getState())
@@ -73,5 +73,5 @@ def nodes(page: Watched, kind: str) -> dict[str, Any]:
     return found
 
 
-def complaints(page: Watched) -> list[str]:
+def complaints(page: WatchedPage) -> list[str]:
     return [text for text in page.complaints if not any(known in text for known in FOREIGN)]

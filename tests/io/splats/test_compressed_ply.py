@@ -6,6 +6,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_cases import N, damaged, edge_splats, greatest, read_or_refused, rotation_error
@@ -182,7 +183,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message):
         tracemalloc.stop()
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=examples(200))
 @given(seed=st.integers(0, 2**63), degree=st.integers(0, 3))
 def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed, degree):
     path = tmp_path_factory.getbasetemp() / "fuzz.compressed.ply"

@@ -9,6 +9,7 @@ import archive_splats
 import damage
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -185,7 +186,7 @@ def _survives(path, data):
 
 
 CAREFUL = settings(
-    deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    max_examples=examples(100), suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @CAREFUL

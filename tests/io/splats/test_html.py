@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from archive_splats import room
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_cases import damaged, read_or_refused
@@ -228,7 +229,7 @@ def test_a_missing_page_is_refused(tmp_path):
         read_html(tmp_path / "none.html")
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=examples(100))
 @given(seed=st.integers(0, 2**63))
 def test_a_damaged_page_gives_gaussians_or_a_format_error(tmp_path_factory, seed):
     path = tmp_path_factory.getbasetemp() / "fuzz.html"

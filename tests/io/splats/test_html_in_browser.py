@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from archive_splats import room
-from browser import Watched
+from browser import WatchedPage
 from PIL import Image
 from scenes import camera_at
 
@@ -43,14 +43,14 @@ def made(path: Path, degree: int = 3, count: int = 3000, title: str = "room") ->
     return path
 
 
-def opened(page: Watched, path: Path, *, hash: str = "") -> None:
+def opened(page: WatchedPage, path: Path, *, hash: str = "") -> None:
     """Opens a page in a window of the cameras' size and waits until it shows the scene."""
     page.page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
     page.page.goto(f"{path.as_uri()}{hash}")
     page.page.wait_for_selector("#message:empty", state="attached", timeout=60_000)
 
 
-def picture(page: Watched) -> np.ndarray:
+def picture(page: WatchedPage) -> np.ndarray:
     """What the settled page shows without its buttons, [H, W, 3] in [0, 1]."""
     page.page.add_style_tag(content="footer { visibility: hidden }")
     page.page.evaluate("recon.settled()")
@@ -70,7 +70,7 @@ def psnr_db(one: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(max(((one - other) ** 2).mean(), 1e-12)))
 
 
-def nearest(page: Watched, path: Path) -> int:
+def nearest(page: WatchedPage, path: Path) -> int:
     """The number, from 1, of the camera whose picture the page shows."""
     seen = picture(page)
     scores = [psnr_db(seen, rendered(path, camera)) for camera in cameras()]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_cases import N, damaged, edge_splats, greatest, read_or_refused, rotation_error
@@ -114,7 +115,7 @@ def test_nothing_and_values_that_are_not_finite_are_not_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=examples(200))
 @given(seed=st.integers(0, 2**63))
 def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed):
     folder = tmp_path_factory.getbasetemp()

@@ -6,6 +6,7 @@ import tracemalloc
 
 import pytest
 import zstandard
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_cases import damaged, few, plain, read_or_refused
@@ -126,7 +127,7 @@ def test_a_count_that_no_file_of_this_size_holds_is_refused(tmp_path, version):
     assert "promises 50000000" in refused_at(path, 2 * MIB)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=examples(300))
 @given(seed=st.integers(0, 2**63), form=st.sampled_from(["plain", "inside gzip", "gzip", "zstd"]))
 def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed, form):
     path = tmp_path_factory.getbasetemp() / "fuzz.spz"
