@@ -23,7 +23,7 @@ from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import STAGES
 from recon_cli.workspace.layout import Workspace
 
-TABLE = tuple(dataclasses.replace(row, module="fake_stages") for row in STAGES)
+TABLE = tuple(dataclasses.replace(row, module="fake_stages", summary=None) for row in STAGES)
 NAMES = [row.name for row in TABLE]
 STEPS = 6
 

@@ -64,8 +64,6 @@ def take(config: IngestConfig, path: Path, out: Path, ctx: Context) -> Taken:
         lost=len(broken) + len(posed.missing),
         skipped=(*posed.missing, *(image.name for image, name in zip(images, names, strict=True)
                                    if name in broken)),
-        details={"metric": posed.metric,
-                 **({} if poses.points is None else {"points": len(poses.points)})},
         splits=posed.splits, poses=poses)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from recon_cli.capture.contact_sheet import SHEET, ContactSheet
 from recon_cli.capture.selection_record import CHOICE, Candidate, write_choice
@@ -70,7 +70,6 @@ class Taken:
         lost: how many are broken or missing.
         blurred: how many were passed over for blur or exposure.
         skipped: names of files that were left out.
-        details: further facts for the summary, JSON values.
         splits: the source says itself which frames are held out.
         poses: known poses, by the names of the frames.
         choice: what it was chosen from, None where nothing was to be chosen.
@@ -84,7 +83,6 @@ class Taken:
     lost: int
     blurred: int = 0
     skipped: tuple[str, ...] = ()
-    details: dict[str, Any] | None = None
     splits: bool = False
     poses: KnownPoses | None = None
     choice: Choice | None = None
@@ -109,5 +107,4 @@ def joined(parts: Sequence[Taken]) -> Taken:
         lost=sum(part.lost for part in parts),
         blurred=sum(part.blurred for part in parts),
         skipped=tuple(name for part in parts for name in part.skipped),
-        details={key: value for part in parts for key, value in (part.details or {}).items()},
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ from recon_cli.io.import_record import Origin
 from recon_cli.scene.gravity import camera_up, turn_onto
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.measure import Measurement, ScaleBetween, measure
+from recon_cli.workspace.summaries import WorldSummary
 
 _UP = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 
@@ -80,10 +80,8 @@ def _up(inputs: StageInputs, *, asked: bool) -> NDArray[np.float64]:
     origin = Origin.of(inputs.folders["train"])
     if origin and not has_views(inputs):
         return np.array(_UP["z" if origin.z_up else "-y"])
-    world = inputs.folders["sfm"] / "world.json"
-    evidence = json.loads(world.read_text(encoding="utf-8")).get("evidence") if (
-        world.exists()) else None
-    if evidence and evidence.get("up_found"):
+    world = WorldSummary.read(inputs.folders["sfm"])
+    if world and world.evidence.up_found:
         return np.array(_UP["z"])
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
     viewmats = np.stack([viewmat for _, _, viewmat in read_images(sparse / "images.bin")])

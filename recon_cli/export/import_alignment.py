@@ -21,7 +21,7 @@ from recon_cli.evaluation.reference_views import Truth, mean_psnr, truths
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
-from recon_cli.workspace.atomic import read_json
+from recon_cli.workspace.summaries import WorldSummary
 
 SOURCE, WORKSPACE = "source", "workspace"
 _VIEWS = 6  # rendered in each frame, at most
@@ -76,14 +76,13 @@ def world_of(sfm: Path) -> Similarity:
     Raises:
         FormatError: its record is damaged.
     """
-    path = sfm / "world.json"
-    if not path.exists():
-        return Similarity()
+    world = WorldSummary.read(sfm)
     try:
-        return Similarity.from_json(read_json(path)["similarity"])
+        return Similarity.from_json(world.similarity) if world else Similarity()
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path} holds no similarity: {error}.", hint="Run `recon sfm --again`.") from error
+            f"{sfm / WorldSummary.FILE} holds no similarity: {error}.",
+            hint="Run `recon sfm --again`.") from error
 
 
 def match(

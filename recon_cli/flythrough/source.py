@@ -23,6 +23,7 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.train.runner import read_config
 from recon_cli.workspace.manifest import Manifest
+from recon_cli.workspace.summaries import SfmSummary
 
 _NEEDS = ("ingest", "train", "sfm")  # training runs sfm first where that is missing too
 
@@ -91,11 +92,11 @@ def open_source(job: Job, model: str, *, verb: str = "render") -> Source:
     folders = {name: job.workspace.folder(name) for name in _NEEDS}
     config = read_config(folders["train"])
     splats = read_ply(job.workspace.folder("prune" if pruned else "train") / "splats.ply")
-    evidence = manifests["sfm"].run.summary.get("world", {}).get("evidence", {})
+    world = SfmSummary.from_json(manifests["sfm"].run.summary).world
     return Source(
         "pruned" if pruned else "base", splats, _digest(splats), config.sh_degree, config.max_size,
         load_scene(StageInputs(folders), validation=config.validation),
-        bool(evidence.get("up_found")), bool(evidence.get("metres")))
+        world.evidence.up_found, world.evidence.metres)
 
 
 def _viewless(job: Job, model: str, origin: Origin) -> Source:

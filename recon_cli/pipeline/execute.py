@@ -24,6 +24,7 @@ from recon_cli.stages import STAGES, Stage
 from recon_cli.workspace.digests import Source, read_source
 from recon_cli.workspace.layout import Workspace, combined
 from recon_cli.workspace.manifest import Basis, Manifest, RunRecord, Unfinished
+from recon_cli.workspace.summaries import JsonRecord
 
 _RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
 
@@ -125,12 +126,13 @@ def _no_trace_of_nothing(workspace: Workspace, stage: str) -> Iterator[None]:
 
 
 def _run_record(
-    row: Stage, ctx: StageContext, meter: machine.Meter, earlier: Unfinished, summary: Summary
+    row: Stage, ctx: StageContext, meter: machine.Meter, earlier: Unfinished,
+    summary: JsonRecord | Summary,
 ) -> RunRecord:
     return RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
         peak_memory_bytes=meter.peak_memory_bytes,
-        summary=summary,
+        summary=summary.to_json() if isinstance(summary, JsonRecord) else summary,
         versions=machine.versions(),
         device=ctx.device if row.renders else None,
         backend=ctx.backend if row.renders else None,

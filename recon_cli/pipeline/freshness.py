@@ -166,6 +166,7 @@ class Inspection:
         reasons += differences(
             manifest.basis, expected, section=layers.section_of(row.config))
         reasons += changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)
+        reasons += _unreadable_summary(row, manifest)
         return Check(row, manifest, tuple(reasons), gone, self._unfinished(row))
 
     def _expected(
@@ -197,3 +198,13 @@ class Inspection:
         _, sources = self._read_again(basis.sources)
         expected = self._expected(row, self.config(row, basis), basis, sources)
         return unfinished if expected.fingerprint == basis.fingerprint else None
+
+
+def _unreadable_summary(row: Stage, manifest: Manifest) -> list[str]:
+    """Returns why the record of a result cannot be read, as that of another version may not be."""
+    try:
+        if row.summary:
+            row.summary.from_json(manifest.run.summary)
+    except ManifestError as error:
+        return [error.message]
+    return []

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -18,6 +17,7 @@ from recon_cli.report.chart import entry, mark
 from recon_cli.report.images import data_uri, sheet
 from recon_cli.report.stage_status import Standing
 from recon_cli.scene.scene import Scene
+from recon_cli.workspace.summaries import SfmSummary
 
 _SHEETS = 4  # contact sheets that are shown; a capture may have many sources
 _THUMBS, _THUMB_SIDE, _THUMB_QUALITY = 24, 220, 72
@@ -69,7 +69,7 @@ def capture(stages: Mapping[str, Standing]) -> Capture:
             scene = _scene(stages, frames)
         except (FormatError, OSError) as error:
             damaged.append(f"The plan is not shown: {error}")
-    plan, notes = _plan(scene, stages["sfm"].summary) if scene else (None, ())
+    plan, notes = _plan(scene, stages["sfm"].read_summary(SfmSummary)) if scene else (None, ())
     return Capture(
         tuple(sheets), more, tuple(thumbs), plan, notes,
         _strip(frames, scene) if frames else None, _legend(frames, scene) if frames else None,
@@ -93,10 +93,9 @@ def _scene(stages: Mapping[str, Standing], frames: Sequence[Frame]) -> Scene:
         validation=TrainConfig.validation if share is None else float(share))
 
 
-def _plan(scene: Scene, summary: Mapping[str, Any]) -> tuple[Markup, tuple[str, ...]]:
-    evidence = summary.get("world", {}).get("evidence", {})
-    metres = bool(evidence.get("metres"))
-    axes = floor_plan.frame_of(scene, z_up=bool(evidence.get("up_found")))
+def _plan(scene: Scene, sfm: SfmSummary | None) -> tuple[Markup, tuple[str, ...]]:
+    metres = sfm is not None and sfm.world.evidence.metres
+    axes = floor_plan.frame_of(scene, z_up=sfm is not None and sfm.world.evidence.up_found)
     notes = [f"{len(scene.points):,} points."]
     if not axes.known:
         notes.append("Up is not known: this is seen along the mean up of the cameras.")

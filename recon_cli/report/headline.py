@@ -10,6 +10,7 @@ from typing import Any
 from recon_cli.evaluation.tables import format_duration, format_megabytes
 from recon_cli.report.records import BASE, PRUNED, Metrics
 from recon_cli.report.stage_status import Standing
+from recon_cli.workspace.summaries import IngestSummary, SfmSummary
 
 _UNITS = {"_db": "dB", "_px": "px", "_deg": "degrees", "_255": "of 255"}
 _NAMES = {"psnr": "PSNR", "ssim": "SSIM", "gaussians": "Gaussians", "cuda": "CUDA"}
@@ -108,7 +109,8 @@ def headline(stages: Mapping[str, Standing], metrics: Metrics | None) -> Headlin
     """Returns the top of the page of a workspace whose ingest is there."""
     ingest = stages["ingest"]
     basis = ingest.manifest.basis if ingest.manifest else None
-    kind = str(ingest.summary.get("kind", ""))
+    summary = ingest.read_summary(IngestSummary)
+    kind = summary.kind if summary else ""
     return Headline(
         _KINDS.get(kind, kind),
         tuple(Path(source.path).name for source in basis.sources) if basis else (),
@@ -119,39 +121,51 @@ def verdict(sfm: Standing) -> Verdict:
     """Returns what sfm found out about its own result, in plain words."""
     if not sfm.there:
         return Verdict("unknown", "The cameras have not been found yet.")
-    summary = sfm.summary
-    found, lines = summary.get("verdict"), tuple(map(str, summary.get("lines", ())))
-    counted = f"{_count(summary, 'registered')} of {_count(summary, 'frames')} frames have a camera"
-    more = (*lines, *_apart(summary), *map(str, summary.get("world", {}).get("sentences", ())))
-    if found is None:
-        poses = summary.get("poses") or {}
-        whose = "; the poses came with the data set" if poses else ""
-        return Verdict("unknown", f"{counted}{whose}.", more)
-    if found.get("trusted"):
+    summary = sfm.read_summary(SfmSummary)
+    if summary is None:
+        return Verdict("unknown", "The cameras were found by another version of recon.")
+    counted = f"{summary.registered:,} of {summary.frames:,} frames have a camera"
+    more = (*summary.lines, *_apart(summary), *summary.world.sentences)
+    if summary.trusted is None:
+        source = "; the poses came with the data set" if summary.poses else ""
+        return Verdict("unknown", f"{counted}{source}.", more)
+    if summary.trusted:
         return Verdict("good", f"The mapping can be trusted: {counted}.", more[1:])
     return Verdict("warn", f"The mapping is not to be trusted, although {counted}.", more[1:])
 
 
-def _apart(summary: Mapping[str, Any]) -> list[str]:
-    told = [f"{name} was taken out of the model: {reason}."
-            for name, reason in (summary.get("rejected") or {}).items()]
-    if summary.get("apart"):
-        told.append("The capture fell apart; left aside are parts of "
-                    f"{', '.join(str(len(part)) for part in summary['apart'])} frames.")
-    return told
+def _apart(summary: SfmSummary) -> list[str]:
+    sentences = [f"{name} was taken out of the model: {reason}."
+                 for name, reason in summary.rejected.items()]
+    if summary.apart:
+        sentences.append("The capture fell apart; left aside are parts of "
+                         f"{', '.join(str(len(part)) for part in summary.apart)} frames.")
+    return sentences
 
 
 def _tiles(stages: Mapping[str, Standing], metrics: Metrics | None) -> list[Tile]:
     ingest, sfm, train, prune = (stages[name] for name in ("ingest", "sfm", "train", "prune"))
-    held_out = _count(ingest.summary, "held_out")
-    size = (f"{ingest.summary.get('width', _LACKING)}x{ingest.summary.get('height', _LACKING)}, "
-            f"{held_out} held out")
     return [
-        Tile("frames", _count(ingest.summary, "frames"), size, not ingest.fresh),
-        _of(sfm, "registered", _count(sfm.summary, "registered"), _share(sfm.summary)),
+        _frames(ingest), _registered(sfm),
         _of(train, "Gaussians", _count(train.summary, "gaussians"), _pruned(train, prune)),
         *_scores(stages["evaluate"], metrics),
         _training(train)]
+
+
+def _frames(ingest: Standing) -> Tile:
+    summary = ingest.read_summary(IngestSummary)
+    if summary is None:
+        return Tile("frames", _LACKING, "cannot be read", not ingest.fresh)
+    size = f"{summary.width}x{summary.height}, {summary.held_out:,} held out"
+    return Tile("frames", f"{summary.frames:,}", size, not ingest.fresh)
+
+
+def _registered(sfm: Standing) -> Tile:
+    summary = sfm.read_summary(SfmSummary)
+    if summary is None:
+        return _of(sfm, "registered", _LACKING, "")
+    share = f"{summary.registered / summary.frames:.0%} of the frames" if summary.frames else ""
+    return _of(sfm, "registered", f"{summary.registered:,}", share)
 
 
 def _training(train: Standing) -> Tile:
@@ -192,8 +206,3 @@ def _scores(evaluate: Standing, metrics: Metrics | None) -> list[Tile]:
 def _count(summary: Mapping[str, Any], key: str) -> str:
     value = summary.get(key)
     return f"{value:,}" if isinstance(value, int) else _LACKING
-
-
-def _share(summary: Mapping[str, Any]) -> str:
-    have, of = summary.get("registered"), summary.get("frames")
-    return f"{have / of:.0%} of the frames" if have is not None and of else ""

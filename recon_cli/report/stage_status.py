@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from recon_cli.errors import ManifestError, StageError
 from recon_cli.pipeline import plan
@@ -14,8 +14,11 @@ from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.freshness import Check, Inspection
 from recon_cli.stages import Stage
 from recon_cli.workspace.manifest import Manifest
+from recon_cli.workspace.summaries import JsonRecord
 
 DAMAGED = "damaged"
+
+S = TypeVar("S", bound=JsonRecord)
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,13 @@ class Standing:
     def summary(self) -> Mapping[str, Any]:
         """What the stage said about its result; empty without one."""
         return self.manifest.run.summary if self.manifest else {}
+
+    def read_summary(self, kind: type[S]) -> S | None:
+        """Returns the stage's record; None without one that this version can read."""
+        try:
+            return kind.from_json(self.manifest.run.summary) if self.manifest else None
+        except ManifestError:  # the stage is stale then, and `why` says so
+            return None
 
 
 def standings(job: Job) -> dict[str, Standing]:

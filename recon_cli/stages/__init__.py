@@ -19,6 +19,12 @@ from recon_cli.config.stages import (
     SfmConfig,
     TrainConfig,
 )
+from recon_cli.workspace.summaries import (
+    DenoiseSummary,
+    IngestSummary,
+    JsonRecord,
+    SfmSummary,
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class Stage:
         renders: it needs a rasterizer, and so torch and a device.
         takes: what the user hands in, as usage shows it; empty for stages that read others alone.
         spares: of `needs`, what an imported scene does without: then they are among `uses`.
+        summary: the record that run() returns.
     """
 
     name: str
@@ -53,15 +60,17 @@ class Stage:
     renders: bool = False
     takes: str = ""
     spares: tuple[str, ...] = ()
+    summary: type[JsonRecord] | None = None
 
 
 STAGES: tuple[Stage, ...] = (
     Stage("ingest", "ingest", (), (), IngestConfig, 3, False, "recon_cli.stages.ingest",
-          takes="VIDEO"),
+          takes="VIDEO", summary=IngestSummary),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
-          "recon_cli.stages.denoise"),
+          "recon_cli.stages.denoise", summary=DenoiseSummary),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 3, True, "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json", "verdict.json", "model/*")),
+          ("database.db", "log.txt", "steps.json", "verdict.json", "model/*"),
+          summary=SfmSummary),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 4, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 4, False,

@@ -17,9 +17,10 @@ from recon_cli.capture.filters import FILTERS
 from recon_cli.capture.noise import estimate_noise
 from recon_cli.capture.pace import paced
 from recon_cli.config.stages import DenoiseConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.io import frames as store
 from recon_cli.workspace import atomic
+from recon_cli.workspace.summaries import DenoiseSummary
 
 NOISE = "noise.json"
 
@@ -31,7 +32,7 @@ class _Outcome:
     filtered: bool
 
 
-def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> DenoiseSummary:
     """Writes frames/*.png, twins of ingest's, and noise.json into `out`.
 
     Args:
@@ -39,9 +40,6 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
         inputs: the finished folder of ingest.
         out: the stage's partial folder; frames already in it are kept.
         ctx: for progress; the result does not depend on its threads.
-
-    Returns:
-        mode, filter, frames, denoised (count), median_sigma_255.
 
     Raises:
         FormatError: ingest's folder does not hold what its list says.
@@ -53,13 +51,13 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
         outcome.name: {"sigma_255": outcome.sigma, "denoised": outcome.filtered}
         for outcome in outcomes
     })
-    return {
-        "mode": config.mode,
-        "filter": config.filter,
-        "frames": len(outcomes),
-        "denoised": sum(outcome.filtered for outcome in outcomes),
-        "median_sigma_255": round(float(np.median([item.sigma for item in outcomes])), 4),
-    }
+    return DenoiseSummary(
+        mode=config.mode,
+        filter=config.filter,
+        frames=len(outcomes),
+        denoised=sum(outcome.filtered for outcome in outcomes),
+        median_sigma_255=round(float(np.median([item.sigma for item in outcomes])), 4),
+    )
 
 
 def _process(

@@ -14,16 +14,17 @@ from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import Taken, joined
 from recon_cli.config.fields import parse_holdout
 from recon_cli.config.stages import IngestConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import InputError
 from recon_cli.io import frames as store
 from recon_cli.io.frames import FrameList
 from recon_cli.io.layouts import recognise, refuse_incomplete
+from recon_cli.workspace.summaries import IngestSummary
 
 MIN_TRAINED = 2  # one view holds no depth
 
 
-def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> IngestSummary:
     """Writes frames/*.png and frames.json into `out` and returns what was taken and what lost.
 
     choice.json and contact.png tell what was kept and what was dropped of each source.
@@ -34,12 +35,6 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
             set with poses, told by its layout. The frames of each get intrinsics of their own.
         out: the stage's partial folder; frames already in it are kept.
         ctx: for notices and progress.
-
-    Returns:
-        kind ("video", "photos", "mixed" or the layout of a data set), declared_frames (0 where
-        unknown), decoded_frames (whole ones), lost_frames, dropped_blurred, skipped (file names),
-        of a data set points and metric, frames, held_out, groups, width, height (of the
-        largest group).
 
     Raises:
         InputError: a source is missing, unreadable, or holds too little.
@@ -57,21 +52,23 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         if part.choice is not None:
             part.choice.write(out, held)
     FrameList(taken.kind, taken.groups, frames).write(out)
+    poses = taken.poses
     largest = max(taken.groups, key=lambda group: group.width * group.height)
-    return {
-        "kind": taken.kind,
-        "declared_frames": taken.declared,
-        "decoded_frames": taken.decoded,
-        "lost_frames": taken.lost,
-        "dropped_blurred": taken.blurred,
-        "skipped": list(taken.skipped),
-        **(taken.details or {}),
-        "frames": len(frames),
-        "held_out": sum(frame.held_out for frame in frames),
-        "groups": len(taken.groups),
-        "width": largest.width,
-        "height": largest.height,
-    }
+    return IngestSummary(
+        kind=taken.kind,
+        declared_frames=taken.declared,
+        decoded_frames=taken.decoded,
+        lost_frames=taken.lost,
+        dropped_blurred=taken.blurred,
+        skipped=taken.skipped,
+        metric=None if poses is None else poses.metric,
+        points=None if poses is None or poses.points is None else len(poses.points),
+        frames=len(frames),
+        held_out=sum(frame.held_out for frame in frames),
+        groups=len(taken.groups),
+        width=largest.width,
+        height=largest.height,
+    )
 
 
 def _held_out(taken: Taken, config: IngestConfig, ctx: StageContext) -> frozenset[str]:

@@ -6,13 +6,13 @@ cameras of their originals.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from recon_cli.capture.pace import paced
 from recon_cli.config.stages import SfmConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError
 from recon_cli.io import frames as store
 from recon_cli.io.frames import FrameList
@@ -22,11 +22,12 @@ from recon_cli.sfm.checks import listed
 from recon_cli.sfm.job import CameraGroup, Job
 from recon_cli.sfm.measure import parse_place
 from recon_cli.sfm.step_log import Ledger
+from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
 
 APART = 1e6  # seconds from clip to clip: the camera may have gone anywhere meanwhile
 
 
-def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> SfmSummary:
     """Writes sparse/ and undistorted/{images,denoised,sparse} into `out`.
 
     Args:
@@ -34,14 +35,6 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         inputs: the finished folders of ingest and denoise.
         out: the stage's partial folder; the database and finished steps in it are kept.
         ctx: for notices, progress and threads; the model does not depend on the threads.
-
-    Returns:
-        frames, registered (counts), unregistered, unregistered_held_out (names), rejected (why
-        frames were taken out of the model, by name), points, mean_track_length,
-        reprojection_error_px, median_triangulation_angle_deg, models (number of frames in the model
-        and in what is left of others), rungs (what was tried; see `mapping.ladder.Note`), verdict,
-        poses (of known poses: see `mapping.known`), world (see `mapping.world`), cameras (width,
-        height, focal_px undistorted and frames of each), seconds (by step).
 
     Raises:
         SfmError: there are too few cameras, the model cannot be trusted, the time is up, or the
@@ -105,7 +98,7 @@ def _check_frames(job: Job) -> None:
                 hint=f"Run `recon {verb} --again`.")
 
 
-def _summary(frames: FrameList, job: Job) -> Summary:
+def _summary(frames: FrameList, job: Job) -> SfmSummary:
     results: dict[str, dict[str, Any]] = {}
     for step in job.steps:
         result = Ledger(job.out).result(step)
@@ -114,58 +107,57 @@ def _summary(frames: FrameList, job: Job) -> Summary:
     model = results["model"]
     unregistered = sorted({frame.name for frame in frames.frames} - set(model["registered"]))
     held_out = {frame.name for frame in frames.frames if frame.held_out}
-    return {
-        "frames": len(frames.frames),
+    return SfmSummary.from_json({
         **model,
+        "frames": len(frames.frames),
         "registered": len(model["registered"]),
         "unregistered": unregistered,
         "unregistered_held_out": [name for name in unregistered if name in held_out],
         "world": results["sparse"],
         "cameras": results["undistorted"]["cameras"],
         "seconds": {step: result["seconds"] for step, result in results.items()},
-    }
+    })
 
 
-def _report(summary: Summary, ctx: StageContext) -> None:
+def _report(summary: SfmSummary, ctx: StageContext) -> None:
     """Says what was tried, which frames have no camera and which models were left aside."""
-    told = (*_tried(summary["rungs"]), *summary["lines"], *_moved(summary["poses"]),
-            *_left_out(summary), *summary["world"]["sentences"])
-    for text in told:
-        ctx.notice(text)
+    for sentence in (*_attempts(summary.rungs), *summary.lines, *_movement(summary.poses),
+                     *_left_out(summary), *summary.world.sentences):
+        ctx.notice(sentence)
 
 
-def _tried(rungs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yields a sentence for each way to a model behind the first."""
-    for rung in rungs[1:]:
-        reason = rung["reason"][:1].lower() + rung["reason"][1:].rstrip(".")  # may be a sentence
-        if rung["skipped"]:
-            yield (f"{rung['name']} was not tried although {reason}: {rung['skipped']}, more than "
+def _attempts(attempts: Sequence[AttemptSummary]) -> Iterator[str]:
+    """Yields a sentence for each mapper that was tried after the first."""
+    for attempt in attempts[1:]:
+        reason = attempt.reason[:1].lower() + attempt.reason[1:].rstrip(".")  # may be a sentence
+        if attempt.skipped:
+            yield (f"{attempt.name} was not tried although {reason}: {attempt.skipped}, more than "
                    "is left of --max-minutes.")
         else:
-            yield (f"{rung['name']} was tried, because {reason}: {rung['registered']} frames got a "
-                   f"camera{', and this model is kept' if rung['kept'] else ''}.")
+            yield (f"{attempt.name} was tried, because {reason}: {attempt.registered} frames got a "
+                   f"camera{', and this model is kept' if attempt.kept else ''}.")
 
 
-def _moved(poses: Mapping[str, Any] | None) -> Iterator[str]:
+def _movement(poses: PosesSummary | None) -> Iterator[str]:
     """Yields a sentence on how far refining moved the given cameras."""
-    if poses and poses["use"] == "refine":
-        yield (f"Refining moved the cameras by {poses['moved_median']:.2%} of the size of their "
-               f"path (at most {poses['moved_max']:.2%}) and turned them by "
-               f"{poses['turned_median_deg']:.2f} degrees (at most "
-               f"{poses['turned_max_deg']:.2f}).")
+    if poses and poses.moved_median is not None:
+        yield (f"Refining moved the cameras by {poses.moved_median:.2%} of the size of their "
+               f"path (at most {poses.moved_max:.2%}) and turned them by "
+               f"{poses.turned_median_deg:.2f} degrees (at most {poses.turned_max_deg:.2f}).")
 
 
-def _left_out(summary: Summary) -> Iterator[str]:
-    missing, held_out = summary["unregistered"], summary["unregistered_held_out"]
-    for name, reason in summary["rejected"].items():
+def _left_out(summary: SfmSummary) -> Iterator[str]:
+    """Yields sentences on frames without a camera and on models that were left aside."""
+    missing, held_out = summary.unregistered, summary.unregistered_held_out
+    for name, reason in summary.rejected.items():
         yield f"{name} was taken out of the model: {reason}."
-    if missing and not summary["lines"]:  # the verdict names them, and why
-        yield (f"{len(missing)} of {summary['frames']} frames have no camera and are left out: "
+    if missing and not summary.lines:  # the verdict names them, and why
+        yield (f"{len(missing)} of {summary.frames} frames have no camera and are left out: "
                f"{listed(missing)}.")
     if held_out:
         yield (f"{len(held_out)} frames without a camera were held out and so cannot be scored: "
                f"{listed(held_out)}.")
-    if summary["apart"]:
-        parts = "; ".join(f"{len(part)} frames ({listed(part, 3)})" for part in summary["apart"])
-        yield (f"The capture fell apart: the largest model, of {summary['models'][0]} frames, is "
+    if summary.apart:
+        parts = "; ".join(f"{len(part)} frames ({listed(part, 3)})" for part in summary.apart)
+        yield (f"The capture fell apart: the largest model, of {summary.models[0]} frames, is "
                f"kept; left aside are {parts}.")

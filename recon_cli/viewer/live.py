@@ -27,8 +27,8 @@ from recon_cli.viewer.content import FAR, eye_of
 from recon_cli.viewer.frustums import stand
 from recon_cli.viewer.gaussians import packed
 from recon_cli.viewer.server import Server, begin_at
-from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.summaries import WorldSummary
 
 SHARE = 0.04  # of the training's time, for all updates together
 # viser's page goes on drawing for a quarter of a second after an update (RENDER_SETTLE_MS).
@@ -139,10 +139,10 @@ class LiveView:
 
     def _up(self, cameras: Sequence[Camera]) -> NDArray[np.float64]:
         try:
-            world = read_json(self._workspace.folder("sfm") / "world.json")
-            if world["evidence"]["up_found"]:
+            world = WorldSummary.read(self._workspace.folder("sfm"))
+            if world and world.evidence.up_found:
                 return np.array([0.0, 0.0, 1.0])
-        except (ReconError, OSError, KeyError, TypeError, ValueError):
+        except (ReconError, OSError):
             pass  # a look at a training does without
         if len(cameras) < MIN_CAMERAS:
             return np.asarray(-cameras[0].viewmat[1, :3])

@@ -11,6 +11,7 @@ from fake_stages import NAMES, bring, job_at, stale
 from recon_cli.errors import ConfigError, InputError, StageError
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job
+from recon_cli.workspace.summaries import IngestSummary
 
 AFTER = {name: NAMES[NAMES.index(name):] for name in NAMES}  # a stage and all behind it
 
@@ -90,6 +91,13 @@ def test_a_newer_version_of_a_stage_makes_its_results_stale(job: Job) -> None:
     now = next(row.version for row in job.table if row.name == "evaluate")
     assert stale(replace(job, table=newer)) == {
         "evaluate": (f"stage version {now} -> {now + 1}",)}
+
+
+def test_a_result_whose_record_another_version_wrote_is_stale(job: Job) -> None:
+    typed = [replace(row, summary=IngestSummary if row.name == "ingest" else None)
+             for row in job.table]
+    reason, = stale(replace(job, table=typed))["ingest"]
+    assert reason.startswith("the summary lacks kind, declared_frames")
 
 
 def test_a_changed_input_is_named(job: Job, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import summaries
 
 from recon_cli.report.headline import facts, verdict
 from recon_cli.report.stage_status import Standing
@@ -10,7 +11,7 @@ from recon_cli.workspace.manifest import Basis, Manifest, RunRecord
 
 
 def sfm(**summary):
-    run = RunRecord(1.0, 1, {"registered": 9, "frames": 12, **summary}, {}, None, None, 1, "")
+    run = RunRecord(1.0, 1, {**summaries.SFM.to_json(), **summary}, {}, None, None, 1, "")
     return Standing("sfm", Path("sfm"), "fresh", "", "recon sfm",
                     Manifest(Basis("sfm", 3, {}, (), {}), {}, "", run))
 
@@ -30,7 +31,7 @@ def test_a_mapping_that_was_accepted_although_weak_is_not_to_be_trusted():
 
 
 def test_poses_of_a_data_set_are_neither_praised_nor_blamed():
-    found = verdict(sfm(verdict=None, poses={"use": "keep"}, lines=["100% agree."]))
+    found = verdict(sfm(verdict=None, poses={"use": "keep", "metric": True}, lines=["100% agree."]))
     assert found.level == "unknown"
     assert found.text == "9 of 12 frames have a camera; the poses came with the data set."
     assert found.lines == ("100% agree.",)

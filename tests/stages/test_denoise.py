@@ -69,7 +69,7 @@ def test_clean_frames_stay_byte_identical_and_noisy_ones_come_closer_to_the_trut
         if sigma:
             before = psnr(read_png(ingest / "frames" / name), room())
             assert psnr(read_png(out / "frames" / name), room()) > before + 4
-    assert (summary["mode"], summary["frames"], summary["denoised"]) == ("auto", 4, 2)
+    assert (summary.mode, summary.frames, summary.denoised) == ("auto", 4, 2)
 
 
 def test_the_noise_of_each_frame_is_written_down(ingest, tmp_path):
@@ -79,7 +79,7 @@ def test_the_noise_of_each_frame_is_written_down(ingest, tmp_path):
     for name, sigma in SIGMAS.items():
         assert noise[name]["denoised"] == (sigma > 0)
         assert noise[name]["sigma_255"] == pytest.approx(sigma, rel=0.2, abs=1)
-    assert summary["median_sigma_255"] == pytest.approx(
+    assert summary.median_sigma_255 == pytest.approx(
         np.median([entry["sigma_255"] for entry in noise.values()]), abs=1e-4)
 
 
@@ -93,19 +93,19 @@ def test_a_copy_is_no_link(ingest, tmp_path):
 def test_off_passes_everything_through(ingest, tmp_path):
     summary = run(ingest, tmp_path / "out", mode="off")
     assert all(same(ingest, tmp_path / "out", name) for name in SIGMAS)
-    assert summary["denoised"] == 0
-    assert summary["median_sigma_255"] > 0
+    assert summary.denoised == 0
+    assert summary.median_sigma_255 > 0
 
 
 def test_force_filters_everything(ingest, tmp_path):
     summary = run(ingest, tmp_path / "out", mode="force")
     assert not any(same(ingest, tmp_path / "out", name) for name in SIGMAS)
-    assert summary["denoised"] == 4
+    assert summary.denoised == 4
 
 
 def test_the_threshold_decides(ingest, tmp_path):
     summary = run(ingest, tmp_path / "out", threshold=11.0)
-    assert summary["denoised"] == 1
+    assert summary.denoised == 1
     assert same(ingest, tmp_path / "out", "000012.png")
 
 
@@ -121,7 +121,7 @@ def test_strength_sets_how_much_is_smoothed(ingest, tmp_path):
 def test_the_filter_can_be_chosen(ingest, tmp_path):
     results = {}
     for name in ("joint", "bilateral"):
-        assert run(ingest, tmp_path / name, filter=name)["filter"] == name
+        assert run(ingest, tmp_path / name, filter=name).filter == name
         results[name] = read_png(tmp_path / name / "frames" / "000004.png")
     assert psnr(results["joint"], room()) > psnr(results["bilateral"], room())
 

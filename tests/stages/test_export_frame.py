@@ -5,9 +5,11 @@ from __future__ import annotations
 import gzip
 import json
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import summaries
 import torch
 from scenes import random_splats
 from tiny_scene import make_inputs
@@ -51,7 +53,8 @@ def inputs(tmp_path):
 
 
 def up_is_z(inputs):
-    write_json(inputs.folders["sfm"] / "world.json", {"evidence": {"up_found": True}})
+    world = replace(summaries.WORLD, evidence=replace(summaries.EVIDENCE, up_found=True))
+    write_json(inputs.folders["sfm"] / "world.json", world.to_json())
 
 
 def exported(inputs, **options):

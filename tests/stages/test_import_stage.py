@@ -2,9 +2,11 @@
 
 import json
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import summaries
 import torch
 from foreign import truth
 from scenes import random_splats
@@ -29,7 +31,8 @@ CONTEXT = StageContext(backend="numba")
 @pytest.fixture
 def inputs(tmp_path):
     given = make_inputs(tmp_path / "views")
-    write_json(given.folders["sfm"] / "world.json", {"similarity": WORLD.to_json()})
+    world = replace(summaries.WORLD, similarity=WORLD.to_json())
+    write_json(given.folders["sfm"] / "world.json", world.to_json())
     return given
 
 

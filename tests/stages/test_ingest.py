@@ -28,7 +28,7 @@ def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notice
     summary = take(video, tmp_path / "out")
     found = listed(tmp_path / "out")
     names = [frame["name"] for frame in found["frames"]]
-    assert summary == {
+    assert summary.to_json() == {
         "kind": "video", "declared_frames": 40, "decoded_frames": 40, "lost_frames": 0,
         "dropped_blurred": 0, "skipped": [], "frames": len(names), "held_out": -(-len(names) // 8),
         "groups": 1, "width": 128, "height": 96,
@@ -54,17 +54,17 @@ def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notice
 
 def test_the_bundled_video_gives_a_number_that_structure_from_motion_likes(sample_video, tmp_path):
     summary = take(sample_video, tmp_path / "out")
-    assert 60 <= summary["frames"] <= 100
-    assert (summary["width"], summary["height"], summary["lost_frames"]) == (600, 340, 0)
+    assert 60 <= summary.frames <= 100
+    assert (summary.width, summary.height, summary.lost_frames) == (600, 340, 0)
 
 
 def test_as_many_frames_as_asked_for_are_taken(video, tmp_path, notices):
-    assert take(video, tmp_path / "out", config=IngestConfig(frames=17))["frames"] == 17
+    assert take(video, tmp_path / "out", config=IngestConfig(frames=17)).frames == 17
     assert notices() == []
 
 
 def test_asking_for_more_frames_than_there_are_is_noticed(video, tmp_path, notices):
-    assert take(video, tmp_path / "out", config=IngestConfig(frames=50))["frames"] == 40
+    assert take(video, tmp_path / "out", config=IngestConfig(frames=50)).frames == 40
     assert notices() == ["50 frames were asked for, but the video has 40."]
 
 
@@ -75,14 +75,14 @@ def test_asking_for_more_frames_than_are_sharp_is_noticed(tmp_path, notices):
     video = write_video(tmp_path / "blurred.mp4", frames)
     config = IngestConfig(frames=40)
     summary = take(video, tmp_path / "out", config=config)
-    assert (summary["frames"], summary["dropped_blurred"]) == (37, 3)
+    assert (summary.frames, summary.dropped_blurred) == (37, 3)
     assert len(notices()) == 1
     assert "37 of 40 frames are sharp enough" in notices()[0]
     assert not (tmp_path / "out" / "frames" / "000011.png").exists()
 
 
 def test_the_automatic_number_stays_under_its_bound(video, tmp_path):
-    assert take(video, tmp_path / "out", config=IngestConfig(max_frames=9))["frames"] == 9
+    assert take(video, tmp_path / "out", config=IngestConfig(max_frames=9)).frames == 9
 
 
 @pytest.mark.parametrize("kind", ["video", "photos"])
@@ -100,7 +100,7 @@ def test_photos_of_the_same_view_are_left_out_and_named(tmp_path, notices):
     folder = write_photos(tmp_path / "room", 6)
     (folder / "IMG_0007.jpg").write_bytes((folder / "IMG_0002.jpg").read_bytes())
     summary = take(folder, tmp_path / "out")
-    assert (summary["frames"], summary["skipped"]) == (6, ["IMG_0007.jpg"])
+    assert (summary.frames, summary.skipped) == (6, ("IMG_0007.jpg",))
     assert not (tmp_path / "out" / "frames" / "IMG_0007.png").exists()
     assert notices() == [
         "1 photos are left out, for others show the same: IMG_0007.jpg (like IMG_0002.jpg)."]
@@ -120,7 +120,7 @@ def test_held_out_frames_are_frozen_here(video, tmp_path, holdout, expected):
 def test_long_frames_are_reduced_with_a_notice(video, tmp_path, notices):
     config = IngestConfig(frames=5, max_size=64)
     summary = take(video, tmp_path / "out", config=config)
-    assert (summary["width"], summary["height"]) == (64, 48)
+    assert (summary.width, summary.height) == (64, 48)
     assert notices() == [
         "Frames of 128x96 are reduced to 64 pixels on the longer side; --max-size changes that."]
 
@@ -136,8 +136,8 @@ def test_several_sources_are_kept_apart_and_share_the_budget(video, tmp_path):
     folder = write_photos(tmp_path / "room", 4)
     config = IngestConfig(frames=30, holdout="every:4")
     summary = take((video, folder, other), tmp_path / "out", config=config)
-    assert (summary["kind"], summary["groups"], summary["frames"]) == ("mixed", 3, 34)
-    assert (summary["width"], summary["height"]) == (128, 96)
+    assert (summary.kind, summary.groups, summary.frames) == ("mixed", 3, 34)
+    assert (summary.width, summary.height) == (128, 96)
     found = listed(tmp_path / "out")
     assert [(group["name"], group["width"], group["height"]) for group in found["groups"]] == [
         ("walk.mp4", 128, 96), ("room", 64, 48), ("slow.mp4", 128, 64)]
@@ -157,7 +157,7 @@ def test_several_sources_are_kept_apart_and_share_the_budget(video, tmp_path):
 def test_photos_become_frames_that_keep_their_names(tmp_path, notices):
     folder = write_photos(tmp_path / "room", 9, suffix=".png")
     summary = take(folder, tmp_path / "out")
-    assert summary == {
+    assert summary.to_json() == {
         "kind": "photos", "declared_frames": 9, "decoded_frames": 9, "lost_frames": 0,
         "dropped_blurred": 0, "skipped": [], "frames": 9, "held_out": 2, "groups": 1,
         "width": 64, "height": 48,
@@ -247,14 +247,14 @@ def test_progress_that_would_survive_a_crash_is_recorded(video, tmp_path):
 ])
 def test_phone_videos_come_out_upright_and_complete(shared_data, tmp_path, name, size, count):
     summary = take(shared_data / name, tmp_path / "out", config=IngestConfig(frames=3))
-    assert (summary["width"], summary["height"]) == size
-    assert (summary["decoded_frames"], summary["lost_frames"]) == (count, 0)
-    assert summary["dropped_blurred"] > 0
+    assert (summary.width, summary.height) == size
+    assert (summary.decoded_frames, summary.lost_frames) == (count, 0)
+    assert summary.dropped_blurred > 0
 
 
 def test_what_was_done_to_a_video_is_said_once_for_each_thing(tmp_path, notices):
     path = media.write_video(tmp_path / "wide.mp4", walk(40), aspect=Fraction(4, 3))
     summary = take(path, tmp_path / "out")
-    assert (summary["width"], summary["height"]) == (171, 96)
+    assert (summary.width, summary.height) == (171, 96)
     assert notices() == [
         "wide.mp4 has pixels of aspect 4/3: its frames of 128x96 are stretched to 171x96."]

@@ -35,8 +35,8 @@ def known(out):
 
 def test_a_replica_sequence_brings_poses_points_and_its_own_test_views(tmp_path, notices):
     summary = take(make_replica(tmp_path / "room"), tmp_path / "out")
-    assert (summary["kind"], summary["frames"], summary["held_out"]) == ("replica", 6, 2)
-    assert summary["metric"]
+    assert (summary.kind, summary.frames, summary.held_out) == ("replica", 6, 2)
+    assert summary.metric
     assert "a Replica sequence" in notices()[0]
     assert "--holdout has no effect" in notices()[-1]
     found, poses = listed(tmp_path / "out"), known(tmp_path / "out")
@@ -48,7 +48,7 @@ def test_a_replica_sequence_brings_poses_points_and_its_own_test_views(tmp_path,
         np.linalg.inv(poses.viewmats[held[0]]), pose(10), atol=1e-8)
     assert found["groups"][0]["lens"]["params"][2:] == [16.5, 11.0]  # half a pixel from the file's
     assert poses.metric
-    assert summary["points"] == len(poses.points) > 100
+    assert summary.points == len(poses.points) > 100
 
 
 def test_depth_of_views_that_are_held_out_lends_no_points(tmp_path):
@@ -63,7 +63,7 @@ def test_depth_of_views_that_are_held_out_lends_no_points(tmp_path):
 def test_a_long_sequence_is_thinned_evenly_and_its_test_views_are_not(tmp_path, notices):
     folder = make_replica(tmp_path / "room", frames=12, tests=3)
     summary = take(folder, tmp_path / "out", config=IngestConfig(frames=4))
-    assert (summary["frames"], summary["held_out"]) == (7, 3)
+    assert (summary.frames, summary.held_out) == (7, 3)
     poses = known(tmp_path / "out").viewmats
     places = [np.linalg.inv(poses[name])[:3, 3] for name in sorted(poses)][:4]
     np.testing.assert_allclose(places, [pose(index)[:3, 3] for index in (1, 4, 7, 10)], atol=1e-8)
@@ -74,8 +74,8 @@ def test_missing_images_of_a_transforms_file_are_counted_and_told(tmp_path, noti
     folder = make_transforms(tmp_path / "fox", transforms(frames=6))
     (folder / "images" / "0002.png").unlink()
     summary = take(folder, tmp_path / "out", config=IngestConfig(holdout="every:4"))
-    assert (summary["declared_frames"], summary["frames"], summary["lost_frames"]) == (6, 5, 1)
-    assert "0002.png" in summary["skipped"][0]
+    assert (summary.declared_frames, summary.frames, summary.lost_frames) == (6, 5, 1)
+    assert "0002.png" in summary.skipped[0]
     assert any("missing" in text for text in notices())
     assert [frame["held_out"] for frame in listed(tmp_path / "out")["frames"]] == [
         True, False, False, False, True]
@@ -109,7 +109,7 @@ def test_exif_turns_no_image_whose_pose_is_known(tmp_path):
     for path in sorted((folder / "images").iterdir()):
         Image.open(path).save(path, exif=exif)
     summary = take(folder, tmp_path / "out")
-    assert (summary["width"], summary["height"], summary["lost_frames"]) == (WIDTH, HEIGHT, 0)
+    assert (summary.width, summary.height, summary.lost_frames) == (WIDTH, HEIGHT, 0)
 
 
 def test_transparent_pixels_become_a_mask(tmp_path):
@@ -137,7 +137,7 @@ def test_half_an_image_is_left_out_and_named(tmp_path, notices):
     Image.fromarray(blocks(HEIGHT, WIDTH)).save(half, quality=100)
     half.write_bytes(half.read_bytes()[:-400])
     summary = take(folder, tmp_path / "out")
-    assert (summary["frames"], summary["lost_frames"], summary["skipped"]) == (4, 1, ["3.jpg"])
+    assert (summary.frames, summary.lost_frames, summary.skipped) == (4, 1, ("3.jpg",))
     assert any("3.jpg" in text for text in notices())
 
 

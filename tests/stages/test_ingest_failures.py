@@ -28,11 +28,11 @@ def test_a_video_cut_off_goes_on_with_what_is_left(video, tmp_path, notices):
     data = video.read_bytes()
     video.write_bytes(data[:len(data) // 2])
     summary = take(video, tmp_path / "out")
-    assert summary["declared_frames"] == 40
-    assert 3 <= summary["decoded_frames"] < 40
-    assert summary["lost_frames"] == 40 - summary["decoded_frames"]
+    assert summary.declared_frames == 40
+    assert 3 <= summary.decoded_frames < 40
+    assert summary.lost_frames == 40 - summary.decoded_frames
     assert len(notices()) == 1
-    assert f"{summary['lost_frames']} of 40 frames are lost" in notices()[0]
+    assert f"{summary.lost_frames} of 40 frames are lost" in notices()[0]
 
 
 @pytest.mark.parametrize("filler", [b"\0", b"\xa5"])
@@ -45,9 +45,9 @@ def test_a_video_corrupted_in_the_middle_goes_on_around_the_damage(
     data[middle:middle + 1500] = filler * 1500
     video.write_bytes(data)
     summary = take(video, tmp_path / "out")
-    assert 1 <= summary["lost_frames"] <= 20  # at most the two groups that the hole may touch
-    assert summary["decoded_frames"] == 60 - summary["lost_frames"]
-    assert f"{summary['lost_frames']} of 60 frames are lost" in notices()[0]
+    assert 1 <= summary.lost_frames <= 20  # at most the two groups that the hole may touch
+    assert summary.decoded_frames == 60 - summary.lost_frames
+    assert f"{summary.lost_frames} of 60 frames are lost" in notices()[0]
     for frame in listed(tmp_path / "out")["frames"]:
         rgb = store.read_png(tmp_path / "out" / "frames" / frame["name"])
         truth = walk(60)[int(frame["time_seconds"] * 10 + 0.5)].astype(float)
@@ -171,8 +171,8 @@ def test_half_a_jpeg_among_good_photos_is_left_out_and_named(tmp_path, notices):
     half.write_bytes(half.read_bytes()[:half.stat().st_size // 2])
     (folder / "IMG_0007.jpg").write_bytes(b"no photo at all")
     summary = take(folder, tmp_path / "out")
-    assert (summary["frames"], summary["lost_frames"]) == (5, 2)
-    assert summary["skipped"] == ["IMG_0002.jpg", "IMG_0007.jpg"]
+    assert (summary.frames, summary.lost_frames) == (5, 2)
+    assert summary.skipped == ("IMG_0002.jpg", "IMG_0007.jpg")
     assert not (tmp_path / "out" / "frames" / "IMG_0002.png").exists()
     assert sum("IMG_0002.jpg" in text for text in notices()) == 1
     assert sum("IMG_0007.jpg" in text for text in notices()) == 1

@@ -29,7 +29,7 @@ def test_mixed_sizes_become_groups_and_are_told(tmp_path, notices):
     Image.fromarray(blocks(128, 96)).save(folder / "IMG_0001.jpg")
     Image.fromarray(blocks(128, 96, seed=7)).save(folder / "IMG_0009.jpg")
     summary = take(folder, tmp_path / "out", config=IngestConfig(max_size=64))
-    assert (summary["groups"], summary["frames"], summary["lost_frames"]) == (2, 5, 0)
+    assert (summary.groups, summary.frames, summary.lost_frames) == (2, 5, 0)
     written = listed(tmp_path / "out")
     assert [(g["name"], g["width"], g["height"]) for g in written["groups"]] == [
         ("room: 128x96", 64, 48), ("room: 96x128", 48, 64)]
@@ -72,7 +72,7 @@ def test_a_photo_whose_mask_is_broken_is_left_out_and_named(tmp_path, notices):
     with pytest.raises(InputError, match=r"2 that cannot.*IMG_0001\.png has 48x48"):
         take(folder, tmp_path / "out")
     (folder / "masks" / "IMG_0002.png").unlink()
-    assert take(folder, tmp_path / "out")["skipped"] == ["IMG_0001.jpg"]
+    assert take(folder, tmp_path / "out").skipped == ("IMG_0001.jpg",)
     assert any("The mask IMG_0001.png has 48x48" in notice for notice in notices())
 
 
@@ -118,7 +118,7 @@ def test_options_without_effect_on_photos_are_told(tmp_path, notices):
 
 def test_a_photo_that_is_given_twice_is_taken_once(tmp_path):
     files = sorted(write_photos(tmp_path / "room", 4).iterdir())
-    assert take((*files, files[0]), tmp_path / "out")["frames"] == 4
+    assert take((*files, files[0]), tmp_path / "out").frames == 4
 
 
 def test_a_file_name_cannot_pass_for_a_message(tmp_path, notices):
@@ -135,7 +135,7 @@ def test_photos_in_an_inner_folder_are_taken_and_their_masks_beside_it(tmp_path,
     mask = np.full((48, 64), 255, np.uint8)
     mask[0] = 0
     mask_of(tmp_path / "room" / "masks", "IMG_0000.png", mask)
-    assert take(tmp_path / "room", tmp_path / "out")["frames"] == 3
+    assert take(tmp_path / "room", tmp_path / "out").frames == 3
     assert listed(tmp_path / "out")["frames"][0]["masked"]
     assert "those in images/ are taken" in notices()[0]
 
@@ -180,7 +180,7 @@ def test_a_plan_that_is_there_is_kept_and_gives_the_same_frames(tmp_path, monkey
 def test_a_jpeg_beside_its_raw_is_left_out_and_told(tmp_path, notices):
     folder = write_raw(tmp_path / "room", [0, 0, 0])
     write_photos(folder, 2)
-    assert take(folder, tmp_path / "out")["frames"] == 3
+    assert take(folder, tmp_path / "out").frames == 3
     assert [frame["source"] for frame in listed(tmp_path / "out")["frames"]] == [
         "IMG_0000.dng", "IMG_0001.dng", "IMG_0002.dng"]
     assert "2 photos are left out" in notices()[0]

@@ -17,6 +17,7 @@ from recon_cli.io.frames import read_png
 from recon_cli.sfm import database
 from recon_cli.sfm.step_log import STEPS
 from recon_cli.workspace.atomic import clear_leftovers
+from recon_cli.workspace.summaries import SfmSummary
 
 STEP, COUNT = 4, 12  # every 4th frame of the sample: few, and each still overlaps the next
 BLANK = "000099.png"  # a grey frame, held out, that can find no camera
@@ -66,21 +67,22 @@ def mapped(room, tmp_path_factory):
 
 def test_every_frame_that_shows_the_room_gets_a_camera(mapped):
     _, summary, _ = mapped
-    assert summary["frames"] == COUNT + 1
-    assert summary["registered"] == COUNT
-    assert summary["unregistered"] == summary["unregistered_held_out"] == [BLANK]
+    assert summary.frames == COUNT + 1
+    assert summary.registered == COUNT
+    assert summary.unregistered == summary.unregistered_held_out == (BLANK,)
 
 
 def test_the_summary_is_json_and_has_plausible_figures(mapped):
     _, summary, _ = mapped
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
-    assert summary["points"] > 300
-    assert summary["mean_track_length"] > 2
-    assert 0 < summary["reprojection_error_px"] < 1
-    assert summary["median_triangulation_angle_deg"] > 5
-    assert summary["models"][0] == COUNT
-    assert set(summary["seconds"]) == {"features", "matches", "model", "sparse", "undistorted"}
-    camera, = summary["cameras"]
+    text = json.dumps(summary.to_json(), allow_nan=False)
+    assert SfmSummary.from_json(json.loads(text)) == summary
+    assert summary.points > 300
+    assert summary.mean_track_length > 2
+    assert 0 < summary.reprojection_error_px < 1
+    assert summary.median_triangulation_angle_deg > 5
+    assert summary.models[0] == COUNT
+    assert set(summary.seconds) == {"features", "matches", "model", "sparse", "undistorted"}
+    camera, = summary.cameras
     assert camera["frames"] == COUNT
     assert camera["focal_px"] == pytest.approx(300, rel=0.03)  # the room was rendered with 300
 
@@ -113,9 +115,9 @@ def test_the_scene_can_be_read_with_its_twins(mapped):
     assert len(scene.train) + len(scene.validation) == COUNT - 2
     assert [view.name for view in scene.test] == ["000000.png", "000040.png"]
     assert scene.unregistered_test == (BLANK,)
-    assert len(scene.points) == summary["points"]
+    assert len(scene.points) == summary.points
     assert (scene.train[0].camera.width, scene.train[0].camera.height) == (
-        summary["cameras"][0]["width"], summary["cameras"][0]["height"])
+        summary.cameras[0]["width"], summary.cameras[0]["height"])
 
 
 def test_twins_are_identical_exactly_where_nothing_was_denoised(mapped):

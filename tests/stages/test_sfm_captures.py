@@ -30,11 +30,11 @@ def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
     office = frames(sample_video, count=10, prefix="office")
     living = frames(shared_data / "rooms" / "living" / "video.mp4", count=6, prefix="living")
     summary = run(write_inputs(tmp_path / "in", office | living), tmp_path / "out")
-    assert summary["unregistered"] == sorted(living)
-    assert summary["apart"] == [sorted(living)]
-    assert summary["models"] == [10, 6]
+    assert summary.unregistered == tuple(sorted(living))
+    assert summary.apart == (tuple(sorted(living)),)
+    assert summary.models == (10, 6)
     # No match ties the two together, so that no further way is worth trying.
-    assert [rung["name"] for rung in summary["rungs"]] == ["exhaustive"]
+    assert [attempt.name for attempt in summary.rungs] == ["exhaustive"]
     assert "The capture fell apart: the largest model, of 10 frames, is kept" in caplog.text
     assert "living000000.png" in caplog.text
 
@@ -50,9 +50,9 @@ def test_photos_of_other_things_are_named_and_not_in_the_model(sample_video, tmp
     wrong = {f"wrong{seed}.png": texture(340, 600, seed) for seed in range(3)}
     images = frames(sample_video, count=12) | wrong
     summary = run(write_inputs(tmp_path / "in", images), tmp_path / "out")
-    assert summary["registered"] == 12
-    assert summary["unregistered"] == sorted(wrong)
-    assert [rung["name"] for rung in summary["rungs"]] == ["exhaustive"]
+    assert summary.registered == 12
+    assert summary.unregistered == tuple(sorted(wrong))
+    assert [attempt.name for attempt in summary.rungs] == ["exhaustive"]
 
 
 def test_one_frame_many_times_over_is_no_capture(sample_video, tmp_path):
@@ -66,7 +66,7 @@ def test_frames_given_twice_do_no_harm(sample_video, tmp_path):
     once = frames(sample_video, count=8)
     twice = {f"copy{name}": image for name, image in once.items()}
     summary = run(write_inputs(tmp_path / "in", once | twice), tmp_path / "out")
-    assert summary["registered"] == 16
+    assert summary.registered == 16
 
 
 def test_twelve_neighbours_of_a_fast_video_show_too_little_parallax(shared_data, tmp_path):
@@ -84,9 +84,9 @@ def test_the_frames_of_every_way_of_pairing_meet(sample_video, tmp_path):
     for pairs in ("retrieval", "sequential"):
         summary = run(write_inputs(tmp_path / pairs, images), tmp_path / f"{pairs}.out",
                       pairs=pairs)
-        assert summary["registered"] == 8
-        rung, = summary["rungs"]
-        assert (rung["name"], rung["reason"], rung["kept"]) == (pairs, "it was asked for", True)
+        assert summary.registered == 8
+        attempt, = summary.rungs
+        assert (attempt.name, attempt.reason, attempt.kept) == (pairs, "it was asked for", True)
 
 
 def test_from_clip_to_clip_the_camera_may_be_anywhere():

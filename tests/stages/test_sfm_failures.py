@@ -1,13 +1,16 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import summaries
 from sfm_inputs import run, texture, turning, write_inputs
 
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, SfmError
 from recon_cli.sfm import database
 from recon_cli.stages import sfm
+from recon_cli.workspace.summaries import AttemptSummary, PosesSummary
 
 
 def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
@@ -52,31 +55,36 @@ def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
         run(base, tmp_path / "out")
 
 
+def attempt(name, **fields):
+    """What became of one mapper."""
+    return AttemptSummary(**{
+        "name": name, "reason": "", "skipped": "", "registered": 0, "models": (), "weak_link": None,
+        "reprojection_error_px": None, "seconds": 1.0, "kept": False, **fields})
+
+
 def told(caplog, **changes):
     """What the stage says of a summary."""
-    summary = {
-        "frames": 60, "unregistered": [f"{i}.png" for i in range(11)],
-        "unregistered_held_out": [], "models": [49], "apart": [], "rejected": {}, "lines": [],
-        "poses": None, "world": {"sentences": []},
-        "rungs": [{"name": "exhaustive", "skipped": "", "registered": 40, "kept": False}]}
-    sfm._report(summary | changes, StageContext())
+    summary = replace(
+        summaries.SFM, frames=60, unregistered=tuple(f"{i}.png" for i in range(11)), models=(49,),
+        rungs=(attempt("exhaustive", registered=40),))
+    sfm._report(replace(summary, **changes), StageContext())
     return caplog.text
 
 
 def test_models_that_are_left_aside_are_told(caplog):
-    text = told(caplog, models=[49, 3], apart=[["5.png", "6.png", "7.png"]])
+    text = told(caplog, models=(49, 3), apart=(("5.png", "6.png", "7.png"),))
     assert "of 49 frames, is kept; left aside are 3 frames (5.png, 6.png, 7.png)" in text
 
 
 def test_frames_without_a_camera_are_told(caplog):
-    text = told(caplog, unregistered_held_out=["3.png"])
+    text = told(caplog, unregistered_held_out=("3.png",))
     assert "11 of 60 frames have no camera" in text
     assert "and 6 more" in text
     assert "1 frames without a camera were held out and so cannot be scored: 3.png" in text
 
 
 def test_where_there_is_a_verdict_it_speaks_of_the_missing_frames(caplog):
-    text = told(caplog, lines=["All but eleven hang together."])
+    text = told(caplog, lines=("All but eleven hang together.",))
     assert "All but eleven hang together." in text
     assert "11 of 60" not in text
 
@@ -87,20 +95,19 @@ def test_frames_that_were_taken_out_of_the_model_are_told_with_the_reason(caplog
 
 
 def test_how_far_given_poses_were_moved_is_told(caplog):
-    text = told(caplog, poses={
-        "use": "refine", "moved_median": 0.0021, "moved_max": 0.013, "turned_median_deg": 0.04,
-        "turned_max_deg": 0.31})
+    text = told(caplog, poses=PosesSummary(
+        use="refine", metric=True, moved_median=0.0021, moved_max=0.013, turned_median_deg=0.04,
+        turned_max_deg=0.31))
     assert ("Refining moved the cameras by 0.21% of the size of their path (at most 1.30%) and "
             "turned them by 0.04 degrees (at most 0.31).") in text
 
 
 def test_every_further_way_to_a_model_is_told_with_its_reason(caplog):
-    text = told(caplog, rungs=[
-        {"name": "exhaustive", "reason": "", "skipped": "", "registered": 40, "kept": False},
-        {"name": "relaxed", "reason": "only 40 of 60 frames got a camera", "skipped": "",
-         "registered": 49, "kept": True},
-        {"name": "global", "reason": "the capture fell into 2 models",
-         "skipped": "it would take about 9 minutes", "registered": 0, "kept": False}])
+    text = told(caplog, rungs=(
+        attempt("exhaustive", registered=40),
+        attempt("relaxed", reason="only 40 of 60 frames got a camera", registered=49, kept=True),
+        attempt("global", reason="the capture fell into 2 models",
+                skipped="it would take about 9 minutes")))
     assert ("relaxed was tried, because only 40 of 60 frames got a camera: 49 frames got a camera, "
             "and this model is kept.") in text
     assert ("global was not tried although the capture fell into 2 models: it would take about 9 "
@@ -117,7 +124,6 @@ def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monke
 
 
 def test_a_problem_of_the_model_before_goes_on_within_the_sentence():
-    rung = {"name": "global", "reason": "The model is broken.", "skipped": "", "registered": 9,
-            "kept": False}
-    assert list(sfm._tried([{}, rung])) == [
+    broken = attempt("global", reason="The model is broken.", registered=9)
+    assert list(sfm._attempts([attempt("exhaustive"), broken])) == [
         "global was tried, because the model is broken: 9 frames got a camera."]

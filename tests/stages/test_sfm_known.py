@@ -13,6 +13,7 @@ from recon_cli.io.colmap import read_images, read_scene
 from recon_cli.io.frames import Frame, FrameList, Group, read_png, write_png
 from recon_cli.io.posed import KnownPoses
 from recon_cli.scene.camera import Lens
+from recon_cli.workspace.summaries import PosesSummary, SfmSummary
 
 STEP, COUNT = 4, 9  # every 4th frame of the sample
 LENS = Lens("PINHOLE", 600, 340, (300.0, 300.0, 300.0, 170.0))  # what the room was rendered with
@@ -65,16 +66,17 @@ def test_poses_and_points_that_are_kept_are_written_as_they_were_given(
     scene = read_scene(tmp_path / "out" / "undistorted", held_out=frozenset(), validation=0.0)
     np.testing.assert_allclose(
         np.sort(scene.points, axis=0), np.sort(points, axis=0), atol=1e-6)
-    assert summary["registered"] == COUNT
-    assert summary["points"] == 50
-    assert summary["reprojection_error_px"] is None
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    assert summary.registered == COUNT
+    assert summary.points == 50
+    assert summary.reprojection_error_px is None
+    text = json.dumps(summary.to_json(), allow_nan=False)
+    assert SfmSummary.from_json(json.loads(text)) == summary
     assert not (tmp_path / "out" / "database.db").exists()
 
 
 def test_kept_poses_are_held_against_some_of_the_images(room, truth, given, tmp_path):
     given(truth, np.random.default_rng(0).normal(size=(50, 3)))
-    line, = run(room, tmp_path / "out")["lines"]
+    line, = run(room, tmp_path / "out").lines
     share, matches = re.match(r"(\d+)% of (\d+) matches between sampled images", line).groups()
     assert int(share) > 80
     assert int(matches) > 500
@@ -105,11 +107,11 @@ def test_a_known_distance_scales_cameras_points_and_what_is_undistorted(
             tmp_path / "out" / folder / "images.bin")}
         assert np.linalg.norm(centers[first] - centers[last]) == pytest.approx(5)
     plain = np.linalg.inv(truth[first])[:3, 3] - np.linalg.inv(truth[last])[:3, 3]
-    similarity = summary["world"]["similarity"]
+    similarity = summary.world.similarity
     assert similarity["scale"] == pytest.approx(5 / np.linalg.norm(plain))
     np.testing.assert_array_equal(similarity["rotation"], np.eye(3))  # others build on the axes
     written = json.loads((tmp_path / "out" / "world.json").read_text())
-    assert summary["world"] == {**written, "seconds": summary["world"]["seconds"]}
+    assert summary.world.to_json() == {**written, "seconds": summary.world.seconds}
 
 
 def test_a_place_that_does_not_exist_is_told_before_anything_is_mapped(
@@ -125,13 +127,13 @@ def test_points_are_triangulated_from_poses_that_stay_where_they_are(room, truth
     given({name: viewmat for name, viewmat in truth.items() if name != POSELESS})
     summary = run(room, tmp_path / "out")
     poses = found(tmp_path / "out")
-    assert summary["unregistered"] == [POSELESS]
-    assert summary["poses"] == {"use": "keep", "metric": True}
+    assert summary.unregistered == (POSELESS,)
+    assert summary.poses == PosesSummary(use="keep", metric=True)
     for name, viewmat in poses.items():
         np.testing.assert_allclose(viewmat, truth[name], atol=1e-9)
-    assert summary["points"] > 300
-    assert summary["reprojection_error_px"] < 1
-    camera, = summary["cameras"]
+    assert summary.points > 300
+    assert summary.reprojection_error_px < 1
+    camera, = summary.cameras
     assert camera == {"width": 600, "height": 340, "focal_px": 300.0, "frames": COUNT - 1}
 
 
@@ -142,9 +144,9 @@ def test_refined_poses_come_nearer_to_the_truth_and_keep_its_unit(room, truth, g
     # Steps between frames do not depend on where the whole was moved to: they were given with an
     # error of 2 cm and more, over a path of some 2 m.
     np.testing.assert_allclose(steps(found(tmp_path / "out")), steps(truth), rtol=0.05)
-    moved = summary["poses"]
-    assert 0 < moved["moved_median"] < moved["moved_max"] < 0.1
-    assert summary["reprojection_error_px"] < moved["reprojection_error_px_before"]
+    moved = summary.poses
+    assert 0 < moved.moved_median < moved.moved_max < 0.1
+    assert summary.reprojection_error_px < moved.reprojection_error_px_before
 
 
 def steps(viewmats):
@@ -198,11 +200,11 @@ def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(t
     KnownPoses(dict(zip(images, viewmats, strict=True)), True, np.ones((4, 3)),
                np.zeros((4, 3), np.uint8)).write(base / "ingest")
     summary = run(base, tmp_path / "out")
-    assert [camera["frames"] for camera in summary["cameras"]] == [2, 1]
+    assert [camera["frames"] for camera in summary.cameras] == [2, 1]
     undistorted = tmp_path / "out" / "undistorted"
     for name, camera in (("1.png", 0), ("2.png", 1)):
         shape = read_png(undistorted / "images" / name).shape
-        assert shape == (*(summary["cameras"][camera][side] for side in ("height", "width")), 3)
+        assert shape == (*(summary.cameras[camera][side] for side in ("height", "width")), 3)
     assert [path.name for path in (undistorted / "masks").iterdir()] == ["1.png"]
     mask = cv2.imread(str(undistorted / "masks" / "1.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == read_png(undistorted / "images" / "1.png").shape[:2]

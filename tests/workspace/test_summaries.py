@@ -1,0 +1,56 @@
+"""Records between stages: what is written is read back, and another version is named."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import summaries
+
+from recon_cli.errors import ManifestError
+from recon_cli.workspace.summaries import (
+    AttemptSummary,
+    IngestSummary,
+    PosesSummary,
+    SfmSummary,
+    WorldSummary,
+)
+
+ATTEMPT = AttemptSummary(
+    name="relaxed", reason="few cameras", skipped="", registered=9, models=(9, 3), weak_link=None,
+    reprojection_error_px=0.5, seconds=1.5, kept=True)
+MAPPED = replace(
+    summaries.SFM, rungs=(ATTEMPT,), apart=(("a.png", "b.png"),), rejected={"c.png": "wrong"},
+    poses=PosesSummary(use="refine", metric=True, moved_median=0.1))
+
+
+@pytest.mark.parametrize("record", [MAPPED, summaries.SFM, summaries.INGEST])
+def test_a_record_comes_back_from_json_as_it_was(record):
+    assert type(record).from_json(json.loads(json.dumps(record.to_json()))) == record
+
+
+def test_the_keys_are_the_fields_in_order_without_what_does_not_apply():
+    assert list(summaries.INGEST.to_json()) == [
+        "kind", "declared_frames", "decoded_frames", "lost_frames", "dropped_blurred", "skipped",
+        "frames", "held_out", "groups", "width", "height"]
+    assert summaries.SFM.to_json()["poses"] is None
+    assert MAPPED.to_json()["poses"] == {"use": "refine", "metric": True, "moved_median": 0.1}
+
+
+def test_a_record_of_another_version_is_refused_with_what_it_lacks():
+    value = MAPPED.to_json()
+    del value["world"]["evidence"]["up_found"]
+    with pytest.raises(ManifestError, match=r"up_found.*another version"):
+        SfmSummary.from_json(value)
+    with pytest.raises(ManifestError, match="not a JSON object"):
+        SfmSummary.from_json({**value, "world": 3})
+
+
+def test_what_another_version_added_is_ignored():
+    value = summaries.INGEST.to_json()
+    assert IngestSummary.from_json({**value, "lenses": 3}) == summaries.INGEST
+
+
+def test_the_world_is_read_from_the_folder_of_sfm(tmp_path):
+    assert WorldSummary.read(tmp_path) is None
+    (tmp_path / "world.json").write_text(json.dumps(summaries.WORLD.to_json()))
+    assert WorldSummary.read(tmp_path) == summaries.WORLD
