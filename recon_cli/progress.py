@@ -81,3 +81,18 @@ class TqdmProgress:
             mininterval=interval, maxinterval=max(10.0, interval), dynamic_ncols=True,
         ) as bar:
             yield _TqdmBar(bar)
+
+
+def format_duration(seconds: float) -> str:
+    """Returns seconds as a person says them: 8.2 s, 4 min 10 s, 1 h 05 min."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def format_megabytes(size: int) -> str:
+    """Returns a number of bytes in MB."""
+    return f"{size / 1e6:.1f} MB"

@@ -13,7 +13,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 500
 
 # Each part of the package (a module or folder at its top) and the parts that it may import.
-BASE = {"errors", "progress", "machine"}
+BASE = {"errors", "lazy", "progress", "machine"}
 RECORDS = BASE | {"workspace", "config"}
 READ = RECORDS | {"scene", "io"}
 DRAW = READ | {"context", "render", "evaluation"}
@@ -21,6 +21,7 @@ MAKE = DRAW | {"capture", "sfm", "train", "export", "stages"}
 RUN = MAKE | {"pipeline"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
+    "lazy": set(),
     "progress": {"errors"},
     "machine": {"errors"},
     "scene": set(),
@@ -71,7 +72,7 @@ def part(path: Path) -> str:
 
 @cache
 def imports(path: Path) -> tuple[str, ...]:
-    """Returns the dotted name of every import of a file, wherever in the file it stands."""
+    """Returns the dotted name of every import of a file; one by `load` counts as well."""
     names: list[str] = []
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
@@ -80,7 +81,26 @@ def imports(path: Path) -> tuple[str, ...]:
             assert node.level == 0, f"{path} imports relatively"
             assert node.module
             names += [f"{node.module}.{alias.name}" for alias in node.names]
-    return tuple(names)
+    return (*names, *loads(path))
+
+
+def loads(path: Path) -> Iterator[str]:
+    """Yields the dotted name of everything that a file imports late, by `load("...")`."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "load":
+            for argument in node.args:
+                if str(getattr(argument, "value", "")).startswith("recon_cli."):
+                    yield argument.value
+
+
+def defined(path: Path) -> set[str]:
+    """Returns the names at the top of a file."""
+    names = {node.name for node in tree(path).body if isinstance(
+        node, (ast.FunctionDef, ast.ClassDef))}
+    assigned = [target for node in tree(path).body if isinstance(node, (ast.Assign, ast.AnnAssign))
+                for target in (node.targets if isinstance(node, ast.Assign) else [node.target])]
+    return names | {name.id for target in assigned for name in ast.walk(target)
+                    if isinstance(name, ast.Name)}
 
 
 def inside(path: Path) -> Iterator[tuple[str, ...]]:
@@ -104,6 +124,14 @@ def test_a_file_imports_only_what_lies_below_it() -> None:
         for name, *_ in inside(path) if name not in ALLOWED[part(path)] | {part(path)}}
     assert not wrong
     assert not list(inside(PACKAGE / "__init__.py"))
+
+
+def test_what_is_loaded_late_exists() -> None:
+    for path in FILES:
+        for name in loads(path):
+            module, _, symbol = name.rpartition(".")
+            file = PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py")
+            assert symbol in defined(file), f"{path.relative_to(PACKAGE)} loads {name}"
 
 
 def test_a_package_that_has_a_home_is_imported_nowhere_else() -> None:

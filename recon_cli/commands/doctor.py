@@ -1,19 +1,35 @@
-"""What this machine has to offer: programs, rasterizers, memory, disk."""
+"""The verb `recon doctor`: versions, rasterizers, memory and disk of this machine."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import click
 import psutil
 
 from recon_cli import machine
+from recon_cli.commands import options
+from recon_cli.commands.options import Call, pass_call, verb
 
 if TYPE_CHECKING:  # at run time it would import torch
     from recon_cli.render.registry import BackendStatus
+
+
+@verb("doctor")
+@click.option("--json", "as_json", is_flag=True, help="Print the same as JSON.  [default: off]")
+@options.common()
+@pass_call
+def doctor(call: Call, as_json: bool) -> None:
+    """Show versions, rasterizers, memory and disk."""
+    findings = examine(call.workspace)
+    click.echo(json.dumps(dataclasses.asdict(findings), indent=1) if as_json
+               else findings_text(findings))
 
 
 @dataclass(frozen=True)
@@ -63,3 +79,22 @@ def examine(workspace: Path) -> Findings:
         workspace=str(root),
         writable=place.is_dir() and os.access(place, os.W_OK | os.X_OK),
     )
+
+
+def findings_text(findings: Findings) -> str:
+    """Returns the findings, one line each."""
+    lines = [f"{name:<13} {version}" for name, version in findings.versions.items()]
+    lines.append(f"{'device':<13} {findings.device}")
+    for backend in findings.backends:
+        state = f"missing: {backend.missing}" if backend.missing else (
+            "runs on " + ", ".join(backend.devices))
+        lines.append(f"{'backend':<13} {backend.name}: {state}")
+    writable = "writable" if findings.writable else "NOT writable"
+    lines += [
+        f"{'cores':<13} {findings.cores}",
+        f"{'memory':<13} {findings.memory_free_bytes / 1e9:.1f} GB free of "
+        f"{findings.memory_total_bytes / 1e9:.1f} GB",
+        f"{'disk':<13} {findings.disk_free_bytes / 1e9:.1f} GB free",
+        f"{'workspace':<13} {findings.workspace} ({writable})",
+    ]
+    return "\n".join(lines)

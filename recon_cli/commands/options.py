@@ -61,6 +61,11 @@ class Call:
 pass_call = click.make_pass_decorator(Call, ensure=True)
 
 
+def verb(name: str) -> Callable[[Command], click.Command]:
+    """Returns a decorator that makes a function the command `recon NAME`."""
+    return click.command(name)
+
+
 def explicit(call: Call) -> Settings:
     """Returns what recon.toml, --config and --set set, checked.
 
@@ -122,14 +127,6 @@ def print_config() -> Decorator:
     return click.option(
         "--print-config", is_flag=True, expose_value=False, callback=_keep("print_config"),
         help="Print the options that would be used as TOML, and stop.  [default: off]")
-
-
-def compare() -> Decorator:
-    """Returns a decorator that adds --compare."""
-    return click.option(
-        "--compare", is_flag=True,
-        help="Print what each filter would gain and lose on this capture, write compare.json into "
-             "the workspace, and stop.  [default: off]")
 
 
 def sweep() -> Decorator:

@@ -1,4 +1,4 @@
-"""The verb `recon render`: what can be asked of it. Torch is imported only when it runs."""
+"""The verb `recon render`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.options import Call, pass_call
-from recon_cli.config import settings
+from recon_cli.commands.jobs import open_job
+from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TRAINING, Request
-from recon_cli.pipeline.plan import Job
-from recon_cli.progress import TqdmProgress
-from recon_cli.workspace.layout import Workspace
+from recon_cli.lazy import load
 
 
 def _outputs(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[str, ...]:
@@ -33,7 +31,7 @@ def _color(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
     return red, green, blue
 
 
-@click.command("render")
+@verb("render")
 @click.option(
     "--path", metavar="training|orbit|FILE.json",
     help="A smooth path through the training cameras in the order of their names, a circle around "
@@ -87,18 +85,15 @@ def render(
     width: int | None, height: int | None, background: tuple[int, int, int], codec: str | None,
     crf: int | None, out: Path | None,
 ) -> None:
-    """Render the trained model along a path, or its views.
+    """Render the trained model along a path, or at given views.
 
-    Pictures or a video of colour, depth and coverage. What an interrupted run has finished is kept;
-    beside the frames of a path lies camera_path.json, which --path takes again.
+    Images or a video of colour, depth and alpha. Finished frames of an interrupted run are kept.
+    The cameras of a path are written to camera_path.json, which --path accepts.
     """
     if path is not None and views:
         raise click.UsageError("--path and --views exclude each other.")
     request = Request(
         path or TRAINING, views, outputs, model, fps, seconds, size, width, height, background,
         form, codec, crf, out)
-    explicit = options.explicit(call)
-    compute = settings.build(ComputeConfig, settings.merged([explicit, call.settings]))
-    from recon_cli.flythrough.run import run
-
-    click.echo(run(request, Job(Workspace(call.workspace), explicit, compute, TqdmProgress())))
+    job, _ = open_job(call, ComputeConfig)
+    click.echo(load("recon_cli.flythrough.run.run")(request, job))

@@ -1,4 +1,4 @@
-"""The verb `recon view`: what can be asked of it. Torch and viser are imported when it runs."""
+"""The verb `recon view`, and the page that shows a training while it runs."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.options import Call, pass_call
-from recon_cli.config import settings
+from recon_cli.commands.jobs import open_job
+from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import Watcher
 from recon_cli.errors import InputError
-from recon_cli.pipeline.plan import Job
-from recon_cli.progress import TqdmProgress
+from recon_cli.lazy import load
 from recon_cli.workspace.layout import Workspace
 
 
-@click.command("view")
+@verb("view")
 @click.argument("item", metavar="[ITEM]", required=False, type=click.Path(path_type=Path))
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
@@ -43,30 +42,24 @@ from recon_cli.workspace.layout import Workspace
 def view(
     call: Call, item: Path | None, model: str, host: str, port: int | None, opening: bool | None
 ) -> None:
-    """Look at the trained scene in the browser.
+    """View the trained scene in the browser.
 
-    ITEM is a workspace in place of -w, or a file of Gaussians (.ply, .spz, .sog, .splat, .glb).
-    Ctrl-C ends it.
+    ITEM is a workspace (instead of -w) or a splat file (.ply, .spz, .sog, .splat, .glb). Ctrl-C
+    ends it.
     """
     workspace = _workspace(call, item)
     if item is not None and workspace is None and model != "auto":
         raise click.UsageError("--model has no effect on a file.")
-    from recon_cli.viewer.content import of_file, of_workspace
-    from recon_cli.viewer.photo_pairs import Pictures
-    from recon_cli.viewer.server import showing
-
     if workspace is None:
-        assert item is not None
-        content, pictures = of_file(item), None
+        content, photos = load("recon_cli.viewer.content.of_file")(item), None
     else:
         call.workspace = workspace
-        explicit = options.explicit(call)
-        compute = settings.build(ComputeConfig, settings.merged([explicit, call.settings]))
-        job = Job(Workspace(workspace), explicit, compute, TqdmProgress())
-        content = of_workspace(job, model)
-        pictures = Pictures(job, content.max_size)
+        job, _ = open_job(call, ComputeConfig)
+        content = load("recon_cli.viewer.content.of_workspace")(job, model)
+        photos = load("recon_cli.viewer.photo_pairs.Pictures")(job, content.max_size)
+    showing = load("recon_cli.viewer.server.showing")
     try:
-        with showing(content, pictures, host, port) as (_, address):
+        with showing(content, photos, host, port) as (_, address):
             click.echo(f"The scene is at {address} (Ctrl-C ends it)")
             if _at_a_desktop() if opening is None else opening:
                 webbrowser.open(address)
@@ -76,17 +69,15 @@ def view(
 
 
 @contextmanager
-def looking_on(call: Call) -> Iterator[Watcher]:
+def show_training(call: Call) -> Iterator[Watcher]:
     """Yields a watcher that shows a training in the browser, on this machine alone.
 
     Raises:
         ConfigError: no port is free.
     """
-    from recon_cli.viewer.live import LiveView
-    from recon_cli.viewer.server import HOST, serving
-
-    with serving(HOST, None, label="recon train") as (server, address):
-        live = LiveView(server, Workspace(call.workspace))
+    serving, host = load("recon_cli.viewer.server.serving"), load("recon_cli.viewer.server.HOST")
+    with serving(host, None, label="recon train") as (server, address):
+        live = load("recon_cli.viewer.live.LiveView")(server, Workspace(call.workspace))
         click.echo(f"The training can be watched at {address}")
         try:
             yield live
@@ -96,7 +87,7 @@ def looking_on(call: Call) -> Iterator[Watcher]:
 
 
 def _workspace(call: Call, item: Path | None) -> Path | None:
-    """Returns the workspace that is meant, None where a file is.
+    """Returns the workspace to show; None where ITEM is a file.
 
     Raises:
         InputError: there is no such file or workspace.
@@ -112,13 +103,13 @@ def _workspace(call: Call, item: Path | None) -> Path | None:
         return None
     if not Workspace(item).holds_results:
         raise InputError(
-            f"{item} is neither a workspace nor a file of Gaussians.",
-            hint="Give a folder that `recon train` was run in, or a file of Gaussians.")
+            f"{item} is neither a workspace nor a splat file.",
+            hint="Give a folder that `recon train` was run in, or a splat file.")
     return item
 
 
 def _at_a_desktop() -> bool:
-    """Returns whether a browser would come up beside this terminal and not in it."""
+    """Returns whether a browser would open in a window and not inside this terminal."""
     desktop = sys.platform in ("darwin", "win32") or bool(
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     return sys.stdout.isatty() and desktop

@@ -88,18 +88,3 @@ def number(value: float | None, digits: int = 3) -> str:
 def percent(value: float | None) -> str:
     """Returns a share in percent, "-" for one that is not known."""
     return "-" if value is None else f"{100 * value:.3g}%"
-
-
-def format_duration(seconds: float) -> str:
-    """Returns seconds as a person says them: 8.2 s, 4 min 10 s, 1 h 05 min."""
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-def format_megabytes(size: int) -> str:
-    """Returns a number of bytes in MB."""
-    return f"{size / 1e6:.1f} MB"

@@ -21,7 +21,7 @@ class Freed:
     size: int
 
 
-def clean(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:
+def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:
     """Removes what can be spared and returns it.
 
     Without `stages` that is unfinished work, replaced results, and large volatile files: what is

@@ -14,8 +14,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
-from recon_cli.evaluation.tables import format_duration, format_megabytes
 from recon_cli.pipeline.execute import Job, last_sources
+from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.capture import capture
 from recon_cli.report.curves import curve, curves, rounds
 from recon_cli.report.headline import facts, headline

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recon_cli.evaluation.tables import format_duration, format_megabytes
+from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.records import BASE, PRUNED, Metrics
 from recon_cli.report.stage_status import Standing
 from recon_cli.workspace.summaries import IngestSummary, SfmSummary

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from recon_cli.evaluation.tables import Table, format_megabytes
+from recon_cli.evaluation.tables import Table
+from recon_cli.progress import format_megabytes
 from recon_cli.report.records import BASE, MODELS, PRUNED, Interval, Metrics, ModelRow
 
 LABELS = {BASE: "base", PRUNED: "pruned"}

@@ -9,9 +9,9 @@ import fake_stages
 import pytest
 from fake_stages import NAMES
 
-from recon_cli import __version__, cli
-from recon_cli.cli import main
-from recon_cli.commands import shared
+from recon_cli import __version__
+from recon_cli.cli import VERBS, cli, main
+from recon_cli.commands import jobs, stages, workspace
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import StageStatus
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def _fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fake_stages.actions.clear()
     fake_stages.ran.clear()
-    for module in (cli, shared):
+    for module in (jobs, stages, workspace):
         monkeypatch.setattr(module, "STAGES", fake_stages.TABLE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("RECON_WORKSPACE", raising=False)
@@ -68,7 +68,7 @@ def test_run_can_leave_pruning_out() -> None:
 def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
     capsys: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "SAMPLE", Path("room.mp4").absolute())
+    monkeypatch.setattr(stages, "SAMPLE", Path("room.mp4").absolute())
     monkeypatch.setenv("RECON_WORKSPACE", "elsewhere")
     assert main(["demo", "--set", "train.iterations=10"]) == 0
     assert fake_stages.ran == NAMES
@@ -81,8 +81,8 @@ def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
 
 
 def test_the_bundled_video_is_there(sample_video: Path) -> None:
-    assert sample_video == cli.SAMPLE
-    assert cli.SAMPLE.exists()
+    assert sample_video == stages.SAMPLE
+    assert stages.SAMPLE.exists()
 
 
 def test_train_prune_branches_off_in_the_middle() -> None:
@@ -300,7 +300,15 @@ def test_the_version_is_printed(capsys: Said) -> None:
     assert capsys.readouterr().out == f"recon, version {__version__}\n"
 
 
-@pytest.mark.parametrize("verb", list(cli.cli.commands))
-def test_every_verb_has_help(verb: str, capsys: Said) -> None:
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_and_its_first_line_in_the_list_of_verbs(
+    verb: str, capsys: Said
+) -> None:
     assert main([verb, "--help"]) == 0
-    assert "Usage: recon" in capsys.readouterr().out
+    assert f"Usage: recon {verb}" in capsys.readouterr().out
+    assert (cli.commands[verb].help or "").splitlines()[0] == VERBS[verb][1]
+
+
+def test_a_mistyped_verb_is_corrected(capsys: Said) -> None:
+    assert main(["trian"]) == 2
+    assert "train" in capsys.readouterr().err

@@ -14,7 +14,7 @@ import fake_stages
 import pytest
 from fake_stages import STEPS, bring, job_at, stale
 
-from recon_cli.commands import console
+from recon_cli.commands.workspace import status_table
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.errors import BackendError, InputError, ManifestError, StageError, WorkspaceError
@@ -192,7 +192,7 @@ def test_an_interrupted_run_is_partial_until_what_it_reads_changes(job: Job) -> 
     shutil.rmtree(job.workspace.folder("train"))
     one = plan.status(job)[3]
     assert (one.state, one.done, one.total) == ("partial", 0, 0)
-    assert "partial (just begun)" in console.status_table([one])
+    assert "partial (just begun)" in status_table([one])
     with pytest.raises(StageError, match=r"unfinished \(just begun\)") as caught:
         bring(job, "prune", again=True)
     assert caught.value.hint == "Run `recon train --iterations 100` first."

@@ -1,0 +1,109 @@
+"""What verbs share: a job made from the options, stages brought up to date, what is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from recon_cli.commands.options import Call, explicit
+from recon_cli.config import settings as layers
+from recon_cli.config.settings import C, Settings
+from recon_cli.config.stages import ComputeConfig, TrainConfig
+from recon_cli.context import Nobody, Watcher
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.plan import Job, Outcome, Target
+from recon_cli.progress import TqdmProgress, format_duration
+from recon_cli.stages import STAGES
+from recon_cli.workspace.layout import Workspace
+
+
+def run_stages(
+    call: Call,
+    verb: str,
+    stages: Sequence[str],
+    *,
+    sources: tuple[Path, ...] = (),
+    base: Settings | None = None,
+    forced: Settings | None = None,
+    watcher: Watcher | None = None,
+) -> None:
+    """Runs stages one after the other, or prints their options.
+
+    Args:
+        call: what was typed.
+        verb: named to other processes that want the workspace.
+        stages: by name, in the order of the table.
+        sources: the user's files, for ingest.
+        base: defaults of the verb; recon.toml, --config and options win over them.
+        forced: settings that the verb implies; they win over everything.
+        watcher: observes the training.
+    """
+    file_settings = explicit(call)
+    values = layers.merged(
+        [base or {}, file_settings, _of_all_processes(call, file_settings), forced or {}])
+    rows = [row for row in STAGES if row.name in stages]
+    configs = {row.name: layers.build(row.config, values) for row in rows}
+    compute = layers.build(ComputeConfig, values)
+    if call.print_config:
+        click.echo(layers.to_toml({**configs, "compute": compute}), nl=False)
+        return
+    job = Job(
+        Workspace(call.workspace), file_settings, compute, TqdmProgress(), report_outcome, STAGES,
+        watcher or Nobody(), call.ranks)
+    targets = [
+        Target(row.name, configs[row.name], () if row.needs else sources) for row in rows]
+    plan.run(job, verb, targets, again=call.again)
+    if "evaluate" in stages:
+        click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
+
+
+def _of_all_processes(call: Call, file_settings: Settings) -> Settings:
+    """Returns the settings that were typed, with the views that all processes together take.
+
+    `--batch-views` counts those of one process. What is recorded, and what files and --set say, are
+    the views of a step: a result does not depend on who computed it.
+    """
+    typed = call.settings.get("train", {}).get("batch_views")
+    if typed is None and "batch_views" not in file_settings.get("train", {}):
+        typed = TrainConfig.batch_views
+    total = {} if typed is None else {"batch_views": typed * call.ranks.count}
+    return layers.merged([call.settings, {"train": total}])
+
+
+def open_job(call: Call, kind: type[C]) -> tuple[Job, C]:
+    """Returns a job on the workspace that runs no stage, and the options of one config class."""
+    file_settings = explicit(call)
+    values = layers.merged([file_settings, call.settings])
+    compute = layers.build(ComputeConfig, values)
+    job = Job(
+        Workspace(call.workspace), file_settings, compute, TqdmProgress(), table=STAGES,
+        ranks=call.ranks)
+    return job, layers.build(kind, values)
+
+
+def report_outcome(outcome: Outcome) -> None:
+    """Prints one line about a stage: its summary, or that it is up to date."""
+    if outcome.ran:
+        run = outcome.manifest.run
+        summary = ": ".join(filter(None, [outcome.stage, summary_text(run.summary)]))
+        click.echo(f"{summary} ({format_duration(run.seconds)})")
+    else:
+        click.echo(f"{outcome.stage} is up to date")
+
+
+def summary_text(summary: Mapping[str, Any]) -> str:
+    """Returns a stage's summary on one line: numbers and words, no lists, nothing that is empty."""
+    return ", ".join(
+        f"{name.replace('_', ' ')} {_value_text(value)}" for name, value in summary.items()
+        if value is not None and value != "" and not isinstance(value, (list, dict)))
+
+
+def _value_text(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,178 @@
+"""The verbs that run stages: one each, and `run` and `demo`, which run them all."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import nullcontext
+from pathlib import Path
+
+import click
+
+from recon_cli.commands import options
+from recon_cli.commands.jobs import open_job, run_stages
+from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.commands.view import show_training
+from recon_cli.config.settings import Settings
+from recon_cli.config.stages import (
+    ComputeConfig,
+    DenoiseConfig,
+    EvaluateConfig,
+    ExportConfig,
+    IngestConfig,
+    PruneConfig,
+    SfmConfig,
+    TrainConfig,
+)
+from recon_cli.lazy import load
+from recon_cli.stages import STAGES
+
+SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
+MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune while training goes on
+FORMS = ("text", "markdown", "csv", "latex", "json")
+
+_inputs = click.argument(
+    "inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))
+
+
+@verb("ingest")
+@_inputs
+@options.stage(IngestConfig)
+@pass_call
+def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
+    """Choose frames from videos, photos or a data set with poses.
+
+    INPUT: videos, photos, folders of photos, or a COLMAP model, transforms.json, Replica or ScanNet
+    scene, recognised by its layout. Each video and each folder gets its own intrinsics. Without
+    INPUT, the previous input is used.
+    """
+    run_stages(call, "ingest", ["ingest"], sources=inputs)
+
+
+@verb("denoise")
+@click.option(
+    "--compare", is_flag=True,
+    help="Print what each filter would gain and lose on this capture, write compare.json into the "
+         "workspace, and stop.  [default: off]")
+@options.stage(DenoiseConfig)
+@pass_call
+def denoise(call: Call, compare: bool) -> None:
+    """Filter noisy frames and pass the others through."""
+    if compare:
+        compare_filters = load("recon_cli.commands.compare_filters.compare_filters")
+        click.echo(compare_filters(*open_job(call, DenoiseConfig)))
+        return
+    run_stages(call, "denoise", ["denoise"])
+
+
+@verb("sfm")
+@options.stage(SfmConfig)
+@pass_call
+def sfm(call: Call) -> None:
+    """Estimate cameras and a sparse point cloud."""
+    run_stages(call, "sfm", ["sfm"])
+
+
+@verb("train")
+@click.option(
+    "--prune", "with_prune", is_flag=True,
+    help="Then prune the state in mid-training and finish from there.  [default: off]")
+@options.of(PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"), lead="With --prune: ")
+@click.option(
+    "--view", "with_view", is_flag=True,
+    help="Show the training in the browser; the result is the same.  [default: off]")
+@options.stage(TrainConfig, renders=True)
+@pass_call
+def train(call: Call, with_prune: bool, with_view: bool) -> None:
+    """Fit Gaussians; denoise and sfm run first where needed."""
+    for name in call.settings.get("prune", {}) if not with_prune else ():
+        raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
+    with show_training(call) if with_view and not call.print_config else nullcontext() as watcher:
+        if with_prune:
+            run_stages(call, "train --prune", ["train", "prune"], forced=MID, watcher=watcher)
+        else:
+            run_stages(call, "train", ["train"], watcher=watcher)
+
+
+@verb("prune")
+@options.sweep()
+@options.stage(PruneConfig, renders=True)
+@pass_call
+def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
+    """Remove the least important Gaussians and fine-tune the rest."""
+    if sweep:
+        run_sweep = load("recon_cli.commands.prune_sweep.sweep")
+        click.echo(run_sweep(*open_job(call, PruneConfig), ratios))
+        return
+    run_stages(call, "prune", ["prune"])
+
+
+@verb("eval")
+@click.argument("items", metavar="[ITEM]...", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--seeds", type=click.IntRange(min=1), metavar="N",
+    help="Train the models N - 1 more times with other seeds; print mean and deviation.  "
+         "[default: off]")
+@click.option(
+    "--form", type=click.Choice(FORMS), default="text",
+    help="With ITEM or --seeds: format of the table.  [default: text]")
+@options.stage(EvaluateConfig, renders=True)
+@pass_call
+def evaluate(call: Call, items: tuple[Path, ...], seeds: int | None, form: str) -> None:
+    """Score every model on the held-out views.
+
+    With ITEM, workspaces and splat files (.ply, .spz, .sog, .splat, .glb): their models in one
+    table. Files are scored on the views of the workspace.
+    """
+    if items and seeds:
+        raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
+    if seeds:
+        score_seeds = load("recon_cli.commands.compare_scores.over_seeds")
+        click.echo(score_seeds(*open_job(call, EvaluateConfig), seeds, form))
+        return
+    if items:
+        compare = load("recon_cli.commands.compare_scores.compare")
+        click.echo(compare(
+            lambda path: open_job(dataclasses.replace(call, workspace=path), EvaluateConfig),
+            call.workspace, items, form))
+        return
+    run_stages(call, "eval", ["evaluate"])
+
+
+@verb("export")
+@options.stage(ExportConfig, renders=True)
+@pass_call
+def export(call: Call) -> None:
+    """Write a .ply and other formats that viewers open; verify each."""
+    run_stages(call, "export", ["export"])
+
+
+@verb("run")
+@_inputs
+@click.option(
+    "--prune/--no-prune", "with_prune", default=True,
+    help="Also prune in mid-training.  [default: on]")
+@options.assignments()
+@options.of(ComputeConfig)
+@options.again()
+@options.print_config()
+@options.common()
+@pass_call
+def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
+    """Run every stage from INPUT to the exported .ply.
+
+    INPUT is what `recon ingest` takes. Without it, the previous input is used.
+    """
+    stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
+    run_stages(call, "run", stages, sources=inputs, base=MID)
+
+
+@verb("demo")
+@options.assignments()
+@options.of(ComputeConfig)
+@options.again()
+@options.common(workspace="demo", envvar=None)
+@pass_call
+def demo(call: Call) -> None:
+    """Run every stage on the bundled room video."""
+    run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=MID)
+    click.echo(f"The scene is in {call.workspace / 'export' / 'splats.ply'}")

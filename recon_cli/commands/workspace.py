@@ -1,0 +1,99 @@
+"""The verbs that look at a workspace or tidy it: status, clean, report."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from recon_cli.commands import options
+from recon_cli.commands.jobs import open_job, summary_text
+from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.config.stages import ComputeConfig
+from recon_cli.lazy import load
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.clean import free_space
+from recon_cli.pipeline.plan import Job, StageStatus
+from recon_cli.progress import format_duration, format_megabytes
+from recon_cli.stages import STAGES
+from recon_cli.workspace.layout import Workspace
+
+logger = logging.getLogger("recon")
+
+
+@verb("status")
+@click.option(
+    "--json", "as_json", is_flag=True,
+    help="Print JSON: workspace, and stages with name, state, reasons, done, total, seconds, "
+         "summary, notices.  [default: off]")
+@options.common()
+@pass_call
+def status(call: Call, as_json: bool) -> None:
+    """Show which stages are fresh, stale and why, or missing."""
+    job, _ = open_job(call, ComputeConfig)
+    stages = plan.status(job)
+    if as_json:
+        click.echo(json.dumps({
+            "workspace": str(job.workspace.root),
+            "stages": [dataclasses.asdict(stage) for stage in stages]}, indent=1))
+        return
+    if not job.workspace.root.exists():
+        logger.warning("there is no workspace at %s yet", job.workspace.root)
+    click.echo(status_table(stages))
+    for stage in stages:
+        for notice in stage.notices:
+            logger.warning("%s: %s", stage.name, notice)
+
+
+def status_table(stages: Sequence[StageStatus]) -> str:
+    """Returns stage, state, time, and reasons or summary, one line a stage."""
+    rows = [("stage", "state", "time", "")]
+    for stage in stages:
+        state = f"partial ({stage.how_far})" if stage.state == "partial" else stage.state
+        time = "" if stage.seconds is None else format_duration(stage.seconds)
+        rows.append((
+            stage.name, state, time, "; ".join(stage.reasons) or summary_text(stage.summary)))
+    widths = [max(len(row[column]) for row in rows) for column in range(3)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True))
+             for row in rows]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+@verb("clean")
+@click.argument(
+    "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice([row.name for row in STAGES]))
+@click.option("--dry-run", is_flag=True, help="Only print what would be removed.  [default: off]")
+@options.common()
+@pass_call
+def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
+    """Free disk space.
+
+    Without STAGE, removes unfinished work and scratch files and keeps every finished result. With
+    STAGE, removes the results of those stages.
+    """
+    job = Job(Workspace(call.workspace), table=STAGES)  # recon.toml may be damaged
+    freed = free_space(job, stages, dry=dry_run)
+    for item in freed:
+        click.echo(f"{item.path}: {format_megabytes(item.size)}")
+    outcome = "would be freed" if dry_run else "freed"
+    click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
+
+
+@verb("report")
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), metavar="FILE.html",
+    help="File to write.  [default: report.html in the workspace]")
+@options.common()
+@pass_call
+def report(call: Call, out: Path | None) -> None:
+    """Write an HTML report: capture, scores, views, settings.
+
+    It is one file that any browser opens without a network. No stage is run; the report names what
+    is missing or stale, with the command to type.
+    """
+    job, _ = open_job(call, ComputeConfig)
+    click.echo(load("recon_cli.report.build.write")(job, out))
