@@ -96,4 +96,4 @@ def report(call: Call, out: Path | None) -> None:
     is missing or stale, with the command to type.
     """
     job, _ = open_job(call, ComputeConfig)
-    click.echo(load("recon_cli.report.build.write")(job, out))
+    click.echo(load("recon_cli.report.build.write_report")(job, out))

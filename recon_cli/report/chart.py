@@ -1,7 +1,7 @@
-"""Charts as inline SVG: axes with units, ticks, marks that differ in shape, a legend.
+"""Charts as inline SVG: linear or logarithmic axes with units, lines, marks, a legend.
 
-matplotlib is an extra, and what it draws knows nothing of the page's light and dark colours. Only
-what this page needs is here: lines and marks over two axes, each linear or logarithmic.
+matplotlib is an optional dependency, and its figures do not follow the page's light and dark
+colours, so the few things that the report needs are drawn here.
 """
 
 from __future__ import annotations
@@ -13,112 +13,41 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-_STEPS = (1.0, 2.0, 5.0, 10.0)  # a tick lies at a multiple of one of these and a power of ten
-_NEAR_ZERO = 0.2  # of the highest value
-_LEAST_DECADES = 1.0  # below, a logarithmic axis has too few round numbers and takes linear ticks
-
-
-def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """Returns round numbers from `low` to `high`, at most `most` and at least two.
-
-    Args:
-        low: end of the axis.
-        high: the other end, above `low`.
-        most: how many there may be, 3 or more.
-    """
-    rough = (high - low) / (most - 1)
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(one * power for one in _STEPS if one * power >= rough * (1 - 1e-9))
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    return [number * step for number in range(first, last + 1)]
-
-
-def log_ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """Returns 1, 2, 5 times powers of ten from `low` to `high`, or powers alone where many fit.
-
-    Args:
-        low: end of the axis, above 0.
-        high: the other end, above `low`.
-        most: how many there may be.
-    """
-    if math.log10(high / low) < _LEAST_DECADES:
-        return [tick for tick in linear_ticks(low, high, most) if tick > 0]
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    for factors in ((1, 2, 5), (1, 3), (1,)):
-        ticks = [factor * 10.0 ** power for power in powers for factor in factors]
-        inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
-        if len(inside) <= most:
-            return inside
-    return inside[::math.ceil(len(inside) / most)]
-
-
-def widened(values: Sequence[float], *, log: bool) -> tuple[float, float]:
-    """Returns the ends of an axis that holds all values with a little room, never an empty one."""
-    low, high = min(values), max(values)
-    if log:
-        room = max((high / low) ** 0.04, 1.05)
-        return low / room, high * room
-    room = max(0.05 * (high - low), 1e-3 * abs(high), 1e-9)
-    # counts and seconds begin at 0: an axis that begins near it begins there
-    return (0.0 if 0 <= low < _NEAR_ZERO * high else low - room), high + room
-
-
-def shown(value: float) -> str:
-    """Returns a tick's number as short as can be read: 0.02, 1,500, 20k, 1.5M."""
-    if value == 0 or abs(value) < 1e-12:
-        return "0"
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
-        if abs(value) >= size * (1 - 1e-9):
-            return f"{value / (1e3 if letter == 'k' else size):.6g}{letter}"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.6g}"
-
-
 WIDTH, HEIGHT = 480, 300  # of the drawing; the page scales it
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 12, 44
 _TOP_AXIS = 34  # more room above for a second x axis
 _TICK_CHARS = 62  # pixels that a label of the x axis takes
 MARKS = ("circle", "square", "diamond", "triangle", "cross", "ring", "plus", "bar")
 
+_STEPS = (1.0, 2.0, 5.0, 10.0)  # a tick lies at a multiple of one of these and a power of ten
+_NEAR_ZERO = 0.2  # of the highest value
+_LEAST_DECADES = 1.0  # below, a logarithmic axis has too few round numbers and takes linear ticks
+
 
 @dataclass(frozen=True)
 class Axis:
-    """What an axis shows.
+    """An axis of a chart."""
 
-    Attributes:
-        label: with its unit.
-        log: logarithmic; values of 0 and below are left out.
-    """
-
-    label: str
-    log: bool = False
+    label: str  # with its unit
+    log: bool = False  # values of 0 and below are left out
 
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one kind.
+    """The points of one line or one group of marks."""
 
-    Attributes:
-        label: in the legend.
-        points: (x, y) in the order in which a line joins them.
-        color: 0 to 7, of the page's palette.
-        mark: one of MARKS, or empty for a line alone.
-        line: whether it joins the points.
-        dashed: whether the line is dashed.
-        big: marks that must be seen first.
-    """
-
-    label: str
-    points: tuple[tuple[float, float], ...]
-    color: int = 0
-    mark: str = ""
+    label: str  # in the legend
+    points: tuple[tuple[float, float], ...]  # (x, y) in the order in which a line joins them
+    color: int = 0  # 0 to 7, of the page's palette
+    mark: str = ""  # one of MARKS, or empty for a line alone
     line: bool = True
     dashed: bool = False
-    big: bool = False
+    big: bool = False  # draws larger marks
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Where a value lies on an axis of `length` pixels that runs from `low` to `high`."""
+    """Maps values from `low` to `high` to pixels from 0 to `length`."""
 
     low: float
     high: float
@@ -132,15 +61,15 @@ class Scale:
         return self.length * (value - self.low) / (self.high - self.low)
 
     def ticks(self, most: int) -> list[float]:
-        """Returns where its ticks lie."""
+        """Returns the values that get a tick."""
         return (log_ticks if self.log else linear_ticks)(self.low, self.high, most)
 
 
-def chart(
+def draw_chart(
     title: str, x: Axis, y: Axis, series: Sequence[Series], *,
     above: tuple[str, float] | None = None,
 ) -> Markup:
-    """Returns a figure with its caption and legend; a sentence where there is nothing to draw.
+    """Returns a figure with caption and legend, or a sentence where there is nothing to draw.
 
     Args:
         title: of the figure.
@@ -149,95 +78,31 @@ def chart(
         series: later ones are drawn over earlier ones.
         above: label of a second x axis, and how many of its units one of `x` is.
     """
-    drawn = [one for one in (_drawable(one, x, y) for one in series) if one.points]
-    if not drawn:
+    lines = [line for line in (_drop_undrawable(line, x, y) for line in series) if line.points]
+    if not lines:
         return Markup('<figure class="chart"><figcaption>{}</figcaption>'
                       '<p class="empty">Nothing was recorded.</p></figure>').format(title)
     top = _TOP + (_TOP_AXIS if above else 0)
-    across = _scale([p[0] for one in drawn for p in one.points], x, WIDTH - _LEFT - _RIGHT)
-    up = _scale([p[1] for one in drawn for p in one.points], y, HEIGHT - top - _BOTTOM)
+    across = _fit_scale([p[0] for line in lines for p in line.points], x, WIDTH - _LEFT - _RIGHT)
+    up = _fit_scale([p[1] for line in lines for p in line.points], y, HEIGHT - top - _BOTTOM)
 
     def place(point: tuple[float, float]) -> tuple[float, float]:
         return _LEFT + across(point[0]), HEIGHT - _BOTTOM - up(point[1])
 
-    parts = [*_axes(x, y, across, up, top)]
+    parts = _draw_axes(x, y, across, up, top)
     if above:
-        parts += _axis_above(above, across, x, top)
-    parts += [_line(one, place) for one in drawn if one.line]
-    parts += [mark for one in drawn if one.mark for mark in _marks(one, place, x, y)]
+        parts += _draw_top_axis(above, across, x, top)
+    parts += [_draw_line(line, place) for line in lines if line.line]
+    parts += [mark for line in lines if line.mark for mark in _draw_marks(line, place, x, y)]
     return Markup(
         '<figure class="chart"><figcaption>{}</figcaption>'
         '<svg viewBox="0 0 {} {}" role="img" aria-label="{}">{}</svg>{}</figure>').format(
-            title, WIDTH, HEIGHT, title, Markup("").join(parts), _legend(drawn))
+            title, WIDTH, HEIGHT, title, Markup("").join(parts), _draw_legend(lines))
 
 
-def _drawable(one: Series, x: Axis, y: Axis) -> Series:
-    """Returns a series without what its axes cannot show."""
-    points = tuple(
-        point for point in one.points if all(map(math.isfinite, point))
-        and not (x.log and point[0] <= 0) and not (y.log and point[1] <= 0))
-    return dataclasses.replace(one, points=points)
-
-
-def _scale(values: Sequence[float], axis: Axis, length: float) -> Scale:
-    low, high = widened(values, log=axis.log)
-    return Scale(low, high, axis.log, length)
-
-
-def _axes(x: Axis, y: Axis, across: Scale, up: Scale, top: int) -> list[Markup]:
-    floor, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
-    parts = []
-    for tick in up.ticks(7):
-        at = round(floor - up(tick), 1)
-        parts += [Markup('<line class="grid" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(
-            _LEFT, right, at, at), _text(_LEFT - 7, at + 4, shown(tick), "end")]
-    for tick in across.ticks(round(across.length / _TICK_CHARS)):
-        at = round(_LEFT + across(tick), 1)
-        parts += [Markup('<line class="grid" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(
-            at, at, top, floor), _text(at, floor + 17, shown(tick), "middle")]
-    middle = round((top + floor) / 2, 1)
-    return [
-        *parts,
-        Markup('<path class="axis" d="M{},{}V{}H{}"/>').format(_LEFT, top, floor, right),
-        _text((_LEFT + right) / 2, HEIGHT - 7, x.label, "middle"),
-        Markup('<text class="label" x="13" y="{}" text-anchor="middle" '
-               'transform="rotate(-90 13 {})">{}</text>').format(middle, middle, y.label)]
-
-
-def _axis_above(above: tuple[str, float], across: Scale, x: Axis, top: int) -> list[Markup]:
-    label, factor = above
-    other = Scale(across.low * factor, across.high * factor, x.log, across.length)
-    parts = [_text((_LEFT + WIDTH - _RIGHT) / 2, 13, label, "middle")]
-    for tick in other.ticks(round(across.length / _TICK_CHARS)):
-        at = round(_LEFT + other(tick), 1)
-        parts += [Markup('<line class="axis" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(
-            at, at, top, top - 5), _text(at, top - 9, shown(tick), "middle")]
-    return parts
-
-
-def _text(x: float, y: float, text: str, anchor: str) -> Markup:
-    return Markup('<text class="label" x="{}" y="{}" text-anchor="{}">{}</text>').format(
-        round(x, 1), round(y, 1), anchor, text)
-
-
-def _line(one: Series, place: Callable[[tuple[float, float]], tuple[float, float]]) -> Markup:
-    way = "L".join(f"{x:.1f},{y:.1f}" for x, y in map(place, one.points))
-    return Markup('<path class="line c{}{}" d="M{}"/>').format(
-        one.color, " dashed" if one.dashed else "", way)
-
-
-def _marks(
-    one: Series, place: Callable[[tuple[float, float]], tuple[float, float]], x: Axis, y: Axis
-) -> list[Markup]:
-    """Returns the marks of a series, each of which tells its values to a pointer that rests."""
-    return [mark(one.mark, *place(point), 6.0 if one.big else 3.5, one.color, (
-        f"{one.label}: {x.label} {point[0]:,.6g}, {y.label} {point[1]:,.6g}"))
-        for point in one.points]
-
-
-def mark(shape: str, x: float, y: float, r: float, color: int, title: str = "") -> Markup:
-    """Returns one mark, `r` pixels in radius; its title is shown to a pointer that rests on it."""
-    ways = {
+def draw_mark(shape: str, x: float, y: float, r: float, color: int, title: str = "") -> Markup:
+    """Returns one mark of radius `r` pixels; the browser shows its title as a tooltip."""
+    paths = {
         "circle": f"M{x - r:.1f},{y:.1f}a{r},{r} 0 1 0 {2 * r},0a{r},{r} 0 1 0 {-2 * r},0",
         "ring": f"M{x - r:.1f},{y:.1f}a{r},{r} 0 1 0 {2 * r},0a{r},{r} 0 1 0 {-2 * r},0",
         "square": f"M{x - r:.1f},{y - r:.1f}h{2 * r}v{2 * r}h{-2 * r}z",
@@ -250,25 +115,134 @@ def mark(shape: str, x: float, y: float, r: float, color: int, title: str = "") 
     }
     hollow = " hollow" if shape in ("ring", "cross", "plus", "bar") else ""
     return Markup('<path class="mark c{}{}" d="{}">{}</path>').format(
-        color, hollow, ways[shape], Markup("<title>{}</title>").format(title) if title else "")
+        color, hollow, paths[shape], Markup("<title>{}</title>").format(title) if title else "")
 
 
-def _legend(drawn: Sequence[Series]) -> Markup:
-    if len(drawn) == 1:
-        return Markup("")  # the caption and the axis say it
-    entries = Markup("").join(entry(one.label, _sample(one)) for one in drawn)
-    return Markup('<ul class="legend">{}</ul>').format(entries)
-
-
-def _sample(one: Series) -> Markup:
-    """Returns a piece of a series as its legend shows it."""
-    line = Markup('<path class="line c{}{}" d="M1,7H25"/>').format(
-        one.color, " dashed" if one.dashed else "")
-    dot = mark(one.mark, 13, 7, 5 if one.big else 3.5, one.color) if one.mark else Markup("")
-    return Markup("{}{}").format(line if one.line else "", dot)
-
-
-def entry(label: str, drawing: Markup) -> Markup:
-    """Returns an entry of a legend: what is drawn and what it stands for."""
+def legend_item(label: str, drawing: Markup) -> Markup:
+    """Returns an entry of a legend: a drawing and what it stands for."""
     return Markup('<li><svg viewBox="0 0 26 14" aria-hidden="true">{}</svg>{}</li>').format(
         drawing, label)
+
+
+def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Returns round numbers from `low` to `high`, at least two and at most `most` (3 or more)."""
+    rough = (high - low) / (most - 1)
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * power for factor in _STEPS if factor * power >= rough * (1 - 1e-9))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [number * step for number in range(first, last + 1)]
+
+
+def log_ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Returns 1, 2, 5 times powers of ten from `low` to `high`, or powers alone where many fit."""
+    if math.log10(high / low) < _LEAST_DECADES:
+        return [tick for tick in linear_ticks(low, high, most) if tick > 0]
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    for factors in ((1, 2, 5), (1, 3), (1,)):
+        ticks = [factor * 10.0 ** power for power in powers for factor in factors]
+        inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
+        if len(inside) <= most:
+            return inside
+    return inside[::math.ceil(len(inside) / most)]
+
+
+def axis_limits(values: Sequence[float], *, log: bool) -> tuple[float, float]:
+    """Returns the ends of an axis that holds all values with a little room, never an empty one."""
+    low, high = min(values), max(values)
+    if log:
+        room = max((high / low) ** 0.04, 1.05)
+        return low / room, high * room
+    room = max(0.05 * (high - low), 1e-3 * abs(high), 1e-9)
+    # an axis whose values start near zero starts at zero, as counts and seconds do
+    return (0.0 if 0 <= low < _NEAR_ZERO * high else low - room), high + room
+
+
+def tick_label(value: float) -> str:
+    """Returns a number in short form: 0.02, 1,500, 20k, 1.5M."""
+    if value == 0 or abs(value) < 1e-12:
+        return "0"
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
+        if abs(value) >= size * (1 - 1e-9):
+            return f"{value / (1e3 if letter == 'k' else size):.6g}{letter}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.6g}"
+
+
+def _drop_undrawable(series: Series, x: Axis, y: Axis) -> Series:
+    """Returns a series without the points that its axes cannot show."""
+    return dataclasses.replace(series, points=tuple(
+        point for point in series.points if all(map(math.isfinite, point))
+        and not (x.log and point[0] <= 0) and not (y.log and point[1] <= 0)))
+
+
+def _fit_scale(values: Sequence[float], axis: Axis, length: float) -> Scale:
+    low, high = axis_limits(values, log=axis.log)
+    return Scale(low, high, axis.log, length)
+
+
+def _draw_axes(x: Axis, y: Axis, across: Scale, up: Scale, top: int) -> list[Markup]:
+    floor, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
+    grid_line = Markup('<line class="grid" x1="{}" x2="{}" y1="{}" y2="{}"/>')
+    parts = []
+    for tick in up.ticks(7):
+        at = round(floor - up(tick), 1)
+        parts += [grid_line.format(_LEFT, right, at, at),
+                  _draw_text(_LEFT - 7, at + 4, tick_label(tick), "end")]
+    for tick in across.ticks(round(across.length / _TICK_CHARS)):
+        at = round(_LEFT + across(tick), 1)
+        parts += [grid_line.format(at, at, top, floor),
+                  _draw_text(at, floor + 17, tick_label(tick), "middle")]
+    middle = round((top + floor) / 2, 1)
+    return [
+        *parts,
+        Markup('<path class="axis" d="M{},{}V{}H{}"/>').format(_LEFT, top, floor, right),
+        _draw_text((_LEFT + right) / 2, HEIGHT - 7, x.label, "middle"),
+        Markup('<text class="label" x="13" y="{}" text-anchor="middle" '
+               'transform="rotate(-90 13 {})">{}</text>').format(middle, middle, y.label)]
+
+
+def _draw_top_axis(above: tuple[str, float], across: Scale, x: Axis, top: int) -> list[Markup]:
+    label, factor = above
+    scale = Scale(across.low * factor, across.high * factor, x.log, across.length)
+    parts = [_draw_text((_LEFT + WIDTH - _RIGHT) / 2, 13, label, "middle")]
+    for tick in scale.ticks(round(across.length / _TICK_CHARS)):
+        at = round(_LEFT + scale(tick), 1)
+        parts += [Markup('<line class="axis" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(
+            at, at, top, top - 5), _draw_text(at, top - 9, tick_label(tick), "middle")]
+    return parts
+
+
+def _draw_text(x: float, y: float, text: str, anchor: str) -> Markup:
+    return Markup('<text class="label" x="{}" y="{}" text-anchor="{}">{}</text>').format(
+        round(x, 1), round(y, 1), anchor, text)
+
+
+def _draw_line(
+    series: Series, place: Callable[[tuple[float, float]], tuple[float, float]]
+) -> Markup:
+    path = "L".join(f"{x:.1f},{y:.1f}" for x, y in map(place, series.points))
+    return _line_path(series, path)
+
+
+def _line_path(series: Series, path: str) -> Markup:
+    return Markup('<path class="line c{}{}" d="M{}"/>').format(
+        series.color, " dashed" if series.dashed else "", path)
+
+
+def _draw_marks(
+    series: Series, place: Callable[[tuple[float, float]], tuple[float, float]], x: Axis, y: Axis
+) -> list[Markup]:
+    return [draw_mark(series.mark, *place(point), 6.0 if series.big else 3.5, series.color, (
+        f"{series.label}: {x.label} {point[0]:,.6g}, {y.label} {point[1]:,.6g}"))
+        for point in series.points]
+
+
+def _draw_legend(lines: Sequence[Series]) -> Markup:
+    if len(lines) == 1:
+        return Markup("")  # the caption and the axis say it
+    items = []
+    for line in lines:
+        sample = _line_path(line, "1,7H25") if line.line else Markup("")
+        if line.mark:
+            sample += draw_mark(line.mark, 13, 7, 5 if line.big else 3.5, line.color)
+        items.append(legend_item(line.label, sample))
+    return Markup('<ul class="legend">{}</ul>').format(Markup("").join(items))

@@ -1,4 +1,4 @@
-"""Where the result comes from: settings, versions, machine, commands to repeat it."""
+"""Where the results come from: options, what training decided, versions, machine, commands."""
 
 from __future__ import annotations
 
@@ -11,96 +11,83 @@ import psutil
 
 from recon_cli import __version__, machine
 from recon_cli.errors import FormatError
-from recon_cli.report.stage_status import Standing
+from recon_cli.report.stage_status import StageStatus, Statuses
 from recon_cli.workspace.atomic import read_json
-
-_DECIDED = "config.json"  # of train: numbers in place of what was left automatic
 
 
 @dataclass(frozen=True)
-class Settings:
-    """The options of one stage.
-
-    Attributes:
-        stage: its name.
-        rows: (option, value, what was decided where it was left automatic, else empty).
-        seed: of the stage; None where nothing in it is random.
-        damaged: why what was decided is not shown; empty otherwise.
-    """
+class StageSettings:
+    """The options of one stage."""
 
     stage: str
-    rows: tuple[tuple[str, str, str], ...]
-    seed: int | None
-    damaged: str = ""
+    rows: tuple[tuple[str, str, str], ...]  # (option, value, the value chosen if automatic)
+    seed: int | None  # None where nothing in the stage is random
+    damaged: str = ""  # why the chosen values are not shown
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """All of it.
+    """The section on settings."""
 
-    Attributes:
-        settings: of each stage that has a result.
-        stages: names of these stages, the headings of `versions`.
-        versions: (program, its version at each stage).
-        commands: (stage, what to type to repeat it), in order.
-        sources: paths of the inputs.
-        machine: (what, value) of the machine that wrote the page.
-    """
-
-    settings: tuple[Settings, ...]
-    stages: tuple[str, ...]
-    versions: tuple[tuple[str, ...], ...]
-    commands: tuple[tuple[str, str], ...]
-    sources: tuple[str, ...]
-    machine: tuple[tuple[str, str], ...]
+    settings: tuple[StageSettings, ...]  # of each stage that has a result
+    stages: tuple[str, ...]  # their names, the headings of `versions`
+    versions: tuple[tuple[str, ...], ...]  # (program, its version at each stage)
+    commands: tuple[tuple[str, str], ...]  # (stage, the command that repeats it), in order
+    sources: tuple[str, ...]  # paths of the inputs
+    machine: tuple[tuple[str, str], ...]  # (label, value) of the machine that wrote the page
 
 
-def provenance(stages: Mapping[str, Standing]) -> Provenance:
+def read_provenance(stages: Statuses) -> Provenance:
     """Returns where the results of a workspace come from."""
-    there = {name: one for name, one in stages.items() if one.manifest}
-    names = list(dict.fromkeys(
-        name for one in there.values() if one.manifest for name in one.manifest.run.versions))
-    versions = tuple((name, *(
-        str(one.manifest.run.versions.get(name, "-")) for one in there.values() if one.manifest))
-        for name in names)
+    runs = {name: stage.manifest.run for name, stage in stages.items() if stage.manifest}
+    programs = dict.fromkeys(program for run in runs.values() for program in run.versions)
     ingest = stages["ingest"].manifest
     return Provenance(
-        tuple(_settings(one) for one in there.values()), tuple(there), versions,
-        tuple((name, one.command) for name, one in there.items()),
+        tuple(_read_settings(stages[name]) for name in runs), tuple(runs),
+        tuple((program, *(str(run.versions.get(program, "-")) for run in runs.values()))
+              for program in programs),
+        tuple((name, stages[name].command) for name in runs),
         tuple(source.path for source in ingest.basis.sources) if ingest else (),
-        _machine())
+        (("recon", __version__), ("Python", platform.python_version()),
+         ("system", platform.platform(terse=True)), ("processor", machine.cpu_model()),
+         ("cores", str(machine.usable_threads())),
+         ("memory", f"{psutil.virtual_memory().total / 1e9:.1f} GB")))
 
 
-def _settings(stage: Standing) -> Settings:
+def read_decisions(train: StageStatus) -> tuple[Mapping[str, Any], ...]:
+    """Returns name, on and reason of each part that training decided on; empty if unreadable."""
+    if not train.there:
+        return ()
+    try:
+        needs = read_json(train.folder / "plan.json")["needs"]
+        return tuple({"name": str(need["name"]), "on": bool(need["on"]),
+                      "reason": str(need["reason"])} for need in needs)
+    except (FormatError, KeyError, TypeError):
+        return ()  # a log that nothing depends on
+
+
+def _read_settings(stage: StageStatus) -> StageSettings:
     assert stage.manifest is not None
     config, damaged = stage.manifest.basis.config, ""
-    decided: Mapping[str, Any] = {}
+    chosen: Mapping[str, Any] = {}
     if stage.name == "train":
         try:
-            read = read_json(stage.folder / _DECIDED)
+            value = read_json(stage.folder / "config.json")
         except FormatError as error:
-            read, damaged = None, f"What training decided by itself is not shown: {error.message}"
-        decided = read if isinstance(read, dict) else {}
+            value, damaged = None, f"What training decided by itself is not shown: {error.message}"
+        chosen = value if isinstance(value, dict) else {}
     rows = tuple((
-        name, _shown(value),
-        _shown(decided[name]) if name in decided and decided[name] != value else "")
+        name, _format_option(value),
+        _format_option(chosen[name]) if name in chosen and chosen[name] != value else "")
         for name, value in config.items())
-    return Settings(stage.name, rows, config.get("seed"), damaged)
+    return StageSettings(stage.name, rows, config.get("seed"), damaged)
 
 
-def _shown(value: Any) -> str:
+def _format_option(value: Any) -> str:
     if value is None:
         return "automatic"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, (list, tuple)):
-        return " ".join(map(_shown, value))
+        return " ".join(map(_format_option, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _machine() -> tuple[tuple[str, str], ...]:
-    return (
-        ("recon", __version__), ("Python", platform.python_version()),
-        ("system", platform.platform(terse=True)), ("processor", machine.cpu_model()),
-        ("cores", str(machine.usable_threads())),
-        ("memory", f"{psutil.virtual_memory().total / 1e9:.1f} GB"))

@@ -1,39 +1,37 @@
-"""What stages left in files, read into types.
+"""Scores, logs and sweeps of a workspace, read into types.
 
-A stale stage's files may have been changed by hand, and logs are vouched for by nobody: whatever
-does not hold what it should becomes a FormatError, which the page tells in its place.
+The files of a stale stage may have been edited by hand, and no digest covers logs: content that is
+not as expected becomes a FormatError, which the page shows in its place.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from recon_cli.errors import FormatError
 from recon_cli.workspace.atomic import read_json
 
-T = TypeVar("T")
 BASE, PRUNED = MODELS = ("base", "pruned")
 
 
 @dataclass(frozen=True)
 class ViewRow:
-    """The scores of one held-out view; see `recon_cli.evaluation.ViewScore`."""
+    """The scores of one held-out view."""
 
     name: str
     psnr_db: float
     ssim: float
-    lpips: float | None
 
 
 @dataclass(frozen=True)
 class ModelRow:
-    """The scores of one model; see docs/workspace.md for what each key means."""
+    """The mean scores of one model; docs/workspace.md explains the keys."""
 
     psnr_db: float
     psnr_8bit_db: float
@@ -51,7 +49,7 @@ class ModelRow:
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean difference over the views and its 95% interval; no bounds where there is one view."""
+    """A mean difference over the views and its 95% interval; no bounds if there is one view."""
 
     mean: float
     low: float | None
@@ -60,18 +58,18 @@ class Interval:
 
 @dataclass(frozen=True)
 class Metrics:
-    """What evaluate says: models by key, pruned minus base by score, conventions by score."""
+    """The content of evaluate's metrics.json."""
 
     models: Mapping[str, ModelRow]
-    paired: Mapping[str, Interval]
-    conventions: Mapping[str, str]
-    unregistered: tuple[str, ...]
-    masked_out: tuple[str, ...]
+    paired: Mapping[str, Interval]  # pruned minus base, by score
+    conventions: Mapping[str, str]  # by score
+    unregistered: tuple[str, ...]  # held-out frames without a camera
+    masked_out: tuple[str, ...]  # held-out frames of which masks leave too little
 
 
 @dataclass(frozen=True)
 class LogRow:
-    """One report of a training; None where a row says nothing about it."""
+    """One line of log.jsonl; None where it holds no such value."""
 
     iteration: int
     seconds: float
@@ -82,7 +80,7 @@ class LogRow:
 
 
 @dataclass(frozen=True)
-class Trial:
+class SweepTrial:
     """One way to prune, scored on validation views after recovery."""
 
     score: str
@@ -93,79 +91,63 @@ class Trial:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What `recon prune --sweep` found; `of_train` is the digest of the training it started from,
-    None where an older recon wrote it.
-    """
+    """The content of sweep.json, which `recon prune --sweep` writes."""
 
-    trials: tuple[Trial, ...]
-    before_db: float
+    trials: tuple[SweepTrial, ...]
     score: str
     steps: int
     views: int
-    of_train: str | None
+    of_train: str | None  # digest of the training it started from; None in files of older versions
 
 
 def read_metrics(folder: Path) -> Metrics:
-    """Returns the scores in evaluate's folder.
-
-    Raises:
-        FormatError: metrics.json is missing or does not hold them.
-    """
-    return _read(folder / "metrics.json", _metrics)
+    """Returns the scores in evaluate's folder; FormatError if metrics.json does not hold them."""
+    path = folder / "metrics.json"
+    value = read_json(path)
+    with _format_errors(path):
+        return Metrics(
+            {key: _model(value["models"][key]) for key in MODELS if key in value["models"]},
+            {key: Interval(
+                _number(paired["mean"]), _optional(paired["low"]), _optional(paired["high"]))
+             for key, paired in value.get("pruned_minus_base", {}).items()},
+            {key.removesuffix("_convention"): str(text) for key, text in value.items()
+             if key.endswith("_convention")},
+            tuple(map(str, value.get("unregistered_test", ()))),
+            tuple(map(str, value.get("masked_out_test", ()))))
 
 
 def read_log(path: Path) -> tuple[LogRow, ...]:
-    """Returns the reports of a log.jsonl in order; a last line without its end is left out.
-
-    Raises:
-        FormatError: it is missing or does not hold them.
-    """
-    with _as_format_error(path):
+    """Returns the rows of a log.jsonl without an incomplete last line; FormatError if damaged."""
+    with _format_errors(path):
         lines = path.read_text(encoding="utf-8").splitlines(True)
-        return tuple(_log_row(json.loads(line)) for line in lines if line.endswith("\n"))
+        rows = [json.loads(line) for line in lines if line.endswith("\n")]
+        return tuple(LogRow(
+            int(row["iteration"]), _number(row["seconds"]), _optional(row.get("loss")),
+            _optional(row.get("validation_psnr_db")), _optional_int(row.get("gaussians")),
+            _optional_int(row.get("goes_on_at"))) for row in rows)
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Returns the trials of a sweep.json.
-
-    Raises:
-        FormatError: it is missing or does not hold them.
-    """
-    return _read(path, lambda value: Sweep(
-        tuple(Trial(str(one["score"]), _maybe(one["ratio"]), int(one["gaussians"]),
-                    _number(one["recovered"]["psnr_db"])) for one in value["trials"]),
-        _number(value["before"]["psnr_db"]), str(value["equal_seconds_of"]),
-        int(value["recovery_steps"]), int(value["validation_views"]), value.get("of_train")))
-
-
-def _metrics(value: Any) -> Metrics:
-    return Metrics(
-        {key: _model(value["models"][key]) for key in MODELS if key in value["models"]},
-        {key: Interval(_number(one["mean"]), _maybe(one["low"]), _maybe(one["high"]))
-         for key, one in value.get("pruned_minus_base", {}).items()},
-        {key.removesuffix("_convention"): str(text) for key, text in value.items()
-         if key.endswith("_convention")},
-        tuple(map(str, value.get("unregistered_test", ()))),
-        tuple(map(str, value.get("masked_out_test", ()))))
+    """Returns the trials of a sweep.json; FormatError if it does not hold them."""
+    value = read_json(path)
+    with _format_errors(path):
+        return Sweep(
+            tuple(SweepTrial(
+                str(trial["score"]), _optional(trial["ratio"]), int(trial["gaussians"]),
+                _number(trial["recovered"]["psnr_db"])) for trial in value["trials"]),
+            str(value["equal_seconds_of"]), int(value["recovery_steps"]),
+            int(value["validation_views"]), value.get("of_train"))
 
 
 def _model(value: Any) -> ModelRow:
-    views = tuple(ViewRow(
-        str(view["name"]), _number(view["psnr_db"]), _number(view["ssim"]),
-        _maybe(view.get("lpips"))) for view in value["views"])
+    views = tuple(ViewRow(str(view["name"]), _number(view["psnr_db"]), _number(view["ssim"]))
+                  for view in value["views"])
     return ModelRow(
         _number(value["psnr_db"]), _number(value["psnr_8bit_db"]), _number(value["ssim"]),
-        _number(value["ssim_padded"]), _maybe(value.get("lpips")), int(value["gaussians"]),
-        int(value["bytes"]), _number(value["render_ms"]), _maybe(value["train_seconds"]),
-        _maybe(value.get("gain_psnr_db")),
-        {str(key): _number(one) for key, one in value["seen_psnr_db"].items()}, views)
-
-
-def _log_row(value: Any) -> LogRow:
-    return LogRow(
-        int(value["iteration"]), _number(value["seconds"]), _maybe(value.get("loss")),
-        _maybe(value.get("validation_psnr_db")), _maybe_int(value.get("gaussians")),
-        _maybe_int(value.get("goes_on_at")))
+        _number(value["ssim_padded"]), _optional(value.get("lpips")), int(value["gaussians"]),
+        int(value["bytes"]), _number(value["render_ms"]), _optional(value["train_seconds"]),
+        _optional(value.get("gain_psnr_db")),
+        {str(key): _number(decibels) for key, decibels in value["seen_psnr_db"].items()}, views)
 
 
 def _number(value: Any) -> float:
@@ -175,23 +157,17 @@ def _number(value: Any) -> float:
     return number
 
 
-def _maybe(value: Any) -> float | None:
+def _optional(value: Any) -> float | None:
     """Returns a number that may be missing; one that is not finite counts as missing."""
     return None if value is None or not math.isfinite(float(value)) else float(value)
 
 
-def _maybe_int(value: Any) -> int | None:
+def _optional_int(value: Any) -> int | None:
     return None if value is None else int(value)
 
 
-def _read(path: Path, parse: Callable[[Any], T]) -> T:
-    value = read_json(path)
-    with _as_format_error(path):
-        return parse(value)
-
-
 @contextmanager
-def _as_format_error(path: Path) -> Iterator[None]:
+def _format_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

@@ -4,19 +4,19 @@
 function tabs() {
   const buttons = [...document.querySelectorAll("[role=tab]")];
   const open = (button, focus) => {
-    for (const one of buttons) {
-      const chosen = one === button;
-      one.setAttribute("aria-selected", String(chosen));
-      one.tabIndex = chosen ? 0 : -1;
-      document.getElementById(one.getAttribute("aria-controls")).classList.toggle("open", chosen);
+    for (const tab of buttons) {
+      const chosen = tab === button;
+      tab.setAttribute("aria-selected", String(chosen));
+      tab.tabIndex = chosen ? 0 : -1;
+      document.getElementById(tab.getAttribute("aria-controls")).classList.toggle("open", chosen);
     }
     if (focus) button.focus();
     button.scrollIntoView({ block: "nearest", inline: "nearest" });
-    // a section begins at its top, wherever the one before was left
+    // show a section from its top, however far the last one was scrolled
     const main = document.querySelector("main");
     if (main.getBoundingClientRect().top < 0) window.scrollTo(0, main.offsetTop - button.offsetHeight - 4);
   };
-  const named = () => buttons.find((one) => "#" + one.getAttribute("aria-controls") === location.hash);
+  const named = () => buttons.find((tab) => "#" + tab.getAttribute("aria-controls") === location.hash);
   buttons.forEach((button, at) => {
     button.addEventListener("click", () => {
       open(button, false);
@@ -61,13 +61,13 @@ function views() {
   const show = () => {
     const view = all[state.view], model = view.models[state.model];
     frame.style.aspectRatio = `${view.width} / ${view.height}`;
-    // as large as the window allows, but not far beyond the pixels that there are
+    // as large as the window allows, but at most twice the number of pixels
     const width = `min(100%, 72vh * ${view.width} / ${view.height}, max(320px, ${2 * view.width}px))`;
     frame.style.width = slide.style.width = width;
     by("under").src = shots[state.view].querySelector("img").src;
     by("over").src = state.difference ? model.difference : model.render;
     by("over").alt = state.difference ? "Difference of render and truth" : "Render";
-    const label = radios.find((one) => one.value === state.model).parentElement.textContent.trim();
+    const label = radios.find((radio) => radio.value === state.model).parentElement.textContent.trim();
     by("side").textContent = `${state.difference ? "difference" : "render"}, ${label}`;
     by("caption").textContent = `${order.indexOf(state.view) + 1} of ${all.length}: ${view.name}, ` +
       `PSNR ${model.psnr.toFixed(2)} dB, SSIM ${model.ssim.toFixed(4)}`;
@@ -81,15 +81,15 @@ function views() {
     });
     cut();
   };
-  const turn = (by_how_many, focus) => {
-    const at = order.indexOf(state.view) + by_how_many;
+  const turn = (step, focus) => {
+    const at = order.indexOf(state.view) + step;
     state.view = order[Math.min(Math.max(at, 0), order.length - 1)];
     show();
     if (focus) shots[state.view].focus();
   };
   const choose = (model) => {
     state.model = model;
-    radios.forEach((one) => { one.checked = one.value === model; });
+    radios.forEach((radio) => { radio.checked = radio.value === model; });
     sort();
     show();
   };
@@ -103,13 +103,13 @@ function views() {
   shots.forEach((shot, at) => {
     shot.addEventListener("click", () => { state.view = at; show(); });
     shot.addEventListener("keydown", (event) => {
-      const way = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
-      if (!way) return;
+      const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+      if (!step) return;
       event.preventDefault();
-      turn(way, true);
+      turn(step, true);
     });
   });
-  radios.forEach((one) => one.addEventListener("change", () => choose(one.value)));
+  radios.forEach((radio) => radio.addEventListener("change", () => choose(radio.value)));
   slide.addEventListener("input", cut);
   toggle.addEventListener("click", flip);
   by("previous").addEventListener("click", () => turn(-1, false));
@@ -117,9 +117,9 @@ function views() {
   frame.addEventListener("pointerdown", (event) => { frame.setPointerCapture(event.pointerId); drag(event); });
   frame.addEventListener("pointermove", (event) => { if (frame.hasPointerCapture(event.pointerId)) drag(event); });
   document.addEventListener("keydown", (event) => {
-    const shown = by("views").classList.contains("open");
-    if (!shown || event.ctrlKey || event.metaKey || event.altKey) return;
-    const other = radios.find((one) => one.value !== state.model);
+    const open = by("views").classList.contains("open");
+    if (!open || event.ctrlKey || event.metaKey || event.altKey) return;
+    const other = radios.find((radio) => radio.value !== state.model);
     if (event.key === "d") flip();
     else if (event.key === "n") turn(1, false);
     else if (event.key === "p") turn(-1, false);

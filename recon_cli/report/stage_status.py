@@ -1,4 +1,4 @@
-"""How each stage stands, in the words of the page."""
+"""The status of each stage as the report shows it: state, reasons, the command to type."""
 
 from __future__ import annotations
 
@@ -16,33 +16,20 @@ from recon_cli.stages import Stage
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.summaries import JsonRecord
 
-DAMAGED = "damaged"
-
-S = TypeVar("S", bound=JsonRecord)
+Record = TypeVar("Record", bound=JsonRecord)
 
 
 @dataclass(frozen=True)
-class Standing:
-    """One stage.
-
-    Attributes:
-        name: of the stage.
-        folder: of its result.
-        state: fresh, stale, partial or missing as in `recon status`; or damaged, where its manifest
-            or one before it cannot be trusted.
-        why: reasons or progress, in words; empty where it is fresh.
-        command: what to type to bring it up to date.
-        manifest: of its result; None where there is none that can be trusted.
-        gone: inputs that are no longer there.
-    """
+class StageStatus:
+    """The status of one stage."""
 
     name: str
-    folder: Path
-    state: str
-    why: str
-    command: str
-    manifest: Manifest | None = None
-    gone: tuple[str, ...] = ()
+    folder: Path  # of its result
+    state: str  # as in `recon status`; "damaged" if a manifest up to it cannot be trusted
+    why: str  # reasons or progress; empty where it is fresh
+    command: str  # brings it up to date
+    manifest: Manifest | None = None  # None without a result that can be trusted
+    gone: tuple[str, ...] = ()  # inputs that no longer exist
 
     @property
     def fresh(self) -> bool:
@@ -56,52 +43,61 @@ class Standing:
 
     @property
     def summary(self) -> Mapping[str, Any]:
-        """What the stage said about its result; empty without one."""
+        """The summary that the stage left in its manifest; empty without a result."""
         return self.manifest.run.summary if self.manifest else {}
 
-    def read_summary(self, kind: type[S]) -> S | None:
-        """Returns the stage's record; None without one that this version can read."""
+    def read_summary(self, kind: type[Record]) -> Record | None:
+        """Returns the summary as the stage's record; None without one that can be read."""
         try:
-            return kind.from_json(self.manifest.run.summary) if self.manifest else None
-        except ManifestError:  # the stage is stale then, and `why` says so
+            return kind.from_json(self.summary) if self.manifest else None
+        except ManifestError:  # of another version: the stage is stale then, and `why` says so
             return None
 
+    @property
+    def stale_suffix(self) -> str:
+        """What a label of its figures ends with: nothing where they are fresh."""
+        return "" if self.fresh else " (stale)"
 
-def standings(job: Job) -> dict[str, Standing]:
-    """Returns how every stage stands, by name.
+
+Statuses = Mapping[str, StageStatus]  # by the name of the stage
+
+
+def inspect_stages(job: Job) -> dict[str, StageStatus]:
+    """Returns the status of every stage by name.
 
     Raises:
-        StageError: nothing was read in yet.
+        StageError: ingest has not run yet.
         ManifestError: the manifest of ingest cannot be trusted.
         ConfigError: the settings hold a value that cannot be used.
     """
-    look = job.inspect()
-    first = look.check("ingest")
+    inspection = job.inspect()
+    first = inspection.check("ingest")
     if first.manifest is None:
         raise StageError(
             f"The report needs ingest, which is {first.described()}.",
-            hint=f"Run `{_command(look, first, job.workspace.root)}` first.")
-    return {row.name: _standing(look, row, job) for row in job.table}
+            hint=f"Run `{_command(inspection, first, job.workspace.root)}` first.")
+    return {row.name: _inspect_stage(inspection, row, job) for row in job.table}
 
 
-def _standing(look: Inspection, row: Stage, job: Job) -> Standing:
+def _inspect_stage(inspection: Inspection, row: Stage, job: Job) -> StageStatus:
     folder, root = job.workspace.folder(row.name), job.workspace.root
     try:
-        check = look.check(row.name)
+        check = inspection.check(row.name)
     except ManifestError as error:
         again = f"recon {row.verb} --again -w {shlex.quote(str(root))}"
-        return Standing(row.name, folder, DAMAGED, error.message, again)
+        return StageStatus(row.name, folder, "damaged", error.message, again)
     why = "; ".join(check.reasons)
     if check.state == "partial" and check.unfinished:
         why = "; ".join(filter(None, [
             f"a run was interrupted at {check.unfinished.done} of {check.unfinished.total}", why]))
-    return Standing(
-        row.name, folder, check.state, why, _command(look, check, root), check.manifest, check.gone)
+    return StageStatus(
+        row.name, folder, check.state, why, _command(inspection, check, root), check.manifest,
+        check.gone)
 
 
-def _command(look: Inspection, check: Check, root: Path) -> str:
-    """Returns what to type, with the inputs where the stage reads any, and the workspace."""
-    words = plan.command(look, check)
+def _command(inspection: Inspection, check: Check, root: Path) -> str:
+    """Returns the command with its inputs, if the stage reads any, and the workspace."""
     latest = check.unfinished or check.manifest
     inputs = [source.path for source in latest.basis.sources] if latest else []
-    return " ".join([words, *map(shlex.quote, inputs), "-w", shlex.quote(str(root))])
+    return " ".join([
+        plan.command(inspection, check), *map(shlex.quote, inputs), "-w", shlex.quote(str(root))])

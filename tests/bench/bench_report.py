@@ -23,10 +23,9 @@ import cv2
 from recon_cli.evaluation.tables import Table
 from recon_cli.io.frames import FOLDER, read_png, write_png
 from recon_cli.pipeline.execute import Job
-from recon_cli.report.build import write
-from recon_cli.report.images import MAX_FILE_BYTES
+from recon_cli.report.build import write_report
+from recon_cli.report.gallery import MAX_FILE_BYTES, build_gallery
 from recon_cli.report.records import MODELS, read_metrics
-from recon_cli.report.views import gallery
 from recon_cli.workspace.layout import Workspace
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -48,7 +47,7 @@ def main(workspaces: tuple[Path, ...], times: int, views: int) -> None:
         for workspace in workspaces:
             path = Path(folder) / "report.html"
             begin = time.perf_counter()
-            write(Job(Workspace(workspace)), path)
+            write_report(Job(Workspace(workspace)), path)
             wrote, opened = time.perf_counter() - begin, []
             for _ in range(times):
                 with watch_page(started) as page:
@@ -85,11 +84,11 @@ def large(workspace: Path, views: int) -> str:
             "views": [{"name": f"{i}.png", "psnr_db": i, "ssim": 1.0} for i in range(views)]}
         (root / "metrics.json").write_text(json.dumps({"models": dict.fromkeys(MODELS, model)}))
         begin = time.process_time()
-        found = gallery(root, read_metrics(root), MAX_FILE_BYTES - RESERVED)
+        gallery = build_gallery(root, read_metrics(root), MAX_FILE_BYTES - RESERVED)
         seconds = time.process_time() - begin
-    size = sum(view.size for view in found.views) / 1e6
-    width, height = found.full
-    return (f"{len(found.views)} of {views} views of {width}x{height}: {found.rung}, "
+    size = sum(view.size for view in gallery.views) / 1e6
+    width, height = gallery.full
+    return (f"{len(gallery.views)} of {views} views of {width}x{height}: {gallery.encoding}, "
             f"{size:.1f} MB, {seconds / views:.2f} CPU s a view")
 
 

@@ -14,7 +14,7 @@ import click
 from PIL import Image
 
 from recon_cli.pipeline.execute import Job
-from recon_cli.report.build import write
+from recon_cli.report.build import write_report
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import Workspace
 
@@ -33,7 +33,7 @@ def main(workspace: Path) -> None:
     """Writes the picture and says how large it is."""
     with tempfile.TemporaryDirectory() as folder, launch_browser() as started:
         path = Path(folder) / "report.html"
-        write(Job(Workspace(workspace)), path)
+        write_report(Job(Workspace(workspace)), path)
         shots = []
         for section, scheme in (("views", "light"), ("training", "dark")):
             with watch_page(started, width=WIDTH, height=HEIGHT) as page:

@@ -86,9 +86,9 @@ def page_of(workspace: Path) -> str:
 
 def section(page: str, name: str) -> str:
     """Returns one section of a page."""
-    found = re.search(rf'<section [^>]*id="{name}".*?</section>', page, re.DOTALL)
-    assert found, f"no section {name}"
-    return found.group()
+    match = re.search(rf'<section [^>]*id="{name}".*?</section>', page, re.DOTALL)
+    assert match, f"no section {name}"
+    return match.group()
 
 
 def change(path: Path, edit) -> None:

@@ -12,12 +12,12 @@ from recon_cli.report.chart import (
     Axis,
     Scale,
     Series,
-    chart,
+    axis_limits,
+    draw_chart,
+    draw_mark,
     linear_ticks,
     log_ticks,
-    mark,
-    shown,
-    widened,
+    tick_label,
 )
 
 X, Y = Axis("step"), Axis("PSNR, dB")
@@ -40,22 +40,22 @@ def test_ticks_are_round_and_lie_within():
 @pytest.mark.parametrize(("low", "high"), [
     (0, 1e-9), (1e6, 1e6 + 1), (3, 1e9), (0.001, 0.0011), (17.3, 34.9)])
 def test_an_axis_has_two_to_seven_ticks_whatever_its_range(low, high):
-    for found in (linear_ticks(low, high, 7), log_ticks(max(low, 1e-12), high, 7)):
-        assert 2 <= len(found) <= 7
-        assert found == sorted(found)
+    for ticks in (linear_ticks(low, high, 7), log_ticks(max(low, 1e-12), high, 7)):
+        assert 2 <= len(ticks) <= 7
+        assert ticks == sorted(ticks)
 
 
 def test_numbers_are_short():
-    assert [shown(value) for value in (0, 0.02, 7.5, 1500, 20_000, 1.5e6, 2e9)] == [
+    assert [tick_label(value) for value in (0, 0.02, 7.5, 1500, 20_000, 1.5e6, 2e9)] == [
         "0", "0.02", "7.5", "1,500", "20k", "1.5M", "2G"]
 
 
 def test_an_axis_is_never_empty_and_counts_begin_at_zero():
-    assert widened([100, 3000], log=False)[0] == 0
-    low, high = widened([17, 35], log=False)
+    assert axis_limits([100, 3000], log=False)[0] == 0
+    low, high = axis_limits([17, 35], log=False)
     assert 15 < low < 17 < 35 < high
     for values, log in (([5], False), ([0, 0], False), ([-3, -3], False), ([2], True)):
-        low, high = widened(values, log=log)
+        low, high = axis_limits(values, log=log)
         assert low < high
         assert low <= min(values) <= max(values) <= high
 
@@ -67,7 +67,7 @@ def test_a_value_lies_where_its_scale_says():
 
 
 def test_more_is_further_right_and_higher():
-    figure = chart("t", X, Y, [Series("a", ((1, 10), (2, 20), (3, 30)), mark="circle")])
+    figure = draw_chart("t", X, Y, [Series("a", ((1, 10), (2, 20), (3, 30)), mark="circle")])
     (x1, y1), (x2, y2), (x3, y3) = marks(figure)
     assert 0 < x1 < x2 < x3 < WIDTH
     assert HEIGHT > y1 > y2 > y3 > 0
@@ -76,7 +76,7 @@ def test_more_is_further_right_and_higher():
 
 
 def test_decades_are_equally_far_apart_on_a_logarithmic_axis():
-    figure = chart("t", Axis("s", log=True), Y, [
+    figure = draw_chart("t", Axis("s", log=True), Y, [
         Series("a", ((0, 5), (1, 10), (10, 20), (100, 30)), mark="circle")])
     (x1, _), (x2, _), (x3, _) = marks(figure)  # 0 has no place there
     assert x2 - x1 == pytest.approx(x3 - x2, abs=0.2)
@@ -84,12 +84,12 @@ def test_decades_are_equally_far_apart_on_a_logarithmic_axis():
 
 def test_what_is_not_finite_is_left_out_and_nothing_left_is_said():
     points = ((1.0, float("nan")), (float("inf"), 2.0))
-    assert "Nothing was recorded" in chart("t", X, Y, [Series("a", points)])
-    assert len(marks(chart("t", X, Y, [Series("a", (*points, (1, 2)), mark="circle")]))) == 1
+    assert "Nothing was recorded" in draw_chart("t", X, Y, [Series("a", points)])
+    assert len(marks(draw_chart("t", X, Y, [Series("a", (*points, (1, 2)), mark="circle")]))) == 1
 
 
 def test_axes_have_labels_with_units_and_a_legend_names_every_series():
-    figure = chart("A title", X, Y, [
+    figure = draw_chart("A title", X, Y, [
         Series("one", ((1, 10), (2, 20))), Series("two", ((1, 11), (2, 19)), 1, "square")])
     assert "<figcaption>A title</figcaption>" in figure
     for text in (">step<", ">PSNR, dB<", "</svg>one</li>", "</svg>two</li>"):
@@ -97,27 +97,27 @@ def test_axes_have_labels_with_units_and_a_legend_names_every_series():
 
 
 def test_a_second_axis_is_the_first_in_other_units():
-    figure = chart("t", Axis("Gaussians"), Y, [Series("a", ((0, 1), (100, 2)))],
+    figure = draw_chart("t", Axis("Gaussians"), Y, [Series("a", ((0, 1), (100, 2)))],
                    above=("MB", 0.1))
 
     def place(text, y):
-        found = re.search(rf'x="([\d.]+)" y="{y}" text-anchor="middle">{text}<', figure)
-        assert found, (text, figure)
-        return float(found.group(1))
+        match = re.search(rf'x="([\d.]+)" y="{y}" text-anchor="middle">{text}<', figure)
+        assert match, (text, figure)
+        return float(match.group(1))
 
     assert place("100", "273") == pytest.approx(place("10", "37"), abs=0.2)
 
 
 @pytest.mark.parametrize("shape", MARKS)
 def test_every_mark_is_drawn_around_its_place(shape):
-    drawn = mark(shape, 50, 40, 4, 0)
+    drawn = draw_mark(shape, 50, 40, 4, 0)
     x, y = map(float, re.search(r"M([-\d.]+),([-\d.]+)", drawn).groups())
     assert abs(x - 50) <= 6
     assert abs(y - 40) <= 6
 
 
 def test_names_are_escaped():
-    figure = chart("<b>t</b>", Axis("<i>"), Axis('"'), [
+    figure = draw_chart("<b>t</b>", Axis("<i>"), Axis('"'), [
         Series("<script>a", ((1, 1),), mark="circle"), Series("b", ((2, 2),))])
     assert isinstance(figure, Markup)
     for harm in ("<b>", "<i>", "<script>"):

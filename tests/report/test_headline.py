@@ -5,46 +5,49 @@ from pathlib import Path
 import pytest
 import summaries
 
-from recon_cli.report.headline import facts, verdict
-from recon_cli.report.stage_status import Standing
+from recon_cli.report.headline import format_facts, judge_poses
+from recon_cli.report.stage_status import StageStatus
 from recon_cli.workspace.manifest import Basis, Manifest, RunRecord
 
 
 def sfm(**summary):
     run = RunRecord(1.0, 1, {**summaries.SFM.to_json(), **summary}, {}, None, None, 1, "")
-    return Standing("sfm", Path("sfm"), "fresh", "", "recon sfm",
+    return StageStatus("sfm", Path("sfm"), "fresh", "", "recon sfm",
                     Manifest(Basis("sfm", 3, {}, (), {}), {}, "", run))
 
 
-def test_a_mapping_that_nothing_speaks_against_can_be_trusted():
-    found = verdict(sfm(verdict={"trusted": True}, lines=["9 of 12; trusted.", "Weakest link."]))
-    assert found.level == "good"
-    assert found.text == "The mapping can be trusted: 9 of 12 frames have a camera."
-    assert found.lines == ("Weakest link.",)
+def test_a_trusted_verdict_is_good():
+    verdict = judge_poses(
+        sfm(verdict={"trusted": True}, lines=["9 of 12; trusted.", "Weakest link."]))
+    assert verdict.level == "good"
+    assert verdict.text == "The camera poses can be trusted: 9 of 12 frames have a camera."
+    assert verdict.lines == ("Weakest link.",)
 
 
 def test_a_mapping_that_was_accepted_although_weak_is_not_to_be_trusted():
-    found = verdict(sfm(verdict={"trusted": False}, lines=["head", "The model is broken."]))
-    assert found.level == "warn"
-    assert "not to be trusted" in found.text
-    assert "The model is broken." in found.lines
+    verdict = judge_poses(sfm(verdict={"trusted": False}, lines=["head", "The model is broken."]))
+    assert verdict.level == "warn"
+    assert "cannot be trusted" in verdict.text
+    assert "The model is broken." in verdict.lines
 
 
 def test_poses_of_a_data_set_are_neither_praised_nor_blamed():
-    found = verdict(sfm(verdict=None, poses={"use": "keep", "metric": True}, lines=["100% agree."]))
-    assert found.level == "unknown"
-    assert found.text == "9 of 12 frames have a camera; the poses came with the data set."
-    assert found.lines == ("100% agree.",)
+    verdict = judge_poses(
+        sfm(verdict=None, poses={"use": "keep", "metric": True}, lines=["100% agree."]))
+    assert verdict.level == "unknown"
+    assert verdict.text == "9 of 12 frames have a camera; the poses came with the data set."
+    assert verdict.lines == ("100% agree.",)
 
 
 def test_what_was_left_out_of_the_model_is_said():
-    found = verdict(sfm(verdict={"trusted": True}, lines=["head"], rejected={"a.png": "astray"},
-                        apart=[["b.png", "c.png"]]))
-    assert "a.png was taken out of the model: astray." in found.lines
-    assert "The capture fell apart; left aside are parts of 2 frames." in found.lines
+    verdict = judge_poses(sfm(
+        verdict={"trusted": True}, lines=["head"], rejected={"a.png": "astray"},
+        apart=[["b.png", "c.png"]]))
+    assert "a.png was removed from the model: astray." in verdict.lines
+    assert "The capture has disconnected parts; left out are parts of 2 frames." in verdict.lines
 
 
-@pytest.mark.parametrize(("name", "value", "shown"), [
+@pytest.mark.parametrize(("name", "value", "expected"), [
     ("validation_psnr_db", 31.9637, ("validation PSNR", "31.96 dB")),
     ("validation_psnr_db_before", 31.9637, ("validation PSNR before", "31.96 dB")),
     ("train_seconds", 70.0, ("train time", "1 min 10 s")),
@@ -54,9 +57,9 @@ def test_what_was_left_out_of_the_model_is_said():
     ("bytes", 4_080_415, ("size", "4.1 MB")),
     ("kind", "video", ("kind", "video")),
 ])
-def test_a_fact_has_its_unit(name, value, shown):
-    assert facts({name: value}) == (shown,)
+def test_a_fact_has_its_unit(name, value, expected):
+    assert format_facts({name: value}) == (expected,)
 
 
-def test_lists_and_what_is_empty_are_no_facts():
-    assert facts({"a": [], "b": {}, "c": None, "d": "", "cuda_peak_bytes": 0}) == ()
+def test_lists_and_what_is_empty_are_no_format_facts():
+    assert format_facts({"a": [], "b": {}, "c": None, "d": "", "cuda_peak_bytes": 0}) == ()

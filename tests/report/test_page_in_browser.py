@@ -49,7 +49,7 @@ def by_psnr(workspace: Path, model: str) -> list[str]:
 def test_every_tab_shows_its_section_alone_without_a_complaint_or_the_network(shown):
     for name in SECTIONS:
         shown.page.click(f"#tab-{name}")
-        visible = [one for one in SECTIONS if shown.page.locator(f"#{one}").is_visible()]
+        visible = [tab for tab in SECTIONS if shown.page.locator(f"#{tab}").is_visible()]
         assert visible == [name]
         assert shown.page.locator(f"#{name} h2").inner_text()
         assert shown.page.get_attribute(f"#tab-{name}", "aria-selected") == "true"

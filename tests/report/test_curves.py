@@ -37,7 +37,7 @@ def test_the_curve_has_every_score_the_control_and_both_models_marked(sweep):
     for label in ("loo", "random", "no prune, as many steps", "base model", "pruned model"):
         assert f"</svg>{label}</li>" in pruning
     assert "<figcaption>PSNR on 2 validation views after 9 steps of recovery" in pruning
-    assert "loo: Gaussians that are left 10, PSNR, dB 25</title>" in pruning
+    assert "loo: Gaussians left 10, PSNR, dB 25</title>" in pruning
     assert "megabytes of the .ply" in pruning
     assert "stale" not in pruning
 
@@ -57,7 +57,7 @@ def test_megabytes_are_those_of_the_ply(sweep):
 
 def test_a_sweep_of_another_training_is_stale(sweep):
     pruning = section(page_of(sweep(of_train="0" * 64)), "pruning")
-    assert "<strong>The sweep is stale</strong>: it was made from another training." in pruning
+    assert "<strong>The sweep is stale</strong>: it started from another training." in pruning
     assert "recon prune --sweep -w" in pruning
 
 
@@ -71,7 +71,7 @@ def test_a_sweep_that_does_not_say_its_training_goes_by_its_age(sweep):
 def test_a_sweep_of_a_training_that_went_stale_is_stale_with_it(sweep):
     workspace = sweep()
     (workspace / "recon.toml").write_text("[train]\niterations = 7\n")
-    assert "the training that it was made from is stale" in section(page_of(workspace), "pruning")
+    assert "the training that it started from is stale" in section(page_of(workspace), "pruning")
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"trials": [{}]}', '{"trials": 3}'])
@@ -83,5 +83,5 @@ def test_a_sweep_that_cannot_be_read_is_said(workspace, content):
 
 def test_without_a_sweep_the_command_is_named(workspace):
     pruning = section(page_of(workspace), "pruning")
-    assert f"Type <code>recon prune --sweep -w {workspace}</code>" in pruning
+    assert f"Run <code>recon prune --sweep -w {workspace}</code>" in pruning
     assert "Rounds of removal" in pruning

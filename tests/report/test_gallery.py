@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 from recon_cli.io.images import write_png
-from recon_cli.report.images import MOST_ERROR, RUNGS, colored, error_of
+from recon_cli.report.gallery import (
+    ENCODINGS,
+    MOST_ERROR,
+    apply_colormap,
+    build_gallery,
+    draw_difference,
+)
 from recon_cli.report.records import read_metrics
-from recon_cli.report.views import gallery
 
 
 def gray(value, height=6, width=8):
@@ -18,32 +23,32 @@ def gray(value, height=6, width=8):
 
 
 def level(value):
-    return colored(np.array([[value]], np.uint8))[0, 0]
+    return apply_colormap(np.array([[value]], np.uint8))[0, 0]
 
 
 def test_an_error_of_sixteen_steps_is_a_quarter_of_the_colours():
     assert MOST_ERROR == 64
-    found = error_of(gray(10), gray(26), None, 100)
-    assert (found == level(64)).all()
-    assert (error_of(gray(10), gray(10), None, 100) == level(0)).all()
-    assert (error_of(gray(0), gray(255), None, 100) == level(255)).all()
+    colors = draw_difference(gray(10), gray(26), None, 100)
+    assert (colors == level(64)).all()
+    assert (draw_difference(gray(10), gray(10), None, 100) == level(0)).all()
+    assert (draw_difference(gray(0), gray(255), None, 100) == level(255)).all()
 
 
 def test_an_error_is_taken_before_a_picture_is_reduced():
     truth = gray(100, 8, 8)
     render = truth.copy()
     render[::2], render[1::2] = 90, 110  # whose mean is the truth: reduced first, nothing differs
-    found = error_of(truth, render, None, 4)
-    assert found.shape == (4, 4, 3)
-    assert (found == level(40)).all()
+    colors = draw_difference(truth, render, None, 4)
+    assert colors.shape == (4, 4, 3)
+    assert (colors == level(40)).all()
 
 
 def test_what_a_mask_hides_has_no_colour():
     hidden = np.zeros((6, 8), bool)
     hidden[:, :4] = True
-    found = error_of(gray(0), gray(255), hidden, 8)
-    assert (found[:, :4] == 96).all()
-    assert (found[:, 4:] == level(255)).all()
+    colors = draw_difference(gray(0), gray(255), hidden, 8)
+    assert (colors[:, :4] == 96).all()
+    assert (colors[:, 4:] == level(255)).all()
 
 
 @pytest.fixture
@@ -68,30 +73,30 @@ def noisy(tmp_path):
 
 
 def test_pictures_keep_their_size_where_there_is_room(noisy):
-    found = gallery(noisy, read_metrics(noisy), 50_000_000)
-    assert (found.rung, found.scaled, found.left_out) == (RUNGS[0], False, 0)
-    assert [view.name for view in found.views[:2]] == ["05.png", "00.png"]  # worst of the base
-    assert (found.views[0].width, found.views[0].height) == found.full == (300, 220)
+    gallery = build_gallery(noisy, read_metrics(noisy), 50_000_000)
+    assert (gallery.encoding, gallery.scaled, gallery.left_out) == (ENCODINGS[0], False, 0)
+    assert [view.name for view in gallery.views[:2]] == ["05.png", "00.png"]  # worst of the base
+    assert (gallery.views[0].width, gallery.views[0].height) == gallery.full == (300, 220)
 
 
 @pytest.mark.parametrize("share", [0.7, 0.4])
 def test_pictures_get_smaller_until_all_fit(noisy, share):
-    whole = sum(view.size for view in gallery(noisy, read_metrics(noisy), 50_000_000).views)
-    found = gallery(noisy, read_metrics(noisy), int(share * whole))
-    assert len(found.views) == 6
-    assert sum(view.size for view in found.views) <= share * whole
-    assert found.rung != RUNGS[0]
+    whole = sum(view.size for view in build_gallery(noisy, read_metrics(noisy), 50_000_000).views)
+    gallery = build_gallery(noisy, read_metrics(noisy), int(share * whole))
+    assert len(gallery.views) == 6
+    assert sum(view.size for view in gallery.views) <= share * whole
+    assert gallery.encoding != ENCODINGS[0]
 
 
 def test_at_the_last_resort_the_worst_views_stay_and_the_rest_is_counted(noisy):
-    least = gallery(noisy, read_metrics(noisy), 1)
+    least = build_gallery(noisy, read_metrics(noisy), 1)
     assert (least.views, least.left_out) == ((), 6)
-    found = gallery(noisy, read_metrics(noisy), 250_000)
-    assert 0 < len(found.views) < 6
-    assert found.left_out == 6 - len(found.views)
-    assert found.rung == RUNGS[-1]
-    assert found.views[0].name == "05.png"
-    assert sum(view.size for view in found.views) <= 250_000
+    gallery = build_gallery(noisy, read_metrics(noisy), 250_000)
+    assert 0 < len(gallery.views) < 6
+    assert gallery.left_out == 6 - len(gallery.views)
+    assert gallery.encoding == ENCODINGS[-1]
+    assert gallery.views[0].name == "05.png"
+    assert sum(view.size for view in gallery.views) <= 250_000
 
 
 def test_a_view_larger_than_a_screen_is_scaled_down(tmp_path):
@@ -105,21 +110,22 @@ def test_a_view_larger_than_a_screen_is_scaled_down(tmp_path):
         "psnr_db": 30.0, "psnr_8bit_db": 30.0, "ssim": 0.9, "ssim_padded": 0.9, "gaussians": 9,
         "bytes": 9, "render_ms": 1.0, "train_seconds": None, "seen_psnr_db": {},
         "views": [{"name": "a.png", "psnr_db": 20.0, "ssim": 0.9}]}}}))
-    found = gallery(tmp_path, read_metrics(tmp_path), 12_000_000)
-    assert (found.views[0].width, found.views[0].height) == (1600, 900)
-    assert found.scaled
-    assert found.full == (1920, 1080)
+    gallery = build_gallery(tmp_path, read_metrics(tmp_path), 12_000_000)
+    assert (gallery.views[0].width, gallery.views[0].height) == (1600, 900)
+    assert gallery.scaled
+    assert gallery.full == (1920, 1080)
 
 
 def test_what_evaluate_did_not_score_is_gray_in_the_difference(noisy):
     (noisy / "difference" / "base").mkdir(parents=True)
-    told = np.full((220, 300, 3), 40, np.uint8)
-    told[:, :150] = 0  # masked: the pixels differ, and the difference says nothing
-    write_png(noisy / "difference" / "base" / "05.png", told)
-    found = {view.name: view for view in gallery(noisy, read_metrics(noisy), 50_000_000).views}
-    assert found["05.png"].masked
-    assert not found["04.png"].masked
-    data = base64.b64decode(found["05.png"].differences["base"].split(",")[1])
-    shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert np.abs(shown[:, :140].astype(int) - 96).max() < 12
-    assert shown[:, 160:].astype(int).std() > 20
+    difference = np.full((220, 300, 3), 40, np.uint8)
+    difference[:, :150] = 0  # masked: the pixels differ, and the difference says nothing
+    write_png(noisy / "difference" / "base" / "05.png", difference)
+    gallery = build_gallery(noisy, read_metrics(noisy), 50_000_000)
+    views = {view.name: view for view in gallery.views}
+    assert views["05.png"].masked
+    assert not views["04.png"].masked
+    data = base64.b64decode(views["05.png"].differences["base"].split(",")[1])
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(decoded[:, :140].astype(int) - 96).max() < 12
+    assert decoded[:, 160:].astype(int).std() > 20

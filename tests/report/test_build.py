@@ -18,7 +18,7 @@ from recon_cli.workspace.digests import read_source
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import Manifest, Unfinished
 
-STALE = "What is shown here is the old result"
+STALE = "The result shown here is out of date"
 
 
 def files(workspace):
@@ -32,7 +32,7 @@ def test_the_page_is_one_file_and_nothing_else_changes(workspace, capsys):
     assert str(workspace / "report.html") in capsys.readouterr().out
     assert files(workspace) == before
     assert main(["status", "--json", "-w", str(workspace)]) == 0
-    states = {one["state"] for one in json.loads(capsys.readouterr().out)["stages"]}
+    states = {stage["state"] for stage in json.loads(capsys.readouterr().out)["stages"]}
     assert states == {"fresh"}
 
 
@@ -45,7 +45,7 @@ def test_the_page_shows_what_the_stages_say(workspace):
             assert f"{view['psnr_db']:.2f}" in section(page, "scores")
     low = metrics["pruned_minus_base"]["psnr_db"]["low"]
     assert f"{low:+.2f} to " in section(page, "scores")
-    assert "The mapping can be trusted: 12 of 12 frames have a camera." in page
+    assert "The camera poses can be trusted: 12 of 12 frames have a camera." in page
     assert "splats.spz" in section(page, "exports")
     settings = section(page, "settings")
     assert f"room.mp4 -w {workspace}\n" in settings
@@ -175,7 +175,7 @@ def test_contact_sheets_take_the_place_of_thumbnails_and_many_are_counted(worksp
                   np.full((30, 40, 3), 9, np.uint8))
     capture = section(page_of(workspace), "capture")
     assert capture.count('alt="Contact sheet of the capture"') == 4
-    assert "2 more contact sheets lie in ingest/" in capture
+    assert "2 more contact sheets are in ingest/" in capture
     assert "Some of the frames" not in capture
 
 
@@ -213,7 +213,7 @@ def test_a_file_name_that_is_no_utf8_is_shown_as_it_can_be(workspace):
     dataclasses.replace(manifest, basis=dataclasses.replace(
         manifest.basis, sources=(source,))).write(workspace / "ingest")
     page = page_of(workspace)
-    assert "The input /gone/b\\udcff.mp4 is gone." in section(page, "overview")
+    assert "The input /gone/b\\udcff.mp4 no longer exists." in section(page, "overview")
     assert "from a video: b\\udcff.mp4" in page
 
 
@@ -265,4 +265,4 @@ def test_the_whole_file_stays_within_its_bounds(workspace, monkeypatch):
     page = page_of(workspace)
     assert len(page.encode()) <= limit
     assert "Pictures are scaled down for this page" in page
-    assert "where evaluate left 400x300" in page
+    assert "evaluate scored 400x300" in page
