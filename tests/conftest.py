@@ -7,13 +7,15 @@ starts at once.
 from __future__ import annotations
 
 import os
+import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from examples import load_profile
+from filelock import FileLock
 
 if TYPE_CHECKING:
     from browser import WatchedPage
@@ -31,10 +33,38 @@ load_profile()
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks every test that opens a page."""
+    """Marks every test that opens a page or looks at a process that compiled kernels."""
     for item in items:
-        if "chromium" in getattr(item, "fixturenames", ()):
+        fixtures = set(getattr(item, "fixturenames", ()))
+        if "chromium" in fixtures:
             item.add_marker(pytest.mark.browser)
+        if fixtures & {"damaged_run", "repaired_run", "avx2_run"}:
+            item.add_marker(pytest.mark.compile)
+
+
+@pytest.fixture(scope="session")
+def build_once(
+    tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str, Callable[[Path], None]], Path]:
+    """Returns a folder by name, which one function fills once for all workers; copy, never write.
+
+    The function gets the empty folder. A failure is the failure of every test that asks.
+    """
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent  # of all workers
+
+    def build(name: str, fill: Callable[[Path], None]) -> Path:
+        folder, filled = base / f"shared-{name}", base / f"shared-{name}.filled"
+        with FileLock(f"{folder}.lock"):
+            if not filled.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                fill(folder)
+                filled.touch()
+        return folder
+
+    return build
 
 
 @pytest.fixture(scope="session")

@@ -53,6 +53,7 @@ def test_the_design_names_every_module_of_the_package():
 
 
 
+@pytest.mark.integration
 def test_the_batch_example_goes_on_after_a_failure_and_says_so(tmp_path, sample_video):
     videos, results = tmp_path / "videos", tmp_path / "results"
     videos.mkdir()

@@ -31,6 +31,7 @@ TINY = SceneSize(200, 48, 32)
 IMAGE_RMS, GRADIENT = 1e-5, 1e-3
 
 
+@pytest.mark.integration
 def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     tmp_path: Path, capsys: Said
 ) -> None:

@@ -76,6 +76,7 @@ def test_a_guess_is_corrected_on_the_line_through_two_runs():
     assert corrected(100, 250, 4.0, 3.0, 10.0) == 250  # a line that falls says nothing
 
 
+@pytest.mark.integration
 def test_arms_whose_steps_grow_dearer_still_take_the_same_seconds(
     ground, made, tmp_path, monkeypatch
 ):
@@ -122,6 +123,7 @@ def test_the_seconds_that_are_made_equal_can_be_chosen(ground, made, tmp_path):
 
 # ---- resuming ----
 
+@pytest.mark.integration
 @pytest.mark.parametrize("stop_at", [0, 3, 10, 13])
 def test_a_study_that_was_killed_gives_the_same_figures(ground, made, tmp_path, stop_at):
     whole = work(tmp_path / "whole").done(ground, NullProgress())
@@ -135,6 +137,7 @@ def test_a_study_that_was_killed_gives_the_same_figures(ground, made, tmp_path, 
     assert sorted(made) == sorted(once)  # nothing twice
 
 
+@pytest.mark.integration
 def test_what_is_kept_is_announced(ground, made, tmp_path):
     before = work(tmp_path / "out", seeds=1).announced([ground], NullProgress())
     assert before.startswith("about 8 runs are to be made, 0 are kept from before; about")
@@ -144,6 +147,7 @@ def test_what_is_kept_is_announced(ground, made, tmp_path):
     assert made
 
 
+@pytest.mark.integration
 def test_a_line_that_a_kill_cut_short_is_dropped(ground, made, tmp_path):
     one = work(tmp_path / "out", seeds=1)
     first = one.done(ground, NullProgress())
@@ -214,6 +218,7 @@ def studied(tmp_path_factory):
     return base, words
 
 
+@pytest.mark.integration
 def test_the_command_leaves_tables_figures_and_a_picture(studied):
     base, _ = studied
     out = base / "out"
@@ -227,6 +232,7 @@ def test_the_command_leaves_tables_figures_and_a_picture(studied):
     assert (out / "scenes" / "office0" / "sfm" / "manifest.json").exists()
 
 
+@pytest.mark.integration
 def test_a_second_call_runs_nothing_and_says_the_same(studied, capsys, monkeypatch):
     base, words = studied
     monkeypatch.setattr(work_module, "run_trial", lambda *_, **__: pytest.fail("ran"))
@@ -238,6 +244,7 @@ def test_a_second_call_runs_nothing_and_says_the_same(studied, capsys, monkeypat
     assert "Scores at equal seconds" in said.out
 
 
+@pytest.mark.integration
 def test_an_interrupted_study_says_so(studied, tmp_path, capsys, monkeypatch):
     _, words = studied
 

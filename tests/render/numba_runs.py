@@ -2,19 +2,17 @@
 
 Two of them compile every kernel, some ten seconds each: the one whose cache was damaged, and the
 one that compiles for a CPU with AVX2. Their machine code is read by the guard of vectorization.
+The fixtures `damaged_run`, `repaired_run` and `avx2_run` (conftest.py) hold what they left.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,6 @@ import numpy as np
 import pytest
 
 from recon_cli.render.numba import kernel, warm
-from recon_cli.render.numba.simd import LANES
 
 HERE = Path(__file__).parent
 # What every CPU with AVX2 has; numba takes the name and the features together.
@@ -49,63 +46,48 @@ class Run:
     folder: Path
 
 
-def run(cache_dir: Path, **variables: str) -> Run:
-    """Runs numba_process with a cache folder of its own."""
-    out = Path(tempfile.mkdtemp(dir=_base()))
+def start(out: Path, cache_dir: Path, **variables: str) -> None:
+    """Runs numba_process with a cache folder of its own; `out` is what `read_run` reads."""
+    out.mkdir()
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith("NUMBA_")}
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, str(HERE / "numba_process.py"), str(out)],
         env=environment | {"RECON_CACHE_DIR": str(cache_dir), "OMP_NUM_THREADS": "1"} | variables,
         capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
+    (out / "stderr.txt").write_text(process.stderr, encoding="utf-8")
+
+
+def read_run(out: Path) -> Run:
+    """Returns what a process left in `out`."""
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     with np.load(out / "picture.npz") as arrays:
         picture = dict(arrays)
-    return Run(report, picture, done.stderr, out)
+    return Run(report, picture, (out / "stderr.txt").read_text(encoding="utf-8"), out)
 
 
-@cache
-def after_damage() -> Run:
-    """Returns the run that found every file of the cache cut in half."""
-    return run(_damaged_cache())
+def damage_and_repair(folder: Path) -> None:
+    """Runs a process that finds every file of the cache cut in half, and one after it."""
+    cache_dir = folder / "cache"
+    _copy_damaged(cache_dir)
+    start(folder / "damaged", cache_dir)
+    start(folder / "repaired", cache_dir)
 
 
-@cache
-def after_repair() -> Run:
-    """Returns the run after `after_damage`, in the same cache folder."""
-    return run(Path(after_damage().report["folder"]).parents[1])
+def compile_for_avx2(folder: Path) -> None:
+    """Runs a process that compiles for a CPU with AVX2, from an empty cache folder."""
+    start(folder / "avx2", folder / "cache", **HASWELL)
 
 
-@cache
-def for_avx2() -> Run:
-    """Returns the run that compiled for a CPU with AVX2, from an empty cache folder."""
-    if platform.machine() not in ("x86_64", "AMD64"):
-        pytest.skip("AVX2 is of x86 CPUs; this machine has another")
-    if LANES == 8:
-        pytest.skip("this machine computes with 8 lanes anyway: all other tests are of them")
-    return run(_base() / "avx2", **HASWELL)
-
-
-@cache
-def _holder() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="recon-numba-")  # deleted when the tests end
-
-
-def _base() -> Path:
-    return Path(_holder().name)
-
-
-def _damaged_cache() -> Path:
+def _copy_damaged(target: Path) -> None:
     """Copies this process's own cache, so that nothing is compiled for it, and cuts the files."""
     warm.warm_up()
     source = kernel.cache_folder()
     if source is None:
         pytest.skip("there is no place to keep compiled kernels, see RECON_CACHE_DIR")
-    target = _base() / "damaged"
     shutil.copytree(source, target / "kernels" / source.name)
     files = [*target.rglob("*.nbc"), *target.rglob("*.nbi")]
     assert files
     for path in files:
         os.truncate(path, path.stat().st_size // 2)
-    return target

@@ -14,6 +14,7 @@ from backends import (
     IMAGE_TOLERANCE,
     compared,
     every_backend,
+    every_backend_at_size,
 )
 from oracle import composited
 from scenes import camera_at, joined, one_splat, random_splats
@@ -103,7 +104,7 @@ def test_many_layers_agree_with_the_oracle_until_the_pixel_stops(case, logit):
         assert found.gradients[name] <= GRADIENT_TOLERANCE[case.dtype], name
 
 
-@every_backend
+@every_backend_at_size
 def test_the_transmittance_of_faint_layers_does_not_underflow(case):
     splats = layers(3000, logit=-4.0)  # alpha .018: 3,000 would leave 1e-24
     out, _ = rendered(case, splats, camera_at(8, 8), scores=True)
@@ -126,7 +127,7 @@ def test_coincident_gaussians_composite_in_order_of_index(case):
     assert (second[..., 1] > second[..., 0]).all()
 
 
-@every_backend
+@every_backend_at_size
 def test_a_hundred_coincident_gaussians_agree_with_the_oracle(case):
     splats = layers(100, logit=-2.0, seed=2)
     splats.means[:] = torch.tensor([0.0, 0.0, 2.0])
@@ -159,7 +160,7 @@ def test_the_thresholds_drop_no_more_than_the_theory_says(case, seed):
     assert dropped.max() <= faint.sum(0).max() * ALPHA_MIN
 
 
-@every_backend
+@every_backend_at_size
 def test_gaussians_that_cover_every_tile_agree_with_the_oracle(case):
     splats = random_splats(30, seed=3)
     splats.means[:, 2] = splats.means[:, 2].abs() + 1.0

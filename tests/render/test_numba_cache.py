@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba_process import STATISTICS, picture
-from numba_runs import HASWELL, after_damage, after_repair, for_avx2
+from numba_runs import HASWELL
 
 from recon_cli.pipeline.execute import Job, context_for
 from recon_cli.render import registry
@@ -50,51 +50,49 @@ def assert_same_picture(ours, theirs):
 
 # ---- from process to process ----
 
-def test_a_damaged_cache_is_noticed_and_compiled_again():
-    run = after_damage()
-    assert "cannot be read; compiling them again" in run.stderr
-    assert run.report["folder"] in run.stderr
-    assert set(run.report["misses"].values()) == {1}
-    assert run.report["is_warm"]
+def test_a_damaged_cache_is_noticed_and_compiled_again(damaged_run):
+    assert "cannot be read; compiling them again" in damaged_run.stderr
+    assert damaged_run.report["folder"] in damaged_run.stderr
+    assert set(damaged_run.report["misses"].values()) == {1}
+    assert damaged_run.report["is_warm"]
 
 
-def test_the_next_process_finds_every_kernel_and_compiles_nothing():
-    run = after_repair()
-    assert run.report["was_warm"]
-    assert set(run.report["hits"].values()) == {1}
-    assert set(run.report["misses"].values()) == {0}
-    assert "kernels" not in run.stderr
+def test_the_next_process_finds_every_kernel_and_compiles_nothing(repaired_run):
+    assert repaired_run.report["was_warm"]
+    assert set(repaired_run.report["hits"].values()) == {1}
+    assert set(repaired_run.report["misses"].values()) == {0}
+    assert "kernels" not in repaired_run.stderr
 
 
-def test_machine_code_from_the_cache_computes_the_same_bits():
-    compiled, loaded = after_damage().picture, after_repair().picture
+def test_machine_code_from_the_cache_computes_the_same_bits(
+        damaged_run, repaired_run):
+    compiled, loaded = damaged_run.picture, repaired_run.picture
     for name, value in compiled.items():
         assert np.array_equal(value, loaded[name]), name
 
 
-def test_the_progress_counts_every_kernel_that_threads_share():
-    for run in (after_damage(), after_repair()):
+def test_the_progress_counts_every_kernel_that_threads_share(damaged_run, repaired_run):
+    for run in (damaged_run, repaired_run):
         assert run.report["kernels_ready"] == warm.KERNELS
 
 
 # ---- another CPU ----
 
-def test_code_for_another_cpu_is_kept_apart():
-    assert Path(for_avx2().report["folder"]).name != kernel.fingerprint()
-    assert not for_avx2().report["was_warm"]
-    assert for_avx2().report["is_warm"]
+def test_code_for_another_cpu_is_kept_apart(avx2_run):
+    assert Path(avx2_run.report["folder"]).name != kernel.fingerprint()
+    assert not avx2_run.report["was_warm"]
+    assert avx2_run.report["is_warm"]
 
 
-def test_eight_lanes_compute_the_picture_of_sixteen():
-    run = for_avx2()
-    assert (run.report["lanes"], run.report["tile"]) == (8, [8, 16])
-    assert_same_picture(run.picture, picture("numba"))
+def test_eight_lanes_compute_the_picture_of_sixteen(avx2_run):
+    assert (avx2_run.report["lanes"], avx2_run.report["tile"]) == (8, [8, 16])
+    assert_same_picture(avx2_run.picture, picture("numba"))
 
 
-def test_eight_lanes_compute_the_picture_of_the_torch_backend():
-    assert {name for name in for_avx2().picture if name.startswith("stat.")} == {
+def test_eight_lanes_compute_the_picture_of_the_torch_backend(avx2_run):
+    assert {name for name in avx2_run.picture if name.startswith("stat.")} == {
         f"stat.{name}" for name in STATISTICS}
-    assert_same_picture(for_avx2().picture, picture("torch"))
+    assert_same_picture(avx2_run.picture, picture("torch"))
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names of x86 CPUs")

@@ -11,7 +11,6 @@ import numba
 import numpy as np
 import pytest
 from machine_code import Loop, loops
-from numba_runs import after_damage, for_avx2
 
 REGISTER = {8: "ymm", 16: "zmm"}  # of AVX2 and AVX-512, by LANES
 # Addresses, broadcasts and the number of an instance are computed one by one, which takes a few
@@ -88,10 +87,9 @@ def check_kernel(name, run):
 
 
 @pytest.fixture
-def host_run(cpu_features):
+def host_features(cpu_features):
     if not cpu_features.get("avx2"):
         pytest.skip("this CPU has no AVX2: its registers are narrower than LANES")
-    return after_damage()
 
 
 @pytest.fixture
@@ -105,13 +103,14 @@ KERNELS = sorted({hot.kernel for hot in HOT})
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_hot_loops_are_vectorized_for_this_cpu(kernel, host_run):
-    check_kernel(kernel, host_run)
+@pytest.mark.usefixtures("host_features")
+def test_hot_loops_are_vectorized_for_this_cpu(kernel, damaged_run):
+    check_kernel(kernel, damaged_run)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_hot_loops_are_vectorized_for_avx2(kernel):
-    check_kernel(kernel, for_avx2())
+def test_hot_loops_are_vectorized_for_avx2(kernel, avx2_run):
+    check_kernel(kernel, avx2_run)
 
 
 # ---- the guard can fail ----
@@ -131,8 +130,9 @@ def scalar_exponentials(values):
     return result
 
 
+@pytest.mark.usefixtures("host_features")
 @pytest.mark.parametrize("register", ["zmm", "ymm"])
-def test_a_scalar_kernel_is_named_with_its_loop_and_its_calls(host_run, register):  # noqa: ARG001
+def test_a_scalar_kernel_is_named_with_its_loop_and_its_calls(register):
     found = loops(assembler(scalar_exponentials, np.ones(64, np.float32)))
     with pytest.raises(pytest.fail.Exception) as failure:
         check(Hot("composite", "alpha along a row of pixels", 8, powers=True), found, register)
@@ -142,7 +142,8 @@ def test_a_scalar_kernel_is_named_with_its_loop_and_its_calls(host_run, register
     assert "exp" in message.split("calls")[1]
 
 
-def test_a_vector_loop_that_calls_a_scalar_function_is_named(host_run):  # noqa: ARG001
+@pytest.mark.usefixtures("host_features")
+def test_a_vector_loop_that_calls_a_scalar_function_is_named():
     loop = Loop(".LBB0_1", calls={"expf"})
     loop.packed["zmm"] = 40
     with pytest.raises(pytest.fail.Exception, match="adam: moments calls expf"):

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("triton") is None, reason="the package triton is not installed")
 
 
+@pytest.mark.compile
 def test_every_kernel_compiles_for_gpus_old_and_new_without_spilling(tmp_path):
     script = Path(__file__).with_name("triton_targets.py")
     environment = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path), "TRITON_INTERPRET": "0"}

@@ -73,6 +73,7 @@ def test_a_killed_training_ends_with_the_bytes_of_an_uninterrupted_one(
             inputs.folders["train"] / name).read_bytes(), name
 
 
+@pytest.mark.integration
 def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path, monkeypatch):
     recorded = []
 

@@ -241,6 +241,7 @@ def test_progress_that_would_survive_a_crash_is_recorded(video, tmp_path):
 # Real captures
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("name", "size", "count"), [
     ("video_house_entry/video.mp4", (540, 960), 686),
     ("video_bedroom/room.mp4", (848, 364), 1091),

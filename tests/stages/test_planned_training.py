@@ -80,6 +80,7 @@ def test_the_numbers_of_a_plan_repeat_the_run_to_the_byte(inputs, done, tmp_path
     assert same_bytes(first, tmp_path / "again")
 
 
+@pytest.mark.integration
 def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monkeypatch):
     out = tmp_path / "out"
     with monkeypatch.context() as patch:

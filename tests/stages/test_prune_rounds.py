@@ -74,6 +74,7 @@ def test_nothing_is_left_that_only_a_resumed_run_would_need(whole):
             "log.jsonl", "rounds.json", "splats.ply"]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("config", [THREE, SEARCH], ids=["ratio", "search"])
 def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     config, inputs, whole, tmp_path, monkeypatch

@@ -178,6 +178,7 @@ def noted(out, step):
         return False
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_run_killed_in_every_step_ends_with_the_bytes_of_one_that_was_not(
     mapped, room, tmp_path
@@ -203,6 +204,7 @@ def test_a_run_killed_in_every_step_ends_with_the_bytes_of_one_that_was_not(
         path.name for path in uninterrupted.iterdir())
 
 
+@pytest.mark.integration
 def test_the_model_does_not_depend_on_the_number_of_threads(mapped, room, tmp_path):
     other, _, _ = mapped
     run(room, tmp_path / "out", ctx=StageContext(threads=1), max_features=FEATURES)
@@ -252,6 +254,7 @@ def test_an_interrupt_ends_the_mapping_process_and_goes_on(room, tmp_path):
     assert not (tmp_path / "out" / "job.json").exists()
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs signals")
 def test_ctrl_c_in_every_step_ends_the_mapping_process_at_once(room, tmp_path):
     """The waiting has a bound only so that the test ends; it came to 0.5 to 0.6 seconds."""

@@ -24,6 +24,7 @@ def frames(path, *, first=0, step=4, count=8, prefix=""):
     raise AssertionError(f"{path} is too short")
 
 
+@pytest.mark.integration
 def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
     sample_video, shared_data, tmp_path, caplog
 ):
@@ -39,6 +40,7 @@ def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
     assert "living000000.png" in caplog.text
 
 
+@pytest.mark.integration
 def test_two_clips_of_one_length_are_not_passed_off_as_a_room(sample_video, shared_data, tmp_path):
     office = frames(sample_video, count=6, prefix="office")
     living = frames(shared_data / "rooms" / "living" / "video.mp4", count=6, prefix="living")
@@ -46,6 +48,7 @@ def test_two_clips_of_one_length_are_not_passed_off_as_a_room(sample_video, shar
         run(write_inputs(tmp_path / "in", office | living), tmp_path / "out", min_registered=0.75)
 
 
+@pytest.mark.integration
 def test_photos_of_other_things_are_named_and_not_in_the_model(sample_video, tmp_path):
     wrong = {f"wrong{seed}.png": texture(340, 600, seed) for seed in range(3)}
     images = frames(sample_video, count=12) | wrong
@@ -55,6 +58,7 @@ def test_photos_of_other_things_are_named_and_not_in_the_model(sample_video, tmp
     assert [attempt.name for attempt in summary.rungs] == ["exhaustive"]
 
 
+@pytest.mark.integration
 def test_one_frame_many_times_over_is_no_capture(sample_video, tmp_path):
     still, = frames(sample_video, count=1).values()
     images = {f"{index}.png": still for index in range(6)}
@@ -62,6 +66,7 @@ def test_one_frame_many_times_over_is_no_capture(sample_video, tmp_path):
         run(write_inputs(tmp_path / "in", images), tmp_path / "out")
 
 
+@pytest.mark.integration
 def test_frames_given_twice_do_no_harm(sample_video, tmp_path):
     once = frames(sample_video, count=8)
     twice = {f"copy{name}": image for name, image in once.items()}
@@ -69,6 +74,7 @@ def test_frames_given_twice_do_no_harm(sample_video, tmp_path):
     assert summary.registered == 16
 
 
+@pytest.mark.integration
 def test_twelve_neighbours_of_a_fast_video_show_too_little_parallax(shared_data, tmp_path):
     """A fifth of a second: the camera moved by a few millimetres."""
     images = frames(shared_data / "video_bedroom" / "room.mp4", first=200, step=1, count=12)
@@ -79,6 +85,7 @@ def test_twelve_neighbours_of_a_fast_video_show_too_little_parallax(shared_data,
     assert caught.value.hint
 
 
+@pytest.mark.integration
 def test_the_frames_of_every_way_of_pairing_meet(sample_video, tmp_path):
     images = frames(sample_video, count=8)
     for pairs in ("retrieval", "sequential"):

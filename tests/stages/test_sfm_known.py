@@ -74,6 +74,7 @@ def test_poses_and_points_that_are_kept_are_written_as_they_were_given(
     assert not (tmp_path / "out" / "database.db").exists()
 
 
+@pytest.mark.integration
 def test_kept_poses_are_held_against_some_of_the_images(room, truth, given, tmp_path):
     given(truth, np.random.default_rng(0).normal(size=(50, 3)))
     line, = run(room, tmp_path / "out").lines
@@ -82,6 +83,7 @@ def test_kept_poses_are_held_against_some_of_the_images(room, truth, given, tmp_
     assert int(matches) > 500
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("change", ["flipped axes", "shuffled"])
 def test_wrong_poses_are_refused_although_points_came_with_them(
     room, truth, given, tmp_path, change
@@ -96,6 +98,7 @@ def test_wrong_poses_are_refused_although_points_came_with_them(
     assert not (tmp_path / "out" / "sparse").exists()
 
 
+@pytest.mark.integration
 def test_a_known_distance_scales_cameras_points_and_what_is_undistorted(
     room, truth, given, tmp_path
 ):
@@ -137,6 +140,7 @@ def test_points_are_triangulated_from_poses_that_stay_where_they_are(room, truth
     assert camera == {"width": 600, "height": 340, "focal_px": 300.0, "frames": COUNT - 1}
 
 
+@pytest.mark.integration
 def test_refined_poses_come_nearer_to_the_truth_and_keep_its_unit(room, truth, given, tmp_path):
     noise = np.random.default_rng(0)
     given({name: shaken(viewmat, noise) for name, viewmat in truth.items()})
@@ -164,6 +168,7 @@ def shaken(viewmat, noise):
     return other
 
 
+@pytest.mark.integration
 def test_poses_that_have_nothing_to_do_with_the_images_are_refused(room, truth, given, tmp_path):
     """Every camera looks backwards, as with the axes of another convention."""
     given({name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()})
@@ -173,6 +178,7 @@ def test_poses_that_have_nothing_to_do_with_the_images_are_refused(room, truth, 
     assert "--poses ignore" in caught.value.hint
 
 
+@pytest.mark.integration
 def test_two_posed_frames_are_too_few(room, truth, given, tmp_path):
     given(dict(list(truth.items())[:2]))
     with pytest.raises(SfmError, match="Only 2 of 9 frames have a camera"):

@@ -108,6 +108,7 @@ def with_step(monkeypatch, made, **options):
     monkeypatch.setattr(triton_step, "PhotometricStep", Step)
 
 
+@pytest.mark.slow
 def test_the_room_that_there_was_changes_no_bit(reference, monkeypatch):
     accounts = []
     with monkeypatch.context() as patch:
@@ -131,6 +132,7 @@ def test_the_room_that_there_was_changes_no_bit(reference, monkeypatch):
     assert max(needed[:4]) > needed[0], "no run was stopped in mid-way"
 
 
+@pytest.mark.slow
 def test_recorded_launches_give_the_same_bits(reference, monkeypatch):
     played = []
 
@@ -155,6 +157,7 @@ def test_recorded_launches_give_the_same_bits(reference, monkeypatch):
     assert_same(held(state), reference)
 
 
+@pytest.mark.slow
 def test_launches_that_cannot_be_recorded_are_started_one_by_one(reference, monkeypatch, caplog):
     def recorder(_):
         raise RuntimeError("operation not permitted when stream is capturing")
@@ -211,6 +214,7 @@ def failing_at(monkeypatch, numbers):
     monkeypatch.setattr(triton_step, "loss_and_gradient", loss)
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_no_number_moves_nothing_and_is_counted(monkeypatch):
     states = []
     for step_by_step in (True, False):
@@ -231,6 +235,7 @@ def test_a_loss_that_is_no_number_moves_nothing_and_is_counted(monkeypatch):
     assert torch.equal(states[0].gathered.count, states[1].gathered.count)
 
 
+@pytest.mark.slow
 def test_losses_that_stay_no_number_end_the_run(monkeypatch):
     failing_at(monkeypatch, set(range(1, 20)))
     with pytest.raises(TrainingError, match="not finite"):
@@ -250,6 +255,7 @@ class NoWaiting(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
+@pytest.mark.slow
 def test_steps_of_several_views_go_ahead_to_the_same_bits(monkeypatch):
     config = dataclasses.replace(CONFIG, batch_views=2)
     failing, states, accounts = {5}, [], []  # the third step comes to nothing

@@ -71,6 +71,7 @@ def states(workspace, capsys):
     return {row["name"]: row for row in stages}
 
 
+@pytest.mark.integration
 @torchrun_is_here
 def test_two_processes_train_and_prune_what_one_then_finds_fresh_and_scores(trained, capsys):
     workspace, said = trained
@@ -87,6 +88,7 @@ def test_two_processes_train_and_prune_what_one_then_finds_fresh_and_scores(trai
     assert "train is up to date" in capsys.readouterr().out
 
 
+@pytest.mark.integration
 @torchrun_is_here
 def test_ctrl_c_saves_the_state_and_one_process_goes_on(mapped, trained, tmp_path, capsys):
     workspace = shutil.copytree(mapped, tmp_path / "w")
@@ -107,6 +109,7 @@ def test_ctrl_c_saves_the_state_and_one_process_goes_on(mapped, trained, tmp_pat
     assert (mine.means - theirs.means).norm() <= 1e-2 * theirs.means.norm()
 
 
+@pytest.mark.integration
 @torchrun_is_here
 def test_verbs_that_do_not_train_run_once_and_the_others_end_well(tmp_path):
     process = torchrun("-m", "recon_cli", "status", "-w", tmp_path / "none")

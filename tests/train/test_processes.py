@@ -13,6 +13,8 @@ from recon_cli.context import ALONE
 from recon_cli.errors import LostError
 from recon_cli.train.cost import CostModel, LevelCost, with_exchange
 
+pytestmark = pytest.mark.integration
+
 
 def test_a_leader_that_is_gone_is_followed_without_a_word(tmp_path):
     with team(2, tmp_path) as found:
