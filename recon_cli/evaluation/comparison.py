@@ -12,28 +12,23 @@ from typing import Any
 
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, InputError
-from recon_cli.evaluation import (
+from recon_cli.evaluation.intervals import Interval, paired_bootstrap
+from recon_cli.evaluation.metrics import (
     MASK_CONVENTION,
     PSNR_8BIT_CONVENTION,
     PSNR_CONVENTION,
     SSIM_CONVENTION,
     SSIM_PADDED_CONVENTION,
-    ModelScore,
-    PairedDifference,
-    ViewScore,
-    csv_table,
-    model_table,
-    paired_bootstrap,
-    paper_table,
 )
 from recon_cli.evaluation.reference_views import (
     LABELS,
-    Truth,
+    ReferenceView,
+    load_held_out_views,
     load_scene,
-    scorable,
-    scored,
-    truth_digest,
+    reference_digest,
+    score_views,
 )
+from recon_cli.evaluation.scores import ModelScore, ViewScore, csv_table, model_table, paper_table
 from recon_cli.evaluation.tables import Table
 from recon_cli.io.splats.registry import read_splats
 from recon_cli.scene.similarity import Similarity
@@ -117,7 +112,7 @@ class Benchmark:
     """
 
     name: str
-    views: Sequence[Truth]
+    views: Sequence[ReferenceView]
     ctx: StageContext
 
 
@@ -135,7 +130,8 @@ def benchmark_of(
     Raises:
         ReconstructionError: no held-out view has a camera.
     """
-    return Benchmark(name, scorable(load_scene(inputs, validation=0.0), max_size, ctx), ctx)
+    scene = load_scene(inputs, validation=0.0)
+    return Benchmark(name, load_held_out_views(scene, max_size, ctx), ctx)
 
 
 def of_file(path: Path, name: str, against: Benchmark) -> Entry:
@@ -153,10 +149,10 @@ def of_file(path: Path, name: str, against: Benchmark) -> Entry:
     """
     splats = _brought_back(read_splats(path), path.with_name(_TRANSFORM))
     splats = splats.map(lambda tensor: tensor.to(against.ctx.device))
-    found = scored(splats, against.views, splats.sh_degree, against.ctx)
+    found = score_views(splats, against.views, splats.sh_degree, against.ctx.backend)
     score = ModelScore(
         name, found.views, len(splats), path.stat().st_size, found.render_ms, None)
-    return Entry(against.name, name, score, truth_digest(against.views))
+    return Entry(against.name, name, score, reference_digest(against.views))
 
 
 def _brought_back(splats: Splats, record: Path) -> Splats:
@@ -208,15 +204,10 @@ def pairs(entries: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
 
 def difference_table(entries: Sequence[Entry]) -> Table:
     """Returns how each entry differs from the first one with the same views, with intervals."""
-    def shown(found: PairedDifference, form: str) -> str:
-        if found.low is None or found.high is None:
-            return f"{found.mean:{form}} (one view)"
-        return f"{found.mean:{form}} [{found.low:{form}}, {found.high:{form}}]"
-
     return Table(("difference, 95%", "PSNR dB", "SSIM"), tuple(
         (f"{ours.score.label} minus {theirs.score.label}",
-         shown(_paired(ours, theirs, "psnr_db"), "+.2f"),
-         shown(_paired(ours, theirs, "ssim"), "+.4f")) for ours, theirs in pairs(entries)))
+         _paired(ours, theirs, "psnr_db").text("+.2f"),
+         _paired(ours, theirs, "ssim").text("+.4f")) for ours, theirs in pairs(entries)))
 
 
 def _beside_the_paper(entries: Sequence[Entry]) -> Table:
@@ -228,7 +219,7 @@ def _beside_the_paper(entries: Sequence[Entry]) -> Table:
         if (group, "base") in models and (group, "pruned") in models})
 
 
-def _paired(ours: Entry, theirs: Entry, key: str) -> PairedDifference:
+def _paired(ours: Entry, theirs: Entry, key: str) -> Interval:
     return paired_bootstrap(*([getattr(view, key) for view in entry.score.views]
                               for entry in (ours, theirs)))
 

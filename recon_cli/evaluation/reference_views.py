@@ -1,4 +1,8 @@
-"""Views to score at the size they are scored at, and the scores of a model on them."""
+"""Reference views: photos at the size they are scored at, with masks, and scores against them.
+
+Everything is rendered on black. Views whose mask leaves too little to score are left out by
+whoever loads them here.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,9 @@ import hashlib
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,195 +20,58 @@ from numpy.typing import NDArray
 
 from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.evaluation import MIN_PIXELS, MIN_SIDE, ViewScore, leaves_enough, psnr, ssim
-from recon_cli.evaluation.lpips import Perceptual
-from recon_cli.evaluation.quality import corrected_psnr
+from recon_cli.evaluation.metrics import (
+    MIN_PIXELS,
+    MIN_SIDE,
+    Perceptual,
+    corrected_psnr,
+    leaves_enough,
+    psnr,
+    ssim,
+)
+from recon_cli.evaluation.scores import ViewScore
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.frames import read_frame_list
 from recon_cli.io.images import eight_bit, fitted_camera, read_masked_image
-from recon_cli.render import render
+from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.train_view import TrainView
 
 LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}  # of the models of a workspace
+MASK_HINT = "Run `recon ingest` with masks that hide less."
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
-    """A view at the size it is scored at.
+class ReferenceView(TrainView):
+    """A view with its original pixels, at the size it is scored at."""
 
-    Attributes:
-        name: of the view.
-        camera: at that size.
-        image: [H, W, 3], the original pixels.
-        mask: [H, W], True where a pixel counts; None where all do.
-    """
-
-    name: str
-    camera: Camera
-    image: NDArray[np.uint8]
-    mask: NDArray[np.bool_] | None
-
-    @property
-    def enough(self) -> bool:
-        """Whether the mask leaves enough to score."""
-        return self.mask is None or leaves_enough(self.mask)
+    name: str = field(kw_only=True)
 
 
 @dataclass(frozen=True)
-class Scored:
-    """The scores of one model.
-
-    Attributes:
-        views: per view.
-        corrected_db: mean PSNR after the best gain per channel of each view: a model with exposures
-            shows the mean one, and cannot know that of a view that it was not trained on.
-        render_ms: median milliseconds a view.
-    """
+class RenderScores:
+    """The scores of one model on reference views."""
 
     views: tuple[ViewScore, ...]
+    # Mean PSNR after the best gain per channel of each view: a model with exposures renders the
+    # mean one, and cannot know that of a view that it was not trained on.
     corrected_db: float
-    render_ms: float
+    render_ms: float  # median milliseconds a view
 
 
-def scorable(scene: Scene, max_size: int, ctx: StageContext) -> list[Truth]:
-    """Returns the held-out views that can be scored, and names the others.
+@dataclass(frozen=True)
+class MeanScore:
+    """Means over some views: PSNR in dB, and SSIM by scikit-image."""
 
-    Args:
-        scene: its views.
-        max_size: longest side in pixels.
-        ctx: gets the notices.
-
-    Raises:
-        ReconstructionError: no held-out view has a camera, or masks leave none.
-        ConfigError: they are smaller than the window of SSIM.
-    """
-    if not scene.test:
-        raise ReconstructionError(
-            f"No held-out view has a camera ({len(scene.unregistered_test)} were held out).",
-            hint="Run `recon ingest` with another --holdout, such as every:8.")
-    read = truths(scene.test, max_size)
-    kept = [truth for truth in read if truth.enough]
-    notice_hidden([truth.name for truth in read if truth not in kept], "not scored", ctx)
-    if not kept:
-        raise ReconstructionError(
-            f"The masks leave nothing to score of {len(read)} held-out views.", hint=MASK_HINT)
-    return kept
-
-
-def truths(views: Sequence[View], max_size: int) -> list[Truth]:
-    """Returns views with their original pixels.
-
-    Raises:
-        ConfigError: they are smaller than the window of SSIM.
-    """
-    found = []
-    for view in views:
-        camera = fitted_camera(view.camera, max_size)
-        if min(camera.width, camera.height) < MIN_SIDE:
-            raise ConfigError(
-                f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
-                f"needs {MIN_SIDE} pixels a side.",
-                hint="Run `recon eval` with a larger --max-size.")
-        image, mask = read_masked_image(view.original, view.mask, camera.width, camera.height)
-        found.append(Truth(view.name, camera, image, mask))
-    return found
-
-
-def truth_digest(views: Sequence[Truth]) -> str:
-    """Returns a digest of all that models are held against: names, lenses, pixels, masks.
-
-    Scores of two models can be paired where theirs are equal.
-    """
-    found = hashlib.sha256()
-    for truth in views:
-        camera = truth.camera
-        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        found.update(repr((truth.name, lens, truth.mask is None)).encode())
-        for pixels in (truth.image, truth.mask):
-            if pixels is not None:
-                found.update(np.ascontiguousarray(pixels).tobytes())
-    return found.hexdigest()
-
-
-def scored(
-    splats: Splats, views: Sequence[Truth], sh_degree: int, ctx: StageContext,
-    *, perceptual: Perceptual | None = None,
-    on_view: Callable[[Truth, NDArray[np.float32]], None] = lambda _truth, _image: None,
-) -> Scored:
-    """Renders every view of one model and returns its scores.
-
-    Args:
-        splats: the model, on the device of `ctx`.
-        views: to score, at least one.
-        sh_degree: in use.
-        ctx: backend and device.
-        perceptual: the perceptual distance, where there is one.
-        on_view: gets each view and its picture [H, W, 3], not clamped.
-    """
-    scores, milliseconds, corrected = [], [], []
-    for truth in views:
-        image, elapsed = _timed_render(splats, truth.camera, sh_degree, ctx)
-        milliseconds.append(elapsed)
-        scores.append(view_score(truth, image, perceptual))
-        corrected.append(corrected_psnr(image, truth.image, truth.mask))
-        on_view(truth, image)
-    return Scored(
-        tuple(scores), statistics.fmean(corrected), statistics.median(milliseconds))
-
-
-def mean_psnr(
-    splats: Splats, views: Sequence[Truth], sh_degree: int, ctx: StageContext, *,
-    corrected: bool, on_view: Callable[[], None],
-) -> float:
-    """Returns the mean PSNR in dB over views, at least one.
-
-    Args:
-        splats: the model, on the device of `ctx`.
-        views: to score.
-        sh_degree: in use.
-        ctx: backend and device.
-        corrected: after the best gain per channel of each view.
-        on_view: called after each view.
-    """
-    score = corrected_psnr if corrected else psnr
-    found = []
-    for truth in views:
-        image, _ = _timed_render(splats, truth.camera, sh_degree, ctx)
-        found.append(score(image, truth.image, truth.mask))
-        on_view()
-    return statistics.fmean(found)
-
-
-def view_score(
-    truth: Truth, image: NDArray[np.float32], perceptual: Perceptual | None = None
-) -> ViewScore:
-    """Returns the scores of a picture [H, W, 3]; LPIPS only of views without a mask."""
-    mask = truth.mask
-    distance = None
-    if perceptual is not None and mask is None:
-        distance = perceptual(image, truth.image)
-    return ViewScore(
-        truth.name, psnr(image, truth.image, mask), psnr(eight_bit(image), truth.image, mask),
-        ssim(image, truth.image, mask), ssim(image, truth.image, mask, padded=True), distance,
-        None if mask is None else float(mask.mean()))
-
-
-def _timed_render(
-    splats: Splats, camera: Camera, sh_degree: int, ctx: StageContext
-) -> tuple[NDArray[np.float32], float]:
-    """Returns the image [H, W, 3] and the milliseconds that it took."""
-    start = time.perf_counter()
-    with torch.no_grad():
-        background = torch.zeros(3, device=ctx.device)
-        rgb = render(splats, camera, background, sh_degree, backend=ctx.backend).rgb
-        image: NDArray[np.float32] = rgb.cpu().numpy()  # waits for the device
-    return image, 1e3 * (time.perf_counter() - start)
+    psnr_db: float
+    ssim: float
 
 
 def held_out_names(ingest: Path) -> frozenset[str]:
-    """Returns the names of the frames that ingest kept for the score."""
+    """Returns the names of the frames that ingest held out for the score."""
     return frozenset(frame.name for frame in read_frame_list(ingest).frames if frame.held_out)
 
 
@@ -214,14 +82,194 @@ def load_scene(inputs: StageInputs, *, validation: float) -> Scene:
         undistorted, held_out=held_out_names(inputs.folders["ingest"]), validation=validation)
 
 
-MASK_HINT = "Run `recon ingest` with masks that hide less."
+def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:
+    """Returns at most `most` of the items, evenly spread."""
+    return items[:: max(1, -(-len(items) // most))]
 
 
-def notice_hidden(names: Sequence[str], what: str, ctx: StageContext) -> None:
-    """Says which views are left out because of their masks, and what that means for them."""
+def load_reference_views(
+    views: Sequence[View], max_size: int, ctx: StageContext | None = None
+) -> list[ReferenceView]:
+    """Returns views with their original pixels, without those whose mask leaves too little.
+
+    Args:
+        views: of a scene.
+        max_size: longest side in pixels.
+        ctx: gets a notice that names the views left out; None for no notice.
+
+    Raises:
+        ConfigError: they are smaller than the window of SSIM.
+        FormatError: an image cannot be read.
+    """
+    loaded, hidden = [], []
+    for view in views:
+        camera = fitted_camera(view.camera, max_size)
+        if min(camera.width, camera.height) < MIN_SIDE:
+            raise ConfigError(
+                f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
+                f"needs {MIN_SIDE} pixels a side.", hint="Use a larger --max-size.")
+        image, mask = read_masked_image(view.original, view.mask, camera.width, camera.height)
+        if leaves_enough(mask):
+            loaded.append(ReferenceView(camera, image, mask, name=view.name))
+        else:
+            hidden.append(view.name)
+    if ctx is not None:
+        notice_hidden(hidden, "not scored", ctx)
+    return loaded
+
+
+def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[ReferenceView]:
+    """Returns the held-out views that can be scored; a notice names those that masks hide.
+
+    Raises:
+        ReconstructionError: no held-out view has a camera, or masks leave none.
+        ConfigError: they are smaller than the window of SSIM.
+    """
+    if not scene.test:
+        raise ReconstructionError(
+            f"No held-out view has a camera ({len(scene.unregistered_test)} were held out).",
+            hint="Run `recon ingest` with another --holdout, such as every:8.")
+    views = load_reference_views(scene.test, max_size, ctx)
+    if not views:
+        raise ReconstructionError(
+            f"The masks leave nothing to score of {len(scene.test)} held-out views.",
+            hint=MASK_HINT)
+    return views
+
+
+def notice_hidden(names: Sequence[str], consequence: str, ctx: StageContext) -> None:
+    """Tells which views are left out because of their masks, and what that means for them."""
     if names:
-        ctx.notice(f"{len(names)} views are {what}, for their masks leave fewer than {MIN_PIXELS} "
-                   f"pixels: {', '.join(names)}")
+        ctx.notice(f"{len(names)} views are {consequence}: their masks leave fewer than "
+                   f"{MIN_PIXELS} pixels: {', '.join(names)}")
+
+
+def render_on_black(
+    splats: Splats, camera: Camera, sh_degree: int, backend: str
+) -> RenderOutput:
+    """Returns a view of a model on black, without gradients, on the device of the model."""
+    with torch.no_grad():
+        black = torch.zeros(3, device=splats.means.device)
+        return render(splats, camera, black, sh_degree, backend=backend)
+
+
+def score_views(
+    splats: Splats, views: Sequence[ReferenceView], sh_degree: int, backend: str,
+    *, perceptual: Perceptual | None = None,
+    on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _image: None,
+) -> RenderScores:
+    """Renders every view of one model and returns its scores.
+
+    Args:
+        splats: the model.
+        views: to score, at least one.
+        sh_degree: in use.
+        backend: name of a rasterizer.
+        perceptual: LPIPS, where it is available.
+        on_view: gets each view and its render [H, W, 3], not clamped.
+    """
+    scores, milliseconds, corrected = [], [], []
+    for view in views:
+        start = time.perf_counter()
+        image = _pixels(splats, view, sh_degree, backend)
+        milliseconds.append(1e3 * (time.perf_counter() - start))
+        scores.append(_view_score(view, image, perceptual))
+        corrected.append(corrected_psnr(image, view.image, view.mask))
+        on_view(view, image)
+    return RenderScores(
+        tuple(scores), statistics.fmean(corrected), statistics.median(milliseconds))
+
+
+def mean_psnr(
+    splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str,
+    *, corrected: bool = False, on_view: Callable[[], None] = lambda: None,
+) -> float:
+    """Returns the mean PSNR in dB over views, at least one.
+
+    Args:
+        splats: the model.
+        views: to score.
+        sh_degree: in use.
+        backend: name of a rasterizer.
+        corrected: after the best gain per channel of each view.
+        on_view: called after each view.
+    """
+    metric = corrected_psnr if corrected else psnr
+    values = []
+    for view in views:
+        values.append(metric(_pixels(splats, view, sh_degree, backend), view.image, view.mask))
+        on_view()
+    return statistics.fmean(values)
+
+
+def mean_score(
+    splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str
+) -> MeanScore:
+    """Returns the mean PSNR and SSIM over views, at least one."""
+    pairs = []
+    for view in views:
+        image = _pixels(splats, view, sh_degree, backend)
+        pairs.append((psnr(image, view.image, view.mask), ssim(image, view.image, view.mask)))
+    mean = np.mean(pairs, axis=0)
+    return MeanScore(float(mean[0]), float(mean[1]))
+
+
+def mean_psnr_on_device(
+    splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str
+) -> float:
+    """Returns the mean PSNR in dB over views, at least one, computed where the model lies.
+
+    In float32, which is what a running training can afford; `mean_psnr` computes in float64.
+    """
+    device = splats.means.device
+    values = []
+    with torch.no_grad():
+        for view in views:
+            rgb = render_on_black(splats, view.camera, sh_degree, backend).rgb
+            errors = (rgb.clamp(0, 1) - view.pixels(device)).square()
+            counting = view.counting(device)
+            error = (errors if counting is None else errors[counting]).mean().item()
+            values.append(-10 * np.log10(max(error, 1e-10)))
+    return float(np.mean(values))
+
+
+def _pixels(
+    splats: Splats, view: TrainView, sh_degree: int, backend: str
+) -> NDArray[np.float32]:
+    """Returns the render [H, W, 3] of a view; waits for the device."""
+    image: NDArray[np.float32] = render_on_black(
+        splats, view.camera, sh_degree, backend).rgb.cpu().numpy()
+    return image
+
+
+def _view_score(
+    view: ReferenceView, image: NDArray[np.float32], perceptual: Perceptual | None
+) -> ViewScore:
+    """Returns the scores of a render [H, W, 3]; LPIPS only of views without a mask."""
+    mask = view.mask
+    distance = None
+    if perceptual is not None and mask is None:
+        distance = perceptual(image, view.image)
+    return ViewScore(
+        view.name, psnr(image, view.image, mask), psnr(eight_bit(image), view.image, mask),
+        ssim(image, view.image, mask), ssim(image, view.image, mask, padded=True), distance,
+        None if mask is None else float(mask.mean()))
+
+
+def reference_digest(views: Sequence[ReferenceView]) -> str:
+    """Returns a digest of all that models are compared with: names, lenses, pixels, masks.
+
+    Scores of two models can be paired where theirs are equal.
+    """
+    digest = hashlib.sha256()
+    for view in views:
+        camera = view.camera
+        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        digest.update(repr((view.name, lens, view.mask is None)).encode())
+        for pixels in (view.image, view.mask):
+            if pixels is not None:
+                digest.update(np.ascontiguousarray(pixels).tobytes())
+    return digest.hexdigest()
 
 
 def size_summary(cameras: Sequence[Camera]) -> Summary:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from recon_cli.evaluation import PSNR_CONVENTION, SSIM_CONVENTION
-from recon_cli.evaluation.intervals import Difference, Spread
+from recon_cli.evaluation.intervals import Interval, Spread
+from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.evaluation.tables import TitledTable
 from recon_cli.experiments.study_plot import published
 from recon_cli.experiments.study_result import (
@@ -106,7 +106,7 @@ def _sentence(
     if found.low <= 0 <= found.high:
         return f"{lead}; the interval {span} contains 0: no difference shown."
     return f"{lead}; the interval {span} lies {'above' if found.low > 0 else 'below'} 0: " \
-           f"{ours.label} is {found.shown}."
+           f"{ours.label} is {found.verdict}."
 
 
 def beside_the_paper(result: Result) -> TitledTable | None:
@@ -178,7 +178,7 @@ def _mean_and_deviation(found: Spread, digits: int) -> tuple[str, str]:
     return f"{found.mean:.{digits}f}", deviation
 
 
-def _interval(found: Difference, digits: int) -> tuple[str, str, str]:
+def _interval(found: Interval, digits: int) -> tuple[str, str, str]:
     if found.low is None or found.high is None:
         return f"{found.mean:+.{digits}f}", "-", "-"
     return (f"{found.mean:+.{digits}f}", f"{found.low:+.{digits}f}", f"{found.high:+.{digits}f}")

@@ -9,7 +9,7 @@ from typing import Any
 
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig, RunConfig
-from recon_cli.evaluation.intervals import Difference, Spread, difference, spread
+from recon_cli.evaluation.intervals import Interval, Spread, paired_t
 from recon_cli.experiments.host import Host
 from recon_cli.experiments.records import Record
 from recon_cli.experiments.train_result import shared
@@ -128,14 +128,14 @@ class Result:
 
     def spread(self, row: str, comparison: str, arm: Arm, figure: str) -> Spread:
         """Returns mean and standard deviation over the seeds."""
-        return spread(self.values(row, comparison, arm, figure))
+        return Spread.of(self.values(row, comparison, arm, figure))
 
     def difference(
         self, row: str, comparison: str, ours: Arm, theirs: Arm, figure: str
-    ) -> Difference:
+    ) -> Interval:
         """Returns the paired difference of two arms over the seeds."""
-        return difference(self.values(row, comparison, ours, figure),
-                          self.values(row, comparison, theirs, figure))
+        return paired_t(self.values(row, comparison, ours, figure),
+                        self.values(row, comparison, theirs, figure))
 
     def record(self) -> dict[str, Any]:
         """Returns what the JSON file holds."""
@@ -167,4 +167,4 @@ class Result:
         self, row: str, comparison: str, ours: Arm, theirs: Arm, figure: str
     ) -> dict[str, Any]:
         found = self.difference(row, comparison, ours, theirs, figure)
-        return {**asdict(found), "shown": found.shown}
+        return {**asdict(found), "shown": found.verdict}

@@ -8,11 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from recon_cli.config.stages import PRUNE_SCORES
-from recon_cli.evaluation import psnr, ssim
-from recon_cli.render import render
+from recon_cli.evaluation.reference_views import MeanScore, mean_score
 from recon_cli.train.fit import Report, Task, fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.prune_run import Course
@@ -22,19 +19,6 @@ from recon_cli.workspace import atomic
 
 NONE = "none"  # stands for no score where nothing is removed
 _WARM_STEPS = 10  # before anything is timed: the first steps load kernels and make buffers
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Means over the validation views.
-
-    Attributes:
-        psnr_db: in dB.
-        ssim: structural similarity.
-    """
-
-    psnr_db: float
-    ssim: float
 
 
 @dataclass(frozen=True)
@@ -57,8 +41,8 @@ class Trial:
     gaussians: int
     steps: int
     seconds: float
-    removed: Quality | None
-    recovered: Quality
+    removed: MeanScore | None
+    recovered: MeanScore
 
 
 def trials(ratios: Sequence[float]) -> int:
@@ -129,18 +113,10 @@ def advancing(task: Task) -> Advance:
     return advance
 
 
-def quality(state: TrainState, task: Task) -> Quality:
+def quality(state: TrainState, task: Task) -> MeanScore:
     """Returns the scores of a model on the validation views, of masked ones where they count."""
-    found = []
-    with torch.no_grad():
-        for view in task.validation:
-            rgb = render(
-                state.splats, view.camera, torch.zeros(3, device=task.device),
-                task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend).rgb
-            image = rgb.cpu().numpy()
-            found.append((psnr(image, view.image, view.mask), ssim(image, view.image, view.mask)))
-    decibels, similarities = zip(*found, strict=True)
-    return Quality(sum(decibels) / len(found), sum(similarities) / len(found))
+    degree = task.schedule.sh_degree(max(1, state.iteration))
+    return mean_score(state.splats, task.validation, degree, task.backend)
 
 
 def draw(found: Sequence[Trial], before: float, path: Path) -> None:

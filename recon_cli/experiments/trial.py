@@ -12,20 +12,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
-from recon_cli.evaluation import MIN_SIDE, leaves_enough, psnr, ssim
-from recon_cli.evaluation.reference_views import MASK_HINT, notice_hidden
+from recon_cli.evaluation.reference_views import MASK_HINT, load_reference_views, mean_score
 from recon_cli.experiments.scenes import Place, refuse_unscored
 from recon_cli.experiments.variants import Arm, Prune
-from recon_cli.io.images import fitted_camera, read_masked_image
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.render import render
-from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.feature_trials import PARTS
@@ -98,28 +94,6 @@ class Score:
     bytes: int
 
 
-def load_scored(views: Sequence[View], max_size: int, ctx: StageContext) -> list[TrainView]:
-    """Returns views with their original pixels; those that a mask hides are named and left out.
-
-    Raises:
-        ConfigError: they are smaller than the window of SSIM.
-    """
-    loaded, hidden = [], []
-    for view in views:
-        camera = fitted_camera(view.camera, max_size)
-        if min(camera.width, camera.height) < MIN_SIDE:
-            raise ConfigError(
-                f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
-                f"needs {MIN_SIDE} pixels a side.", hint="Give a larger --max-size.")
-        image, mask = read_masked_image(view.original, view.mask, camera.width, camera.height)
-        if mask is None or leaves_enough(mask):
-            loaded.append(TrainView(camera, image, mask))
-        else:
-            hidden.append(view.name)
-    notice_hidden(hidden, "not scored", ctx)
-    return loaded
-
-
 def score(splats: Splats, views: Sequence[TrainView], sh_degree: int, ctx: StageContext) -> Score:
     """Returns the scores of a model as its .ply holds it.
 
@@ -134,15 +108,8 @@ def score(splats: Splats, views: Sequence[TrainView], sh_degree: int, ctx: Stage
         write_ply(path, splats)
         size = path.stat().st_size
         written = read_ply(path).map(lambda tensor: tensor.to(ctx.device))
-    background = torch.zeros(3, device=ctx.device)
-    pairs = []
-    for view in views:
-        with torch.no_grad():
-            image = render(
-                written, view.camera, background, sh_degree, backend=ctx.backend).rgb.cpu().numpy()
-        pairs.append((psnr(image, view.image, view.mask), ssim(image, view.image, view.mask)))
-    mean = np.mean(pairs, axis=0)
-    return Score(float(mean[0]), float(mean[1]), len(splats), size)
+    mean = mean_score(written, views, sh_degree, ctx.backend)
+    return Score(mean.psnr_db, mean.ssim, len(splats), size)
 
 
 class Advance(Protocol):
@@ -294,7 +261,7 @@ def stand(place: Place, scored: str, base: RunConfig, ctx: StageContext) -> Stan
     """
     scene = place.load(base)
     refuse_unscored(place, scene, test=scored == "test")
-    views = load_scored(
+    views = load_reference_views(
         scene.test if scored == "test" else scene.validation, base.max_size, ctx)
     if not views:
         raise ConfigError(f"The masks of {place.name} leave no view to score.", hint=MASK_HINT)

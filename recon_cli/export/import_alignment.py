@@ -16,8 +16,13 @@ import numpy as np
 
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, ReconstructionError
-from recon_cli.evaluation import psnr
-from recon_cli.evaluation.reference_views import Truth, mean_psnr, truths
+from recon_cli.evaluation.metrics import psnr
+from recon_cli.evaluation.reference_views import (
+    ReferenceView,
+    evenly_spread,
+    load_reference_views,
+    mean_psnr,
+)
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
@@ -107,9 +112,8 @@ def match(
         frames = {frame: frames[frame]}
     elif world.is_identity:
         del frames[SOURCE]
-    some = truths(scene.train[:: max(1, -(-len(scene.train) // _VIEWS))], max_size)
-    some = [truth for truth in some if truth.enough]
-    if not some:
+    views = load_reference_views(evenly_spread(scene.train, _VIEWS), max_size)
+    if not views:
         raise ReconstructionError(
             "There is no training view to hold the imported scene against: none has a camera, or "
             "masks leave nothing of them.",
@@ -117,16 +121,15 @@ def match(
     found = {}
     for name, similarity in frames.items():
         there = transformed(splats, similarity).map(lambda tensor: tensor.to(ctx.device))
-        found[name] = mean_psnr(
-            there, some, there.sh_degree, ctx, corrected=False, on_view=lambda: None)
+        found[name] = mean_psnr(there, views, there.sh_degree, ctx.backend)
     best = max(found, key=lambda name: found[name])
     return Match(
-        best, frames[best], found, statistics.fmean(map(_flat_psnr, some)), len(some))
+        best, frames[best], found, statistics.fmean(map(_flat_psnr, views)), len(views))
 
 
-def _flat_psnr(truth: Truth) -> float:
+def _flat_psnr(view: ReferenceView) -> float:
     """Returns the PSNR of a picture in the view's mean colour."""
-    counted = truth.image.reshape(-1, 3) if truth.mask is None else truth.image[truth.mask]
+    counted = view.image.reshape(-1, 3) if view.mask is None else view.image[view.mask]
     flat = np.broadcast_to(
-        (counted.mean(axis=0) / 255).astype(np.float32), truth.image.shape)
-    return psnr(flat, truth.image, truth.mask)
+        (counted.mean(axis=0) / 255).astype(np.float32), view.image.shape)
+    return psnr(flat, view.image, view.mask)

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconstructionError, StageError
+from recon_cli.evaluation.reference_views import render_on_black
 from recon_cli.io.import_record import Origin
-from recon_cli.render import render
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
@@ -132,9 +131,7 @@ def _shown(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Returns a picture [H, W, 3], and where something is seen in it [H, W]."""
     there = splats.map(lambda tensor: tensor.to(ctx.device))
-    with torch.no_grad():
-        shown = render(there, camera, torch.zeros(3, device=ctx.device), there.sh_degree,
-                       backend=ctx.backend)
+    shown = render_on_black(there, camera, there.sh_degree, ctx.backend)
     image: NDArray[np.float32] = shown.rgb.clamp(0, 1).cpu().numpy()
     seen: NDArray[np.bool_] = (shown.alpha > _VISIBLE).cpu().numpy()
     return image, seen

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
-from recon_cli.evaluation.reference_views import MASK_HINT, Truth, mean_psnr, truths
+from recon_cli.evaluation.reference_views import (
+    MASK_HINT,
+    ReferenceView,
+    evenly_spread,
+    load_reference_views,
+    mean_psnr,
+)
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats
@@ -25,7 +31,7 @@ class Fidelity:
         ctx: backend and device.
     """
 
-    views: Sequence[Truth]
+    views: Sequence[ReferenceView]
     ctx: StageContext
 
     def described(self) -> str:
@@ -35,8 +41,7 @@ class Fidelity:
     def psnr_db(self, splats: Splats) -> float:
         """Returns the mean PSNR of a scene over the views in dB."""
         there = splats.map(lambda tensor: tensor.to(self.ctx.device))
-        return mean_psnr(
-            there, self.views, there.sh_degree, self.ctx, corrected=False, on_view=lambda: None)
+        return mean_psnr(there, self.views, there.sh_degree, self.ctx.backend)
 
 
 def fidelity(
@@ -53,12 +58,11 @@ def fidelity(
     Raises:
         ReconstructionError: masks leave nothing of any of them.
     """
-    chosen = scene.validation or scene.train
-    some = truths(chosen[::max(1, -(-len(chosen) // _VIEWS))], max_size)
-    views = [dataclasses.replace(truth, camera=similarity.camera(truth.camera))
-             for truth in some if truth.enough]
+    chosen = evenly_spread(scene.validation or scene.train, _VIEWS)
+    views = [dataclasses.replace(view, camera=similarity.camera(view.camera))
+             for view in load_reference_views(chosen, max_size)]
     if not views:
         raise ReconstructionError(
-            f"The masks leave nothing of {len(some)} views to check the export on.",
+            f"The masks leave nothing of {len(chosen)} views to check the export on.",
             hint=MASK_HINT)
     return Fidelity(views, ctx)

@@ -18,37 +18,35 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import EvaluateConfig
 from recon_cli.context import StageContext, StageInputs, Summary
-from recon_cli.evaluation import (
+from recon_cli.evaluation.intervals import Interval, paired_bootstrap
+from recon_cli.evaluation.metrics import (
+    LPIPS_CONVENTION,
     MASK_CONVENTION,
     PSNR_8BIT_CONVENTION,
     PSNR_CONVENTION,
     SSIM_CONVENTION,
     SSIM_PADDED_CONVENTION,
-    ModelScore,
-    csv_table,
-    model_table,
-    paired_bootstrap,
-    paper_table,
-    view_table,
+    load_lpips,
 )
-from recon_cli.evaluation.lpips import LPIPS_CONVENTION, perceptual
 from recon_cli.evaluation.reference_views import (
     LABELS,
-    Scored,
-    Truth,
+    ReferenceView,
+    RenderScores,
+    evenly_spread,
+    load_held_out_views,
+    load_reference_views,
     load_scene,
     mean_psnr,
-    scorable,
-    scored,
+    reference_digest,
+    score_views,
     size_summary,
     sizes_of,
-    truth_digest,
-    truths,
 )
+from recon_cli.evaluation.scores import ModelScore, csv_table, model_table, paper_table, view_table
 from recon_cli.io.images import eight_bit, write_png
 from recon_cli.io.import_record import Origin
 from recon_cli.io.ply import read_ply
-from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.scene import Scene
 from recon_cli.train.runner import LOG, read_config, seconds_at
 from recon_cli.workspace.atomic import write_bytes, write_json
 
@@ -79,17 +77,18 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
     origin = Origin.of(inputs.folders["train"])
     scene = load_scene(inputs, validation=train_config.validation)
     size = config.max_size or train_config.max_size
-    held_out = scorable(scene, size, ctx)
+    held_out = load_held_out_views(scene, size, ctx)
     # where training refined its cameras, their images are no longer what these cameras show
-    trained = scene.train if train_config.poses != "on" else ()
-    seen = {name: views for name, views in (
-        ("training", _seen(trained, size)), ("validation", _seen(scene.validation, size))) if views}
+    splits = {"training": scene.train if train_config.poses != "on" else (),
+              "validation": scene.validation}
+    seen = {name: views for name, split in splits.items() if (
+        views := load_reference_views(evenly_spread(split, _SEEN_VIEWS), size))}
     stages = {"base": "train", "pruned": "prune"}
     folders = {model: inputs.folders[stage] for model, stage in stages.items()
                if stage in inputs.folders}
-    for truth in held_out:
-        _save(out / "truth" / f"{Path(truth.name).stem}.png", truth.image)
-    measure, lacking = perceptual()
+    for view in held_out:
+        _save(out / "truth" / f"{Path(view.name).stem}.png", view.image)
+    perceptual, lacking = load_lpips()
     lacking = lacking or "views with a mask have none"
     gains = train_config.exposure == "on"
     models: dict[str, _Model] = {}
@@ -98,18 +97,21 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
         for model, folder in folders.items():
             splats = read_ply(folder / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
 
-            def keep(truth: Truth, image: NDArray[np.float32], model: str = model) -> None:
-                _save_pictures(out, model, truth, image)
+            def save(
+                view: ReferenceView, image: NDArray[np.float32], model: str = model
+            ) -> None:
+                _save_pictures(out, model, view, image)
                 bar.advance()
 
             degree = train_config.sh_degree
-            found = scored(splats, held_out, degree, ctx, perceptual=measure, on_view=keep)
+            scores = score_views(
+                splats, held_out, degree, ctx.backend, perceptual=perceptual, on_view=save)
             seen_db = {name: mean_psnr(
-                splats, views, degree, ctx, corrected=gains, on_view=bar.advance)
+                splats, views, degree, ctx.backend, corrected=gains, on_view=bar.advance)
                 for name, views in seen.items()}
             seconds = None if origin else seconds_at(folder / LOG, _EVER)
             models[model] = _Model(
-                _model_score(model, folder, found, len(splats), seconds), found.corrected_db,
+                _model_score(model, folder, scores, len(splats), seconds), scores.corrected_db,
                 seen_db)
     if scene.unregistered_test:
         ctx.notice(f"{len(scene.unregistered_test)} held-out views have no camera and are not "
@@ -126,29 +128,23 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
     }
 
 
-def _seen(views: Sequence[View], max_size: int) -> list[Truth]:
-    """Returns at most _SEEN_VIEWS of them, evenly spread, without those that masks hide."""
-    some = views[::max(1, -(-len(views) // _SEEN_VIEWS))]
-    return [truth for truth in truths(some, max_size) if truth.enough]
-
-
 def _model_score(
-    model: str, folder: Path, found: Scored, gaussians: int, train_seconds: float | None
+    model: str, folder: Path, scores: RenderScores, gaussians: int, train_seconds: float | None
 ) -> ModelScore:
     return ModelScore(
-        LABELS[model], found.views, gaussians, (folder / "splats.ply").stat().st_size,
-        found.render_ms, train_seconds)
+        LABELS[model], scores.views, gaussians, (folder / "splats.ply").stat().st_size,
+        scores.render_ms, train_seconds)
 
 
 def _save_pictures(
-    out: Path, model: str, truth: Truth, image: NDArray[np.float32]
+    out: Path, model: str, view: ReferenceView, image: NDArray[np.float32]
 ) -> None:
-    """Saves the picture of a held-out view, and what it differs in from the truth."""
-    name, shown = f"{Path(truth.name).stem}.png", eight_bit(image)
-    _save(out / "renders" / model / name, shown)
-    difference = np.abs(shown.astype(np.int16) - truth.image) * _GAIN
-    if truth.mask is not None:
-        difference[~truth.mask] = 0
+    """Saves the render of a held-out view, and its difference from the photo."""
+    name, rendered = f"{Path(view.name).stem}.png", eight_bit(image)
+    _save(out / "renders" / model / name, rendered)
+    difference = np.abs(rendered.astype(np.int16) - view.image) * _GAIN
+    if view.mask is not None:
+        difference[~view.mask] = 0
     _save(out / "difference" / model / name, difference.clip(0, 255).astype(np.uint8))
 
 
@@ -158,23 +154,25 @@ def _save(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 def _write(
-    out: Path, inputs: StageInputs, models: Mapping[str, _Model], held_out: Sequence[Truth],
+    out: Path, inputs: StageInputs, models: Mapping[str, _Model], held_out: Sequence[ReferenceView],
     scene: Scene, *, gains: bool, lacking: str,
 ) -> None:
     """Writes the scores as JSON and as tables."""
     scores = {name: model.score for name, model in models.items()}
     measured = next(iter(scores.values())).lpips is not None
-    masked = sum(truth.mask is not None for truth in held_out)
+    masked = sum(view.mask is not None for view in held_out)
     origin = Origin.of(inputs.folders["train"])
     write_json(out / "metrics.json", {
         "models": {name: _record(model, gains=gains) for name, model in models.items()},
-        **({"pruned_minus_base": _paired(scores)} if len(scores) == 2 else {}),
+        **({"pruned_minus_base": {
+            key: dataclasses.asdict(_difference(scores, key)) for key in ("psnr_db", "ssim")}}
+           if len(scores) == 2 else {}),
         "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
         "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION,
         "lpips_convention": LPIPS_CONVENTION if measured else f"not measured: {lacking}",
         **({"mask_convention": MASK_CONVENTION} if masked else {}),
-        "truth_digest": truth_digest(held_out),
-        **size_summary([truth.camera for truth in held_out]), **_counts(held_out, scene),
+        "truth_digest": reference_digest(held_out),
+        **size_summary([view.camera for view in held_out]), **_counts(held_out, scene),
         **({"imported_from": origin.file} if origin else {}),
     })
     table = list(scores.values())
@@ -186,7 +184,8 @@ def _write(
                      f"{model.corrected_db:.2f} dB\n")
         note += f"{LABELS[name]}, {_gap(model, gains=gains)}\n"
     if len(scores) == 2:
-        note += _in_words(_paired(scores))
+        note += (f"pruned minus base: PSNR {_difference(scores, 'psnr_db').text('+.2f')} dB, SSIM "
+                 f"{_difference(scores, 'ssim').text('+.4f')} (95% by bootstrap over the views)\n")
     first = model_table(table)
     write_bytes(out / "table.txt", f"{first.text(rule=True)}\n{note}".encode())
     write_bytes(
@@ -215,41 +214,25 @@ def _record(model: _Model, *, gains: bool) -> Summary:
     }
 
 
-def _paired(scores: Mapping[str, ModelScore]) -> Summary:
-    """Returns pruned minus base, view by view, with an interval."""
-    def by(key: str) -> Summary:
-        ours, theirs = ([getattr(view, key) for view in scores[model].views]
-                        for model in ("pruned", "base"))
-        return dataclasses.asdict(paired_bootstrap(ours, theirs))
-
-    return {key: by(key) for key in ("psnr_db", "ssim")}
-
-
-def _in_words(paired: Summary) -> str:
-    """Returns the difference of the two models in one line."""
-    def shown(key: str, form: str) -> str:
-        found = paired[key]
-        if found["low"] is None:
-            return f"{found['mean']:{form}} (one view)"
-        return f"{found['mean']:{form}} [{found['low']:{form}}, {found['high']:{form}}]"
-
-    return (f"pruned minus base: PSNR {shown('psnr_db', '+.2f')} dB, SSIM "
-            f"{shown('ssim', '+.4f')} (95% by bootstrap over the views)\n")
+def _difference(scores: Mapping[str, ModelScore], key: str) -> Interval:
+    """Returns a score of pruned minus base, view by view, with an interval."""
+    return paired_bootstrap(*([getattr(view, key) for view in scores[model].views]
+                              for model in ("pruned", "base")))
 
 
 def _gap(model: _Model, *, gains: bool) -> str:
     """Returns how much better the views are that training saw."""
     held_out = model.corrected_db if gains else model.score.psnr_db
-    shown = {**model.seen_db, "held out": held_out}
-    text = f"PSNR of {', '.join(f'{name} {value:.2f}' for name, value in shown.items())} dB"
+    splits = {**model.seen_db, "held out": held_out}
+    text = f"PSNR of {', '.join(f'{name} {value:.2f}' for name, value in splits.items())} dB"
     if "training" not in model.seen_db:
         return text
     return f"{text}: a gap of {model.seen_db['training'] - held_out:.2f} dB to the training views"
 
 
-def _counts(held_out: Sequence[Truth], scene: Scene) -> Summary:
+def _counts(held_out: Sequence[ReferenceView], scene: Scene) -> Summary:
     """Returns how many views are scored, and the names of those that are not."""
-    hidden = {view.name for view in scene.test} - {truth.name for truth in held_out}
+    hidden = {view.name for view in scene.test} - {view.name for view in held_out}
     return {
         "test_views": len(held_out), "unregistered_test": list(scene.unregistered_test),
         **({"masked_out_test": sorted(hidden)} if hidden else {}),
@@ -257,11 +240,11 @@ def _counts(held_out: Sequence[Truth], scene: Scene) -> Summary:
 
 
 def _note(
-    held_out: Sequence[Truth], scene: Scene, masked: int, *, lacking: str | None
+    held_out: Sequence[ReferenceView], scene: Scene, masked: int, *, lacking: str | None
 ) -> str:
     """Returns what the figures of the tables mean."""
     sizes = " and ".join(
-        f"{width}x{height}" for width, height in sizes_of([truth.camera for truth in held_out]))
+        f"{width}x{height}" for width, height in sizes_of([view.camera for view in held_out]))
     note = (f"{len(held_out)} held-out views at {sizes}, "
             f"{len(scene.unregistered_test)} more without a camera\n"
             f"PSNR: {PSNR_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\n"

@@ -15,13 +15,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.evaluation.quality import corrected_psnr
-from recon_cli.render import render
-from recon_cli.scene.splats import Splats
+from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.background import FarContent, faces, far_content
 from recon_cli.train.exposure import Estimate, estimated
@@ -321,14 +318,8 @@ class _Bench:
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS, on_step=lambda _: None, on_report=lambda _: None,
             looks=lambda _: False)
-        return [_score(state.splats, reduced(view, LEVEL), config, task) for view in held_out]
-
-
-def _score(splats: Splats, view: TrainView, config: RunConfig, task: Task) -> float:
-    with torch.no_grad():
-        image = render(splats, view.camera, torch.zeros(3, device=task.device), config.sh_degree,
-                       backend=task.backend).rgb
-    return corrected_psnr(image.cpu().numpy(), view.image, view.mask)
+        return [mean_psnr(state.splats, [reduced(view, LEVEL)], config.sh_degree, task.backend,
+                          corrected=True) for view in held_out]
 
 
 def described(decisions: Sequence[Decision]) -> list[dict[str, object]]:

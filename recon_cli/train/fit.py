@@ -7,11 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 
 from recon_cli.context import ALONE, Ranks
-from recon_cli.render import render
+from recon_cli.evaluation.reference_views import mean_psnr_on_device
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import async_trainer
 from recon_cli.train.importance import Importance
@@ -146,13 +145,4 @@ def validation_psnr(state: TrainState, task: Task) -> float | None:
     if not task.validation:
         return None
     degree = task.schedule.sh_degree(max(1, state.iteration))
-    values = []
-    with torch.no_grad():
-        for view in task.validation:
-            rgb = render(state.splats, view.camera, torch.zeros(3, device=task.device), degree,
-                         backend=task.backend).rgb
-            errors = (rgb.clamp(0, 1) - view.pixels(task.device)).square()
-            counting = view.counting(task.device)
-            error = (errors if counting is None else errors[counting]).mean().item()
-            values.append(-10 * np.log10(max(error, 1e-10)))
-    return float(np.mean(values))
+    return mean_psnr_on_device(state.splats, task.validation, degree, task.backend)

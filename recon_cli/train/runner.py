@@ -16,7 +16,7 @@ import torch
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import TrainingError
-from recon_cli.evaluation import leaves_enough
+from recon_cli.evaluation.metrics import leaves_enough
 from recon_cli.evaluation.reference_views import MASK_HINT, notice_hidden, sizes_of
 from recon_cli.io.images import fitted_camera, read_masked_image
 from recon_cli.machine import free_memory_bytes
@@ -132,7 +132,7 @@ def load_views(
         camera = fitted_camera(view.camera, config.max_size)
         path = view.denoised if config.images == "denoised" else view.original
         image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
-        if mask is None or leaves_enough(mask):
+        if leaves_enough(mask):
             loaded.append(TrainView(camera, image, mask))
         else:
             hidden.append(view.name)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon_cli.context import StageContext
-from recon_cli.evaluation import leaves_enough, psnr
+from recon_cli.evaluation.metrics import leaves_enough, psnr
+from recon_cli.evaluation.reference_views import render_on_black
 from recon_cli.io.images import eight_bit, fitted_camera, fitted_size, read_image, read_masked_image
 from recon_cli.pipeline.execute import Job, rendering
-from recon_cli.render import render
 from recon_cli.scene.scene import View
 from recon_cli.scene.splats import Splats
 
@@ -55,13 +54,10 @@ class Pictures:
         """
         truth, mask = self.photo(view)
         camera, device = fitted_camera(view.camera, self._max_size), self._ctx.device
-        with torch.no_grad():
-            rgb = render(
-                splats.map(lambda tensor: tensor.to(device)), camera,
-                torch.zeros(3, device=device), splats.sh_degree, backend=self._ctx.backend).rgb
+        there = splats.map(lambda tensor: tensor.to(device))
+        rgb = render_on_black(there, camera, splats.sh_degree, self._ctx.backend).rgb
         image: NDArray[np.float32] = rgb.cpu().numpy()
-        enough = mask is None or leaves_enough(mask)
-        return eight_bit(image), psnr(image, truth, mask) if enough else None
+        return eight_bit(image), psnr(image, truth, mask) if leaves_enough(mask) else None
 
     def thumbnail(self, view: View) -> NDArray[np.uint8]:
         """Returns a small picture of a view.

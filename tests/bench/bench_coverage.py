@@ -19,8 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.experiments.trial import load_scored
+from recon_cli.evaluation.reference_views import load_reference_views, load_scene
 from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
@@ -80,7 +79,7 @@ def main(workspace: Path) -> None:
     config = read_config(workspace / "train")
     scene = load_scene(inputs, validation=config.validation)
     splats, ctx = read_ply(workspace / "train" / "splats.ply"), StageContext(backend="numba")
-    train = load_scored(scene.train, config.max_size, ctx)
+    train = load_reference_views(scene.train, config.max_size, ctx)
     cameras = [view.camera for view in train]
     depths = [picture(splats, camera, config.sh_degree)[1] for camera in cameras]
 
@@ -97,8 +96,8 @@ def main(workspace: Path) -> None:
 
     click.echo("| views | shown by other training views | pixels | squared error | PSNR there |\n"
                "|---|---|---:|---:|---:|")
-    table("held out", load_scored(scene.test, config.max_size, ctx), 0)
-    table("validation", load_scored(scene.validation, config.max_size, ctx), 0)
+    table("held out", load_reference_views(scene.test, config.max_size, ctx), 0)
+    table("validation", load_reference_views(scene.validation, config.max_size, ctx), 0)
     table("training", train[::max(1, -(-len(train) // SHOWN))], 1)
 
 

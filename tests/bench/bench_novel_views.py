@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from pose_errors import similarity
 
-from recon_cli.evaluation import psnr, ssim
+from recon_cli.evaluation.metrics import psnr, ssim
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fitted_camera, read_image
 from recon_cli.io.ply import read_ply

@@ -21,8 +21,9 @@ import click
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.scenes import Place
-from recon_cli.experiments.trial import load_scored, score
+from recon_cli.experiments.trial import score
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.fit import Task, fit
@@ -83,7 +84,7 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
         ctx: StageContext) -> str:
     """Returns the means over seeds as a line of a table."""
     size = task.schedule.config.max_size
-    held_out = load_scored(scene.test, size, ctx)
+    held_out = load_reference_views(scene.test, size, ctx)
     shown = task.train[::max(1, -(-len(task.train) // SHOWN))]
     found = []
     for seed in seeds:

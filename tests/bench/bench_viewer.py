@@ -41,7 +41,7 @@ from playwright.sync_api import Browser
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from browser import launch_browser, watch_page
 
-from recon_cli.evaluation import psnr
+from recon_cli.evaluation.metrics import psnr
 from recon_cli.experiments.synthetic_room import room
 from recon_cli.io.images import eight_bit, fitted_camera
 from recon_cli.pipeline.execute import rendering

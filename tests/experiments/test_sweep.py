@@ -8,7 +8,8 @@ from posed_sets import make_replica
 from recon_cli.cli import main
 from recon_cli.commands.prune_sweep import table
 from recon_cli.config.stages import PRUNE_SCORES
-from recon_cli.experiments.sweep import NONE, Quality, Trial, trials
+from recon_cli.evaluation.reference_views import MeanScore
+from recon_cli.experiments.sweep import NONE, Trial, trials
 
 RATIOS = (0.5, 0.9)
 
@@ -104,10 +105,10 @@ def test_ratios_that_are_none_are_a_usage_error(ratios, capsys):
 
 
 def test_a_table_says_what_is_equal_in_each_control():
-    good = Quality(30.0, 0.9)
+    good = MeanScore(30.0, 0.9)
     text = table([
         Trial(NONE, None, 100, 60, 6.0, None, good),
-        Trial("loo", 0.8, 20, 60, 3.0, Quality(20.0, 0.5), good),
+        Trial("loo", 0.8, 20, 60, 3.0, MeanScore(20.0, 0.5), good),
         Trial(NONE, 0.8, 100, 30, 3.0, None, good)], "loo")
     lines = text.splitlines()
     assert "equal steps" in lines[1]

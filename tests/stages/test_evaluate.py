@@ -14,7 +14,8 @@ from tiny_stages import holding_out, mean_colour_psnr, pruned, run, without
 from recon_cli.config.stages import EvaluateConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.evaluation import psnr, reference_views, ssim
+from recon_cli.evaluation import reference_views
+from recon_cli.evaluation.metrics import psnr, ssim
 from recon_cli.io.images import read_image
 from recon_cli.stages import evaluate
 from recon_cli.train.runner import read_config, write_config

@@ -10,7 +10,8 @@ from tiny_scene import TWO, make_inputs, write_masks
 
 from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation import psnr, reference_views
+from recon_cli.evaluation import reference_views
+from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image
 from recon_cli.stages import evaluate, prune, train
 from recon_cli.train import runner

@@ -10,7 +10,7 @@ from tiny_scene import make_inputs
 
 from recon_cli.config.stages import PruneConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation import psnr
+from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image
 from recon_cli.stages import prune, train
 

@@ -8,7 +8,7 @@ import torch
 import viser.transforms
 from viewing import complaints, nodes, opened, until, view
 
-from recon_cli.evaluation import psnr
+from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import eight_bit, read_image
 from recon_cli.render import render
 from recon_cli.viewer.content import TRAINING

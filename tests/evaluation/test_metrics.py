@@ -9,19 +9,16 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from recon_cli.evaluation import (
+from recon_cli.evaluation.intervals import paired_bootstrap
+from recon_cli.evaluation.metrics import leaves_enough, load_lpips, psnr, ssim
+from recon_cli.evaluation.scores import (
     ModelScore,
     ViewScore,
     csv_table,
-    leaves_enough,
     model_table,
-    paired_bootstrap,
     paper_table,
-    psnr,
-    ssim,
     view_table,
 )
-from recon_cli.evaluation.lpips import perceptual
 from recon_cli.evaluation.tables import Table
 from recon_cli.io.images import eight_bit
 from recon_cli.train.losses import photometric_loss
@@ -213,12 +210,12 @@ def test_lpips_is_left_out_with_its_reason_where_package_or_weights_are_missing(
     monkeypatch, tmp_path
 ):
     monkeypatch.setitem(sys.modules, "lpips", None)
-    distance, reason = perceptual()
+    distance, reason = load_lpips()
     assert distance is None
     assert "recon-cli[lpips]" in reason
     monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    distance, reason = perceptual()
+    distance, reason = load_lpips()
     assert distance is None
     assert str(tmp_path) in reason
 
@@ -236,7 +233,7 @@ def test_lpips_gets_both_pictures_between_minus_one_and_one(monkeypatch, tmp_pat
             return lambda a, b: (a.min(), b.max(), torch.tensor(a.shape))[0] + b.max() / 4
 
     monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=Network))
-    distance, reason = perceptual()
+    distance, reason = load_lpips()
     assert reason == ""
     image, truth = np.zeros((16, 20, 3), np.float32), np.full((16, 20, 3), 255, np.uint8)
     assert distance(image, truth) == pytest.approx(-1 + 1 / 4)

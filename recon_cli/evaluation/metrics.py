@@ -1,0 +1,142 @@
+"""PSNR, SSIM and LPIPS of one rendered view against its photo, by the conventions of papers.
+
+LPIPS is optional: it needs an extra package and weights, and neither is ever downloaded here.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from skimage.metrics import structural_similarity
+
+PSNR_CONVENTION = "mean of per-image dB, float render clamped to [0, 1] against 8-bit truth"
+PSNR_8BIT_CONVENTION = "the same of the render rounded to 8 bits, as a picture file holds it"
+SSIM_CONVENTION = (
+    "scikit-image: 11x11 Gaussian window, sigma 1.5, 5 px border cropped, mean of channels")
+SSIM_PADDED_CONVENTION = (
+    "INRIA: the same window, zeros around the image, mean of all pixels; its borders score higher")
+MASK_CONVENTION = (
+    "ignored pixels have no part in the squared error; the map of SSIM is averaged over the others")
+LPIPS_CONVENTION = "LPIPS 0.1 with AlexNet, of the float render, lower is better"
+MIN_SIDE = 11  # pixels; the window of SSIM
+MIN_PIXELS = MIN_SIDE**2  # that a mask must leave: one window of SSIM
+_MAX_DB = 100.0  # of equal images, which JSON cannot hold
+_BORDER = MIN_SIDE // 2  # pixels; what scikit-image crops, where the window reaches outside
+_LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them
+
+Perceptual = Callable[[NDArray[np.float32], NDArray[np.uint8]], float]
+
+
+def leaves_enough(mask: NDArray[np.bool_] | None) -> bool:
+    """Returns whether a mask [H, W] leaves MIN_PIXELS pixels off the border; None leaves all."""
+    return mask is None or int(np.count_nonzero(_cropped(mask))) >= MIN_PIXELS
+
+
+def psnr(
+    image: NDArray[Any], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> float:
+    """Returns 10 log10(1 / MSE) in dB of an image clamped to [0, 1]; at most 100 dB.
+
+    Args:
+        image: [H, W, 3], in [0, 1] or of 8 bits.
+        truth: [H, W, 3].
+        mask: [H, W], True where a pixel counts; None where all do.
+    """
+    error = _unit(image) - truth / 255.0
+    if mask is not None:
+        error = error[mask]
+    return float(-10 * np.log10(max(float(np.mean(error**2)), 1e-10)))
+
+
+def corrected_psnr(
+    image: NDArray[np.float32], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> float:
+    """Returns the PSNR in dB after the least-squares gain per channel; arguments as of `psnr`."""
+    rendered, true = image.astype(np.float64).reshape(-1, 3), truth.reshape(-1, 3) / 255.0
+    if mask is not None:
+        rendered, true = rendered[mask.reshape(-1)], true[mask.reshape(-1)]
+    energy = (rendered * rendered).sum(axis=0)
+    gain = np.where(energy > 0, (rendered * true).sum(axis=0) / np.maximum(energy, 1e-30), 1.0)
+    error = float(np.mean((np.clip(rendered * gain, 0, 1) - true) ** 2))
+    return float(-10 * np.log10(max(error, 10 ** (-_MAX_DB / 10))))
+
+
+def ssim(
+    image: NDArray[np.float32], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None,
+    *, padded: bool = False,
+) -> float:
+    """Returns the structural similarity of an image clamped to [0, 1].
+
+    With a mask: the mean of the map over the pixels that count, of an image that is the truth
+    elsewhere. The truth under the mask lies in their windows; `io.images.painted` makes it neutral.
+
+    Args:
+        image: [H, W, 3].
+        truth: [H, W, 3].
+        mask: [H, W], True where a pixel counts; None where all do.
+        padded: zeros lie around both images and every pixel counts, as INRIA's scripts score it;
+            otherwise the border that windows reach over is left out.
+
+    Raises:
+        ValueError: the image is smaller than the 11-pixel window, or the mask leaves nothing.
+    """
+    if min(truth.shape[:2]) < MIN_SIDE:
+        raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
+    rendered, true = _unit(image), truth / 255.0
+    if mask is not None:
+        if not _cropped(mask).any():
+            raise ValueError("SSIM of a mask that leaves no pixel off the border")
+        rendered = np.where(mask[..., None], rendered, true)
+    if padded:  # what is cropped below is then the padding
+        around = ((_BORDER, _BORDER), (_BORDER, _BORDER))
+        rendered, true = (np.pad(pixels, (*around, (0, 0))) for pixels in (rendered, true))
+        mask = None if mask is None else np.pad(mask, around)
+    value, similarity = structural_similarity(
+        rendered, true, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        data_range=1.0, channel_axis=-1, full=True)
+    return float(value if mask is None else _cropped(similarity)[_cropped(mask)].mean())
+
+
+def load_lpips() -> tuple[Perceptual | None, str]:
+    """Returns LPIPS of an image [H, W, 3] in [0, 1] and a truth, or None and why there is none.
+
+    (Zhang et al. 2018.) The weights of its backbone must already lie where torchvision keeps them.
+    """
+    try:
+        lpips: Any = importlib.import_module("lpips")
+    except ImportError:
+        return None, "the package lpips is not installed (pip install 'recon-cli[lpips]')"
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / _LPIPS_WEIGHTS
+    if not weights.is_file():
+        return None, (f"its weights are not at {weights}; `python -c \"import lpips; "
+                      "lpips.LPIPS(net='alex')\"` fetches them once")
+    network = lpips.LPIPS(net="alex", verbose=False).eval()
+
+    def distance(image: NDArray[np.float32], truth: NDArray[np.uint8]) -> float:
+        with torch.no_grad():
+            pair = [_centred(pixels) for pixels in (np.clip(image, 0, 1), truth / 255.0)]
+            return float(network(*pair))
+
+    return distance, ""
+
+
+def _centred(image: NDArray[Any]) -> torch.Tensor:
+    """Returns an image in [0, 1] as [1, 3, H, W] in [-1, 1], which the network was trained on."""
+    return torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1
+
+
+def _unit(image: NDArray[Any]) -> NDArray[np.float64]:
+    """Returns an image in [0, 1]."""
+    unit = image / 255.0 if image.dtype == np.uint8 else np.clip(image, 0, 1)
+    return np.asarray(unit, np.float64)
+
+
+def _cropped(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Returns [H, W, ...] without the border that SSIM leaves out."""
+    return pixels[_BORDER:-_BORDER, _BORDER:-_BORDER]
