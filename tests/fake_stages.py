@@ -44,7 +44,7 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
             path.write_text(f"{step} of {name}")
             ctx.record(step, STEPS)
             time.sleep(float(os.environ.get(f"SLOW_{name.upper()}", "0")))
-    options = {key: value for key, value in config.hashed().items() if key != "seed"}
+    options = {key: value for key, value in config.hashed_fields().items() if key != "seed"}
     read = [(path / "result.txt").read_text() for path in inputs.folders.values()]
     read += [path.read_text() for path in inputs.sources if path.is_file()]
     result = hashlib.sha256(json.dumps([name, options, read]).encode()).hexdigest()
@@ -71,7 +71,7 @@ def bring(
 ) -> list[str]:
     """Runs stages as the CLI does, `changes` being what was typed, and returns which ran."""
     before = len(ran)
-    values = layers.merged([job.settings, changes or {}])
+    values = layers.merge([job.settings, changes or {}])
     targets = [
         Target(row.name, layers.build(row.config, values),
                (video,) if video and row.name == "ingest" else ())

@@ -30,8 +30,8 @@ def import_scene(call: Call, file: Path | None) -> None:
     scored; without, it can be viewed, rendered and exported. Without FILE, the previous file is
     used.
     """
-    given = options.explicit(call)
-    values = settings.merged([given, call.settings])
+    given = options.explicit_settings(call)
+    values = settings.merge([given, call.settings])
     config = settings.build(ImportConfig, values)
     compute = settings.build(ComputeConfig, values)
     if call.print_config:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from recon_cli.commands.options import Call, explicit
+from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig, TrainConfig
@@ -41,8 +41,8 @@ def run_stages(
         forced: settings that the verb implies; they win over everything.
         watcher: observes the training.
     """
-    file_settings = explicit(call)
-    values = layers.merged(
+    file_settings = explicit_settings(call)
+    values = layers.merge(
         [base or {}, file_settings, _of_all_processes(call, file_settings), forced or {}])
     rows = [row for row in STAGES if row.name in stages]
     configs = {row.name: layers.build(row.config, values) for row in rows}
@@ -70,13 +70,13 @@ def _of_all_processes(call: Call, file_settings: Settings) -> Settings:
     if typed is None and "batch_views" not in file_settings.get("train", {}):
         typed = TrainConfig.batch_views
     total = {} if typed is None else {"batch_views": typed * call.ranks.count}
-    return layers.merged([call.settings, {"train": total}])
+    return layers.merge([call.settings, {"train": total}])
 
 
 def open_job(call: Call, kind: type[C]) -> tuple[Job, C]:
     """Returns a job on the workspace that runs no stage, and the options of one config class."""
-    file_settings = explicit(call)
-    values = layers.merged([file_settings, call.settings])
+    file_settings = explicit_settings(call)
+    values = layers.merge([file_settings, call.settings])
     compute = layers.build(ComputeConfig, values)
     job = Job(
         Workspace(call.workspace), file_settings, compute, TqdmProgress(), table=STAGES,

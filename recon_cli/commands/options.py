@@ -1,32 +1,37 @@
 """Command-line options: those that every verb has, and those made from the config dataclasses.
 
 An option stores its value in a `Call` and is passed to no function. A config field therefore is
-written down once, in config.py, and only what was typed reaches the settings.
+declared once, in config/stages.py, and only what was typed reaches the settings.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from recon_cli.config.fields import OptionInfo, StageConfig, field_type, member_types, option_info
 from recon_cli.config.settings import (
     FILE,
-    SECTIONS,
     Settings,
     check,
-    merged,
+    merge,
     parse_assignment,
     read_settings,
+    section_of,
 )
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import ALONE, Ranks
 
+if TYPE_CHECKING:
+    from click.types import OptionHelpExtra
+
+HELP_ALL = "recon.help_all"  # in a context's meta: the second page of help is printed
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
@@ -61,30 +66,98 @@ class Call:
 pass_call = click.make_pass_decorator(Call, ensure=True)
 
 
-def verb(name: str) -> Callable[[Command], click.Command]:
+class _HelpFormatter(click.HelpFormatter):
+    """Leaves more of a line to the text of an option than click does."""
+
+    def write_dl(
+        self, rows: Iterable[tuple[str, str]], col_max: int = 24, col_spacing: int = 2
+    ) -> None:
+        """Writes names and texts in two columns."""
+        super().write_dl(rows, col_max, col_spacing)
+
+
+class _VerbContext(click.Context):
+    formatter_class = _HelpFormatter
+
+
+class Verb(click.Command):
+    """A command with a second page of help, --help-all, where some of its options are for experts.
+
+    The first page leaves out these and the ranges of numbers.
+    """
+
+    context_class = _VerbContext
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Returns the options with --help and --help-all as the last ones."""
+        params = super().get_params(ctx)
+        return [*params, self._help_all] if self._help_all else params
+
+    @cached_property
+    def _help_all(self) -> click.Option | None:
+        count = sum(isinstance(option, Option) and option.expert for option in self.params)
+        if not count:
+            return None
+        return click.Option(
+            ["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_print_all,
+            help=f"Show all options ({count} more) and exit.")
+
+
+def _print_all(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        ctx.meta[HELP_ALL] = True
+        click.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
+
+
+class Option(click.Option):
+    """An option of a verb; `expert` ones are in --help-all alone."""
+
+    def __init__(self, *args: Any, expert: bool = False, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self.expert = expert
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Returns name and text, `--[no-]x` for a pair of flags; None where it is left out."""
+        record = super().get_help_record(ctx)
+        if record is None or (self.expert and HELP_ALL not in ctx.meta):
+            return None
+        name, text = record
+        return (f"--[no-]{self.opts[0][2:]}" if self.secondary_opts else name), text
+
+    def get_help_extra(self, ctx: click.Context) -> OptionHelpExtra:
+        """Returns what click adds in brackets; the range of a number on the second page alone."""
+        extra = super().get_help_extra(ctx)
+        if HELP_ALL not in ctx.meta:
+            extra.pop("range", None)
+        return extra
+
+
+def verb(name: str) -> Callable[[Command], Verb]:
     """Returns a decorator that makes a function the command `recon NAME`."""
-    return click.command(name)
+    return click.command(name, cls=Verb)
 
 
-def explicit(call: Call) -> Settings:
+def explicit_settings(call: Call) -> Settings:
     """Returns what recon.toml, --config and --set set, checked.
 
     Raises:
         ConfigError: a file cannot be read, or a value cannot be used.
     """
-    inside = call.workspace / FILE
-    found = [path for path in (inside if inside.exists() else None, call.config_file) if path]
-    together = merged([*map(read_settings, found), call.assigned])
-    check(together)
-    return together
+    in_workspace = call.workspace / FILE
+    files = [in_workspace] if in_workspace.exists() else []
+    files += [call.config_file] if call.config_file else []
+    settings = merge([*map(read_settings, files), call.assigned])
+    check(settings)
+    return settings
 
 
-def _keep(name: str) -> Callable[[click.Context, click.Parameter, Any], None]:
+def _store(name: str) -> Callable[[click.Context, click.Parameter, Any], None]:
     """Returns a callback that stores an option under an attribute of `Call`."""
-    def keep(ctx: click.Context, _parameter: click.Parameter, value: Any) -> None:
+    def store(ctx: click.Context, _parameter: click.Parameter, value: Any) -> None:
         setattr(ctx.ensure_object(Call), name, value)
 
-    return keep
+    return store
 
 
 def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPACE") -> Decorator:
@@ -94,16 +167,15 @@ def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPAC
         workspace: folder where -w is not given.
         envvar: environment variable that stands in for -w, if any.
     """
-    return _stacked([
+    return _stack([
         click.option(
-            "-w", "--workspace", type=click.Path(file_okay=False, path_type=Path),
+            "-w", "--workspace", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
             default=workspace, envvar=envvar, show_default=True, show_envvar=True,
-            expose_value=False, callback=_keep("workspace"), help="Folder of all results."),
+            expose_value=False, callback=_store("workspace"), help="Folder of all results."),
         click.option(
             "--config", "config_file", type=click.Path(dir_okay=False, path_type=Path),
-            expose_value=False, callback=_keep("config_file"),
-            help="TOML file with options; it wins over recon.toml in the workspace.  "
-                 "[default: none]"),
+            expose_value=False, callback=_store("config_file"),
+            help="TOML file with options.  [default: none]"),
         verbosity(),
     ])
 
@@ -111,22 +183,22 @@ def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPAC
 def verbosity() -> Decorator:
     """Returns a decorator that adds -v."""
     return click.option(
-        "-v", "--verbose", is_flag=True, expose_value=False, callback=_keep("verbose"),
-        help="Show details, and the traceback of an error.  [default: off]")
+        "-v", "--verbose", is_flag=True, expose_value=False, callback=_store("verbose"),
+        help="Show details and tracebacks.  [default: off]")
 
 
 def again() -> Decorator:
     """Returns a decorator that adds --again."""
     return click.option(
-        "--again", is_flag=True, expose_value=False, callback=_keep("again"),
-        help="Run even if the result is up to date.  [default: off]")
+        "--again", is_flag=True, expose_value=False, callback=_store("again"),
+        help="Run even if up to date.  [default: off]")
 
 
 def print_config() -> Decorator:
     """Returns a decorator that adds --print-config."""
     return click.option(
-        "--print-config", is_flag=True, expose_value=False, callback=_keep("print_config"),
-        help="Print the options that would be used as TOML, and stop.  [default: off]")
+        "--print-config", is_flag=True, expose_value=False, callback=_store("print_config"),
+        help="Print options as TOML and exit.  [default: off]")
 
 
 def sweep() -> Decorator:
@@ -142,15 +214,15 @@ def sweep() -> Decorator:
                 param=parameter)
         return ratios
 
-    return _stacked([
+    return _stack([
         click.option(
             "--sweep", is_flag=True,
             help="Print what every score costs at every ratio on the validation views, with "
-                 "controls, write sweep.json and sweep.svg into the workspace, and stop.  "
+                 "controls, write sweep.json and sweep.svg into the workspace, and exit.  "
                  "[default: off]"),
         click.option(
             "--ratios", default="0.5,0.66,0.8,0.9", metavar="X,X,...", callback=parse,
-            show_default=True, help="With --sweep: shares that are removed."),
+            show_default=True, help="With --sweep: fractions to remove."),
     ])
 
 
@@ -160,12 +232,12 @@ def assignments(example: str = "train.iterations=1000") -> Decorator:
     Args:
         example: that the help shows.
     """
-    def keep(ctx: click.Context, _parameter: click.Parameter, values: tuple[str, ...]) -> None:
-        ctx.ensure_object(Call).assigned = merged(parse_assignment(text) for text in values)
+    def store(ctx: click.Context, _parameter: click.Parameter, values: tuple[str, ...]) -> None:
+        ctx.ensure_object(Call).assigned = merge(parse_assignment(text) for text in values)
 
     return click.option(
         "--set", "assigned", multiple=True, metavar="SECTION.FIELD=VALUE", expose_value=False,
-        callback=keep,
+        callback=store,
         help=f"Set an option of any stage, such as {example}; may be repeated.  [default: none]")
 
 
@@ -177,12 +249,12 @@ def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
         renders: the stage needs a rasterizer, so that device and backend can be chosen.
     """
     compute: Decorator = of(ComputeConfig, only=() if renders else ("threads",))
-    return _stacked([of(config), compute, again(), print_config(), common()])
+    return _stack([of(config), compute, again(), print_config(), common()])
 
 
 def of(
     config: type[StageConfig], *, only: Sequence[str] = (), without: Sequence[str] = (),
-    lead: str = "",
+    expert: Sequence[str] = (), lead: str = "",
 ) -> Decorator:
     """Returns a decorator that adds an option for each field of a config.
 
@@ -190,52 +262,51 @@ def of(
         config: the class.
         only: names of the fields to take; all if empty.
         without: names of fields to leave out.
+        expert: names of fields that are for experts in this verb.
         lead: text before each help.
     """
-    section = next(name for name, kind in SECTIONS.items() if kind is config)
     decorators: list[Decorator] = []
     for item in dataclasses.fields(config):
         if item.name in without or (only and item.name not in only):
             continue
         info = option_info(item)
-        text = f"{lead}{info.help}  [{described(item)}]"
-        if info.flags:
-            decorators += [
-                _flag(section, item.name, choice, text)
-                for choice in info.choices if choice != item.default]
-        else:
-            decorators.append(_field(section, config, item.name, info, text))
-    return _stacked(decorators)
+        decorators += [
+            _flag(config, item.name, choice, text) for choice, text in info.flags.items()
+        ] or [_field(
+            config, item.name, f"{lead}{info.help}  [{describe_default(item)}]",
+            expert=info.expert or item.name in expert)]
+    return _stack(decorators)
 
 
-def described(item: dataclasses.Field[Any]) -> str:
+def describe_default(item: dataclasses.Field[Any]) -> str:
     """Returns the unit and the default of a field as --help shows them."""
     info = option_info(item)
     if item.default is None:
-        shown = info.automatic
-    elif isinstance(item.default, float):
-        shown = f"{item.default:g}"
+        default = info.automatic
+    elif isinstance(item.default, bool):
+        default = "on" if item.default else "off"
     else:
-        shown = str(item.default)
-    return f"{info.unit}; default: {shown}" if info.unit else f"default: {shown}"
+        default = f"{item.default:g}" if isinstance(item.default, float) else str(item.default)
+    return f"{info.unit}; default: {default}" if info.unit else f"default: {default}"
 
 
-def _field(
-    section: str, config: type[StageConfig], name: str, info: OptionInfo, text: str
-) -> Decorator:
+def _field(config: type[StageConfig], name: str, text: str, *, expert: bool) -> Decorator:
+    """Returns the option that sets one field."""
+    section = section_of(config)
+    info = option_info(config.__dataclass_fields__[name])
     kind, _ = field_type(config, name)
     flag = name.replace("_", "-")
 
-    def keep(ctx: click.Context, _parameter: click.Parameter, value: Any) -> None:
+    def store(ctx: click.Context, _parameter: click.Parameter, value: Any) -> None:
         if value is not None:
             ctx.ensure_object(Call).settings.setdefault(section, {})[name] = (
                 info.read(value) if info.read else value)
 
     return click.option(
         f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}",
-        f"{section}_{name}", type=_click_type(kind, info), default=None, expose_value=False,
-        callback=keep,
-        metavar=None if info.choices else info.metavar or _METAVARS.get(kind), help=text)
+        f"{section}_{name}", cls=Option, expert=expert, type=_click_type(kind, info), default=None,
+        expose_value=False, callback=store, help=text,
+        metavar=None if info.choices else info.metavar or _METAVARS.get(kind))
 
 
 def _click_type(kind: type, info: OptionInfo) -> click.ParamType[Any]:
@@ -253,9 +324,11 @@ def _click_type(kind: type, info: OptionInfo) -> click.ParamType[Any]:
     return click.BOOL if kind is bool else click.STRING
 
 
-def _flag(section: str, name: str, choice: str, text: str) -> Decorator:
+def _flag(config: type[StageConfig], name: str, choice: str, text: str) -> Decorator:
     """Returns the option `--<choice>`, which sets the field to that choice."""
-    def keep(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
+    section = section_of(config)
+
+    def store(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
         if not value:
             return
         values = ctx.ensure_object(Call).settings.setdefault(section, {})
@@ -265,10 +338,10 @@ def _flag(section: str, name: str, choice: str, text: str) -> Decorator:
 
     return click.option(
         f"--{choice}", f"{section}_{name}_{choice}", is_flag=True, expose_value=False,
-        callback=keep, help=f"Set {name} to {choice}: {text}")
+        callback=store, help=f"{text}  [default: off]")
 
 
-def _stacked(decorators: Sequence[Decorator]) -> Decorator:
+def _stack(decorators: Sequence[Decorator]) -> Decorator:
     """Returns one decorator that applies all, so that --help lists them in this order."""
     def apply(function: Command) -> Command:
         for decorator in reversed(decorators):

@@ -34,48 +34,45 @@ def _color(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
 @verb("render")
 @click.option(
     "--path", metavar="training|orbit|FILE.json",
-    help="A smooth path through the training cameras in the order of their names, a circle around "
-         "what they look at, or the cameras of a file in the layout of nerfstudio's viewer.  "
-         "[default: training]")
+    help="Camera path: smooth through the training cameras, a circle around what they look at, or "
+         "a camera path of nerfstudio's viewer.  [default: training]")
 @click.option(
     "--views", multiple=True, metavar="test|train|validation|NAME",
-    help="Views at their own cameras in place of a path: all of a part, or a frame by its name; "
-         "may be repeated.  [default: none]")
+    help="Render these views instead of a path: a set, or a frame by its name; may be repeated.  "
+         "[default: none]")
 @click.option(
     "--output", "outputs", default=OUTPUTS[0], metavar="rgb,depth,alpha", callback=_outputs,
     show_default=True,
-    help="What to write, one or several. Depth is 16-bit, in millimetres where the scale is known, "
-         "and a coloured picture; render.json says what it means.")
+    help="What to write. Depth is a 16-bit image, in millimetres if the scale is known, and a "
+         "coloured one; render.json says what it means.")
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
-    help="auto takes the pruned model where there is a fresh one.")
+    help="Model to render; auto: pruned if it is fresh, else base.")
 @click.option(
     "--format", "form", type=click.Choice(FORMATS),
-    help="mp4 makes a video of the frames, which stay beside it.  "
-         "[default: png, or mp4 where --out ends so]")
+    help="mp4 also makes a video of the frames.  [default: png, or mp4 if --out ends in .mp4]")
 @click.option("--fps", type=float, metavar="X",
-              help="Frames a second.  [default: those of the file, else 30]")
+              help="Frames per second.  [default: those of the file, else 30]")
 @click.option("--seconds", type=float, metavar="X",
-              help="Length of a path through or around the cameras.  [default: 10]")
+              help="Length of a training or orbit path.  [default: 10]")
 @click.option("--size", type=int, metavar="N",
-              help="Longest side.  [pixels; default: of training, or of the file]")
+              help="Longest side.  [pixels; default: as in training, or of the file]")
 @click.option("--width", type=int, metavar="N",
-              help="Width; without --height the shape stays.  [pixels; default: see --size]")
+              help="Width; alone it keeps the aspect ratio.  [pixels; default: see --size]")
 @click.option("--height", type=int, metavar="N",
-              help="Height; without --width the shape stays.  [pixels; default: see --size]")
+              help="Height; alone it keeps the aspect ratio.  [pixels; default: see --size]")
 @click.option(
     "--background", default="0,0,0", metavar="R,G,B", callback=_color, show_default=True,
-    help="Colour where nothing is, 0 to 255.")
-@click.option("--codec", type=click.Choice(CODECS), help="Of the video.  [default: h264]")
+    help="Background colour, 0 to 255.")
+@click.option("--codec", cls=options.Option, expert=True, type=click.Choice(CODECS),
+              help="Video codec.  [default: h264]")
 @click.option(
-    "--crf", type=int, metavar="N",
-    help="Quality of the video; smaller is better and larger in bytes.  "
-         "[default: 18, for av1 28]")
+    "--crf", cls=options.Option, expert=True, type=int, metavar="N",
+    help="Constant rate factor of the video; lower is better and larger.  [default: 18; av1: 28]")
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="FOLDER|FILE",
-    help="Folder of the frames, which are not rendered again where the same are there; or a file "
-         "for the one video (.mp4) or picture (.png).  "
-         "[default: a folder in render/ of the workspace]")
+    help="Folder of the frames, where finished ones are kept; or a file for a single video (.mp4) "
+         "or image (.png).  [default: a folder in render/ of the workspace]")
 @options.of(ComputeConfig)
 @options.common()
 @pass_call

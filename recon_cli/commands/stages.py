@@ -75,11 +75,13 @@ def sfm(call: Call) -> None:
 @verb("train")
 @click.option(
     "--prune", "with_prune", is_flag=True,
-    help="Then prune the state in mid-training and finish from there.  [default: off]")
-@options.of(PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"), lead="With --prune: ")
+    help="Also prune in mid-training.  [default: off]")
+@options.of(
+    PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"),
+    expert=("max_mb", "rounds", "score", "recovery"), lead="With --prune: ")
 @click.option(
     "--view", "with_view", is_flag=True,
-    help="Show the training in the browser; the result is the same.  [default: off]")
+    help="Show the training in the browser.  [default: off]")
 @options.stage(TrainConfig, renders=True)
 @pass_call
 def train(call: Call, with_prune: bool, with_view: bool) -> None:
@@ -149,7 +151,7 @@ def export(call: Call) -> None:
 @verb("run")
 @_inputs
 @click.option(
-    "--prune/--no-prune", "with_prune", default=True,
+    "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
     help="Also prune in mid-training.  [default: on]")
 @options.assignments()
 @options.of(ComputeConfig)

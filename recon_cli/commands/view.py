@@ -26,16 +26,16 @@ from recon_cli.workspace.layout import Workspace
 @click.argument("item", metavar="[ITEM]", required=False, type=click.Path(path_type=Path))
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
-    help="The model to begin with; auto takes the pruned one where there is a fresh one.")
+    help="Model to show first; auto: pruned if it is fresh, else base.")
 @click.option(
     "--host", default="127.0.0.1", metavar="ADDRESS", show_default=True,
-    help="Address to listen on; 0.0.0.0 lets everyone look who reaches this machine.")
+    help="Address to listen on; 0.0.0.0 accepts every machine that reaches this one.")
 @click.option(
     "--port", type=click.IntRange(1, 65535), metavar="N",
     help="Port to listen on.  [default: 8080, or the next free one]")
 @click.option(
-    "--open/--no-open", "opening", default=None,
-    help="Open the page in the browser.  [default: --open in a terminal with a desktop]")
+    "--open/--no-open", "opening", cls=options.Option, default=None,
+    help="Open the page in the browser.  [default: on in a terminal with a desktop]")
 @options.of(ComputeConfig)
 @options.common()
 @pass_call

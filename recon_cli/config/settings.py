@@ -59,13 +59,13 @@ def read_settings(path: Path) -> Settings:
             f"{path} cannot be read: {error.strerror}.",
             hint="Check the path after --config.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}.", hint="Mend that line.") from error
+        raise ConfigError(f"{path} is not valid TOML: {error}.", hint="Fix that line.") from error
     for section, values in settings.items():
         check_section(section, where=str(path))
         if not isinstance(values, dict):
             raise ConfigError(
                 f"{path} sets {section} to {values!r}, but it is a section.",
-                hint=f"Write [{section}] on a line of its own and its fields below.")
+                hint=f"Write [{section}] on a line of its own and its fields below it.")
         for name in values:
             check_field(section, name, where=str(path))
     return settings
@@ -112,7 +112,7 @@ def check_section(section: str, *, where: str) -> None:
     if section not in SECTIONS:
         raise ConfigError(
             f"{where} holds the section {section}, which does not exist.",
-            hint=_suggestion(section, list(SECTIONS), "The sections are"))
+            hint=_suggestion(section, list(SECTIONS), "Sections:"))
 
 
 def check_field(section: str, name: str, *, where: str) -> None:
@@ -121,7 +121,7 @@ def check_field(section: str, name: str, *, where: str) -> None:
     if name not in names:
         raise ConfigError(
             f"{where} sets {section}.{name}, which does not exist.",
-            hint=_suggestion(name, names, f"[{section}] knows"))
+            hint=_suggestion(name, names, f"Options of [{section}]:"))
 
 
 def _suggestion(word: str, known: list[str], lead: str) -> str:
@@ -129,7 +129,7 @@ def _suggestion(word: str, known: list[str], lead: str) -> str:
     return f"Did you mean {close[0]}?" if close else f"{lead} {', '.join(known)}."
 
 
-def merged(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
+def merge(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
     """Returns the settings of all layers; a later layer wins, field by field."""
     result: Settings = {section: {} for section in SECTIONS}
     for layer in layers:

@@ -1,23 +1,17 @@
-"""What each stage can be told: one frozen dataclass a stage, each option written down once.
-
-The command line, recon.toml, the fingerprint of a stage and the documentation are all made from
-these fields.
-"""
+"""The options of each stage: one frozen dataclass a stage."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from recon_cli.config.export import EXPORT_FORMATS as EXPORT_FORMATS
-from recon_cli.config.export import ExportConfig as ExportConfig
-from recon_cli.config.fields import (
-    SCALE_BETWEEN,
-    StageConfig,
-    check_scale_between,
-    option,
-    parse_holdout,
-)
+from recon_cli.config.fields import StageConfig, option
 from recon_cli.errors import ConfigError
+from recon_cli.workspace.atomic import read_json
+
+SCALE_BETWEEN = (
+    "Set the scale: A and B are METRES apart. Each is a frame name (its camera), x,y,z (a point of "
+    "the unscaled scene) or FRAME:u,v (a pixel of the undistorted frame).")
 
 
 @dataclass(frozen=True)
@@ -25,25 +19,44 @@ class IngestConfig(StageConfig):
     """Which frames of the capture are kept."""
 
     frames: int | None = option(
-        None, "How many frames to choose from videos and posed sequences.", unit="frames",
-        minimum=3,
-        automatic="from the camera's motion, at most --max-frames",
-    )
+        None, "Number of frames to choose from videos and posed sequences.", unit="frames",
+        minimum=3, automatic="by camera motion, up to --max-frames")
     max_frames: int = option(
-        100, "Most frames that the automatic choice takes.", unit="frames", minimum=3)
-    max_size: int = option(
-        1920, "Longest side of a stored frame; larger ones are reduced by area.",
-        unit="pixels", minimum=64)
+        100, "Upper limit of the automatic number.", unit="frames", minimum=3)
+    max_size: int = option(1920, "Longest side of a stored frame.", unit="pixels", minimum=64)
     holdout: str = option(
-        "every:8", "Views kept for the score and never trained on: every:N takes each Nth by "
-        "name, segment:A:B a contiguous share of the capture (0 to 1), none takes none.")
+        "every:8", "Held-out test views: every:N (each Nth by name), segment:A:B (from share A to "
+        "share B of the capture) or none.")
     sharpness: float = option(
-        0.5, "A video frame must reach this share of the sharpness around it.",
-        unit="share", minimum=0.0, maximum=1.0)
+        0.5, "Minimum sharpness of a video frame relative to its neighbours.", unit="share",
+        minimum=0.0, maximum=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         parse_holdout(self.holdout)
+
+
+def parse_holdout(text: str) -> tuple[str, float, float]:
+    """Returns (kind, a, b) of --holdout: ("every", N, 0), ("segment", A, B) or ("none", 0, 0).
+
+    Raises:
+        ConfigError: the text has another form.
+    """
+    kind, *numbers = text.split(":")
+    try:
+        values = [float(number) for number in numbers]
+    except ValueError:
+        values = []
+    if kind == "none" and not numbers:
+        return kind, 0.0, 0.0
+    if kind == "every" and len(values) == 1 and values[0] >= 2 and values[0].is_integer():
+        return kind, values[0], 0.0
+    if kind == "segment" and len(values) == 2 and 0 <= values[0] < values[1] <= 1:
+        return kind, values[0], values[1]
+    raise ConfigError(
+        f"holdout is {text!r}, but it must be every:N (N >= 2), segment:A:B (0 <= A < B <= 1) "
+        "or none.",
+        hint="Try --holdout every:8.")
 
 
 @dataclass(frozen=True)
@@ -51,18 +64,18 @@ class DenoiseConfig(StageConfig):
     """Whether and how strongly the training images are denoised."""
 
     mode: str = option(
-        "auto", "auto denoises frames whose noise reaches the threshold; force denoises all; "
-        "off passes all through.", choices=("auto", "force", "off"), flags=True)
+        "auto", "Frames to denoise: auto (noise above the threshold), force (all) or off (none).",
+        choices=("auto", "force", "off"),
+        flags={"force": "Denoise every frame.", "off": "Pass every frame through."})
     threshold: float = option(
-        3.0, "Noise in the flat parts of a frame from which it is denoised.", unit="1/255",
+        3.0, "Noise level of flat regions above which a frame is denoised.", unit="1/255",
         minimum=0.0)
     filter: str = option(
-        "joint", "joint filters with less noisy guides and keeps edges best; bilateral takes a "
-        "quarter of the time.", choices=("joint", "bilateral"))
+        "joint", "joint keeps edges best; bilateral takes a quarter of the time.",
+        choices=("joint", "bilateral"))
     strength: float = option(
-        4.0, "Range sigma of the filter, as a multiple of the noise that it sees: the estimated "
-        "one for bilateral, what is left of it in the guide for joint.", unit="x noise",
-        minimum=0.1)
+        4.0, "Range sigma of the filter, as a multiple of the noise (joint: of the noise that is "
+        "left in the guide).", unit="x noise", minimum=0.1)
 
 
 @dataclass(frozen=True)
@@ -70,122 +83,133 @@ class SfmConfig(StageConfig):
     """How cameras and points are found."""
 
     poses: str = option(
-        "keep", "What becomes of the poses that a data set comes with: keep them, refine them "
-        "together with the points, or ignore them.", choices=("keep", "refine", "ignore"))
+        "keep", "Poses of a data set: keep them, refine them with the points, or ignore them.",
+        choices=("keep", "refine", "ignore"))
     pairs: str = option(
-        "auto", "Image pairs to match: auto takes all of up to 100 images, else neighbours and "
-        "images that look alike, and goes on to more pairs and other ways of mapping where the "
-        "model is not good enough; a named way is the only one tried.",
+        "auto", "Image pairs to match. auto: all pairs of up to 100 images, else neighbours and "
+        "similar images; then more pairs and other mappers if the model is poor.",
         choices=("auto", "exhaustive", "retrieval", "sequential"))
     max_features: int = option(
-        3000, "Most SIFT keypoints of an image; the coarsest are kept.", unit="keypoints",
+        3000, "Maximum SIFT keypoints per image; the coarsest are kept.", unit="keypoints",
         minimum=100)
     min_registered: float = option(
-        0.5, "Fail when fewer images than this share get a camera.", unit="share",
+        0.5, "Fail if a smaller share of the images is registered.", unit="share",
         minimum=0.0, maximum=1.0)
     accept_weak: bool = option(
-        False, "Take a model whose parts hang together by few matches, too.", hashed=False)
-    seed: int = option(0, "Seed of the mapper's random sampling.", minimum=0)
+        False, "Continue even if parts of the model are weakly connected.", hashed=False)
+    seed: int = option(0, "Random seed of the mapper.", minimum=0)
     gravity: str = option(
-        "auto", "auto turns the world so that z is up and the floor lies at 0, where cameras and "
-        "points show it; off leaves it as the mapper made it.", choices=("auto", "off"))
+        "auto", "Turn the world so that z is up and the floor is at 0, if cameras and points show "
+        "it; off keeps the axes of the mapper.", choices=("auto", "off"))
     scale_between: tuple[str, str, float] | None = option(
-        None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale stays arbitrary")
+        None, SCALE_BETWEEN, metavar="A B METRES", automatic="arbitrary scale")
     max_minutes: float = option(
-        20.0, "Give up after this long.", unit="minutes", minimum=0.01, hashed=False)
+        20.0, "Time limit.", unit="minutes", minimum=0.01, hashed=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_scale_between(self.scale_between)
+        _check_scale_between(self.scale_between)
+
+
+def _check_scale_between(value: tuple[str, str, float] | None) -> None:
+    """Raises ConfigError where --scale-between measures nothing."""
+    if value is None:
+        return
+    a, b, metres = value
+    hint = "For example --scale-between 000003.png:120,200 000003.png:480,210 1.5"
+    if a.strip() == b.strip() or not a.strip() or not b.strip():
+        raise ConfigError(
+            f"scale_between goes from {a!r} to {b!r}, but it must name two different places.",
+            hint=hint)
+    if metres <= 0:
+        raise ConfigError(
+            f"scale_between says {metres:g} metres, but it must be more than 0.", hint=hint)
 
 
 MIN_GAUSSIANS = 4  # the first ones are as large as the mean distance to 3 neighbours
+_VALIDATION = "Share of the training views to use for validation."
+DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 
 @dataclass(frozen=True)
 class TrainConfig(StageConfig):
     """How Gaussians are fitted: a recipe, scaled to the number of iterations.
 
-    What is left automatic is decided by `train.plan`, once the scene is known.
+    `train.planning` decides what is left automatic, once the scene is known.
     """
 
     quality: str = option(
-        "normal", "Sets what is not given: iterations, longest side and cap of the count. On two "
-        "cores draft takes about 10 seconds, normal 40, high 2 to 4 minutes.",
+        "normal", "Preset: 1500, 3000 or 8000 steps at 400, 600 or 800 pixels.",
         choices=("draft", "normal", "high"))
     minutes: float | None = option(
-        None, "Time for the training: the steps and the cap of the count that fill it here, by a "
-        "few that are timed first. Excludes --iterations.", unit="minutes", minimum=0.01,
-        automatic="as long as the iterations take")
+        None, "Time budget.", unit="minutes", minimum=0.01, automatic="none")
     densify: str = option(
-        "budget", "How Gaussians are added: budget (where the error is, the count on a line), "
-        "reference (clone, split and reset as in 3DGS) or mcmc (relocation and noise).",
+        "budget", "Add Gaussians by error (budget), as 3DGS (reference) or by relocation (mcmc).",
         choices=("budget", "reference", "mcmc"))
     iterations: int | None = option(
-        None, "Optimization steps of --batch-views views each.", unit="steps", minimum=1,
-        automatic="by --quality: 1,500, 3,000 or 8,000")
+        None, "Optimization steps.", minimum=1, automatic="by --quality")
     batch_views: int = option(
-        1, "Views of one step, whose mean gradient is taken; processes that train together each "
-        "take so many.", unit="views", minimum=1)
+        1, "Views per step and process; their mean gradient is used.", unit="views", minimum=1,
+        expert=True)
     max_size: int | None = option(
-        None, "Longest side of a training image; larger ones are reduced by area.",
-        unit="pixels", minimum=16, automatic="by --quality: 400, 600 or 800")
+        None, "Longest side of a training image.", unit="pixels", minimum=16,
+        automatic="by --quality")
     sh_degree: int | None = option(
-        None, "Highest spherical-harmonics degree of the colours.", minimum=0, maximum=3,
-        automatic="the lowest that a higher one does not beat by enough in a trial")
+        None, "Degree of the spherical harmonics.", minimum=0, maximum=3,
+        automatic="auto, chosen by a short trial")
     sh_uniform: float = option(
         0.0, "Gaussians whose colour deviates less over the training views lose their harmonics "
-        "once densification has ended; 0 keeps all.", minimum=0.0, maximum=1.0)
+        "after densification; 0 keeps all.", minimum=0.0, maximum=1.0, expert=True)
     max_gaussians: int | None = option(
-        None, "Densification stops at this count.", unit="Gaussians", minimum=MIN_GAUSSIANS,
-        automatic="by the detail of the images, the length of the run and the memory")
+        None, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS,
+        automatic="auto, by image detail, steps and memory")
     early_stop: bool = option(
-        True, "Go on to the final phase once the validation views gain nothing more.")
+        True, "Skip to the final phase once validation PSNR stops improving.")
     images: str = option(
-        "auto", "Pixels to train on; scores always use the originals. auto: denoised where a trial "
-        "shows that it pays.", choices=("auto", "denoised", "original"))
+        "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
+        choices=("auto", "denoised", "original"))
     far: str = option(
-        "auto", "Gaussians far outside, for what is seen through windows. auto: where several "
-        "views see nothing near and a trial shows that it pays.", choices=("auto", "on", "off"))
+        "auto", "Add distant background Gaussians; auto: if a trial improves validation PSNR.",
+        choices=("auto", "on", "off"))
     exposure: str = option(
-        "auto", "A gain for each image and channel, for cameras that set their exposure. auto: "
-        "where the images drift and a trial shows that it pays.", choices=("auto", "on", "off"))
+        "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
+        choices=("auto", "on", "off"))
     poses: str = option(
-        "auto", "Refine the training cameras. auto: where their error is large and a trial shows "
-        "that it pays.", choices=("auto", "on", "off"))
-    validation: float = option(
-        0.05, "Share of the training views kept out to watch progress.", unit="share",
-        minimum=0.0, maximum=0.5)
+        "auto", "Refine the training cameras; auto: if a trial improves validation PSNR.",
+        choices=("auto", "on", "off"))
+    validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
-        0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0)
+        0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
+        expert=True)
     means_rate: float = option(
-        1.6e-4, "Initial learning rate of the means, times the scene extent, and 6 with budget; it "
-        "falls to a hundredth.", minimum=0.0)
-    quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0)
+        1.6e-4, "Initial learning rate of the means, times the scene extent (and 6 with budget); "
+        "decays to a hundredth.", minimum=0.0, expert=True)
+    quats_rate: float = option(
+        1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)
     scales_rate: float = option(
-        5e-3, "Learning rate of the log-scales, twice that with budget.", minimum=0.0)
-    opacities_rate: float = option(5e-2, "Learning rate of the opacity logits.", minimum=0.0)
+        5e-3, "Learning rate of the log-scales; doubled with budget.", minimum=0.0, expert=True)
+    opacities_rate: float = option(
+        5e-2, "Learning rate of the opacity logits.", minimum=0.0, expert=True)
     sh_rate: float = option(
-        2.5e-3, "Learning rate of the base colours, twice that with budget; higher degrees get a "
-        "twentieth.", minimum=0.0)
+        2.5e-3, "Learning rate of the base colours; doubled with budget. Higher degrees use a "
+        "twentieth.", minimum=0.0, expert=True)
     densify_every: int = option(
-        100, "Add and delete Gaussians this often.", unit="steps", minimum=1)
+        100, "Interval between densification steps.", unit="steps", minimum=1, expert=True)
     densify_gradient: float = option(
-        2e-4, "With reference: mean gradient of the projected mean from which a Gaussian is cloned "
-        "or split.",
-        unit="NDC", minimum=0.0)
+        2e-4, "With reference: clone or split where the mean gradient of the projected mean is "
+        "larger.", unit="NDC", minimum=0.0, expert=True)
     densify_scale: float = option(
-        0.01, "With reference: clone up to this largest scale, split above it.",
-        unit="x extent", minimum=0.0)
+        0.01, "With reference: split above this scale, clone below.", unit="x extent", minimum=0.0,
+        expert=True)
     min_opacity: float = option(
-        0.005, "Gaussians below this opacity are deleted.", minimum=0.0, maximum=1.0)
+        0.005, "Delete Gaussians below this opacity.", minimum=0.0, maximum=1.0, expert=True)
     mid: float = option(
-        0.6, "Point of the run whose state is kept, so that pruning can branch off there.",
-        unit="share", minimum=0.05, maximum=1.0)
-    seed: int = option(0, "Seed of every random choice.", minimum=0)
+        0.6, "Point of the run whose state is kept for pruning in mid-training.", unit="share",
+        minimum=0.05, maximum=1.0, expert=True)
+    seed: int = option(0, "Random seed.", minimum=0)
     checkpoint_every: int = option(
-        250, "Save the full state this often, or as often as takes a tenth of the time.",
-        unit="steps", minimum=1, hashed=False)
+        250, "Interval between checkpoints; longer where saving takes over a tenth of the time.",
+        unit="steps", minimum=1, hashed=False, expert=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -196,55 +220,56 @@ class TrainConfig(StageConfig):
                 hint=f"Use --mid {DENSIFY_UNTIL:g} or more.")
         if self.iterations is not None and self.minutes is not None:
             raise ConfigError(
-                f"iterations is {self.iterations} and minutes is {self.minutes:g}, but each "
-                "decides how long the training is.",
+                f"iterations is {self.iterations} and minutes is {self.minutes:g}, but both set "
+                "the length of the training.",
                 hint="Leave out --iterations or --minutes, here and in recon.toml.")
 
 
 @dataclass(frozen=True)
 class RunConfig(TrainConfig):
-    """The same with numbers in place of what was automatic; a run and what builds on it read this.
+    """TrainConfig with numbers in place of what was automatic, as `train.planning` makes it.
 
-    `train.plan` makes it. The defaults are those of a run on which nobody decided.
+    The defaults are those of a run that nobody planned.
     """
 
-    iterations: int = option(3000, "Optimization steps.", unit="steps", minimum=1)
+    iterations: int = option(3000, "Optimization steps.", minimum=1)
     max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)
-    sh_degree: int = option(3, "Highest degree of the colours.", minimum=0, maximum=3)
+    sh_degree: int = option(3, "Degree of the spherical harmonics.", minimum=0, maximum=3)
     max_gaussians: int = option(
-        60_000, "Densification stops at this count.", unit="Gaussians", minimum=MIN_GAUSSIANS)
+        60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
 
 
-DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 PRUNE_SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
 
 
 @dataclass(frozen=True)
 class PruneConfig(StageConfig):
-    """Which Gaussians go, and how the rest recovers."""
+    """Which Gaussians are removed, and how the rest is fine-tuned."""
 
     ratio: float | None = option(
-        None, "Share that is removed; one stays.", unit="share", minimum=0.0, maximum=1.0,
-        automatic="0.5 where no other limit is given")
+        None, "Fraction of Gaussians to remove.", minimum=0.0, maximum=1.0,
+        automatic="0.5 unless another limit is set")
     max_gaussians: int | None = option(
-        None, "Most Gaussians that stay.", unit="Gaussians", minimum=1, automatic="no limit")
+        None, "Maximum number of Gaussians to keep.", minimum=1, automatic="no limit")
     max_mb: float | None = option(
-        None, "Largest .ply that is written.", unit="MB", minimum=0.0, automatic="no limit")
+        None, "Maximum size of the .ply.", unit="MB", minimum=0.0, automatic="no limit")
     max_psnr_drop: float | None = option(
-        None, "Most PSNR that validation views lose.", unit="dB", minimum=0.0, automatic="no limit")
+        None, "Maximum loss of validation PSNR.", unit="dB", minimum=0.0, automatic="no limit")
     rounds: int | None = option(
-        None, "Rounds of removal, with training and new scores in between; 1 removes all at once.",
-        unit="rounds", minimum=1, automatic="one an epoch of half the recovery, 3 to 8")
+        None, "Pruning rounds, with fine-tuning and new scores in between.", minimum=1,
+        automatic="3 to 8, one per epoch in half of --recovery")
     score: str = option(
-        "loo", "Rank by loo (error of leaving one out), paper (equations 3 to 5), lightgaussian "
-        "(unclamped), blend_sum, blend_max (its weights), opacity or random.", choices=PRUNE_SCORES)
-    beta: float = option(0.1, "With paper: exponent of the volume (equation 4).", minimum=0.0)
+        "loo", "Importance score: loo (leave-one-out error), paper (eq. 3 to 5), lightgaussian "
+        "(without clamping), blend_sum, blend_max (blend weights), opacity or random.",
+        choices=PRUNE_SCORES)
+    beta: float = option(
+        0.1, "Volume exponent of the `paper` score (eq. 4).", minimum=0.0, expert=True)
     at: str = option(
-        "end", "Prune the finished model, or at mid branch off there and train the rest of the run "
-        "(what train --prune does).", choices=("end", "mid"))
+        "end", "Prune the finished model (end), or its state in mid-training and finish from there "
+        "(mid, as train --prune).", choices=("end", "mid"))
     recovery: int | None = option(
-        None, "Training steps from first to last; with --max-psnr-drop shared out to the rounds.",
-        unit="steps", minimum=0, automatic="the rest of the run at mid; a sixth or 6 epochs at end")
+        None, "Fine-tuning steps after pruning, split over the rounds.", unit="steps", minimum=0,
+        automatic="end: a sixth of the run or 6 epochs; mid: the rest of the run")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -252,11 +277,11 @@ class PruneConfig(StageConfig):
         given = [name for name in limits if getattr(self, name) is not None]
         if len(given) > 1:
             raise ConfigError(
-                f"{' and '.join(given)} are given, but only one can say how much goes.",
+                f"{' and '.join(given)} are given, but only one can limit the pruning.",
                 hint=f"Leave out all but one of {', '.join(limits)}.")
         if self.max_psnr_drop is not None and self.at == "mid":
             raise ConfigError(
-                "max_psnr_drop needs a finished model to hold the pruned one against.",
+                "max_psnr_drop compares with a finished model, but pruning at mid has none yet.",
                 hint="`recon train` and then `recon prune`, both without --prune and --at mid.")
 
 
@@ -265,27 +290,107 @@ class EvaluateConfig(StageConfig):
     """How the held-out views are scored."""
 
     max_size: int | None = option(
-        None, "Longest side at which views are rendered and scored.", unit="pixels", minimum=16,
-        automatic="the size that was trained on")
+        None, "Longest side of rendered and scored views.", unit="pixels", minimum=16,
+        automatic="as in training")
+
+
+EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html", "points.ply",
+                  "colmap", "transforms.json")
+
+
+def read_matrix(path: str) -> list[float]:
+    """Returns the 16 numbers of a JSON file with 4 rows of 4 numbers, row by row.
+
+    Raises:
+        FormatError: the file is missing or no JSON.
+        ConfigError: it holds something else.
+    """
+    rows = read_json(Path(path))
+    if not (isinstance(rows, list) and len(rows) == 4 and all(
+            isinstance(row, list) and len(row) == 4
+            and all(type(value) in (int, float) for value in row) for row in rows)):
+        raise ConfigError(
+            f"{path} holds something else than a matrix of 4 rows of 4 numbers.",
+            hint="For example [[0.01, 0, 0, 0], [0, 0.01, 0, 0], [0, 0, 0.01, 0], [0, 0, 0, 1]].")
+    return [float(value) for row in rows for value in row]
+
+
+@dataclass(frozen=True)
+class ExportConfig(StageConfig):
+    """Which model is exported, in which frame, and to which files."""
+
+    model: str = option(
+        "auto", "Model to export; auto: pruned if it is fresh, else base.",
+        choices=("auto", "base", "pruned"))
+    scale_between: tuple[str, str, float] | None = option(
+        None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale of the training")
+    transform: tuple[
+        float, float, float, float, float, float, float, float,
+        float, float, float, float, float, float, float, float] | None = option(
+        None, "JSON file with a 4 x 4 matrix (rotation, translation, uniform scale) to apply to "
+        "scene and cameras, after --scale-between. In recon.toml: 16 numbers, row by row.",
+        metavar="FILE.json", read=read_matrix, automatic="the frame of the training")
+    up: str | None = option(
+        None, "Turn the scene so that this axis is up: z, y (glTF, three.js, SuperSplat) or -y "
+        "(COLMAP, most 3DGS viewers).", choices=("z", "y", "-y"),
+        automatic="z if up is known, else as in training")
+    crop: tuple[float, float, float, float, float, float] | None = option(
+        None, "Keep the box between two corners, in units of the exported scene.",
+        metavar="X Y Z X Y Z", automatic="everything")
+    drop_floaters: bool = option(
+        False, "Remove Gaussians that no training view sees, or that at most two views see and "
+        "that hide what is behind them or make these views worse.")
+    drop_islands: bool = option(
+        False, "Remove small groups of Gaussians far from all others, unless seen through windows.")
+    sh_degree: int | None = option(
+        None, "Maximum degree of the spherical harmonics.", minimum=0, maximum=3,
+        automatic="that of the scene")
+    max_mb: float | None = option(
+        None, "Maximum size of the first format; degree and number of Gaussians are reduced by "
+        "validation PSNR.", unit="MB", minimum=0.0, automatic="no limit")
+    format: str = option(
+        "ply", f"Formats besides the .ply, with commas between: {', '.join(EXPORT_FORMATS)}.",
+        metavar="NAME,...")
+    max_loss: float | None = option(
+        None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
+        automatic="0.3; 3 for .splat, which has no harmonics")
+    spz_version: int = option(
+        3, "Version of .spz: 3 is what most programs read; 2 is for older ones, with coarser "
+        "rotations; 4 uses zstd.", minimum=2, maximum=4, expert=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_scale_between(self.scale_between)
+        if self.transform is not None and self.up is not None:
+            raise ConfigError(
+                "transform and up are given, but both turn the exported scene.",
+                hint="Leave out --transform or --up, here and in recon.toml.")
+        if self.crop and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
+            raise self._error("crop", list(self.crop), "a lowest and a highest corner")
+        for name in self.formats:
+            if name not in EXPORT_FORMATS:
+                raise self._error("format", name, "one of " + ", ".join(EXPORT_FORMATS))
+
+    @property
+    def formats(self) -> tuple[str, ...]:
+        """The names in `format`, each once."""
+        return tuple(dict.fromkeys(name.strip() for name in self.format.split(",")))
 
 
 @dataclass(frozen=True)
 class ImportConfig(StageConfig):
-    """How a scene from elsewhere comes into a workspace."""
+    """How a splat file is brought into a workspace."""
 
     frame: str = option(
-        "auto", "The world that the file lies in: that of the capture's own cameras (source), that "
-        "of this workspace, or whichever shows some training views better.",
+        "auto", "Coordinate frame of the file: that of the capture's own cameras (source) or of "
+        "this workspace; auto: the one that shows some training views better.",
         choices=("auto", "source", "workspace"))
     axes: str | None = option(
-        None, "Where up is in the file; only matters without views.",
-        choices=("y-down", "z-up"), automatic="z-up for .glb, else y-down, as viewers take it")
+        None, "Up axis of the file, if there are no views.",
+        choices=("y-down", "z-up"), automatic="z-up for .glb, else y-down, as in viewers")
     max_size: int = option(
-        600, "Longest side at which the scene is rendered, scored and pruned.", unit="pixels",
-        minimum=16)
-    validation: float = option(
-        0.05, "Share of the training views kept out of pruning to watch it.", unit="share",
-        minimum=0.0, maximum=0.5)
+        600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
+    validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
 
 
 @dataclass(frozen=True)
@@ -293,10 +398,10 @@ class ComputeConfig(StageConfig):
     """Where the numerical work runs. Recorded in the manifest, never part of a fingerprint."""
 
     device: str = option(
-        "auto", "Where tensors live; auto takes CUDA where there is one.",
+        "auto", "Device; auto: CUDA if available.",
         choices=("auto", "cpu", "cuda"), hashed=False)
     backend: str = option(
-        "auto", "Rasterizer; auto takes the fastest that runs on the device.",
+        "auto", "Rasterizer; auto: the fastest.",
         choices=("auto", "triton", "numba", "torch"), hashed=False)
     threads: int | None = option(
-        None, "CPU threads.", unit="threads", minimum=1, hashed=False, automatic="all cores")
+        None, "CPU threads.", minimum=1, hashed=False, automatic="all cores")

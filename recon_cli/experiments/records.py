@@ -50,7 +50,7 @@ def key_of(where: Stand, digest: str, run: Run) -> str:
     """
     versions = [__version__, *(stage(name).version for name in ("train", "prune", "evaluate"))]
     return sha256_json({
-        "scene": digest, "arm": run.arm.record(), "config": run.config.hashed(),
+        "scene": digest, "arm": run.arm.record(), "config": run.config.hashed_fields(),
         "versions": versions, "backend": where.ctx.backend, "device": where.ctx.device})
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from recon_cli.config.settings import Settings, build, merged
+from recon_cli.config.settings import Settings, build, merge
 from recon_cli.config.stages import ComputeConfig, IngestConfig, RunConfig, SfmConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, InputError, ReconstructionError
@@ -109,7 +109,7 @@ def opened(
     root = path
     if not Workspace(path).holds_results:
         root = scratch / name
-        values = merged([settings, {"sfm": {"poses": "keep"}}])
+        values = merge([settings, {"sfm": {"poses": "keep"}}])
         stages = {part: values[part] for part in ("ingest", "denoise", "sfm")}
         job = Job(Workspace(root), stages, compute, progress)
         plan.run(job, "ingest and sfm", [

@@ -168,7 +168,7 @@ def _with_seed(job: Job, configs: Mapping[str, StageConfig], seed: int) -> list[
     _link_upstream(job.workspace, workspace)
     seeded = dataclasses.replace(
         job, workspace=workspace,
-        settings=layers.merged([job.settings, {"train": {"seed": seed}}]))
+        settings=layers.merge([job.settings, {"train": {"seed": seed}}]))
     plan.run(seeded, "eval --seeds", [Target(name, one) for name, one in configs.items()])
     return of_workspace(f"seed {seed}", workspace.folder("evaluate"))
 

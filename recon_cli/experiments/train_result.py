@@ -147,7 +147,7 @@ def base_config(
 
 def shared(base: RunConfig) -> dict[str, Any]:
     """Returns the options that all arms share, without those that each run has of its own."""
-    return {name: value for name, value in base.hashed().items()
+    return {name: value for name, value in base.hashed_fields().items()
             if name not in _OWN - {"max_size", "max_gaussians", "sh_degree"}}
 
 

@@ -62,7 +62,8 @@ class Arm:
     def record(self) -> dict[str, Any]:
         """Returns what decides about the outcome, as JSON keeps it."""
         prune = self.prune and {
-            "at": self.prune.at, "restarts": self.prune.restarts, **self.prune.config.hashed()}
+            "at": self.prune.at, "restarts": self.prune.restarts,
+            **self.prune.config.hashed_fields()}
         return {"name": self.name, "options": dict(self.options), "prune": prune,
                 "tries_degree": self.tries_degree}
 

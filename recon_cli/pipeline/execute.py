@@ -94,7 +94,7 @@ def run_stage(
     """
     if sources is None:
         sources = () if row.needs else _remembered(job, row)
-    basis = Basis(row.name, row.version, config.hashed(), sources, look.upstream(row))
+    basis = Basis(row.name, row.version, config.hashed_fields(), sources, look.upstream(row))
     _say_what_is_left_out(look, row)
     inputs = StageInputs(
         {name: job.workspace.folder(name) for name, digest in basis.upstream.items() if digest},

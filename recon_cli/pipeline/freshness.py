@@ -133,7 +133,7 @@ class Inspection:
         if recorded:
             before = {key: value for key, value in recorded.config.items() if key in known}
         try:
-            return layers.build(row.config, layers.merged(
+            return layers.build(row.config, layers.merge(
                 [{layers.section_of(row.config): before}, self._settings]))
         except ConfigError:
             # A newer recon may refuse what an older one took; what is set now must be right.
@@ -176,7 +176,7 @@ class Inspection:
         upstream = self.upstream(row)
         for need in row.needs:  # what is missing now cannot be told from what was there
             upstream[need] = upstream[need] or recorded.upstream.get(need)
-        return Basis(row.name, row.version, config.hashed(), sources, upstream)
+        return Basis(row.name, row.version, config.hashed_fields(), sources, upstream)
 
     def _read_again(
         self, recorded: tuple[Source, ...]

@@ -12,8 +12,7 @@ from pathlib import Path
 from recon_cli.capture import from_data_set, from_photos, from_video
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import Taken, joined
-from recon_cli.config.fields import parse_holdout
-from recon_cli.config.stages import IngestConfig
+from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import InputError
 from recon_cli.io import frames as store

@@ -187,7 +187,7 @@ def _check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
 
 def write_config(folder: Path, config: RunConfig) -> None:
     """Writes the options of a run beside its checkpoints."""
-    write_bytes(folder / "config.json", json.dumps(config.hashed(), indent=1).encode())
+    write_bytes(folder / "config.json", json.dumps(config.hashed_fields(), indent=1).encode())
 
 
 def read_config(folder: Path) -> RunConfig:

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from media import texture
 
-from recon_cli.config.fields import parse_holdout
+from recon_cli.config.stages import parse_holdout
 from recon_cli.errors import FormatError
 from recon_cli.io.frames import (
     Frame,

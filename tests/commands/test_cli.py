@@ -309,6 +309,40 @@ def test_every_verb_has_help_and_its_first_line_in_the_list_of_verbs(
     assert (cli.commands[verb].help or "").splitlines()[0] == VERBS[verb][1]
 
 
+@pytest.mark.parametrize("columns", ["80", "100"])
+def test_help_of_train_fits_on_a_screen(
+    columns: str, monkeypatch: pytest.MonkeyPatch, capsys: Said
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    assert main(["train", "--help"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) <= 50
+
+
+@pytest.mark.parametrize(("verb", "flag"), [
+    ("train", "--means-rate"), ("train", "--densify-every"), ("train", "--min-opacity"),
+    ("train", "--mid"), ("train", "--ssim-weight"), ("train", "--checkpoint-every"),
+    ("train", "--batch-views"), ("export", "--spz-version"), ("render", "--crf"),
+    ("render", "--codec"),
+])
+def test_options_for_experts_are_on_the_second_page_of_help(
+    verb: str, flag: str, capsys: Said
+) -> None:
+    assert main([verb, "--help"]) == 0
+    first = capsys.readouterr().out
+    assert main([verb, "--help-all"]) == 0
+    second = capsys.readouterr().out
+    assert f"\n  {flag} " not in first
+    assert f"\n  {flag} " in second
+    hidden = second.count("\n  -") - first.count("\n  -")
+    assert first.splitlines()[-1].split()[0] == "--help-all"
+    assert f"({hidden} more)" in first.splitlines()[-1]
+
+
+def test_an_option_for_experts_can_be_set(capsys: Said) -> None:
+    assert main(["train", "--means-rate", "0.5", "--print-config"]) == 0
+    assert "means_rate = 0.5" in capsys.readouterr().out
+
+
 def test_a_mistyped_verb_is_corrected(capsys: Said) -> None:
     assert main(["trian"]) == 2
     assert "train" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from recon_cli.cli import cli
 from recon_cli.commands import options
 from recon_cli.commands.options import Call
 from recon_cli.config.fields import StageConfig, option, option_info
-from recon_cli.config.settings import SECTIONS
+from recon_cli.config.settings import SECTIONS, section_of
 from recon_cli.config.stages import (
     ComputeConfig,
     DenoiseConfig,
@@ -39,13 +39,14 @@ def parsed(config: type[StageConfig], *words: str) -> dict[str, object]:
 
     call = Call()
     command.main(list(words), obj=call, standalone_mode=False)
-    section = next(name for name, kind in SECTIONS.items() if kind is config)
-    return call.settings.get(section, {})
+    return call.settings.get(section_of(config), {})
 
 
 @pytest.mark.parametrize("parameter", EVERY_OPTION)
 def test_every_option_has_help_and_shows_its_default(parameter: click.Option) -> None:
-    record = parameter.get_help_record(click.Context(click.Command("any")))
+    ctx = click.Context(click.Command("any"))
+    ctx.meta[options.HELP_ALL] = True
+    record = parameter.get_help_record(ctx)
     assert record
     assert "default: " in record[1]
     assert parameter.help
@@ -59,11 +60,11 @@ def test_every_field_says_what_it_is_and_what_happens_without_it(
     info = option_info(item)
     assert info.help.endswith(".")
     if item.default is None:
-        assert info.automatic in options.described(item)
+        assert info.automatic in options.describe_default(item)
         assert info.automatic
     if info.unit:
-        assert info.unit in options.described(item)
-    assert config().hashed().keys() <= {one.name for one in dataclasses.fields(config)}
+        assert info.unit in options.describe_default(item)
+    assert config().hashed_fields().keys() <= {one.name for one in dataclasses.fields(config)}
 
 
 @pytest.mark.parametrize("verb", ["ingest", "denoise", "sfm", "train", "prune", "eval", "export"])
@@ -126,7 +127,7 @@ def test_a_matrix_is_read_from_its_file_when_it_is_typed(tmp_path: Path) -> None
     path.write_text("[[2, 0, 0, 0.5], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]")
     numbers = [2, 0, 0, 0.5, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
     assert parsed(ExportConfig, "--transform", str(path)) == {"transform": numbers}
-    assert ExportConfig(transform=numbers).hashed()["transform"] == numbers  # not the file's name
+    assert ExportConfig(transform=numbers).hashed_fields()["transform"] == numbers
 
 
 def test_an_axis_may_begin_with_a_dash() -> None:

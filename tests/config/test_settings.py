@@ -11,7 +11,7 @@ from recon_cli.errors import ConfigError
 
 
 def test_a_later_layer_wins_field_by_field() -> None:
-    merged = layers.merged([
+    merged = layers.merge([
         {"train": {"iterations": 1, "seed": 1}}, {"train": {"iterations": 2}}, {"prune": {}}])
     assert merged["train"] == {"iterations": 2, "seed": 1}
     config = layers.build(TrainConfig, merged)
@@ -32,9 +32,9 @@ def test_toml_round_trips_every_section(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("text", "message", "hint"), [
     ("[trian]\niterations = 3", "section trian", "Did you mean train?"),
     ("[train]\niteration = 3", "train.iteration,", "Did you mean iterations?"),
-    ("[train]\nxyz = 3", "train.xyz", "[train] knows quality"),
+    ("[train]\nxyz = 3", "train.xyz", "quality, minutes"),
     ("train = 3", "it is a section", "[train]"),
-    ("[train\n", "not valid TOML", "Mend"),
+    ("[train\n", "not valid TOML", "Fix"),
 ])
 def test_a_mistake_in_a_file_names_the_file_and_what_was_meant(
     tmp_path: Path, text: str, message: str, hint: str
