@@ -2,6 +2,7 @@
 
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import (
+    DenoiseSummary,
     IngestSummary,
     SfmSummary,
     WorldEvidence,
@@ -23,3 +24,6 @@ SFM = SfmSummary(
 INGEST = IngestSummary(
     kind="video", declared_frames=20, decoded_frames=20, lost_frames=0, dropped_blurred=0,
     frames=12, held_out=2, groups=1, width=64, height=48)
+DENOISE = DenoiseSummary(
+    mode="auto", filter="joint", frames=12, denoised=0, median_sigma_255=0.5)
+BY_STAGE = {"ingest": INGEST, "denoise": DENOISE, "sfm": SFM}

@@ -3,8 +3,8 @@
 import shutil
 
 import pytest
-from made import make_workspace, wall
-from verb import splats
+from prepared_workspace import make_workspace, wall
+from render_cli import splats
 
 
 @pytest.fixture(scope="module")

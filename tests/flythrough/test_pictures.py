@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from made import wall
+from prepared_workspace import wall
 
 from recon_cli.flythrough.images import DepthScale, depth_colors, depth_scale, depth_steps
 from recon_cli.render import render

@@ -5,7 +5,7 @@ import os
 import shutil
 
 import pytest
-from verb import SHORT, pictures, record, render
+from render_cli import SHORT, pictures, record, render
 
 from recon_cli.flythrough import frames
 from recon_cli.flythrough import run as running

@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from verb import SHORT, pictures, record, render, times
+from render_cli import SHORT, pictures, record, render, times
 
 from recon_cli.cli import main
 from recon_cli.flythrough import run as running

@@ -3,7 +3,7 @@
 
 import av
 import numpy as np
-from verb import SHORT, render
+from render_cli import SHORT, render
 
 from recon_cli.io.images import read_image
 

@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from made_pages import make_workspace
+from report_workspace import make_workspace
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from made_pages import TABLE, change, page_of, report, section
+from report_workspace import TABLE, change, page_of, report, section
 
 from recon_cli.cli import main
 from recon_cli.io.images import write_png

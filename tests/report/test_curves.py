@@ -5,7 +5,7 @@ import os
 import re
 
 import pytest
-from made_pages import page_of, section
+from report_workspace import page_of, section
 
 from recon_cli.workspace.manifest import Manifest
 

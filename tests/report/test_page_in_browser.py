@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import WatchedPage
-from made_pages import change, paint, report
+from report_workspace import change, paint, report
 
 from recon_cli.io.images import write_png
 

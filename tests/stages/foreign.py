@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import torch
-from made import make_workspace
+from prepared_workspace import make_workspace
 from scenes import random_splats
 
 from recon_cli.cli import main

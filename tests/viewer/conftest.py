@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from made import make_workspace
+from prepared_workspace import make_workspace
 from scenes import random_splats
 from viewing import view
 

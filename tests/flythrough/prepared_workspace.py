@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import summaries
 import torch
 from tiny_scene import make_inputs
 
@@ -19,7 +20,7 @@ from recon_cli.stages import STAGES
 from recon_cli.train.runner import write_config
 from recon_cli.workspace.layout import Workspace
 
-TABLE = tuple(dataclasses.replace(row, module="made", renders=False) for row in STAGES)
+TABLE = tuple(replace(row, module="prepared_workspace", renders=False) for row in STAGES)
 prepared: dict[str, Path] = {}  # the folder of all stages
 evidence: dict[str, Any] = {}  # what sfm says of the world
 
@@ -28,7 +29,10 @@ def run(config, inputs, out, ctx):  # noqa: ARG001 - the signature of a stage
     source = prepared["folder"] / out.name
     if source.is_dir():
         shutil.copytree(source, out, dirs_exist_ok=True)
-    return {"world": {"evidence": dict(evidence)}} if out.name == "sfm" else {}
+    if out.name == "sfm":
+        world = replace(summaries.WORLD, evidence=replace(summaries.EVIDENCE, **evidence))
+        return replace(summaries.SFM, world=world)
+    return summaries.BY_STAGE.get(out.name, {})
 
 
 def make_workspace(

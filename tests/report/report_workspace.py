@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import summaries as records
 from tiny_scene import make_inputs
 from tiny_stages import CONTEXT, PRUNE
 
@@ -22,19 +23,19 @@ from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import STAGES, evaluate, export, prune, train
 from recon_cli.workspace.layout import Workspace
 
-TABLE = tuple(dataclasses.replace(row, module="made_pages", renders=False) for row in STAGES)
+TABLE = tuple(replace(row, module="report_workspace", renders=False) for row in STAGES)
 RUN = {"iterations": 60, "max_gaussians": 120, "sh_rate": 0.05, "densify_every": 10,
        "densify_gradient": 1e-5, "validation": 0.15}
 CONFIGS = {"train": TrainConfig(**RUN), "prune": PRUNE, "export": ExportConfig(format="spz")}
 HELD_OUT = ("000000.png", "000004.png", "000008.png")
-VERDICT = {
-    "frames": 12, "registered": 12, "points": 60, "unregistered": [], "rejected": {}, "apart": [],
-    "lines": ["12 of 12 images have a camera; the model is trusted.", "Weakest link: 88%."],
-    "verdict": {"trusted": True},
-    "world": {"evidence": {"up_found": True, "metres": True}, "sentences": ["z is up."]}}
+INGEST = replace(records.INGEST, held_out=3, width=48, height=36)
+SFM = replace(
+    records.SFM, registered=12, lines=("12 of 12 images have a camera.", "Weakest link: 88%."),
+    world=replace(records.WORLD, sentences=("z is up.",), evidence=replace(
+        records.EVIDENCE, up_found=True, metres=True)))
 
 prepared: dict[str, Path] = {}  # the folder of all stages
-summaries: dict[str, dict[str, Any]] = {}
+summaries: dict[str, Any] = {}
 
 
 def run(config, inputs, out, ctx):  # noqa: ARG001 - the signature of a stage
@@ -57,9 +58,7 @@ def make_workspace(folder: Path) -> Path:
         (made / name).mkdir()
         summaries[name] = stage.run(config, inputs, made / name, CONTEXT)
         inputs = StageInputs({**inputs.folders, name: made / name})
-    summaries["sfm"] = VERDICT
-    summaries["ingest"] = {
-        "kind": "video", "frames": 12, "held_out": 3, "width": 48, "height": 36}
+    summaries.update({**records.BY_STAGE, "ingest": INGEST, "sfm": SFM})
     prepared["folder"] = made
     (folder / "room.mp4").write_text("a video")
     bring(folder / "ws", *(row.name for row in TABLE), video=folder / "room.mp4")
