@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,7 +11,7 @@ from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TRAINING, Request
+from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TRAINING, RenderRequest
 from recon_cli.lazy import load
 
 
@@ -76,12 +77,7 @@ def _color(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
 @options.of(ComputeConfig)
 @options.common()
 @pass_call
-def render(
-    call: Call, path: str | None, views: tuple[str, ...], outputs: tuple[str, ...], model: str,
-    form: str | None, fps: float | None, seconds: float | None, size: int | None,
-    width: int | None, height: int | None, background: tuple[int, int, int], codec: str | None,
-    crf: int | None, out: Path | None,
-) -> None:
+def render(call: Call, /, path: str | None, views: tuple[str, ...], **request: Any) -> None:
     """Render the trained model along a path, or at given views.
 
     Images or a video of colour, depth and alpha. Finished frames of an interrupted run are kept.
@@ -89,8 +85,7 @@ def render(
     """
     if path is not None and views:
         raise click.UsageError("--path and --views exclude each other.")
-    request = Request(
-        path or TRAINING, views, outputs, model, fps, seconds, size, width, height, background,
-        form, codec, crf, out)
+    # the other options are fields of the request
+    checked = RenderRequest(path=path or TRAINING, views=views, **request)
     job, _ = open_job(call, ComputeConfig)
-    click.echo(load("recon_cli.flythrough.run.run")(request, job))
+    click.echo(load("recon_cli.flythrough.run.render_frames")(checked, job))

@@ -51,15 +51,15 @@ def view(
     if item is not None and workspace is None and model != "auto":
         raise click.UsageError("--model has no effect on a file.")
     if workspace is None:
-        content, photos = load("recon_cli.viewer.content.of_file")(item), None
+        content, photos = load("recon_cli.viewer.content.load_file")(item), None
     else:
         call.workspace = workspace
         job, _ = open_job(call, ComputeConfig)
-        content = load("recon_cli.viewer.content.of_workspace")(job, model)
-        photos = load("recon_cli.viewer.photo_pairs.Pictures")(job, content.max_size)
-    showing = load("recon_cli.viewer.server.showing")
+        content = load("recon_cli.viewer.content.load_workspace")(job, model)
+        photos = load("recon_cli.viewer.photo_pairs.PhotoPairs")(job, content.max_size)
+    serve_scene = load("recon_cli.viewer.server.serve_scene")
     try:
-        with showing(content, photos, host, port) as (_, address):
+        with serve_scene(content, photos, host, port) as (_, address):
             click.echo(f"The scene is at {address} (Ctrl-C ends it)")
             if _at_a_desktop() if opening is None else opening:
                 webbrowser.open(address)
@@ -75,8 +75,9 @@ def show_training(call: Call) -> Iterator[Watcher]:
     Raises:
         ConfigError: no port is free.
     """
-    serving, host = load("recon_cli.viewer.server.serving"), load("recon_cli.viewer.server.HOST")
-    with serving(host, None, label="recon train") as (server, address):
+    start_server = load("recon_cli.viewer.server.start_server")
+    host = load("recon_cli.viewer.server.HOST")
+    with start_server(host, None, label="recon train") as (server, address):
         live = load("recon_cli.viewer.live.LiveView")(server, Workspace(call.workspace))
         click.echo(f"The training can be watched at {address}")
         try:

@@ -1,4 +1,4 @@
-"""What was asked of `recon render`, checked as far as that goes without a workspace."""
+"""The options of `recon render`, checked as far as possible without a workspace."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 from recon_cli.errors import ConfigError
 
-TRAINING, ORBIT = "training", "orbit"  # what --path takes beside a file
+TRAINING, ORBIT = "training", "orbit"  # values of --path besides a file
 RGB, DEPTH, ALPHA = OUTPUTS = ("rgb", "depth", "alpha")
 PNG, MP4 = FORMATS = ("png", "mp4")
-FPS, SECONDS = 30.0, 10.0  # where nothing else is said
+FPS, SECONDS = 30.0, 10.0  # defaults
 _CRF_LIMITS = {"h264": 51, "av1": 63}
 CODECS = tuple(_CRF_LIMITS)
 CRF = {"h264": 18, "av1": 28}  # hardly a difference to the eye
@@ -19,40 +19,27 @@ MAX_FRAMES = 100_000
 
 
 @dataclass(frozen=True)
-class Request:
-    """The options of the verb.
+class RenderRequest:
+    """The options of the command.
 
-    Attributes:
-        path: "training", "orbit" or a .json with cameras.
-        views: test, train, validation or names of frames: single views in place of a path.
-        outputs: which of rgb, depth, alpha.
-        model: auto, base or pruned, as in `recon export`.
-        fps: frames a second; None takes that of the file, or 30.
-        seconds: length of a path that is made here; None stands for 10.
-        size: longest side in pixels.
-        width: in pixels.
-        height: in pixels; None of the three takes the size of training, or of the file.
-        background: RGB, 0 to 255.
-        form: png or mp4; None is mp4 where `out` is an .mp4.
-        codec: h264 or av1; None is h264.
-        crf: quality of the video, smaller is better.
-        out: folder, or a file that ends in .mp4 or .png; None is a folder in the workspace.
+    Raises:
+        ConfigError: an option is out of range, or options exclude each other.
     """
 
-    path: str = TRAINING
-    views: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = (RGB,)
-    model: str = "auto"
-    fps: float | None = None
-    seconds: float | None = None
-    size: int | None = None
-    width: int | None = None
+    path: str = TRAINING  # "training", "orbit" or a .json with cameras
+    views: tuple[str, ...] = ()  # test, train, validation or names of frames, instead of a path
+    outputs: tuple[str, ...] = (RGB,)  # of rgb, depth, alpha
+    model: str = "auto"  # auto, base or pruned
+    fps: float | None = None  # None takes that of the file, or 30
+    seconds: float | None = None  # length of a path that is made here; None is 10
+    size: int | None = None  # longest side in pixels
+    width: int | None = None  # without size, width and height: the size of training or the file
     height: int | None = None
-    background: tuple[int, int, int] = (0, 0, 0)
-    form: str | None = None
-    codec: str | None = None
-    crf: int | None = None
-    out: Path | None = None
+    background: tuple[int, int, int] = (0, 0, 0)  # RGB, 0 to 255
+    form: str | None = None  # png or mp4; None is mp4 if `out` ends in .mp4
+    codec: str | None = None  # h264 or av1; None is h264
+    crf: int | None = None  # quality of the video, smaller is better
+    out: Path | None = None  # folder, .mp4 or .png; None is a folder in the workspace
 
     def __post_init__(self) -> None:
         if self.file is None and self.path not in (TRAINING, ORBIT):
@@ -63,7 +50,7 @@ class Request:
         self._check_video()
         if self.out_file is not None and len(self.outputs) > 1:
             raise ConfigError(
-                f"{self.out_file} is one file, but {len(self.outputs)} outputs are asked for.",
+                f"{self.out_file} is one file, but there are {len(self.outputs)} outputs.",
                 hint="Give a folder with --out, or one --output.")
 
     @property
@@ -73,7 +60,7 @@ class Request:
 
     @property
     def out_file(self) -> Path | None:
-        """What --out names where it is no folder."""
+        """The file that --out names; None if it names a folder."""
         single = self.out is not None and self.out.suffix.lower() in (".mp4", ".png")
         return self.out if single else None
 
@@ -97,23 +84,25 @@ class Request:
     def _check_numbers(self) -> None:
         for name, value, highest in (("fps", self.fps, 240), ("seconds", self.seconds, 86_400)):
             if value is not None and not (math.isfinite(value) and 0 < value <= highest):
-                raise ConfigError(f"--{name} is {value:g}; needed is one above 0, up to {highest}.")
+                raise ConfigError(
+                    f"--{name} is {value:g}; it must be above 0 and at most {highest}.")
         for name in ("size", "width", "height"):
             pixels = getattr(self, name)
             if pixels is not None and pixels < 1:
-                raise ConfigError(f"--{name} is {pixels}; needed is at least 1 pixel.")
+                raise ConfigError(f"--{name} is {pixels}; it must be at least 1 pixel.")
         if self.size is not None and (self.width or self.height):
             raise ConfigError("--size and --width or --height exclude each other.")
         if not all(0 <= value <= 255 for value in self.background):
-            raise ConfigError(f"--background is {self.background}; needed are 0 to 255.")
+            raise ConfigError(f"--background is {self.background}; values must be 0 to 255.")
         if self.frames() > MAX_FRAMES:
             raise ConfigError(
-                f"{self.frames():,} frames are asked for; at most {MAX_FRAMES:,} are rendered.",
+                f"The path has {self.frames():,} frames; at most {MAX_FRAMES:,} are rendered.",
                 hint="Lower --fps or --seconds.")
 
     def _check_views(self) -> None:
         if self.file is not None and self.seconds is not None:
-            raise ConfigError("--seconds has no effect on a path from a file: it lists its frames.")
+            raise ConfigError(
+                "--seconds has no effect on a path from a file, which lists its frames.")
         if not self.views:
             return
         for name in ("fps", "seconds"):
@@ -121,7 +110,8 @@ class Request:
                 raise ConfigError(f"--{name} has no effect on single views.")
         if self.video:
             raise ConfigError(
-                "Single views make no video.", hint="Leave --views out, or the video.")
+                "Single views cannot become a video.",
+                hint="Give --path instead of --views, or no video.")
         if self.width and self.height:
             raise ConfigError(
                 "--width and --height together have no effect on single views, which keep their "
@@ -131,7 +121,7 @@ class Request:
         codec = self.codec or CODECS[0]
         if self.crf is not None and not 0 <= self.crf <= _CRF_LIMITS[codec]:
             raise ConfigError(
-                f"--crf is {self.crf}; {codec} takes 0 to {_CRF_LIMITS[codec]}.")
+                f"--crf is {self.crf}; {codec} accepts 0 to {_CRF_LIMITS[codec]}.")
         if not self.video:
             for name in ("codec", "crf"):
                 if getattr(self, name) is not None:
@@ -139,8 +129,8 @@ class Request:
         file = self.out_file
         if file is not None and not self.video and DEPTH in self.outputs:
             raise ConfigError(
-                f"{file} alone would not say what its depth means.",
-                hint="Give a folder with --out; render.json in it says that.")
+                f"{file} alone would not tell the unit of its depth.",
+                hint="Give a folder with --out; its render.json tells the unit.")
         if file is not None and (file.suffix.lower() == ".mp4") != self.video:
             raise ConfigError(
                 f"--out names {file.name}, but the format is {'mp4' if self.video else 'png'}.",

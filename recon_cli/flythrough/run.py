@@ -1,8 +1,14 @@
-"""From a request to pictures and videos: what is there already is not rendered again."""
+"""Renders the frames of a request into a folder and encodes videos of them.
+
+render.json in the folder records the settings. Frames are written atomically, so those of the same
+settings are kept, and an interrupted run continues; with other settings everything is rendered
+again.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,88 +16,187 @@ from typing import Any
 import torch
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError, WorkspaceError
+from recon_cli.errors import ConfigError, FormatError, WorkspaceError
 from recon_cli.flythrough.camera_path import write_camera_path
-from recon_cli.flythrough.frames import PATH, Frames, refuse_foreign
+from recon_cli.flythrough.camera_plan import CameraPlan, check_frame_memory, plan_cameras
 from recon_cli.flythrough.images import (
-    SHOWN,
+    FOLDERS,
+    VIDEO_FRAMES,
     DepthScale,
     depth_scale,
-    refuse_what_does_not_fit,
-    write_pictures,
+    write_frame,
 )
-from recon_cli.flythrough.plan import Plan, plan
-from recon_cli.flythrough.request import DEPTH, Request
-from recon_cli.flythrough.source import Source, open_source
-from recon_cli.flythrough.video import Encoding, encode, refuse_what_cannot_be_encoded
+from recon_cli.flythrough.request import DEPTH, RenderRequest
+from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
+from recon_cli.flythrough.video import VideoEncoding, check_encoding, encode_video
 from recon_cli.pipeline.execute import Job, rendering
-from recon_cli.render import RenderOutput, render
-from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.render import render
 from recon_cli.workspace import lock
-from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.atomic import (
+    LEFTOVERS,
+    clear_leftovers,
+    read_json,
+    write_bytes,
+    write_json,
+)
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.layout import disk_errors
+from recon_cli.workspace.lock import HOLDER, LOCK
 
 FOLDER = "render"  # in the workspace
+RECORD = "render.json"
+PATH = "camera_path.json"
+_SCHEMA = 1  # goes up when a frame changes meaning
+
+logger = logging.getLogger("recon")
 
 
-def run(request: Request, job: Job) -> str:
-    """Renders what is missing of a request and returns what was made, in words.
+class FrameFolder:
+    """The frames in one folder, and the record of their settings.
+
+    Args:
+        root: an existing folder.
+        names: stems of all frames, in order.
+        outputs: which of rgb, depth, alpha.
+    """
+
+    def __init__(self, root: Path, names: Sequence[str], outputs: Sequence[str]) -> None:
+        self.root, self.names, self.outputs = root, tuple(names), tuple(outputs)
+        self._folders = [folder for output in outputs for folder in FOLDERS[output]]
+
+    def prepare(self, settings: Mapping[str, Any], about: Mapping[str, Any]) -> tuple[str, ...]:
+        """Prepares the folder for these settings and returns which frames are missing.
+
+        Args:
+            settings: JSON values of everything that decides what a frame shows.
+            about: further JSON values for readers of the record.
+
+        Raises:
+            FormatError: the record of an earlier run is damaged.
+        """
+        settings = {"schema": _SCHEMA, **settings}
+        before = self._read_record()
+        if before is not None and before["digest"] != sha256_json(settings):
+            changed = sorted(key for key in {*settings, *before["settings"]}
+                             if settings.get(key) != before["settings"].get(key))
+            logger.warning("%s: all frames are rendered again, because settings changed: %s",
+                           self.root, ", ".join(changed) or "its record was edited by hand")
+            self._clear()
+            before = None
+        clear_leftovers(self.root)
+        missing = tuple(name for name in self.names if not all(
+            self.frame_path(folder, name).is_file() for folder in self._folders))
+        video = before["video"] if before and not missing else None
+        write_json(self.root / RECORD, {
+            "digest": sha256_json(settings), "settings": settings, "frames": len(self.names),
+            **about, "video": video})
+        for folder in self._folders:
+            (self.root / folder).mkdir(exist_ok=True)
+        return missing
+
+    def frame_path(self, folder: str, name: str) -> Path:
+        """Returns the path of a frame's picture in one of the folders."""
+        return self.root / folder / f"{name}.png"
+
+    @property
+    def video(self) -> Any:
+        """The encoding of the finished video; None if there is none of these frames."""
+        record = self._read_record()
+        return record["video"] if record else None
+
+    @video.setter
+    def video(self, encoding: Any) -> None:
+        write_json(self.root / RECORD, {**(self._read_record() or {}), "video": encoding})
+
+    def _read_record(self) -> dict[str, Any] | None:
+        """Returns the record of an earlier run; None in a new folder."""
+        path = self.root / RECORD
+        if not path.exists():
+            return None
+        record = read_json(path)
+        if not isinstance(record, dict) or not isinstance(record.get("settings"), dict) or not (
+                {"digest", "video"} <= record.keys()):
+            raise FormatError(
+                f"{path} is not a record of recon render.", hint=f"Delete {self.root}.")
+        return record
+
+    def _clear(self) -> None:
+        """Removes the files of an earlier run; its record stays until there is a new one."""
+        for folder in {folder for folders in FOLDERS.values() for folder in folders}:
+            for picture in (self.root / folder).glob("*.png"):
+                picture.unlink()
+        for path in (*(self.root / f"{output}.mp4" for output in FOLDERS), self.root / PATH):
+            path.unlink(missing_ok=True)
+
+
+def check_folder(root: Path) -> None:
+    """Raises WorkspaceError if a folder holds files that no earlier run wrote."""
+    others = {path.name for path in root.iterdir() if not path.match(LEFTOVERS)} - {LOCK, HOLDER}
+    if others and RECORD not in others:
+        raise WorkspaceError(
+            f"{root} is not empty: it holds {min(others)}, but no {RECORD}, so recon did not "
+            "create it.", hint="Give a new or an empty folder with --out.")
+
+
+def render_frames(request: RenderRequest, job: Job) -> str:
+    """Renders the missing frames of a request and returns what was written, in words.
 
     Raises:
         StageError: the workspace holds no trained model that is fresh.
-        ConfigError: a size, a view or a codec cannot be had.
+        ConfigError: a size, a view or a codec cannot be used.
         FormatError: a file cannot be read.
         WorkspaceError: the folder is in use, full, not writable, or holds files of others.
     """
     with disk_errors(job.workspace.root, "reading the model"):
-        source = open_source(job, request.model)
-    asked = plan(request, source)
-    encoding = _checked(request, asked)
+        trained = open_trained_scene(job, request.model)
+    plan = plan_cameras(request, trained)
+    encoding = _check(request, plan)
     ctx = rendering(job.compute, job.progress)
-    folder = _folder(request, asked, job.workspace.root)
+    folder = _make_folders(request, plan, job.workspace.root)
     with disk_errors(folder, "rendering"), lock.held(
             folder, "render", other="another folder with --out"):
-        frames = Frames(folder, list(asked.cameras), request.outputs)
-        scale = depth_scale(source.scene, metres=source.metres)
-        missing = frames.begin(
-            _settings(request, asked, source, scale),
+        frames = FrameFolder(folder, list(plan.cameras), request.outputs)
+        scale = depth_scale(trained.scene, metres=trained.metres)
+        missing = frames.prepare(
+            _frame_settings(request, plan, trained, scale),
             {"device": ctx.device, "backend": ctx.backend})
-        if asked.path is not None:
-            write_camera_path(folder / PATH, asked.path)
-        _render(frames, missing, request, asked, source, scale, ctx)
-        made = _encode(frames, encoding, request, ctx) if encoding else []
+        if plan.path is not None:
+            write_camera_path(folder / PATH, plan.path)
+        _render_missing(frames, missing, request, plan, trained, scale, ctx)
+        files = _encode_videos(frames, encoding, ctx) if encoding else []
     if request.out_file is not None:
-        made = [_delivered(request.out_file, made, frames)]
-    return _told(frames, len(missing), made)
+        files = [_copy_out(request.out_file, files, frames)]
+    total = len(frames.names)
+    return "\n".join([
+        f"{total} frame{'s' * (total != 1)} in {frames.root}, {len(missing)} of them rendered now",
+        *map(str, files)])
 
 
-def _checked(request: Request, asked: Plan) -> Encoding | None:
-    """Returns how the frames are to be encoded, if they are, once all of it can be done."""
-    largest = max(asked.cameras.values(), key=lambda camera: camera.width * camera.height)
-    refuse_what_does_not_fit(largest.width, largest.height)
-    if request.out_file is not None and not request.video and len(asked.cameras) > 1:
+def _check(request: RenderRequest, plan: CameraPlan) -> VideoEncoding | None:
+    """Returns the encoding of the video, if there is one, once the request is known to work."""
+    largest = max(plan.cameras.values(), key=lambda camera: camera.width * camera.height)
+    check_frame_memory(largest.width, largest.height)
+    if request.out_file is not None and not request.video and len(plan.cameras) > 1:
         raise ConfigError(
-            f"{request.out_file} is one picture, but there are {len(asked.cameras)} frames.",
+            f"{request.out_file} is one picture, but there are {len(plan.cameras)} frames.",
             hint="Give a folder with --out, or one view with --views.")
-    if not request.video or asked.path is None:
+    if not request.video or plan.path is None:
         return None
     codec, crf = request.quality
-    encoding = Encoding(codec, crf, largest.width, largest.height, asked.path.fps or 1.0)
-    refuse_what_cannot_be_encoded(encoding)
+    encoding = VideoEncoding(codec, crf, largest.width, largest.height, plan.path.fps or 1.0)
+    check_encoding(encoding)
     return encoding
 
 
-def _folder(request: Request, asked: Plan, workspace: Path) -> Path:
-    """Returns the folder of the frames, made where it was not there."""
-    folder = workspace / FOLDER / f"{asked.name}-{'-'.join(request.outputs)}"
+def _make_folders(request: RenderRequest, plan: CameraPlan, workspace: Path) -> Path:
+    """Returns the folder of the frames; it and the folder of --out exist afterwards."""
+    folder = workspace / FOLDER / f"{plan.name}-{'-'.join(request.outputs)}"
     if request.out is not None and request.out_file is None:
         folder = request.out.absolute()
-    _make(folder)
-    refuse_foreign(folder)
+    _make_folder(folder)
+    check_folder(folder)
     if request.out_file is not None:
-        _make(request.out_file.absolute().parent)
+        _make_folder(request.out_file.absolute().parent)
         if request.out_file.is_dir():
             raise WorkspaceError(
                 f"{request.out_file} is a folder, but a file is to be written there.",
@@ -99,22 +204,22 @@ def _folder(request: Request, asked: Plan, workspace: Path) -> Path:
     return folder
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise WorkspaceError(
-            f"The folder {folder} cannot be made: {error.strerror}.",
+            f"The folder {folder} cannot be created: {error.strerror}.",
             hint="Give another one with --out.") from error
 
 
-def _settings(
-    request: Request, asked: Plan, source: Source, scale: DepthScale
+def _frame_settings(
+    request: RenderRequest, plan: CameraPlan, trained: TrainedScene, scale: DepthScale
 ) -> dict[str, Any]:
     """Returns everything that decides what a frame shows, as JSON values."""
-    cameras = asked.cameras
+    cameras = plan.cameras
     return {
-        "model": source.model, "gaussians": source.digest, "sh_degree": source.sh_degree,
+        "model": trained.model, "gaussians": trained.digest, "sh_degree": trained.sh_degree,
         "outputs": list(request.outputs), "background": list(request.background),
         "sizes": [list(size) for size in sorted(
             {(camera.width, camera.height) for camera in cameras.values()})],
@@ -125,50 +230,41 @@ def _settings(
     }
 
 
-def _render(
-    frames: Frames, missing: Sequence[str], request: Request, asked: Plan, source: Source,
-    scale: DepthScale, ctx: StageContext,
+def _render_missing(
+    frames: FrameFolder, missing: Sequence[str], request: RenderRequest, plan: CameraPlan,
+    trained: TrainedScene, scale: DepthScale, ctx: StageContext,
 ) -> None:
-    splats = source.splats.map(lambda tensor: tensor.to(ctx.device))
+    splats = trained.splats.map(lambda tensor: tensor.to(ctx.device))
     background = torch.tensor(request.background, device=ctx.device) / 255
-    near = scale.surfaces(splats) if DEPTH in request.outputs else splats
+    surfaces = scale.select_surfaces(splats) if DEPTH in request.outputs else splats
     total = len(frames.names)
     with torch.no_grad(), ctx.progress.bar(
             "render", total, unit="frame", done=total - len(missing)) as bar:
         for name in missing:
-            def rendered(what: Splats, camera: Camera = asked.cameras[name]) -> RenderOutput:
-                return render(what, camera, background, source.sh_degree, backend=ctx.backend)
-
-            shown = rendered(splats)
-            surfaces = shown if near is splats else rendered(near)
-            write_pictures(frames.root, name, shown, surfaces, request.outputs, scale)
+            camera, degree = plan.cameras[name], trained.sh_degree
+            output = render(splats, camera, background, degree, backend=ctx.backend)
+            for_depth = output if surfaces is splats else render(
+                surfaces, camera, background, degree, backend=ctx.backend)
+            write_frame(frames.root, name, output, for_depth, request.outputs, scale)
             bar.advance()
 
 
-def _encode(
-    frames: Frames, encoding: Encoding, request: Request, ctx: StageContext
-) -> list[Path]:
-    """Returns the videos, made anew unless they are those of these frames and settings."""
-    videos = {output: frames.root / f"{output}.mp4" for output in request.outputs}
+def _encode_videos(frames: FrameFolder, encoding: VideoEncoding, ctx: StageContext) -> list[Path]:
+    """Returns one video an output, encoded again unless frames and settings are the same."""
+    videos = {output: frames.root / f"{output}.mp4" for output in frames.outputs}
     if frames.video == asdict(encoding) and all(path.is_file() for path in videos.values()):
         return list(videos.values())
     with ctx.progress.bar("encode", len(videos) * len(frames.names), unit="frame") as bar:
         for output, path in videos.items():
-            pictures = [frames.picture(SHOWN[output], name) for name in frames.names]
-            encode(pictures, path, encoding, threads=ctx.threads, on_frame=bar.advance)
+            pictures = [frames.frame_path(VIDEO_FRAMES[output], name) for name in frames.names]
+            encode_video(pictures, path, encoding, threads=ctx.threads, on_frame=bar.advance)
     frames.video = asdict(encoding)
     return list(videos.values())
 
 
-def _delivered(file: Path, videos: Sequence[Path], frames: Frames) -> Path:
-    """Copies the one video or picture to where it was asked for."""
+def _copy_out(file: Path, videos: Sequence[Path], frames: FrameFolder) -> Path:
+    """Copies the one video or picture to the file of --out."""
     with disk_errors(file.absolute().parent, f"writing {file.name}"):
-        made = videos[0] if videos else frames.picture(frames.outputs[0], frames.names[0])
-        write_bytes(file, made.read_bytes())
+        source = videos[0] if videos else frames.frame_path(frames.outputs[0], frames.names[0])
+        write_bytes(file, source.read_bytes())
     return file
-
-
-def _told(frames: Frames, rendered: int, made: Sequence[Path]) -> str:
-    total = len(frames.names)
-    lines = [f"{total} frame{'s' * (total != 1)} in {frames.root}, {rendered} of them rendered now"]
-    return "\n".join([*lines, *map(str, made)])

@@ -1,6 +1,6 @@
-"""Frames as H.264 or AV1 in an .mp4, through PyAV.
+"""Encodes frames as H.264 or AV1 in an .mp4, through PyAV.
 
-Colours are stored as BT.709 of limited range and said to be so: without that, players guess by the
+Colours are stored and tagged as BT.709 of limited range: without the tags, players guess from the
 size of the picture.
 """
 
@@ -23,27 +23,19 @@ from recon_cli.errors import ConfigError
 from recon_cli.io.images import read_image
 from recon_cli.workspace.atomic import replacing
 
-ENCODERS = {"h264": ("libx264",), "av1": ("libsvtav1", "libaom-av1")}  # the first that is there
+ENCODERS = {"h264": ("libx264",), "av1": ("libsvtav1", "libaom-av1")}  # the first available
 _BT709 = 1  # in FFmpeg's lists of primaries, transfer functions and matrices alike
-os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 tells its settings on stderr; 1 leaves errors
+os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 prints its settings to stderr; 1 leaves errors
 
 
 @dataclass(frozen=True)
-class Encoding:
-    """How frames become a video.
+class VideoEncoding:
+    """The parameters of a video."""
 
-    Attributes:
-        codec: h264 or av1.
-        crf: quality, smaller is better.
-        width: in pixels, even.
-        height: in pixels, even.
-        fps: frames a second.
-    """
-
-    codec: str
-    crf: int
-    width: int
-    height: int
+    codec: str  # h264 or av1
+    crf: int  # quality, smaller is better
+    width: int  # in pixels, even
+    height: int  # in pixels, even
     fps: float
 
     @property
@@ -64,27 +56,27 @@ class Encoding:
                 continue
         others = ", ".join(codec for codec in ENCODERS if codec != self.codec)
         raise ConfigError(
-            f"PyAV {av.__version__} as it is installed cannot encode {self.codec}: there is no "
+            f"The installed PyAV {av.__version__} cannot encode {self.codec}: it lacks "
             f"{' or '.join(ENCODERS[self.codec])}.",
             hint=f"Give another --codec ({others}), or install PyAV with pip.")
 
 
-def refuse_what_cannot_be_encoded(encoding: Encoding) -> None:
-    """Raises ConfigError where there is no encoder, or it does not take this size or rate."""
+def check_encoding(encoding: VideoEncoding) -> None:
+    """Raises ConfigError if there is no encoder, or it rejects this size or rate."""
     encoder = encoding.encoder()
     context = VideoCodecContext.create(encoder, "w")
     assert isinstance(context, VideoCodecContext)
-    _set_up(context, encoding)
+    _configure(context, encoding)
     context.time_base = 1 / encoding.rate
     try:
         context.open()
     except av.error.FFmpegError as error:
         raise ConfigError(
-            f"{encoder} does not make a video of {encoding.width}x{encoding.height} pixels at "
+            f"{encoder} cannot encode a video of {encoding.width}x{encoding.height} pixels at "
             f"{encoding.fps:g} fps.", hint="Give another --size, --fps or --codec.") from error
 
 
-def _set_up(context: VideoCodecContext, encoding: Encoding) -> None:
+def _configure(context: VideoCodecContext, encoding: VideoEncoding) -> None:
     context.width, context.height = encoding.width, encoding.height
     context.pix_fmt = "yuv420p"
     context.framerate = encoding.rate
@@ -93,11 +85,11 @@ def _set_up(context: VideoCodecContext, encoding: Encoding) -> None:
     context.color_range = ColorRange.MPEG
 
 
-def encode(
-    pictures: Sequence[Path], path: Path, encoding: Encoding, *, threads: int,
+def encode_video(
+    pictures: Sequence[Path], path: Path, encoding: VideoEncoding, *, threads: int,
     on_frame: Callable[[], None],
 ) -> None:
-    """Writes pictures as a video, whole or not at all.
+    """Writes pictures as a video, atomically.
 
     Args:
         pictures: RGB or gray files, in order.
@@ -114,7 +106,7 @@ def encode(
             str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream(encoding.encoder(), rate=encoding.rate)
         assert isinstance(stream, VideoStream)
-        _set_up(stream.codec_context, encoding)
+        _configure(stream.codec_context, encoding)
         stream.codec_context.thread_count = threads
         for picture in pictures:
             image = read_image(picture, encoding.width, encoding.height)

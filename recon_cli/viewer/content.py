@@ -1,4 +1,4 @@
-"""What there is to look at: the models of a workspace and its views, or a file of Gaussians."""
+"""The content of the viewer: the models and views of a workspace, or a splat file."""
 
 from __future__ import annotations
 
@@ -8,57 +8,46 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import viser
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.flythrough.smooth import depths_seen
-from recon_cli.flythrough.source import open_source
+from recon_cli.flythrough.paths import visible_depths
+from recon_cli.flythrough.trained_scene import open_trained_scene
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import read_splats
 from recon_cli.pipeline.execute import Job
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import View
-from recon_cli.scene.splats import Splats
 from recon_cli.viewer.crop_box import box_around
-from recon_cli.viewer.gaussians import Packed, packed
+from recon_cli.viewer.gaussians import PackedSplats, pack_splats
 
 HELD_OUT, TRAINING, VALIDATION = "held-out", "training", "validation"
 _FOLDERS = {"pruned": "prune", "base": "train"}
-FAR = 1000.0  # world units; what viser draws to by itself
-_FOV = math.radians(60)  # of a file, which has no lens
+FAR = 1000.0  # world units; viser's default
+_FOV = math.radians(60)  # for a file, which has no camera
+# Cosine between the up of the image and of the world, below which a view looks up or down.
+_STEEP = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
-    """Where a browser stands.
+class BrowserCamera:
+    """A camera as the browser takes it; lengths are in world units."""
 
-    Attributes:
-        position: [3] in world units.
-        look_at: [3], what it turns around.
-        fov: vertical, in radians.
-        near: what is nearer is not drawn, world units.
-        far: what is farther is not drawn, world units.
-    """
-
-    position: NDArray[np.float64]
-    look_at: NDArray[np.float64]
-    fov: float
+    position: NDArray[np.float64]  # [3]
+    look_at: NDArray[np.float64]  # [3], the point that it turns around
+    fov: float  # vertical, in radians
     near: float
     far: float
 
 
 @dataclass(frozen=True, eq=False)
-class ShownView:
-    """A view that can be jumped to.
-
-    Attributes:
-        view: with its camera.
-        part: held-out, training or validation.
-    """
+class LabeledView:
+    """A view that can be jumped to."""
 
     view: View
-    part: str
+    part: str  # held-out, training or validation
 
     @property
     def label(self) -> str:
@@ -67,76 +56,74 @@ class ShownView:
 
 
 @dataclass(frozen=True, eq=False)
-class Content:
-    """All that browsers are shown.
+class ViewerContent:
+    """Everything that browsers can show."""
 
-    Attributes:
-        models: by name, the one to begin with first.
-        views: the held-out ones first; none for a file, or a scene imported without views.
-        up: [3] unit vector; None where it is not known.
-        start: where every browser begins.
-        distance: from a camera to what it looks at, world units.
-        max_size: longest side that views are rendered at, in pixels.
-    """
-
-    models: Mapping[str, Packed]
-    views: tuple[ShownView, ...]
-    up: NDArray[np.float64] | None
-    start: Eye
-    distance: float
-    max_size: int
+    models: Mapping[str, PackedSplats]  # by name, the initial one first
+    views: tuple[LabeledView, ...]  # held-out first; none for a file or an import without views
+    up: NDArray[np.float64] | None  # [3] unit vector; None where unknown
+    start: BrowserCamera
+    distance: float  # from a camera to what it looks at, world units
+    max_size: int  # longest side that views are rendered at, in pixels
 
 
-def of_workspace(job: Job, model: str) -> Content:
-    """Returns the trained scene of a workspace, with both models where both are fresh.
+def load_workspace(job: Job, model: str) -> ViewerContent:
+    """Returns the trained scene of a workspace, with both models if both are fresh.
 
     Args:
-        job: whose workspace it is.
-        model: auto, base or pruned: the one to begin with.
+        job: holds the workspace.
+        model: auto, base or pruned: the initial one.
 
     Raises:
-        StageError: there is no such model that is fresh.
+        StageError: the model is missing or stale.
         FormatError: a file of the workspace is damaged.
     """
-    source = open_source(job, model, verb="view")
-    models = {source.model: packed(source.splats)}
+    trained = open_trained_scene(job, model, verb="view")
+    models = {trained.model: pack_splats(trained.splats)}
     fresh = {"base", "pruned"} if job.inspect().check("prune").fresh else {"base"}
     for name in sorted(fresh - models.keys()):
-        models[name] = packed(read_ply(job.workspace.folder(_FOLDERS[name]) / "splats.ply"))
-    scene = source.scene
+        models[name] = pack_splats(read_ply(job.workspace.folder(_FOLDERS[name]) / "splats.ply"))
+    scene = trained.scene
     parts = {HELD_OUT: scene.test, TRAINING: scene.train, VALIDATION: scene.validation}
-    views = tuple(ShownView(view, part) for part, some in parts.items() for view in some
-                  if source.has_views)
+    views = tuple(LabeledView(view, part) for part, members in parts.items() for view in members
+                  if trained.has_views)
     first = scene.train[0].camera
-    seen = depths_seen(first, scene.points)
-    distance = float(np.median(seen)) if len(seen) else scene.extent
-    return Content(
-        models, views, source.up(), eye_of(first, distance, _farthest(models)), distance,
-        source.max_size)
+    depths = visible_depths(first, scene.points)
+    distance = float(np.median(depths)) if len(depths) else scene.extent
+    return ViewerContent(
+        models, views, trained.up(), browser_camera(first, distance, _far_plane(models)), distance,
+        trained.max_size)
 
 
-def of_file(path: Path) -> Content:
-    """Returns a file of Gaussians, looked at from a corner of its room.
+def load_file(path: Path) -> ViewerContent:
+    """Returns a splat file, seen from a corner of its room.
 
     Raises:
         FormatError: its format is not known, or it is damaged or empty.
     """
     splats = read_splats(path)
-    models = {path.name: packed(splats)}
+    models = {path.name: pack_splats(splats)}
     if not len(models[path.name].splats):
         raise FormatError(
             f"{path} holds no Gaussian that can be drawn.", hint="Give another file.")
     box = box_around(splats)
     low, high = np.array(box.low), np.array(box.high)
     middle, corner = (low + high) / 2, low + 0.8 * (high - low)
-    start = Eye(corner, middle, _FOV, NEAR, _farthest(models))
-    return Content(models, (), None, start, float(np.linalg.norm(corner - middle)), 0)
+    start = BrowserCamera(corner, middle, _FOV, NEAR, _far_plane(models))
+    return ViewerContent(models, (), None, start, float(np.linalg.norm(corner - middle)), 0)
 
 
-def eye_of(camera: Camera, distance: float, far: float) -> Eye:
-    """Returns where a camera stands; its principal point is taken for the middle."""
-    forward = camera.viewmat[2, :3]
-    return Eye(camera.center, camera.center + distance * forward, vertical_fov(camera), NEAR, far)
+def _far_plane(models: Mapping[str, PackedSplats]) -> float:
+    """Returns a distance beyond all Gaussians."""
+    reach = [float(model.splats.means.norm(dim=1).max()) if len(model.splats) else 0.0
+             for model in models.values()]
+    return max(FAR, *(2 * distance for distance in reach))
+
+
+def browser_camera(camera: Camera, distance: float, far: float) -> BrowserCamera:
+    """Returns a camera for the browser, which takes the principal point for the image centre."""
+    look_at = camera.center + distance * camera.viewmat[2, :3]
+    return BrowserCamera(camera.center, look_at, vertical_fov(camera), NEAR, far)
 
 
 def vertical_fov(camera: Camera) -> float:
@@ -144,10 +131,26 @@ def vertical_fov(camera: Camera) -> float:
     return 2 * math.atan(camera.height / 2 / camera.fy)
 
 
-def _farthest(models: Mapping[str, Packed]) -> float:
-    """Returns a distance beyond all Gaussians."""
-    return max(FAR, *(2 * _reach(model.splats) for model in models.values()))
+def move_browser(
+    client: viser.ClientHandle, target: BrowserCamera, up: NDArray[np.float64] | None,
+    camera: Camera,
+) -> None:
+    """Moves the camera of a browser to `target`, with the roll of `camera`.
+
+    The browser's up becomes the world's up as the camera sees it, so that dragging the mouse
+    afterwards still turns around the vertical.
+    """
+    right, image_up = camera.viewmat[0, :3], -camera.viewmat[1, :3]
+    world_up = image_up if up is None else up - (up @ right) * right
+    with client.atomic():
+        client.camera.up_direction = world_up if world_up @ image_up > _STEEP else image_up
+        client.camera.position = target.position
+        client.camera.look_at = target.look_at
+        client.camera.fov = target.fov
 
 
-def _reach(splats: Splats) -> float:
-    return float(splats.means.norm(dim=1).max()) if len(splats) else 0.0
+def set_initial_camera(server: viser.ViserServer, start: BrowserCamera) -> None:
+    """Sets the camera of browsers that connect from now on."""
+    camera = server.initial_camera
+    camera.position, camera.look_at = start.position, start.look_at
+    camera.fov, camera.near, camera.far = start.fov, start.near, start.far

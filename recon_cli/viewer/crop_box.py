@@ -1,4 +1,4 @@
-"""The box that Gaussians are cut with: what `recon export --crop` takes, in numbers and words."""
+"""The crop box of the viewer, in the numbers that `recon export --crop` takes."""
 
 from __future__ import annotations
 
@@ -10,47 +10,42 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.splats import Splats
 
-_SHARE = 0.05  # of the Gaussians left out at either end of each axis by the first box
+_SHARE = 0.05  # of the Gaussians outside the initial box at either end of each axis
 _MARGIN = 0.1  # of its sides
 _CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1]
 
 
 @dataclass(frozen=True)
-class Box:
-    """A box along the axes of the world, in world units.
-
-    Attributes:
-        low: its lowest corner.
-        high: its highest corner.
-    """
+class CropBox:
+    """An axis-aligned box in world units."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
     @staticmethod
-    def between(low: Sequence[float], high: Sequence[float]) -> Box:
-        """Returns the box of two corners, as it is written: what is shown is what is cut."""
-        first, second = ((float(_word(x)), float(_word(y)), float(_word(z)))
+    def between(low: Sequence[float], high: Sequence[float]) -> CropBox:
+        """Returns the box of two corners, rounded as `arguments` writes them."""
+        first, second = ((float(_format(x)), float(_format(y)), float(_format(z)))
                          for x, y, z in (low, high))
-        return Box(first, second)
+        return CropBox(first, second)
 
     @property
-    def words(self) -> str:
-        """The six numbers as `recon export --crop` takes them."""
-        return " ".join(_word(value) for value in (*self.low, *self.high))
+    def arguments(self) -> str:
+        """The six numbers for `recon export --crop`."""
+        return " ".join(_format(value) for value in (*self.low, *self.high))
 
     @property
-    def holds_something(self) -> bool:
-        """Whether it is a box at all."""
+    def is_valid(self) -> bool:
+        """Whether its low corner is below its high corner."""
         return all(a < b for a, b in zip(self.low, self.high, strict=True))
 
-    def inside(self, splats: Splats) -> NDArray[np.bool_]:
-        """Returns which centres lie in it, its sides included, [N]."""
+    def contains(self, splats: Splats) -> NDArray[np.bool_]:
+        """Returns [N] which centres are inside, its faces included."""
         low, high = splats.means.new_tensor(self.low), splats.means.new_tensor(self.high)
-        found: NDArray[np.bool_] = (
+        inside: NDArray[np.bool_] = (
             (splats.means >= low) & (splats.means <= high)).all(dim=1).numpy()
-        return found
+        return inside
 
     def edges(self) -> NDArray[np.float32]:
         """Returns its edges [12, 2, 3]."""
@@ -58,14 +53,14 @@ class Box:
         return np.asarray(corners[np.array(_EDGES)], np.float32)
 
 
-def box_around(splats: Splats) -> Box:
-    """Returns a box around the room: nine tenths along each axis, and a tenth of its sides more."""
+def box_around(splats: Splats) -> CropBox:
+    """Returns the initial box: 90% of the Gaussians along each axis, plus a tenth of its sides."""
     if not len(splats):
-        return Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+        return CropBox((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     low, high = np.quantile(splats.means.numpy(), [_SHARE, 1 - _SHARE], axis=0)
     margin = _MARGIN * (high - low) + 1e-3
-    return Box.between((low - margin).tolist(), (high + margin).tolist())
+    return CropBox.between((low - margin).tolist(), (high + margin).tolist())
 
 
-def _word(value: float) -> str:
+def _format(value: float) -> str:
     return f"{value:.4g}"

@@ -1,8 +1,8 @@
-"""Gaussians as a browser draws them: covariances in half precision, colours of 8 bits.
+"""Packs Gaussians for the browser: covariances in half precision, colours of 8 bits.
 
 viser sends a covariance as six half-precision numbers, which overflow above a standard deviation of
-255 and vanish below 0.0003. Therefore all is sent in units in which the largest Gaussian fits and
-the node is scaled back: what the browser shows, and every number it is told, is in world units.
+255 and vanish below 0.0003. Therefore everything is sent in units in which the largest Gaussian
+fits, and the scene node is scaled back to world units.
 """
 
 from __future__ import annotations
@@ -17,53 +17,38 @@ from numpy.typing import NDArray
 from recon_cli.render.torch.projection import colors_from_sh
 from recon_cli.scene.splats import Splats
 
-_LARGEST = 200.0  # standard deviation as sent; its square still is a half-precision number
-# Largest Gaussian in medians of their longest axes; in four scenes it was 450 to 3,000. Beyond,
-# a stray one would leave no precision for the room, and is drawn smaller.
+_LARGEST = 200.0  # standard deviation as sent; its square fits into half precision
+# Limit of the largest Gaussian, in medians of the longest axes; in four scenes it was 450 to 3,000.
+# A larger outlier would leave no precision for the room, so it is drawn smaller.
 _OUTLIER = 5000.0
-# Of the longest axis: a covariance is rounded by 2^-11 of its largest entry, and one with a thinner
-# axis may come out as none. Against our own renders 0.02 dB better than without.
+# Of the longest axis: a covariance is rounded by 2^-11 of its largest entry, so one with a thinner
+# axis may not stay positive definite. Against recon's renders 0.02 dB better than without.
 _THINNEST = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Packed:
-    """N Gaussians as they are sent.
+class PackedSplats:
+    """N Gaussians as they are sent."""
 
-    Attributes:
-        splats: on the CPU, finite.
-        scale: of the node; what is sent is that many times smaller than the world.
-        centers: [N, 3] float32, as sent.
-        covariances: [N, 3, 3] float16, as sent.
-        opacities: [N, 1] of 8 bits.
-    """
+    splats: Splats  # on the CPU, finite
+    scale: float  # of the scene node: world units per unit sent
+    centers: NDArray[np.float32]  # [N, 3]
+    covariances: NDArray[np.float16]  # [N, 3, 3]
+    opacities: NDArray[np.uint8]  # [N, 1]
 
-    splats: Splats
-    scale: float
-    centers: NDArray[np.float32]
-    covariances: NDArray[np.float16]
-    opacities: NDArray[np.uint8]
-
-    def colors(self, place: Sequence[float] | None) -> NDArray[np.uint8]:
-        """Returns the colours [N, 3] as seen from a place.
-
-        Args:
-            place: [3] in world units; None leaves harmonics of degrees 1 and up out.
-        """
+    def colors(self, position: Sequence[float] | None) -> NDArray[np.uint8]:
+        """Returns the colours [N, 3] as seen from `position` [3]; None uses SH degree 0 alone."""
         splats = self.splats
-        degree = 0 if place is None else splats.sh_degree
-        offsets = splats.means - splats.means.new_tensor(place or (0.0, 0.0, 0.0))
+        degree = 0 if position is None else splats.sh_degree
+        offsets = splats.means - splats.means.new_tensor(position or (0.0, 0.0, 0.0))
         rgb = colors_from_sh(
             offsets, splats.sh_dc, splats.sh_rest, torch.arange(len(splats)), degree)
         return _eight_bit(rgb.numpy())
 
 
-def packed(splats: Splats) -> Packed:
-    """Returns Gaussians, on any device, as they are sent; those that are not finite are left out.
-
-    No renderer draws those either.
-    """
-    splats = _finite(splats.map(lambda tensor: tensor.detach().cpu()))
+def pack_splats(splats: Splats) -> PackedSplats:
+    """Packs Gaussians of any device, without those that are not finite, which nothing renders."""
+    splats = _drop_non_finite(splats.map(lambda tensor: tensor.detach().cpu()))
     scales = np.exp(splats.log_scales.numpy().astype(np.float64))
     longest = scales.max(axis=1, initial=0.0)
     largest = min(longest.max(initial=0.0), _OUTLIER * float(np.median(longest))) if len(
@@ -71,13 +56,13 @@ def packed(splats: Splats) -> Packed:
     scale = largest / _LARGEST or 1.0
     spread = np.clip(scales, _THINNEST * longest[:, None], None).clip(max=largest) / scale
     factors = _rotations(splats.quats.numpy()) * spread[:, None, :]
-    return Packed(
+    return PackedSplats(
         splats, scale, (splats.means.numpy() / scale).astype(np.float32),
         (factors @ factors.transpose(0, 2, 1)).astype(np.float16),
         _eight_bit(splats.opacities.numpy())[:, None])
 
 
-def _finite(splats: Splats) -> Splats:
+def _drop_non_finite(splats: Splats) -> Splats:
     good = torch.ones(len(splats), dtype=torch.bool)
     for value in splats.parameters().values():
         finite = torch.isfinite(value)
@@ -87,7 +72,7 @@ def _finite(splats: Splats) -> Splats:
 
 
 def _rotations(quats: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Returns the rotations [N, 3, 3] of quaternions [N, 4] of any length; zeros stand for none."""
+    """Returns the rotations [N, 3, 3] of quaternions [N, 4] of any length; zero is the identity."""
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(length > 0, quats / np.maximum(length, 1e-30), [1.0, 0.0, 0.0, 0.0])
     w, x, y, z = unit.astype(np.float64).T

@@ -1,9 +1,8 @@
-"""`recon train --view`: a training that is looked at, for next to none of its time.
+"""`recon train --view`: shows a training in the browser at a bounded cost.
 
-An update costs the moment of copying, the packing and sending in another thread, and what a browser
-on the same machine takes to draw it. All of that is waited for and measured, and the next update
-comes when it has become a small share of the time since: whatever an update costs, its share of the
-training's time is bounded. Without a browser nothing is copied.
+An update costs the copy, packing and sending in another thread, and the drawing by a browser on the
+same machine. All of it is waited for and measured, and the next update is due when this one has
+become a small share of the time since. Without a browser nothing is copied.
 """
 
 from __future__ import annotations
@@ -19,38 +18,37 @@ import viser
 from numpy.typing import NDArray
 
 from recon_cli.errors import ReconError
-from recon_cli.flythrough.smooth import depths_seen
+from recon_cli.flythrough.paths import visible_depths
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.gravity import MIN_CAMERAS, camera_up
 from recon_cli.scene.splats import Splats
-from recon_cli.viewer.content import FAR, eye_of
-from recon_cli.viewer.frustums import stand
-from recon_cli.viewer.gaussians import packed
-from recon_cli.viewer.server import Server, begin_at
+from recon_cli.viewer.content import FAR, browser_camera, move_browser, set_initial_camera
+from recon_cli.viewer.gaussians import pack_splats
+from recon_cli.viewer.server import Server
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import WorldSummary
 
-SHARE = 0.04  # of the training's time, for all updates together
-# viser's page goes on drawing for a quarter of a second after an update (RENDER_SETTLE_MS).
+SHARE = 0.04  # of the training's time that updates may take
+# viser's page keeps drawing for a quarter of a second after an update (RENDER_SETTLE_MS).
 _SETTLE_SECONDS = 0.25
-_PATIENCE_SECONDS = 30.0  # with a browser that does not answer, as one in a hidden tab
-_ECHO = "recon-echo"  # a name that no browser keeps anything under
+_PATIENCE_SECONDS = 30.0  # for a browser that does not answer, such as one in a hidden tab
+_ECHO = "recon-echo"  # a key under which no browser stores anything
 
 logger = logging.getLogger("recon")
 
 
 class LiveView:
-    """A watcher that shows what it sees to all browsers.
+    """Training callbacks that send the Gaussians to all browsers.
 
     Args:
-        server: where browsers come.
-        workspace: of the training; its sfm says where up is.
+        server: that browsers connect to.
+        workspace: of the training; its sfm knows the vertical.
     """
 
     def __init__(self, server: Server, workspace: Workspace) -> None:
         self._server, self._workspace = server, workspace
         self._work = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recon-view")
-        self._text = server.gui.add_markdown("Waiting for the training to begin.")
+        self._text = server.gui.add_markdown("Waiting for the training to start.")
         server.gui.add_markdown(
             "*Colours are the mean over all directions. `recon view` shows the finished scene.*")
         self._node: viser.GaussianSplatHandle | None = None
@@ -61,31 +59,31 @@ class LiveView:
         self._closed = False
 
     def begin(self, label: str, until: int, cameras: Sequence[Camera], splats: Splats) -> None:
-        """Puts all browsers where the first training camera stands."""
+        """Moves all browsers to the first training camera."""
         self._label, self._until, self._psnr_db = label, until, None
         try:
-            self._begin_at(cameras, splats)
-        except Exception:  # nothing of this may end a training
+            self._place_browsers(cameras, splats)
+        except Exception:  # the viewer must never end a training
             logger.debug("the browsers could not be placed", exc_info=True)
 
-    def _begin_at(self, cameras: Sequence[Camera], splats: Splats) -> None:
+    def _place_browsers(self, cameras: Sequence[Camera], splats: Splats) -> None:
         up = self._up(cameras)
-        seen = depths_seen(cameras[0], splats.means.detach().cpu().double().numpy())
-        eye = eye_of(cameras[0], float(np.median(seen)) if len(seen) else 1.0, FAR)
+        depths = visible_depths(cameras[0], splats.means.detach().cpu().double().numpy())
+        start = browser_camera(cameras[0], float(np.median(depths)) if len(depths) else 1.0, FAR)
         self._server.scene.set_up_direction(up)
-        begin_at(self._server, eye)
+        set_initial_camera(self._server, start)
         if self._node is None:
             for client in self._server.get_clients().values():
-                stand(client, eye, up, cameras[0])
+                move_browser(client, start, up, cameras[0])
 
     def step(self, iteration: int, splats: Splats) -> None:
-        """Sends the Gaussians where that is due and somebody is there."""
+        """Sends the Gaussians if an update is due and a browser is connected."""
         start = time.perf_counter()
         if self._busy or start < self._due or not self._server.get_clients():
             return
         self._busy = True
-        kept = dataclasses.replace(splats, sh_rest=splats.sh_rest[:0])
-        copy = kept.map(lambda tensor: tensor.detach().cpu().clone())
+        flat = dataclasses.replace(splats, sh_rest=splats.sh_rest[:0])
+        copy = flat.map(lambda tensor: tensor.detach().cpu().clone())
         self._work.submit(self._send, iteration, copy, start)
 
     def report(self, iteration: int, validation_psnr_db: float | None) -> None:  # noqa: ARG002
@@ -93,17 +91,17 @@ class LiveView:
         self._psnr_db = validation_psnr_db
 
     def close(self) -> None:
-        """Ends what is under way."""
+        """Stops sending updates."""
         self._closed = True
         self._work.shutdown(wait=False, cancel_futures=True)
 
     def _send(self, iteration: int, splats: Splats, start: float) -> None:
-        """Sends an update, waits until it is drawn, and says when the next one may come."""
+        """Sends an update, waits until it is drawn, and schedules the next one."""
         try:
             self._show(iteration, splats)
             for client in self._server.get_clients().values():
                 self._wait_for(client)
-        except Exception:  # nothing of this may end a training
+        except Exception:  # the viewer must never end a training
             if not self._closed:
                 logger.debug("an update could not be shown", exc_info=True)
         finally:
@@ -112,29 +110,29 @@ class LiveView:
             self._busy = False
 
     def _show(self, iteration: int, splats: Splats) -> None:
-        found = packed(splats)
-        colors = found.colors(None)
+        packed = pack_splats(splats)
+        colors = packed.colors(None)
         psnr = "" if self._psnr_db is None else f", validation **{self._psnr_db:.2f} dB**"
         with self._server.atomic():
             if self._node is None:
                 self._node = self._server.scene.add_gaussian_splats(
-                    "/gaussians", found.centers, found.covariances, colors, found.opacities,
-                    scale=found.scale)
+                    "/gaussians", packed.centers, packed.covariances, colors, packed.opacities,
+                    scale=packed.scale)
             else:
-                self._node.scale = found.scale
+                self._node.scale = packed.scale
                 self._node.set_gaussians(
-                    found.centers, found.covariances, colors, found.opacities)
+                    packed.centers, packed.covariances, colors, packed.opacities)
             self._text.content = (
                 f"{self._label}: step **{iteration:,}** of {self._until:,}{psnr}, "
                 f"{len(splats):,} Gaussians")
         self._server.flush()
 
     def _wait_for(self, client: viser.ClientHandle) -> None:
-        """Waits until a browser has drawn what it was sent: it answers between two pictures."""
+        """Waits until a browser has drawn the update: it answers between two frames."""
         for _ in range(2):
             try:
                 client.local_storage.get_item(_ECHO, timeout=_PATIENCE_SECONDS)
-            except (RuntimeError, TimeoutError):  # gone, or in a hidden tab
+            except (RuntimeError, TimeoutError):  # disconnected, or in a hidden tab
                 return
 
     def _up(self, cameras: Sequence[Camera]) -> NDArray[np.float64]:
@@ -143,7 +141,7 @@ class LiveView:
             if world and world.evidence.up_found:
                 return np.array([0.0, 0.0, 1.0])
         except (ReconError, OSError):
-            pass  # a look at a training does without
+            pass  # the cameras give an approximate up
         if len(cameras) < MIN_CAMERAS:
             return np.asarray(-cameras[0].viewmat[1, :3])
         return camera_up(np.stack([camera.viewmat for camera in cameras])).up

@@ -1,4 +1,4 @@
-"""A view's photo and our own render of it, side by side, and thumbnails for all of them."""
+"""A view's photo next to recon's own render of it, and thumbnails of all views."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from recon_cli.scene.splats import Splats
 _THUMBNAIL = 160  # pixels, longest side
 
 
-class Pictures:
-    """Photos and renders of the views, made when they are asked for, by one thread at a time.
+class PhotoPairs:
+    """Photos and renders of views, made on request, by one thread at a time.
 
     Args:
         job: device, backend and threads to render with.
@@ -34,7 +34,7 @@ class Pictures:
     def _ctx(self) -> StageContext:
         return rendering(self._job.compute, self._job.progress)
 
-    def photo(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    def load_photo(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
         """Returns a photo [H, W, 3] at the size of training, painted under its mask [H, W].
 
         Raises:
@@ -43,19 +43,19 @@ class Pictures:
         camera = fitted_camera(view.camera, self._max_size)
         return read_masked_image(view.original, view.mask, camera.width, camera.height)
 
-    def rendered(self, view: View, splats: Splats) -> tuple[NDArray[np.uint8], float | None]:
-        """Returns recon's own picture [H, W, 3] of a view, and its PSNR in dB as of `recon eval`.
+    def render_view(self, view: View, splats: Splats) -> tuple[NDArray[np.uint8], float | None]:
+        """Returns recon's render [H, W, 3] of a view and its PSNR in dB, as `recon eval` has it.
 
-        The PSNR is None where a mask leaves too little of the view.
+        The PSNR is None if a mask leaves too little of the view.
 
         Raises:
-            BackendError: the rasterizer that was asked for is not here.
+            BackendError: the requested rasterizer is not available.
             FormatError: the photo cannot be read.
         """
-        truth, mask = self.photo(view)
+        truth, mask = self.load_photo(view)
         camera, device = fitted_camera(view.camera, self._max_size), self._ctx.device
-        there = splats.map(lambda tensor: tensor.to(device))
-        rgb = render_on_black(there, camera, splats.sh_degree, self._ctx.backend).rgb
+        on_device = splats.map(lambda tensor: tensor.to(device))
+        rgb = render_on_black(on_device, camera, splats.sh_degree, self._ctx.backend).rgb
         image: NDArray[np.float32] = rgb.cpu().numpy()
         return eight_bit(image), psnr(image, truth, mask) if leaves_enough(mask) else None
 

@@ -1,4 +1,4 @@
-"""One browser: its own camera, model, box and colours, and the panel that sets them."""
+"""The session of one browser: its camera, model, crop box, colours and control panel."""
 
 from __future__ import annotations
 
@@ -13,37 +13,46 @@ import viser
 from numpy.typing import NDArray
 
 from recon_cli.errors import ReconError
-from recon_cli.viewer.content import Content, ShownView, eye_of
-from recon_cli.viewer.crop_box import Box, box_around
-from recon_cli.viewer.frustums import Frustums, stand
-from recon_cli.viewer.gaussians import Packed
-from recon_cli.viewer.photo_pairs import Pictures
+from recon_cli.scene.splats import quaternion
+from recon_cli.viewer.content import (
+    HELD_OUT,
+    LabeledView,
+    ViewerContent,
+    browser_camera,
+    move_browser,
+    vertical_fov,
+)
+from recon_cli.viewer.crop_box import CropBox, box_around
+from recon_cli.viewer.gaussians import PackedSplats
+from recon_cli.viewer.photo_pairs import PhotoPairs
 
+_FRUSTUM_SIZE = 0.03  # of the distance to what is looked at
+_HELD_OUT_COLOR, _FRUSTUM_COLOR = (255, 140, 40), (150, 170, 200)
 NO_VIEW = "none"
 UPS = {"+z": (0, 0, 1), "-y": (0, -1, 0), "+y": (0, 1, 0), "-z": (0, 0, -1), "+x": (1, 0, 0),
        "-x": (-1, 0, 0)}  # recon's own first, then COLMAP's usual one
-_REST_SECONDS = 0.25  # a camera that has not moved for so long has stopped
-_MOVED = 1e-3  # of the distance to what is looked at: less changes no colour
+_REST_SECONDS = 0.25  # a camera that has not moved for this long has stopped
+_MOVED = 1e-3  # of the distance to what is looked at; smaller moves keep the colours
 _BOX_COLOR = (255, 170, 0)
 
 logger = logging.getLogger("recon")
 
 
 class Session:
-    """What one browser is shown, from its arrival until it leaves.
+    """Shows the content in one browser, from its connection until it leaves.
 
     Args:
         client: the browser.
-        content: what there is.
-        pictures: of its views; None where there are none.
-        work: does what takes long, one thing after the other.
+        content: the scene.
+        photos: of its views; None without views.
+        work: runs slow tasks one at a time.
     """
 
     def __init__(
-        self, client: viser.ClientHandle, content: Content, pictures: Pictures | None,
+        self, client: viser.ClientHandle, content: ViewerContent, photos: PhotoPairs | None,
         work: Executor,
     ) -> None:
-        self._client, self._content, self._pictures, self._work = client, content, pictures, work
+        self._client, self._content, self._photos, self._work = client, content, photos, work
         self._lock = threading.RLock()
         self._gone = False
         self._model = next(iter(content.models))
@@ -51,22 +60,22 @@ class Session:
         self._rows: NDArray[np.int64] = np.arange(len(self._packed.splats))
         self._seen_from: NDArray[np.float64] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._current: ShownView | None = None
-        self._frustums: Frustums | None = None  # until they are asked for: they begin hidden,
-        # for who stands at a camera has those beside it before his eyes
-        self._by_label = {shown.label: shown for shown in content.views}
+        self._current: LabeledView | None = None
+        # Frustums are hidden until requested: next to a camera they block the view.
+        self._frustums: Frustums | None = None
+        self._by_label = {view.label: view for view in content.views}
         with client.atomic():
             self._node = self._add_gaussians()
             self._add_panel()
         if any(packed.splats.sh_degree for packed in content.models.values()):
-            client.camera.on_update(self._moved)
+            client.camera.on_update(self._on_move)
 
     def leave(self) -> None:
-        """Stops working for a browser that is gone."""
+        """Stops working for a browser that has disconnected."""
         self._gone = True
 
     @property
-    def _packed(self) -> Packed:
+    def _packed(self) -> PackedSplats:
         return self._content.models[self._model]
 
     def _add_gaussians(self) -> viser.GaussianSplatHandle:
@@ -82,17 +91,17 @@ class Session:
         models = list(self._content.models)
         if len(models) > 1:
             model = gui.add_dropdown("Model", models, initial_value=self._model)
-            model.on_update(lambda _: self._take_model(model.value))
+            model.on_update(lambda _: self._set_model(model.value))
         if self._content.up is None:
             up = gui.add_dropdown("Up", list(UPS), hint="The axis of the file that points up.")
             up.on_update(lambda _: self._client.scene.set_up_direction(UPS[up.value]))
-        if self._pictures is not None:
+        if self._photos is not None:
             self._add_views()
         self._add_crop()
         if any(packed.splats.sh_degree for packed in self._content.models.values()):
             gui.add_markdown(
-                "*Colours are those seen from where the camera last stopped: the browser draws "
-                "no spherical harmonics by itself.*")
+                "*Colours are as seen from where the camera last stopped: the browser does not "
+                "evaluate spherical harmonics.*")
 
     def _add_views(self) -> None:
         gui = self._client.gui
@@ -101,7 +110,7 @@ class Session:
         self._cameras.on_update(lambda _: self._show_cameras())
         with gui.add_folder("Views"):
             self._view = gui.add_dropdown("Jump to", [NO_VIEW, *self._by_label])
-            self._view.on_update(self._chosen)
+            self._view.on_update(self._on_select)
             step = gui.add_button_group("Step", ("previous", "next"))
             step.on_click(lambda _: self._step(1 if step.value == "next" else -1))
             blank = np.zeros((1, 1, 3), np.uint8)
@@ -116,44 +125,44 @@ class Session:
             self._crop = gui.add_checkbox("Hide what is outside", False)
             self._low = gui.add_vector3("Lowest", self._box.low, step=step)
             self._high = gui.add_vector3("Highest", self._box.high, step=step)
-            self._crop_text = gui.add_markdown(self._crop_words())
+            self._crop_text = gui.add_markdown(self._crop_text_content())
         self._edges = self._client.scene.add_line_segments(
             "/crop", self._box.edges(), _BOX_COLOR, thickness=2.0, thickness_units="screen",
             visible=False)
         for control in (self._crop, self._low, self._high):
-            control.on_update(lambda _: self._take_box())
+            control.on_update(lambda _: self._set_box())
 
-    def _crop_words(self) -> str:
-        if not self._box.holds_something:
-            return "The lowest corner is not below the highest: nothing is hidden."
-        if self._pictures is None:
-            return f"From `{self._box.words}` in the units of the file."
-        return f"`recon export --crop {self._box.words}`"
+    def _crop_text_content(self) -> str:
+        if not self._box.is_valid:
+            return "The lowest corner is not below the highest, so nothing is hidden."
+        if self._photos is None:
+            return f"From `{self._box.arguments}` in the units of the file."
+        return f"`recon export --crop {self._box.arguments}`"
 
     def _count_text(self) -> str:
         total = len(self._packed.splats)
         return f"**{len(self._rows):,}** of {total:,} Gaussians ({self._model})"
 
-    def _take_model(self, name: str) -> None:
+    def _set_model(self, name: str) -> None:
         with self._lock:
             self._model = name
             self._refresh()
             if self._current is not None:
                 self._compare(self._current)
 
-    def _take_box(self) -> None:
+    def _set_box(self) -> None:
         with self._lock:
-            self._box = Box.between(self._low.value, self._high.value)
-            self._crop_text.content = self._crop_words()
+            self._box = CropBox.between(self._low.value, self._high.value)
+            self._crop_text.content = self._crop_text_content()
             self._edges.points = self._box.edges()
             self._edges.visible = self._crop.value
             self._refresh()
 
     def _refresh(self) -> None:
-        """Sends the Gaussians that are to be seen."""
+        """Sends the visible Gaussians."""
         packed = self._packed
-        if self._crop.value and self._box.holds_something:
-            self._rows = np.nonzero(self._box.inside(packed.splats))[0]
+        if self._crop.value and self._box.is_valid:
+            self._rows = np.nonzero(self._box.contains(packed.splats))[0]
         else:
             self._rows = np.arange(len(packed.splats))
         self._seen_from = np.asarray(self._client.camera.position)
@@ -168,25 +177,25 @@ class Session:
                     packed.opacities[rows])
             self._count.content = self._count_text()
 
-    async def _moved(self, _camera: viser.CameraHandle) -> None:
-        """Waits until the camera rests; each movement begins the wait anew."""
+    async def _on_move(self, _camera: viser.CameraHandle) -> None:
+        """Recolours once the camera has stopped; each movement restarts the wait."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = asyncio.get_running_loop().call_later(
-            _REST_SECONDS, lambda: self._later(self._recolor))
+            _REST_SECONDS, lambda: self._submit(self._recolor))
 
     def _recolor(self) -> None:
-        """Colours the Gaussians for where the camera has stopped."""
+        """Colours the Gaussians as seen from the camera."""
         with self._lock:
-            place = np.asarray(self._client.camera.position)
+            position = np.asarray(self._client.camera.position)
             far = self._seen_from is None or bool(
-                np.linalg.norm(place - self._seen_from) > _MOVED * self._content.distance)
+                np.linalg.norm(position - self._seen_from) > _MOVED * self._content.distance)
             if far and len(self._rows):
-                self._seen_from = place
-                self._node.rgbs = self._packed.colors(place.tolist())[self._rows]
+                self._seen_from = position
+                self._node.rgbs = self._packed.colors(position.tolist())[self._rows]
 
-    def _chosen(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
-        if event.client is not None:  # the user, and not the list that follows a jump
+    def _on_select(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+        if event.client is not None:  # the user, not the list that follows a jump
             self._jump_to(event.target.value)
 
     def _step(self, by: int) -> None:
@@ -196,59 +205,57 @@ class Session:
 
     def _show_cameras(self) -> None:
         with self._lock:
-            if self._frustums is None and self._cameras.value and self._pictures is not None:
-                frustums, pictures = Frustums(
-                    self._client, self._content, self._jump_to), self._pictures
-                self._later(lambda: frustums.fill(pictures, lambda: self._gone))
+            if self._frustums is None and self._cameras.value and self._photos is not None:
+                frustums, photos = Frustums(
+                    self._client, self._content, self._jump_to), self._photos
+                self._submit(lambda: frustums.add_photos(photos, lambda: self._gone))
                 self._frustums = frustums
             if self._frustums is not None:
                 self._frustums.show(self._cameras.value)
 
     def _jump_to(self, label: str) -> None:
-        """Puts the camera where a view was taken, and the photo into the panel.
-
-        Hides the cameras, among which the browser then stands.
-        """
+        """Moves the camera to a view, hides the frustums and shows the view's photo."""
         with self._lock:
-            shown = self._current = self._by_label.get(label)
+            view = self._current = self._by_label.get(label)
             if self._view.value != label:
                 self._view.value = label  # type: ignore[misc]  # has a setter
             for part in (self._truth, self._ours, self._score):
                 part.visible = False
-            if shown is not None:
+            if view is not None:
                 self._cameras.value = False  # type: ignore[misc]  # has a setter
-                eye = eye_of(shown.view.camera, self._content.distance, self._content.start.far)
-                stand(self._client, eye, self._content.up, shown.view.camera)
-                self._compare(shown)
+                camera, content = view.view.camera, self._content
+                target = browser_camera(camera, content.distance, content.start.far)
+                move_browser(self._client, target, content.up, camera)
+                self._compare(view)
 
-    def _compare(self, shown: ShownView) -> None:
-        """Shows a view's photo, and our render of it and its score as soon as they are there."""
-        model, packed, pictures = self._model, self._packed, self._pictures
-        assert pictures is not None
+    def _compare(self, view: LabeledView) -> None:
+        """Shows a view's photo, then recon's render of it and its score."""
+        model, packed, photos = self._model, self._packed, self._photos
+        assert photos is not None
 
-        def photo() -> None:
-            image, _ = pictures.photo(shown.view)
+        def show_photo() -> None:
+            image, _ = photos.load_photo(view.view)
             with self._lock:
-                if self._current == shown:
+                if self._current == view:
                     self._truth.image, self._truth.visible = image, True
 
-        def rendered() -> None:
-            if (self._current, self._model) != (shown, model):
-                return  # the user has gone on
-            image, psnr_db = pictures.rendered(shown.view, packed.splats)
+        def show_render() -> None:
+            if (self._current, self._model) != (view, model):
+                return  # the user has moved on
+            image, psnr_db = photos.render_view(view.view, packed.splats)
             with self._lock, self._client.atomic():
-                if (self._current, self._model) == (shown, model):
+                if (self._current, self._model) == (view, model):
                     score = "its mask leaves too little to score" if psnr_db is None else (
                         f"PSNR **{psnr_db:.2f} dB**")
-                    self._score.content = f"{shown.label}, {model}: {score}"
+                    self._score.content = f"{view.label}, {model}: {score}"
                     self._ours.image = image
                     self._ours.visible = self._score.visible = True
 
-        self._later(photo)
-        self._later(rendered)
+        self._submit(show_photo)
+        self._submit(show_render)
 
-    def _later(self, task: Callable[[], None]) -> None:
-        """Does something that takes long after what was asked for before, unless the user left."""
+    def _submit(self, task: Callable[[], None]) -> None:
+        """Queues a slow task, which is dropped if the user has left by then."""
         def run() -> None:
             if self._gone:
                 return
@@ -256,12 +263,53 @@ class Session:
                 task()
             except ReconError as error:
                 logger.warning("%s", error.message)
-                self._client.add_notification("This did not work", f"{error.message} {error.hint}")
+                self._client.add_notification("Error", f"{error.message} {error.hint}")
             except Exception:
                 if not self._gone:
-                    logger.exception("the viewer could not do what was asked for")
+                    logger.exception("a task of the viewer failed")
 
         try:
             self._work.submit(run)
         except RuntimeError:  # the viewer is closing
             self._gone = True
+
+
+class Frustums:
+    """The cameras of all views in one browser.
+
+    Args:
+        client: the browser.
+        content: has the views.
+        jump: called with the label of the view whose camera was clicked.
+    """
+
+    def __init__(
+        self, client: viser.ClientHandle, content: ViewerContent, jump: Callable[[str], None]
+    ) -> None:
+        self._client, self._content, self._jump = client, content, jump
+        self._parent = client.scene.add_frame("/cameras", show_axes=False)
+        with client.atomic():
+            self._handles = {
+                view.label: self._add(number, view) for number, view in enumerate(content.views)}
+
+    def _add(self, number: int, view: LabeledView) -> viser.CameraFrustumHandle:
+        camera = view.view.camera
+        handle = self._client.scene.add_camera_frustum(
+            f"/cameras/{number}", vertical_fov(camera), camera.width / camera.height,
+            scale=_FRUSTUM_SIZE * self._content.distance, thickness=1.5, thickness_units="screen",
+            color=_HELD_OUT_COLOR if view.part == HELD_OUT else _FRUSTUM_COLOR,
+            wxyz=quaternion(camera.viewmat[:3, :3].T), position=camera.center,
+            cast_shadow=False, receive_shadow=False)
+        handle.on_click(lambda _: self._jump(view.label))
+        return handle
+
+    def show(self, visible: bool) -> None:
+        """Shows or hides all of them."""
+        self._parent.visible = visible
+
+    def add_photos(self, photos: PhotoPairs, stopped: Callable[[], bool]) -> None:
+        """Shows the photos in the frustums, until `stopped` returns True."""
+        for view in self._content.views:
+            if stopped():
+                return
+            self._handles[view.label].image = photos.thumbnail(view.view)

@@ -48,11 +48,17 @@ from recon_cli.pipeline.execute import rendering
 from recon_cli.pipeline.plan import Job
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
-from recon_cli.viewer.content import FAR, HELD_OUT, Content, eye_of, of_workspace
-from recon_cli.viewer.frustums import stand
-from recon_cli.viewer.gaussians import packed
-from recon_cli.viewer.photo_pairs import Pictures
-from recon_cli.viewer.server import HOST, showing
+from recon_cli.viewer.content import (
+    FAR,
+    HELD_OUT,
+    ViewerContent,
+    browser_camera,
+    load_workspace,
+    move_browser,
+)
+from recon_cli.viewer.gaussians import pack_splats
+from recon_cli.viewer.photo_pairs import PhotoPairs
+from recon_cli.viewer.server import HOST, serve_scene
 from recon_cli.workspace.layout import Workspace
 
 DRAWN = """() => Object.values(window.__viserSceneTree?.getState() ?? {}).some(
@@ -83,9 +89,9 @@ def started(chromium: Browser, workspace: Path) -> float:
             process.wait()
 
 
-def speed(chromium: Browser, content: Content) -> tuple[float, float]:
+def speed(chromium: Browser, content: ViewerContent) -> tuple[float, float]:
     """Returns pictures a second while the mouse turns the camera, and CPU seconds a picture."""
-    with (showing(content, None, HOST, None) as (_, address),
+    with (serve_scene(content, None, HOST, None) as (_, address),
           watch_page(chromium, width=WIDTH, height=HEIGHT) as page):
         page.page.goto(address)
         page.page.wait_for_function(DRAWN)
@@ -111,23 +117,23 @@ def browser_seconds() -> float:
     return total
 
 
-def of_room(count: int) -> Content:
+def of_room(count: int) -> ViewerContent:
     """Returns the synthetic room of `recon bench`, looked at by its camera."""
     splats, camera = room(count, WIDTH, HEIGHT)
-    start = eye_of(camera, 3.0, FAR)
-    return Content({"room": packed(splats)}, (), -camera.viewmat[1, :3], start, 3.0, 0)
+    start = browser_camera(camera, 3.0, FAR)
+    return ViewerContent({"room": pack_splats(splats)}, (), -camera.viewmat[1, :3], start, 3.0, 0)
 
 
 def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
     """Yields a line for each held-out view, and one for their mean."""
     job = Job(Workspace(workspace))
-    content = of_workspace(job, "auto")
+    content = load_workspace(job, "auto")
     name, shown = next(iter(content.models.items()))
     splats = shown.splats.with_degree(0)
     flat = dataclasses.replace(content, models={name: dataclasses.replace(shown, splats=splats)})
     ctx = rendering(job.compute, job.progress)
     found = []
-    with (showing(flat, None, HOST, None) as (server, address),
+    with (serve_scene(flat, None, HOST, None) as (server, address),
           watch_page(chromium, width=WIDTH, height=HEIGHT) as page,
           ThreadPoolExecutor(1) as elsewhere):
         page.page.goto(address)
@@ -150,10 +156,11 @@ def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
 
 
 def drawn(
-    client: viser.ClientHandle, content: Content, camera: Camera
+    client: viser.ClientHandle, content: ViewerContent, camera: Camera
 ) -> NDArray[np.float32]:
     """Returns the browser's picture of a camera of the size of its page, over black."""
-    stand(client, eye_of(camera, content.distance, content.start.far), content.up, camera)
+    target = browser_camera(camera, content.distance, content.start.far)
+    move_browser(client, target, content.up, camera)
     # get_render projects with the lens of the picture before
     while (client.camera.image_width, client.camera.image_height) != (camera.width, camera.height):
         time.sleep(0.05)
@@ -165,8 +172,8 @@ def drawn(
 def photographed(chromium: Browser, workspace: Path, path: Path) -> None:
     """Takes a picture of the page, with a held-out view beside its photo."""
     job = Job(Workspace(workspace))
-    content = of_workspace(job, "auto")
-    with (showing(content, Pictures(job, content.max_size), HOST, None) as (_, address),
+    content = load_workspace(job, "auto")
+    with (serve_scene(content, PhotoPairs(job, content.max_size), HOST, None) as (_, address),
           watch_page(chromium, width=WIDTH, height=HEIGHT) as page):
         page.page.goto(address)
         page.page.wait_for_function(DRAWN)

@@ -7,7 +7,7 @@ import pytest
 
 from recon_cli.errors import FormatError
 from recon_cli.flythrough.camera_path import CameraPath, read_camera_path, write_camera_path
-from recon_cli.flythrough.smooth import orbit_path
+from recon_cli.flythrough.paths import orbit_path
 
 # a camera at (1, 2, 3) that looks along +y with z up, as OpenGL has it: the columns are right (x),
 # up (z) and backward (-y)
@@ -85,7 +85,7 @@ def test_the_pace_may_be_said_by_the_seconds_or_not_at_all(tmp_path):
 
 def test_a_crop_is_left_out_with_a_word(tmp_path, caplog):
     read(tmp_path, value(crop={"crop_center": [0, 0, 0]}))
-    assert "crop is left out" in caplog.text
+    assert "crop is ignored" in caplog.text
 
 
 SCALED = [2 * one if at < 12 and at % 4 < 3 else one for at, one in enumerate(POSE)]
@@ -95,9 +95,9 @@ BAD = [
     (value(camera_path=[]), "lists no cameras"),
     (without(value(), "camera_path"), "lists no cameras"),
     (without(value(), "render_width"), "has no render_width"),
-    (value(render_height=0), "whole pixels"),
-    (value(render_height=10.5), "whole pixels"),
-    (value(camera_path=[7]), "camera 0, is no entry"),
+    (value(render_height=0), "whole number of pixels"),
+    (value(render_height=10.5), "whole number of pixels"),
+    (value(camera_path=[7]), "camera 0, is not a JSON object"),
     (value(camera_path=[entry(), without(entry(), "camera_to_world")]),
      "camera 1, has no camera_to_world"),
     (value(camera_path=[entry(camera_to_world=POSE[:12])]), "no matrix|12 numbers"),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from recon_cli.flythrough.smooth import looking_at, middle_of_sight, orbit_path
-from recon_cli.scene.camera import Camera
+from recon_cli.flythrough.paths import find_look_at, orbit_path
+from recon_cli.scene.camera import Camera, looking_at
 
 UPS = [np.array([0.0, 0, 1]), np.array([0.0, -1, 0]), np.array([2.0, -1, 2]) / 3]
 
@@ -64,7 +64,7 @@ def test_the_middle_of_sight_of_cameras_around_an_object_is_the_object():
     points = np.array([1.0, 2, 3]) + rng.normal(scale=0.05, size=(500, 3))
     eyes = np.array([1.0, 2, 3]) + 4 * rng.normal(size=(20, 3))
     cameras = [camera(looking_at(eye, np.array([1.0, 2, 3]), UPS[0])) for eye in eyes]
-    np.testing.assert_allclose(middle_of_sight(cameras, points), [1, 2, 3], atol=0.05)
+    np.testing.assert_allclose(find_look_at(cameras, points), [1, 2, 3], atol=0.05)
 
 
 def test_the_middle_of_sight_of_cameras_that_look_out_is_the_middle_of_the_room():
@@ -77,10 +77,10 @@ def test_the_middle_of_sight_of_cameras_that_look_out_is_the_middle_of_the_room(
         camera(looking_at(np.array([10.5, 0.2, 0]),
                           np.array([10.5 + np.cos(a), 0.2 + np.sin(a), 0]), UPS[0]))
         for a in angles]
-    np.testing.assert_allclose(middle_of_sight(cameras, walls), [10, 0, 0], atol=0.6)
+    np.testing.assert_allclose(find_look_at(cameras, walls), [10, 0, 0], atol=0.6)
 
 
 def test_without_points_in_sight_the_middle_is_that_of_the_points():
     points = np.array([[0.0, 0, -5], [0, 1, -6], [1, 0, -7]])
     np.testing.assert_array_equal(
-        middle_of_sight([camera(np.eye(4))], points), [0, 0, -6])
+        find_look_at([camera(np.eye(4))], points), [0, 0, -6])

@@ -6,7 +6,7 @@ import pytest
 
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.flythrough import video
-from recon_cli.flythrough.video import Encoding, encode, refuse_what_cannot_be_encoded
+from recon_cli.flythrough.video import VideoEncoding, check_encoding, encode_video
 from recon_cli.io.images import read_image, write_png
 
 
@@ -23,7 +23,7 @@ def pictures(tmp_path_factory):
 
 def make(pictures, path, codec="h264", crf=12, fps=25.0):
     seen = []
-    encode(pictures, path, Encoding(codec, crf, 64, 48, fps), threads=1,
+    encode_video(pictures, path, VideoEncoding(codec, crf, 64, 48, fps), threads=1,
            on_frame=lambda: seen.append(1))
     assert len(seen) == len(pictures)
 
@@ -73,15 +73,15 @@ def test_a_smaller_crf_is_closer(pictures, tmp_path):
 
 def test_a_codec_that_this_build_lacks_is_refused(monkeypatch):
     monkeypatch.setitem(video.ENCODERS, "h264", ("libnone",))
-    with pytest.raises(ConfigError, match=r"cannot encode h264: there is no libnone") as caught:
-        refuse_what_cannot_be_encoded(Encoding("h264", 18, 64, 48, 30))
+    with pytest.raises(ConfigError, match=r"cannot encode h264: it lacks libnone") as caught:
+        check_encoding(VideoEncoding("h264", 18, 64, 48, 30))
     assert "av1" in caught.value.hint
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1"])
 def test_a_size_that_no_encoder_takes_is_refused(codec):
     with pytest.raises(ConfigError, match="40000x48 pixels"):
-        refuse_what_cannot_be_encoded(Encoding(codec, 18, 40_000, 48, 30))
+        check_encoding(VideoEncoding(codec, 18, 40_000, 48, 30))
 
 
 def test_a_picture_that_is_gone_leaves_no_video_and_the_old_one_stays(pictures, tmp_path):

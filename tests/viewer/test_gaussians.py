@@ -10,7 +10,7 @@ from scenes import random_splats
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.viewer.gaussians import packed
+from recon_cli.viewer.gaussians import pack_splats
 
 
 def one(scales, quat=(1.0, 0, 0, 0), mean=(1.0, -2.0, 3.0)):
@@ -21,7 +21,8 @@ def one(scales, quat=(1.0, 0, 0, 0), mean=(1.0, -2.0, 3.0)):
 
 def test_a_turned_gaussian_has_the_covariance_r_s_s_r():
     half = float(np.sqrt(0.5))
-    found = packed(one((0.3, 0.2, 0.1), quat=(2 * half, 0, 0, 2 * half)))  # a quarter turn about z
+    quat = (2 * half, 0, 0, 2 * half)  # a quarter turn about z
+    found = pack_splats(one((0.3, 0.2, 0.1), quat=quat))
     covariance = found.covariances[0].astype(float) * found.scale**2
     np.testing.assert_allclose(
         covariance, np.diag([0.04, 0.09, 0.01]), atol=0.09 * 2**-10)
@@ -37,7 +38,7 @@ def test_covariances_fit_half_precision_whatever_the_unit_of_the_scene(unit):
     scales = 10 ** (4 * torch.rand(200, 1, generator=generator) - 3.5).repeat(1, 3)
     splats = dataclasses.replace(
         splats, means=splats.means * unit, log_scales=torch.log(scales * unit))
-    found = packed(splats)
+    found = pack_splats(splats)
     sizes = np.sqrt(np.linalg.eigvalsh(found.covariances.astype(float))) * found.scale
     np.testing.assert_allclose(sizes, (scales * unit).numpy(), rtol=2e-3)
 
@@ -46,7 +47,7 @@ def test_one_gaussian_as_large_as_the_world_leaves_the_others_their_size():
     splats = random_splats(50, seed=1, dtype=torch.float32)
     splats.log_scales[:] = -4.0
     splats.log_scales[7] = 20.0
-    found = packed(splats)
+    found = pack_splats(splats)
     sizes = np.sqrt(np.linalg.eigvalsh(found.covariances.astype(float))) * found.scale
     np.testing.assert_allclose(np.delete(sizes, 7, axis=0), np.exp(-4.0), rtol=2e-3)
     assert np.isfinite(sizes[7]).all()
@@ -56,8 +57,8 @@ def test_what_is_not_finite_is_left_out_and_nothing_is_no_error():
     splats = random_splats(5, seed=2, dtype=torch.float32)
     splats.means[1, 0] = float("nan")
     splats.log_scales[3, 2] = float("inf")
-    assert len(packed(splats).splats) == 3
-    empty = packed(splats.select(torch.zeros(5, dtype=torch.bool)))
+    assert len(pack_splats(splats).splats) == 3
+    empty = pack_splats(splats.select(torch.zeros(5, dtype=torch.bool)))
     assert empty.centers.shape == (0, 3)
     assert empty.colors((0.0, 0.0, 0.0)).shape == (0, 3)
 
@@ -74,4 +75,4 @@ def test_colours_are_those_that_a_camera_at_that_place_sees():
         camera = Camera(33, 33, 30.0, 30.0, 16.5, 16.5, viewmat)
         output = render(splats, camera, torch.zeros(3), 1)
         seen = (output.rgb / output.alpha[..., None])[16, 16].clamp(0, 1).numpy() * 255
-        assert np.abs(packed(splats).colors(place)[0] - seen).max() <= 0.51
+        assert np.abs(pack_splats(splats).colors(place)[0] - seen).max() <= 0.51

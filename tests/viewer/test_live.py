@@ -19,7 +19,7 @@ from recon_cli.io.ply import read_ply
 from recon_cli.stages import train
 from recon_cli.viewer import live
 from recon_cli.viewer.live import SHARE, LiveView
-from recon_cli.viewer.server import HOST, serving
+from recon_cli.viewer.server import HOST, start_server
 from recon_cli.workspace.layout import Workspace
 
 SHORT = dataclasses.replace(CONFIG, iterations=60)
@@ -71,7 +71,7 @@ def test_a_training_that_is_looked_at_in_a_browser_is_the_same_to_the_byte(
 ):
     monkeypatch.setattr(live, "SHARE", 0.9)  # many updates in a short training
     inputs, expected = plain
-    with serving(HOST, None, label="x") as (server, address):
+    with start_server(HOST, None, label="x") as (server, address):
         watcher = LiveView(server, Workspace(tmp_path))
         page.page.set_viewport_size({"width": 320, "height": 240})
         page.page.goto(address)

@@ -7,7 +7,7 @@ import pytest
 
 from recon_cli.errors import ConfigError
 from recon_cli.viewer import server
-from recon_cli.viewer.server import HOST, serving
+from recon_cli.viewer.server import HOST, start_server
 
 
 def listening(port=0):
@@ -18,15 +18,15 @@ def listening(port=0):
 def test_the_next_free_port_is_taken_where_none_was_asked_for(monkeypatch):
     taken, port = listening()
     monkeypatch.setattr(server, "PORT", port)
-    with taken, serving(HOST, None, label="x") as (found, address):
+    with taken, start_server(HOST, None, label="x") as (found, address):
         assert found.get_port() > port
         assert address == f"http://127.0.0.1:{found.get_port()}"
 
 
 def test_a_port_that_was_asked_for_and_is_taken_is_an_error_with_a_hint():
     taken, port = listening()
-    with taken, pytest.raises(ConfigError, match=f"port {port} is taken") as raised:
-        serving(HOST, port, label="x").__enter__()
+    with taken, pytest.raises(ConfigError, match=f"port {port} is in use") as raised:
+        start_server(HOST, port, label="x").__enter__()
     assert "--port" in raised.value.hint
 
 
@@ -34,20 +34,20 @@ def test_no_free_port_at_all_is_an_error(monkeypatch):
     taken, port = listening()
     monkeypatch.setattr(server, "PORT", port)
     monkeypatch.setattr(server, "_TRIED", 1)
-    with taken, pytest.raises(ConfigError, match="all taken"):
-        serving(HOST, None, label="x").__enter__()
+    with taken, pytest.raises(ConfigError, match="all in use"):
+        start_server(HOST, None, label="x").__enter__()
 
 
 @pytest.mark.parametrize("host", ["no.such.host.invalid", "203.0.113.7"])
 def test_an_address_that_is_not_of_this_machine_is_an_error(host):
     with pytest.raises(ConfigError, match=host.replace(".", r"\.")) as raised:
-        serving(host, None, label="x").__enter__()
+        start_server(host, None, label="x").__enter__()
     assert "--host" in raised.value.hint
 
 
 def test_afterwards_the_port_is_free_and_no_thread_is_left(capfd):
     before = set(threading.enumerate())
-    with serving(HOST, None, label="x") as (found, _):
+    with start_server(HOST, None, label="x") as (found, _):
         port = found.get_port()
     assert not {one for one in threading.enumerate() if one.is_alive()} - before
     listening(port)[0].close()
@@ -55,13 +55,13 @@ def test_afterwards_the_port_is_free_and_no_thread_is_left(capfd):
 
 
 def test_a_server_for_all_says_so_and_one_for_this_machine_does_not(caplog):
-    with serving(HOST, None, label="x"):
+    with start_server(HOST, None, label="x"):
         assert not caplog.records
-    with serving("0.0.0.0", None, label="x") as (_, address):
-        assert "everyone who reaches this machine" in caplog.text
+    with start_server("0.0.0.0", None, label="x") as (_, address):
+        assert "everyone who can reach this machine" in caplog.text
     assert address.startswith("http://127.0.0.1:")
 
 
 def test_no_browser_can_have_the_scene_sent_to_a_server_of_others():
-    with serving(HOST, None, label="x") as (found, _):
+    with start_server(HOST, None, label="x") as (found, _):
         assert found.request_share_url() is None

@@ -17,7 +17,7 @@ import torch
 from recon_cli.cli import main
 from recon_cli.commands import view
 from recon_cli.io.splats.registry import FORMATS
-from recon_cli.viewer.content import of_file
+from recon_cli.viewer.content import load_file
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def test_it_prints_its_address_and_opens_no_browser_where_there_is_no_terminal(
 def test_a_file_of_any_format_is_shown_without_cameras(room, tmp_path, name):
     path = tmp_path / f"some.{name}"
     FORMATS[name].write(path, FORMATS["ply"].read(room / "train" / "splats.ply"))
-    content = of_file(path)
+    content = load_file(path)
     assert [len(packed.splats) for packed in content.models.values()] == [60]
     assert content.views == ()
     assert main(["view", str(path)]) == 0
@@ -52,7 +52,7 @@ def test_a_file_of_any_format_is_shown_without_cameras(room, tmp_path, name):
 
 @pytest.mark.parametrize(("words", "code", "said"), [
     (["nothing.ply"], 3, "does not exist"),
-    (["empty"], 3, "neither a workspace nor a file"),
+    (["empty"], 3, "neither a workspace nor a splat file"),
     (["text.txt"], 3, "no known format"),
     (["room", "-w", "room"], 2, "exclude each other"),
     (["room/train/splats.ply", "--model", "base"], 2, "no effect on a file"),
@@ -92,7 +92,7 @@ def test_a_port_that_is_taken_is_refused(room, capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["view", str(room), "--port", str(port)]) == 2
-    assert f"the port {port} is taken" in capsys.readouterr().err.lower()
+    assert f"the port {port} is in use" in capsys.readouterr().err.lower()
 
 
 def test_ctrl_c_ends_it_without_a_word_too_many_and_frees_the_port(room):

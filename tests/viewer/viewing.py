@@ -12,10 +12,9 @@ from typing import Any, TypeVar
 from browser import WatchedPage
 
 from recon_cli.pipeline.plan import Job
-from recon_cli.viewer import server as run
-from recon_cli.viewer.content import Content, of_workspace
-from recon_cli.viewer.photo_pairs import Pictures
-from recon_cli.viewer.server import HOST, Server
+from recon_cli.viewer.content import ViewerContent, load_workspace
+from recon_cli.viewer.photo_pairs import PhotoPairs
+from recon_cli.viewer.server import HOST, Server, serve_scene
 from recon_cli.workspace.layout import Workspace
 
 T = TypeVar("T")
@@ -30,7 +29,7 @@ class Shown:
 
     server: Server
     address: str
-    content: Content
+    content: ViewerContent
 
     def client(self) -> Any:
         """Returns the only browser."""
@@ -41,8 +40,9 @@ class Shown:
 @contextmanager
 def view(workspace: Path) -> Iterator[Shown]:
     job = Job(Workspace(workspace))
-    content = of_workspace(job, "auto")
-    with run.showing(content, Pictures(job, content.max_size), HOST, None) as (server, address):
+    content = load_workspace(job, "auto")
+    photos = PhotoPairs(job, content.max_size)
+    with serve_scene(content, photos, HOST, None) as (server, address):
         yield Shown(server, address, content)
 
 

@@ -1,4 +1,4 @@
-"""What is rendered: the model of a workspace, its views, and what is known of the world."""
+"""Reads the trained scene of a workspace: a model, its views, and what is known of the world."""
 
 from __future__ import annotations
 
@@ -27,114 +27,103 @@ from recon_cli.workspace.summaries import SfmSummary
 
 _NEEDS = ("ingest", "train", "sfm")  # training runs sfm first where that is missing too
 
+
 logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """A trained scene.
+class TrainedScene:
+    """The trained scene of a workspace."""
 
-    Attributes:
-        model: base or pruned.
-        splats: its Gaussians, on the CPU.
-        digest: SHA-256 of their parameters.
-        sh_degree: that it was trained with.
-        max_size: longest side of a training image in pixels; what `recon eval` renders at.
-        scene: views and points.
-        z_up: the world's z axis is known to be up.
-        metres: one world unit is a metre.
-        has_views: False where an imported scene came without; those of `scene` are made up then.
-    """
-
-    model: str
-    splats: Splats
-    digest: str
-    sh_degree: int
-    max_size: int
+    model: str  # base or pruned
+    splats: Splats  # on the CPU
+    digest: str  # SHA-256 of their parameters
+    sh_degree: int  # of the training
+    max_size: int  # longest side of a training image in pixels, at which `recon eval` scores
     scene: Scene
-    z_up: bool
-    metres: bool
-    has_views: bool = True
+    z_up: bool  # the world's z axis is known to be up
+    metres: bool  # one world unit is a metre
+    has_views: bool = True  # False for an import without views: those of `scene` are synthetic
 
     def up(self) -> NDArray[np.float64]:
-        """Returns the unit vector [3] that is up, at worst that of the cameras, with a warning."""
+        """Returns the unit vector [3] that is up; if unknown the cameras' mean, with a warning."""
         if self.z_up:
             return np.array([0.0, 0.0, 1.0])
         if not self.has_views:
             return np.array([0.0, -1.0, 0.0])
         viewmats = np.stack([view.camera.viewmat for view in self.scene.train])
-        found = find_gravity(self.scene.points, viewmats)
-        if found.up is not None:
-            return found.up
-        logger.warning("up is not known, so the mean up of the cameras is taken: %s", found.reason)
+        gravity = find_gravity(self.scene.points, viewmats)
+        if gravity.up is not None:
+            return gravity.up
+        logger.warning("up is not known; the mean up of the cameras is used: %s", gravity.reason)
         return camera_up(viewmats).up
 
 
-def open_source(job: Job, model: str, *, verb: str = "render") -> Source:
+def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> TrainedScene:
     """Returns the trained scene of a workspace.
 
     Args:
-        job: whose workspace it is.
-        model: auto, base or pruned; auto takes the pruned one where there is a fresh one.
-        verb: that asks, for messages.
+        job: holds the workspace.
+        model: auto, base or pruned; auto is the pruned one if it is fresh.
+        verb: the command, for messages.
 
     Raises:
-        StageError: there is no such model that is fresh.
+        StageError: the model is missing or stale.
         FormatError: a file of the workspace is damaged.
     """
-    look = job.inspect()
+    inspection = job.inspect()
     origin = Origin.of(job.workspace.folder("train"))
     if origin and not origin.views:
-        _fresh(look, "train", verb)
-        return _viewless(job, model, origin)
-    manifests = {name: _fresh(look, name, verb) for name in _NEEDS}
-    pruned = _take_pruned(look, model, verb)
+        _require_fresh(inspection, "train", verb)
+        return _open_viewless(job, model, origin)
+    manifests = {name: _require_fresh(inspection, name, verb) for name in _NEEDS}
+    pruned = _use_pruned(inspection, model, verb)
     folders = {name: job.workspace.folder(name) for name in _NEEDS}
     config = read_config(folders["train"])
     splats = read_ply(job.workspace.folder("prune" if pruned else "train") / "splats.ply")
     world = SfmSummary.from_json(manifests["sfm"].run.summary).world
-    return Source(
+    return TrainedScene(
         "pruned" if pruned else "base", splats, _digest(splats), config.sh_degree, config.max_size,
         load_scene(StageInputs(folders), validation=config.validation),
         world.evidence.up_found, world.evidence.metres)
 
 
-def _viewless(job: Job, model: str, origin: Origin) -> Source:
-    """Returns an imported scene with made-up cameras."""
+def _open_viewless(job: Job, model: str, origin: Origin) -> TrainedScene:
+    """Returns an imported scene with synthetic cameras."""
     if model == "pruned":
         raise StageError(
-            "The pruned model was asked for, but a scene without views cannot be pruned.",
+            "There is no pruned model: a scene without views cannot be pruned.",
             hint=HINT)
     folder = job.workspace.folder("train")
     config, splats = read_config(folder), read_ply(folder / "splats.ply")
-    return Source(
+    return TrainedScene(
         "base", splats, _digest(splats), config.sh_degree, config.max_size,
         made_up_scene(splats, z_up=origin.z_up, max_size=config.max_size), origin.z_up, False,
         has_views=False)
 
 
-def _fresh(look: Inspection, name: str, verb: str) -> Manifest:
-    check = look.check(name)
+def _require_fresh(inspection: Inspection, name: str, verb: str) -> Manifest:
+    check = inspection.check(name)
     if check.manifest is None or not check.fresh:
         raise StageError(
             f"{verb} needs {name}, which is {check.described()}.",
-            hint=f"Run `{plan.command(look, check)}` first.")
+            hint=f"Run `{plan.command(inspection, check)}` first.")
     return check.manifest
 
 
-def _take_pruned(look: Inspection, model: str, verb: str) -> bool:
-    check = look.check("prune")
+def _use_pruned(inspection: Inspection, model: str, verb: str) -> bool:
+    check = inspection.check("prune")
     if model == "pruned" and not check.fresh:
         raise StageError(
-            f"The pruned model was asked for, but it is {check.described()}.",
+            f"{verb} needs the pruned model, which is {check.described()}.",
             hint=f"Run `recon prune` first, or `recon {verb} --model base`.")
     if model == "auto" and check.manifest and not check.fresh:
-        logger.warning("the pruned model is left out: it is %s", check.described())
+        logger.warning("the pruned model is not used: it is %s", check.described())
     return check.fresh and model != "base"
 
 
 def _digest(splats: Splats) -> str:
-    """Returns the digest of what was read; the file itself may have been replaced since."""
+    """Returns the digest of the parameters; the file may have been replaced since it was read."""
     digest = hashlib.sha256()
     for name, value in splats.parameters().items():
         digest.update(f"{name}{tuple(value.shape)}".encode())

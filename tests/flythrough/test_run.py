@@ -142,8 +142,8 @@ def test_other_settings_start_anew_and_are_named(room, tmp_path, caplog, change,
     assert render(room, *words) == 0
     before = times(tmp_path / "out")
     assert render(room, *words, *change) == 0
-    [said_so] = [text for text in caplog.messages if "starts anew" in text]
-    assert said_so.endswith(f"for there are other settings: {said}")
+    [said_so] = [text for text in caplog.messages if "rendered again" in text]
+    assert said_so.endswith(f"because settings changed: {said}")
     after = times(tmp_path / "out")
     assert not {name for name in after if after[name] == before[name]}
     assert pictures(tmp_path / "out", "alpha") == (

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import Rotation
 
-from recon_cli.flythrough.smooth import looking_at, orbit_path, smooth_path
+from recon_cli.flythrough.paths import orbit_path, smooth_path
+from recon_cli.scene.camera import looking_at
 
 UP, AHEAD = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
 

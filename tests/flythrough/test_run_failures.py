@@ -7,7 +7,6 @@ import shutil
 import pytest
 from render_cli import SHORT, pictures, record, render
 
-from recon_cli.flythrough import frames
 from recon_cli.flythrough import run as running
 from recon_cli.flythrough import video as videos
 from recon_cli.io.images import read_image
@@ -40,7 +39,7 @@ def test_a_pruned_model_that_is_not_there_is_an_error_and_a_stale_one_is_left_ou
     assert "Run `recon prune` first" in capsys.readouterr().err
     (copied / "prune" / "splats.ply").write_bytes((copied / "train" / "splats.ply").read_bytes())
     assert render(copied, "--views", "000001", "--out", tmp_path / "out") == 0
-    assert "the pruned model is left out: it is stale" in caplog.text
+    assert "the pruned model is not used: it is stale" in caplog.text
     assert record(tmp_path / "out")["settings"]["model"] == "base"
 
 
@@ -51,8 +50,8 @@ def test_a_pruned_model_that_is_not_there_is_an_error_and_a_stale_one_is_left_ou
     (["--output", "rgb,normals"], "'rgb,normals' is no list"),
     (["--background", "white"], "no colour such as"),
     (["--size", "100000"], "MB to render"),
-    (["--width", "321", "--format", "mp4"], "sides are even"),
-    (["--format", "mp4", "--width", "40000", "--height", "2"], "libx264 does not make"),
+    (["--width", "321", "--format", "mp4"], "must be even"),
+    (["--format", "mp4", "--width", "40000", "--height", "2"], "libx264 cannot encode"),
 ])
 def test_what_cannot_be_rendered_is_a_usage_error(copied, capsys, words, said):
     assert render(copied, *words) == 2
@@ -86,7 +85,7 @@ def test_a_folder_of_other_files_is_left_alone(room, tmp_path, capsys):
 def test_a_folder_that_cannot_be_made_is_an_error(room, tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert render(room, *SHORT, "--out", tmp_path / "file" / "out") == 7
-    assert "cannot be made" in capsys.readouterr().err
+    assert "cannot be created" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("number", "said"), [
@@ -94,7 +93,7 @@ def test_a_folder_that_cannot_be_made_is_an_error(room, tmp_path, capsys):
 def test_a_disk_that_takes_no_more_is_an_error_and_frames_stay(
     room, tmp_path, monkeypatch, capsys, number, said
 ):
-    write, written = running.write_pictures, []
+    write, written = running.write_frame, []
 
     def failing(*given):
         if written:
@@ -104,7 +103,7 @@ def test_a_disk_that_takes_no_more_is_an_error_and_frames_stay(
 
     words = [*SHORT, "--out", tmp_path / "out"]
     with monkeypatch.context() as patch:
-        patch.setattr(running, "write_pictures", failing)
+        patch.setattr(running, "write_frame", failing)
         assert render(room, *words) == 7
     assert said in capsys.readouterr().err
     assert pictures(tmp_path / "out") == ["00000.png"]
@@ -116,7 +115,7 @@ def test_a_damaged_record_is_refused(room, tmp_path, capsys):
     assert render(room, *words) == 0
     (tmp_path / "out" / "render.json").write_text("[]")
     assert render(room, *words) == 3
-    assert "no record of recon render" in capsys.readouterr().err
+    assert "not a record of recon render" in capsys.readouterr().err
 
 
 def test_a_kill_between_old_frames_and_new_ones_leaves_a_folder_that_goes_on(
@@ -131,7 +130,7 @@ def test_a_kill_between_old_frames_and_new_ones_leaves_a_folder_that_goes_on(
     words = [*SHORT, "--out", tmp_path / "out"]
     for _ in ("a new folder", "one with frames of other settings"):
         with monkeypatch.context() as patch:
-            patch.setattr(frames, "write_json", die)
+            patch.setattr(running, "write_json", die)
             with pytest.raises(Killed):
                 render(room, *words, "--size", "40")
         assert render(room, *words) == 0

@@ -44,9 +44,9 @@ def test_what_lies_outside_the_windows_moves_no_depth():
     near, far = wall(3.217, spacing=0.1, half=3.0), wall(300.0, spacing=10.0, half=300.0)
     near.logit_opacities -= 7.0  # some light shines through
     both = joined([near, far])[0]
-    kept = SCALE.surfaces(both)
+    kept = SCALE.select_surfaces(both)
     assert len(kept) == len(near)
-    assert SCALE.surfaces(near) is near
+    assert SCALE.select_surfaces(near) is near
     shown = render(both, camera, torch.zeros(3), 0, backend="torch")
     surfaces = render(kept, camera, torch.zeros(3), 0, backend="torch")
     assert (depth_steps(surfaces.depth.numpy(), surfaces.alpha.numpy(), 1e-3) == 3217).all()
