@@ -1,21 +1,21 @@
-"""The verb `recon bench`: what can be asked of it. Torch is imported only when it runs."""
+"""`recon bench`: the options of the rasterizer benchmark."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 from click.core import ParameterSource
 
 from recon_cli.commands import options
-from recon_cli.commands.bench_train import train
+from recon_cli.commands.bench_train import output_options, train
 from recon_cli.commands.options import Call, pass_call
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.experiments.bench_run import Request
+from recon_cli.experiments.outputs import OutputFiles
+from recon_cli.lazy import load
 from recon_cli.progress import TqdmProgress
-
-_file = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.group("bench", invoke_without_command=True, subcommand_metavar="[train ...]")
@@ -40,28 +40,15 @@ _file = click.Path(dir_okay=False, path_type=Path)
 @click.option(
     "--quick", is_flag=True,
     help="A tiny scene and few rounds: whether it works, not how fast.  [default: off]")
-@click.option("--json", "json_file", type=_file, help="Write all figures to FILE.  "
-              "[default: nowhere]")
+@output_options("Draw speed against error")
 @click.option(
-    "--plot", type=_file,
-    help="Draw speed against error into a .png or .svg; needs recon-cli[plot].  "
-         "[default: nowhere]")
-@click.option(
-    "--markdown", type=_file,
-    help="Write the tables between the lines `<!-- recon bench: begin -->` and "
-         "`<!-- recon bench: end -->` of FILE.  [default: nowhere]")
-@click.option(
-    "--compare", type=_file,
+    "--compare", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
     help="Print the ratio of each figure of an earlier --json FILE to this run's.  "
          "[default: none]")
 @options.verbosity()
 @pass_call
 @click.pass_context
-def bench(
-    ctx: click.Context, call: Call, scene: str, gaussians: int | None, size: str | None,
-    sh_degree: int, backends: tuple[str, ...], rounds: int | None, quick: bool,
-    json_file: Path | None, plot: Path | None, markdown: Path | None, compare: Path | None,
-) -> None:
+def bench(ctx: click.Context, call: Call, /, outputs: OutputFiles, **typed: Any) -> None:
     """Measure the rasterizers: speed against error.
 
     Times every stage on a synthetic room and compares images and gradients with a rasterizer in
@@ -71,13 +58,12 @@ def bench(
     if ctx.invoked_subcommand is not None:
         _refuse_own_options(ctx)
         return
-    from recon_cli.experiments.bench_run import run
-
     compute = settings.build(ComputeConfig, call.settings)
-    request = Request(
-        scene, gaussians, size, sh_degree, backends, compute.device, compute.threads, rounds,
-        quick, json_file, plot, markdown, compare)
-    click.echo(run(request, TqdmProgress()))
+    request = load("recon_cli.experiments.bench_run.BenchRequest")
+    run = load("recon_cli.experiments.bench_run.run")
+    click.echo(run(
+        request(**typed, outputs=outputs, device=compute.device, threads=compute.threads),
+        TqdmProgress()))
 
 
 def _refuse_own_options(ctx: click.Context) -> None:

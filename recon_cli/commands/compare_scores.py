@@ -1,4 +1,4 @@
-"""`recon eval A B C`: brings every workspace's scores up to date and sets them side by side."""
+"""`recon eval A B C`: brings every workspace's scores up to date and puts them into one table."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from recon_cli.config.stages import EvaluateConfig
-from recon_cli.context import StageInputs
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.errors import ConfigError, InputError
 from recon_cli.evaluation.comparison import (
-    Benchmark,
-    Entry,
-    benchmark_of,
-    checked,
-    of_file,
-    of_workspace,
+    ScoredModel,
+    format_comparison,
+    read_workspace_scores,
+    score_file,
 )
+from recon_cli.evaluation.reference_views import ReferenceView, load_held_out_views, load_scene
 from recon_cli.pipeline import execute, plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.plan import Target
@@ -24,74 +24,73 @@ from recon_cli.train.plan import QUALITIES
 from recon_cli.train.runner import read_config
 from recon_cli.workspace.layout import Workspace
 
-FORMS = ("text", "markdown", "csv", "latex", "json")
-
 
 def compare(
-    opened: Callable[[Path], tuple[Job, EvaluateConfig]], workspace: Path, items: Sequence[Path],
-    form: str,
+    open_job: Callable[[Path], tuple[Job, EvaluateConfig]], workspace: Path,
+    items: Sequence[Path], form: str,
 ) -> str:
-    """Returns the scores of workspaces and files in one of FORMS; see `compare.compared`."""
-    from recon_cli.evaluation.comparison import report
-
-    return report(compared(opened, workspace, items), form)
-
-
-def over_seeds(job: Job, config: EvaluateConfig, count: int, form: str) -> str:
-    """Returns the scores of a workspace over seeds in one of FORMS; see `seeds.over_seeds`."""
-    from recon_cli.experiments import seeds
-
-    return seeds.over_seeds(job, config, count).text(form)
-
-
-Open = Callable[[Path], tuple[Job, EvaluateConfig]]
-
-
-def compared(opened: Open, workspace: Path, items: Sequence[Path]) -> list[Entry]:
     """Returns the scores of several workspaces and files, in their order.
 
     Files are scored on the held-out views of one workspace, in whose world they must lie.
 
     Args:
-        opened: returns the job and the options of a workspace, its own recon.toml among them.
+        open_job: returns the job and the options of a workspace, its own recon.toml among them.
         workspace: that of -w.
         items: workspaces and files, at least one.
+        form: text, markdown, csv, latex or json.
 
     Raises:
         InputError: a path is neither.
         StageError: a workspace has no fresh model, or the one of -w no fresh cameras.
     """
-    checked(items)
+    _check_items(items)
     names = _names(items)
-    entries: list[Entry] = []
-    views: Benchmark | None = None
+    models: list[ScoredModel] = []
+    held_out: tuple[str, list[ReferenceView], StageContext] | None = None
     for path in items:
         if Workspace(path).holds_results:
-            job, config = opened(path)
+            job, config = open_job(path)
             plan.run(job, "eval", [Target("evaluate", config)])
-            entries += of_workspace(names[path], job.workspace.folder("evaluate"))
+            models += read_workspace_scores(names[path], job.workspace.folder("evaluate"))
         else:
-            views = views or _views(*opened(workspace))
-            entries.append(of_file(path, names[path], views))
-    return entries
+            held_out = held_out or _load_held_out(*open_job(workspace))
+            models.append(score_file(path, names[path], *held_out))
+    return format_comparison(models, form)
+
+
+def _check_items(items: Sequence[Path]) -> None:
+    """Raises InputError or ConfigError unless each path is a workspace or a file, none twice."""
+    resolved = set()
+    for path in items:
+        if not path.exists():
+            raise InputError(f"{path} does not exist.", hint="Check the path.")
+        if path.is_dir() and not Workspace(path).holds_results:
+            raise InputError(
+                f"{path} is neither a workspace nor a file of Gaussians.",
+                hint="Give folders that `recon train` was run in, or files of Gaussians.")
+        if path.resolve() in resolved:
+            raise ConfigError(f"{path} appears twice.", hint="Remove one of them.")
+        resolved.add(path.resolve())
 
 
 def _names(items: Sequence[Path]) -> dict[Path, str]:
-    """Returns what tables call each path: its last part, or where two share that, all of it."""
+    """Returns the name of each path in tables: its last part, or all of it if two share that."""
     short = {path: path.resolve().name for path in items}
     shared = Counter(short.values())
     return {path: name if shared[name] == 1 else str(path) for path, name in short.items()}
 
 
-def _views(job: Job, config: EvaluateConfig) -> Benchmark:
-    """Returns the held-out views of the workspace of -w."""
-    row = stage("evaluate")
+def _load_held_out(
+    job: Job, config: EvaluateConfig
+) -> tuple[str, list[ReferenceView], StageContext]:
+    """Returns the name of the workspace of -w, its held-out views, and where to render them."""
     plan.require_fresh(job, ("ingest", "sfm"))
-    folders = {name: job.workspace.folder(name) for name in ("ingest", "sfm")}
+    inputs = StageInputs({name: job.workspace.folder(name) for name in ("ingest", "sfm")})
     max_size = config.max_size
     if max_size is None:
         trained = job.inspect().check("train").fresh
         max_size = (read_config(job.workspace.folder("train")) if trained
                     else QUALITIES["normal"]).max_size
-    context = execute.context_for(job, row, lambda _done, _total: None)
-    return benchmark_of(job.workspace.root.name, StageInputs(folders), max_size, context)
+    ctx = execute.context_for(job, stage("evaluate"), lambda _done, _total: None)
+    views = load_held_out_views(load_scene(inputs, validation=0.0), max_size, ctx)
+    return job.workspace.root.name, views, ctx

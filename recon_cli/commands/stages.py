@@ -58,7 +58,7 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 def denoise(call: Call, compare: bool) -> None:
     """Filter noisy frames and pass the others through."""
     if compare:
-        compare_filters = load("recon_cli.commands.compare_filters.compare_filters")
+        compare_filters = load("recon_cli.experiments.filter_comparison.compare_filters")
         click.echo(compare_filters(*open_job(call, DenoiseConfig)))
         return
     run_stages(call, "denoise", ["denoise"])
@@ -102,7 +102,7 @@ def train(call: Call, with_prune: bool, with_view: bool) -> None:
 def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
     """Remove the least important Gaussians and fine-tune the rest."""
     if sweep:
-        run_sweep = load("recon_cli.commands.prune_sweep.sweep")
+        run_sweep = load("recon_cli.experiments.sweep.run_sweep")
         click.echo(run_sweep(*open_job(call, PruneConfig), ratios))
         return
     run_stages(call, "prune", ["prune"])
@@ -128,8 +128,8 @@ def evaluate(call: Call, items: tuple[Path, ...], seeds: int | None, form: str) 
     if items and seeds:
         raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
     if seeds:
-        score_seeds = load("recon_cli.commands.compare_scores.over_seeds")
-        click.echo(score_seeds(*open_job(call, EvaluateConfig), seeds, form))
+        score_seeds = load("recon_cli.experiments.seeds.score_seeds")
+        click.echo(score_seeds(*open_job(call, EvaluateConfig), seeds).text(form))
         return
     if items:
         compare = load("recon_cli.commands.compare_scores.compare")

@@ -22,36 +22,23 @@ FLIP = 1e-5  # a pixel that errs by more has won or lost a fragment: rounding al
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What one renderer makes of a scene.
+    """What one renderer makes of a scene, in float64."""
 
-    Attributes:
-        image: [H, W, 3] float64.
-        gradients: float64, by raw parameter, of the sum of image times the scene's weights.
-    """
-
-    image: Tensor
-    gradients: dict[str, Tensor]
+    image: Tensor  # [H, W, 3]
+    gradients: dict[str, Tensor]  # by raw parameter, of the sum of image times scene.weights
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """The distance of an answer from the oracle's.
+    """The distance of an answer from the oracle's."""
 
-    Attributes:
-        image_error_max: largest difference of a channel of a pixel.
-        image_error_rms: root of the mean square of the differences.
-        flipped_pixels: share of the pixels with a channel that errs by more than `FLIP`.
-        gradient_relative_error: ||g - g*|| / ||g*|| of the raw parameter for which it is largest.
-        gradient_worst: the name of that parameter.
-        gradient_cosine: between all gradients in a row, each parameter's divided by its ||g*||
-            first, so that no unit outweighs the others.
-    """
-
-    image_error_max: float
-    image_error_rms: float
-    flipped_pixels: float
-    gradient_relative_error: float
-    gradient_worst: str
+    image_error_max: float  # largest difference of a channel of a pixel
+    image_error_rms: float  # root of the mean square of the differences
+    flipped_pixels: float  # fraction of the pixels with a channel that errs by more than FLIP
+    gradient_relative_error: float  # ||g - g*|| / ||g*||, of the raw parameter where it is largest
+    gradient_worst: str  # the name of that parameter
+    # between all gradients in a row, each parameter's divided by its ||g*|| first, so that no unit
+    # outweighs the others
     gradient_cosine: float
 
 
@@ -60,11 +47,11 @@ def answer(scene: BenchScene, renderer: Renderer) -> Answer:
     splats = scene.splats.map(lambda tensor: tensor.detach().requires_grad_())
     output = renderer(splats, scene.camera, scene.background, scene.sh_degree, False)
     leaves = splats.parameters()
-    found = torch.autograd.grad(
+    computed = torch.autograd.grad(
         output.rgb, list(leaves.values()), scene.weights, allow_unused=True)
     gradients = {
         name: (torch.zeros_like(leaf) if gradient is None else gradient).double()
-        for (name, leaf), gradient in zip(leaves.items(), found, strict=True)}
+        for (name, leaf), gradient in zip(leaves.items(), computed, strict=True)}
     return Answer(output.rgb.detach().double(), gradients)
 
 
@@ -91,7 +78,7 @@ def accuracy(candidate: Answer, truth: Answer) -> Accuracy:
 
 
 def _compare(
-    found: Mapping[str, Tensor], true: Mapping[str, Tensor]
+    candidate: Mapping[str, Tensor], true: Mapping[str, Tensor]
 ) -> tuple[dict[str, float], float]:
     """Returns the relative error of each parameter's gradient, and the cosine over all of them."""
     relative: dict[str, float] = {}
@@ -100,7 +87,7 @@ def _compare(
         length = float(gradient.norm())
         if length == 0:
             continue
-        scaled, unit = found[name] / length, gradient / length
+        scaled, unit = candidate[name] / length, gradient / length
         relative[name] = _known((scaled - unit).norm())
         product += float((scaled * unit).sum())
         square += float(scaled.square().sum())

@@ -1,4 +1,4 @@
-"""The run itself: every backend, thread count, loss and approximation on one scene."""
+"""The measurement: every backend, thread count, loss and approximation on one scene."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments.accuracy import Answer, accuracy, answer, oracle
-from recon_cli.experiments.bench_result import BackendResult, SceneResult, Speed, VariantResult
+from recon_cli.experiments.bench_result import BackendResult, BenchedScene, Speed, VariantResult
 from recon_cli.experiments.host import (
     FLOPS_BACKWARD,
     FLOPS_FORWARD,
@@ -128,24 +128,15 @@ Pairs = tuple[int, int] | None
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is measured.
-
-    Attributes:
-        size: of the scene.
-        sh_degree: 0 to 3.
-        backends: by name.
-        device: "cpu" or "cuda".
-        threads: CPU threads; the figures of one thread are taken as well.
-        rounds: behind each median.
-    """
+class BenchPlan:
+    """What is measured."""
 
     size: SceneSize
     sh_degree: int
-    backends: tuple[str, ...]
-    device: str
-    threads: int
-    rounds: int
+    backends: tuple[str, ...]  # by name
+    device: str  # "cpu" or "cuda"
+    threads: int  # CPU threads; the figures of one thread are taken as well
+    rounds: int  # behind each median
 
     @property
     def thread_counts(self) -> list[int]:
@@ -153,7 +144,7 @@ class Plan:
         return [self.threads] if self.device == "cuda" else sorted({1, self.threads})
 
 
-def measure(plan: Plan, host: Host, progress: Progress) -> SceneResult:
+def measure(plan: BenchPlan, host: Host, progress: Progress) -> BenchedScene:
     """Returns every figure of one scene."""
     scene = build_scene(plan.size, plan.sh_degree, plan.device)
     with _threads(plan.threads), progress.bar(
@@ -168,14 +159,15 @@ def measure(plan: Plan, host: Host, progress: Progress) -> SceneResult:
              for name, work in loss_passes(scene, plan.device).items()},
             plan.rounds, bar.advance)
         variants = _variants(scene, plan, truth, bar)
-    return SceneResult(
+    return BenchedScene(
         plan.size.gaussians, plan.size.width, plan.size.height, plan.sh_degree, backends,
         {name: timing_of(samples["whole"]) for name, samples in losses.items()},
         plan.backends[0], variants)
 
 
 def _backends(
-    scene: BenchScene, plan: Plan, host: Host, truth: Answer, memory: Mapping[str, int], bar: Bar
+    scene: BenchScene, plan: BenchPlan, host: Host, truth: Answer, memory: Mapping[str, int],
+    bar: Bar,
 ) -> dict[str, BackendResult]:
     """Returns speed and accuracy of every backend, all thread counts in turn."""
     peak = host.peak_gflops if plan.device == "cpu" else None
@@ -193,21 +185,22 @@ def _backends(
 
 
 def _variants(
-    scene: BenchScene, plan: Plan, truth: Answer, bar: Bar
+    scene: BenchScene, plan: BenchPlan, truth: Answer, bar: Bar
 ) -> list[VariantResult]:
     """Returns time and accuracy of the contract and of every approximation, in turn."""
     backend = plan.backends[0]
-    tried = [CONTRACT, *variants_for(backend, plan.sh_degree)]
-    renderers = {one.name: renderer_of(one, backend) for one in tried}
+    variants = [CONTRACT, *variants_for(backend, plan.sh_degree)]
+    renderers = {variant.name: renderer_of(variant, backend) for variant in variants}
     with _threads(plan.threads, backend):
         samples = alternate(
             {name: _whole(_passes(scene, draw), plan.device) for name, draw in renderers.items()},
             plan.rounds, bar.advance)
     return [
         VariantResult(
-            one.name, timing_of(samples[one.name]["whole"]) if one.saves_time else None,
-            accuracy(answer(scene, renderers[one.name]), truth))
-        for one in tried]
+            variant.name,
+            timing_of(samples[variant.name]["whole"]) if variant.saves_time else None,
+            accuracy(answer(scene, renderers[variant.name]), truth))
+        for variant in variants]
 
 
 def _label(backend: str, threads: int) -> str:
@@ -240,7 +233,7 @@ def _memory(scene: BenchScene, backend: str, device: str) -> int:
     return added_memory(_passes(scene, draw), device)
 
 
-def _speed_works(scene: BenchScene, plan: Plan) -> tuple[dict[str, Work], dict[str, Pairs]]:
+def _speed_works(scene: BenchScene, plan: BenchPlan) -> tuple[dict[str, Work], dict[str, Pairs]]:
     """Returns the timed work of each backend and thread count, and where their pairs end up."""
     pairs: dict[str, Pairs] = dict.fromkeys(plan.backends)
 
@@ -288,11 +281,11 @@ def _timed_step(step: Callable[[Mark], None], name: str, device: str) -> dict[st
 
 def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float]:
     """Returns the time of a pass under its name, and of its parts with what they leave over."""
-    found = {whole: ms}
+    times = {whole: ms}
     if parts:
-        found |= {f"{whole}: {part}": part_ms for part, part_ms in parts.items()}
-        found[f"{whole}: rest"] = max(0.0, ms - sum(parts.values()))
-    return found
+        times |= {f"{whole}: {part}": part_ms for part, part_ms in parts.items()}
+        times[f"{whole}: rest"] = max(0.0, ms - sum(parts.values()))
+    return times
 
 
 def _whole(work: Callable[[], object], device: str) -> Work:

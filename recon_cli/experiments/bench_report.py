@@ -1,129 +1,140 @@
-"""What a result says, table by table."""
+"""What the rasterizer benchmark shows: its tables, and the picture of speed against error."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from recon_cli.evaluation.tables import TitledTable, number, percent
 from recon_cli.experiments.accuracy import Accuracy
-from recon_cli.experiments.bench_result import BackendResult, Result, SceneResult, Speed
+from recon_cli.experiments.bench_result import (
+    BackendResult,
+    BenchedScene,
+    BenchResult,
+    Speed,
+    ratio,
+)
 from recon_cli.experiments.host import Timing
+from recon_cli.experiments.outputs import drawing
 
 _REFERENCE = "torch"  # what the other backends and losses are compared with
 _RATED = {"forward: composite": "forward", "backward: decompose": "backward"}
 
 
-def tables(result: Result) -> list[TitledTable]:
+def tables(result: BenchResult) -> list[TitledTable]:
     """Returns all tables of a result, in the order in which they are read."""
-    found = []
+    all_tables: list[TitledTable] = []
     for name, scene in result.scenes.items():
         where = (f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
                  f"SH degree {scene.sh_degree}")
-        found += [
+        all_tables += [
             _figures(where, scene, result.warm_start), _stages(where, scene), _errors(where, scene),
             _variants(where, scene)]
-    return found
+    return all_tables
 
 
-def head(result: Result) -> str:
+def head(result: BenchResult) -> str:
     """Returns the line about machine and method that stands above the tables."""
     return (f"{result.host.line}; medians of {result.rounds} alternated rounds, "
             "interquartile range in brackets")
 
 
-def timed(timing: Timing | None) -> str:
-    """Returns median and spread in milliseconds."""
+def _ms(timing: Timing | None) -> str:
+    """Returns median and interquartile range in milliseconds."""
     return "-" if timing is None else f"{number(timing.ms)} ({number(timing.iqr_ms, 2)})"
 
 
 def _ratio(old: float | None, new: float | None) -> str:
-    return "-" if old is None or not new else f"{old / new:.2f}x"
+    return "-" if (value := ratio(old, new)) is None else f"{value:.2f}x"
 
 
 def _both(speed: Speed) -> float:
     return speed.forward.ms + speed.backward.ms
 
 
-def _figures(where: str, scene: SceneResult, warm_start: Timing | None) -> TitledTable:
-    """The figures that are quoted, one row each, a column a backend."""
+def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> TitledTable:
+    """Returns the figures that are quoted, one row each, a column a backend."""
     backends = scene.backends
-    rows = [(what, *(figure(one) for one in backends.values()))
-            for what, figure in _quoted(scene)]
+    rows = [(name, *(figure(backend) for backend in backends.values()))
+            for name, figure in _quoted(scene)]
     width = len(backends) - 1
     if warm_start is not None:
-        rows.append(("kernels ready in a fresh process, ms", timed(warm_start), *[""] * width))
+        rows.append(("kernels ready in a fresh process, ms", _ms(warm_start), *[""] * width))
     fused = scene.losses.get("fused")
     for name, timing in scene.losses.items():
-        rows.append((f"loss {name}, ms", timed(timing), *[""] * width))
+        rows.append((f"loss {name}, ms", _ms(timing), *[""] * width))
         if fused and timing is not fused:
             rows.append((f"loss {name} : fused", _ratio(timing.ms, fused.ms), *[""] * width))
     return TitledTable(f"Figures ({where})", ("what", *backends), rows)
 
 
-def _quoted(scene: SceneResult) -> list[tuple[str, Callable[[BackendResult], str]]]:
-    """Returns what the rows of `_figures` say, and how a backend's cell is made."""
+def _quoted(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult], str]]]:
+    """Returns the names of the rows of `_figures`, and how a backend's cell is made."""
     reference = scene.backends.get(_REFERENCE)
     threads = next(iter(scene.backends.values())).speed.threads
 
-    def against(one: BackendResult) -> str:
-        return _ratio(_both(reference.speed), _both(one.speed)) if reference else "-"
+    def speedup(of: Callable[[BackendResult], Speed]) -> Callable[[BackendResult], str]:
+        return lambda backend: (
+            _ratio(_both(of(reference)), _both(of(backend))) if reference else "-")
 
-    def alone(one: BackendResult) -> str:
-        return _ratio(_both(_core(reference)), _both(_core(one))) if reference else "-"
+    def core(cell: Callable[[Speed], str]) -> Callable[[BackendResult], str]:
+        return lambda backend: cell(_core(backend))
 
     several: list[tuple[str, Callable[[BackendResult], str]]] = [
-        ("the same with 1 thread", alone),
+        ("the same with 1 thread", speedup(_core)),
         (f"1 thread : {threads} threads, whole step",
-         lambda one: _ratio(_core(one).step.ms, one.speed.step.ms)),
+         lambda backend: _ratio(_core(backend).step.ms, backend.speed.step.ms)),
     ]
     return [
-        ("forward + backward, ms", lambda one: number(_both(one.speed))),
-        ("whole step, ms", lambda one: timed(one.speed.step)),
-        (f"{_REFERENCE} : this, forward + backward", against),
+        ("forward + backward, ms", lambda backend: number(_both(backend.speed))),
+        ("whole step, ms", lambda backend: _ms(backend.speed.step)),
+        (f"{_REFERENCE} : this, forward + backward", speedup(lambda backend: backend.speed)),
         *(several if threads > 1 and _has_core(scene) else []),
-        ("Gpairs/s a core, forward", lambda one: number(_core(one).gpairs_per_s_forward)),
-        ("Gpairs/s a core, backward", lambda one: number(_core(one).gpairs_per_s_backward)),
-        ("of the core's peak, forward", lambda one: percent(_core(one).peak_fraction_forward)),
-        ("of the core's peak, backward", lambda one: percent(_core(one).peak_fraction_backward)),
-        ("evaluated Mpairs, forward", lambda one: _millions(one.pairs, 0)),
-        ("evaluated Mpairs, backward", lambda one: _millions(one.pairs, 1)),
-        ("memory added, MB", lambda one: f"{one.memory_bytes / 1e6:.0f}"),
+        ("Gpairs/s a core, forward", core(lambda speed: number(speed.gpairs_per_s_forward))),
+        ("Gpairs/s a core, backward", core(lambda speed: number(speed.gpairs_per_s_backward))),
+        ("of the core's peak, forward", core(lambda speed: percent(speed.peak_fraction_forward))),
+        ("of the core's peak, backward", core(lambda speed: percent(speed.peak_fraction_backward))),
+        ("evaluated Mpairs, forward", lambda backend: _millions(backend.pairs, 0)),
+        ("evaluated Mpairs, backward", lambda backend: _millions(backend.pairs, 1)),
+        ("memory added, MB", lambda backend: f"{backend.memory_bytes / 1e6:.0f}"),
     ]
 
 
-def _core(one: BackendResult) -> Speed:
+def _core(backend: BackendResult) -> Speed:
     """Returns the speed of one thread, on a GPU that of the GPU."""
-    return one.one_thread or one.speed
+    return backend.one_thread or backend.speed
 
 
-def _has_core(scene: SceneResult) -> bool:
-    return all(one.one_thread for one in scene.backends.values())
+def _has_core(scene: BenchedScene) -> bool:
+    return all(backend.one_thread for backend in scene.backends.values())
 
 
-def _millions(pairs: tuple[int, int] | None, which: int) -> str:
-    return number(pairs[which] / 1e6 if pairs else None)
+def _millions(pairs: tuple[int, int] | None, index: int) -> str:
+    return number(pairs[index] / 1e6 if pairs else None)
 
 
-def _stages(where: str, scene: SceneResult) -> TitledTable:
-    """Every stage of every backend, with one thread and with all."""
+def _stages(where: str, scene: BenchedScene) -> TitledTable:
+    """Returns every stage of every backend, with one thread and with all."""
     threads = next(iter(scene.backends.values())).speed.threads
     several = threads > 1 and _has_core(scene)  # otherwise both columns would say the same
     rows: list[tuple[str, ...]] = []
-    for name, one in scene.backends.items():
-        speeds = (_core(one), one.speed) if several else (one.speed,)
+    for name, backend in scene.backends.items():
+        speeds = (_core(backend), backend.speed) if several else (backend.speed,)
         for label in ("forward", "backward", "step"):
-            parts = [part for part in one.speed.stages if part.startswith(f"{label}: ")]
+            parts = [part for part in backend.speed.stages if part.startswith(f"{label}: ")]
             rows += [
-                (f"{name} {part}", *(timed(_time(speed, part)) for speed in speeds),
-                 *_rates(_core(one), part)) for part in (label, *parts)]
+                (f"{name} {part}", *(_ms(_time(speed, part)) for speed in speeds),
+                 *_rates(_core(backend), part)) for part in (label, *parts)]
     columns = ("ms, 1 thread", f"ms, {threads} threads") if several else ("ms",)
     return TitledTable(
         f"Stages ({where})", ("stage", *columns, "Gpairs/s a core", "of peak"), rows)
 
 
 def _time(speed: Speed, part: str) -> Timing | None:
-    whole = {"forward": speed.forward, "backward": speed.backward, "step": speed.step}
-    return whole.get(part) or speed.stages.get(part)
+    passes = {"forward": speed.forward, "backward": speed.backward, "step": speed.step}
+    return passes.get(part) or speed.stages.get(part)
 
 
 def _rates(speed: Speed, part: str) -> tuple[str, str]:
@@ -137,27 +148,105 @@ def _rates(speed: Speed, part: str) -> tuple[str, str]:
 _ERRORS = ("image max", "image RMS", "pixels > 1e-5", "gradient rel.", "worst", "gradient 1 - cos")
 
 
-def _errors(where: str, scene: SceneResult) -> TitledTable:
-    """Every backend against the oracle."""
-    rows = [(name, number(_both(one.speed)), *_accuracy_cells(one.accuracy))
-            for name, one in scene.backends.items()]
+def _errors(where: str, scene: BenchedScene) -> TitledTable:
+    """Returns every backend against the oracle."""
+    rows = [(name, number(_both(backend.speed)), *_accuracy_cells(backend.accuracy))
+            for name, backend in scene.backends.items()]
     return TitledTable(f"Error against float64 ({where})", ("backend", "ms", *_ERRORS), rows)
 
 
-def _accuracy_cells(found: Accuracy) -> tuple[str, ...]:
+def _accuracy_cells(accuracy: Accuracy) -> tuple[str, ...]:
     """Returns the cells under `_ERRORS`."""
-    return (number(found.image_error_max), number(found.image_error_rms),
-            percent(found.flipped_pixels), number(found.gradient_relative_error),
-            found.gradient_worst, number(1 - found.gradient_cosine, 2))
+    return (number(accuracy.image_error_max), number(accuracy.image_error_rms),
+            percent(accuracy.flipped_pixels), number(accuracy.gradient_relative_error),
+            accuracy.gradient_worst, number(1 - accuracy.gradient_cosine, 2))
 
 
-def _variants(where: str, scene: SceneResult) -> TitledTable:
-    """Every approximation against the oracle, and what it saves."""
+def _variants(where: str, scene: BenchedScene) -> TitledTable:
+    """Returns every approximation against the oracle, and what it saves."""
     contract = scene.variants[0].time
     rows = []
-    for one in scene.variants:
-        saved = None if one.time is None or contract is None else contract.ms - one.time.ms
-        rows.append((one.name, timed(one.time), number(saved, 2), *_accuracy_cells(one.accuracy)))
+    for variant in scene.variants:
+        saved = None if variant.time is None or contract is None else contract.ms - variant.time.ms
+        rows.append((variant.name, _ms(variant.time), number(saved, 2),
+                     *_accuracy_cells(variant.accuracy)))
     return TitledTable(
         f"Approximations on {scene.variants_of} ({where})",
         ("what", "ms", "ms saved", *_ERRORS), rows)
+
+
+_FLOOR = 1e-9  # an error of zero has no place on a logarithmic axis
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One point of the picture."""
+
+    name: str  # its label
+    ms: float  # forward and backward
+    image_error: float  # root mean square
+    gradient_error: float  # relative
+
+
+def candidates_of(scene: BenchedScene) -> list[Candidate]:
+    """Returns every backend, then every approximation that has a time.
+
+    The backend that drew the approximations has the time that was taken in turn with theirs.
+    """
+    contract, *others = scene.variants
+    times = {name: _both(backend.speed) for name, backend in scene.backends.items()}
+    if contract.time:
+        times[scene.variants_of] = contract.time.ms
+    timed = [*((name, times[name], backend.accuracy) for name, backend in scene.backends.items()),
+             *((other.name, other.time.ms, other.accuracy) for other in others if other.time)]
+    return [Candidate(name, ms, accuracy.image_error_rms, accuracy.gradient_relative_error)
+            for name, ms, accuracy in timed]
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Returns the points (ms, error) that no other beats in both, by rising milliseconds."""
+    best, front = float("inf"), []
+    for i in sorted(range(len(points)), key=lambda i: points[i]):
+        if points[i][1] < best:
+            best = points[i][1]
+            front.append(i)
+    return front
+
+
+def draw(result: BenchResult, path: Path) -> None:
+    """Draws speed against error of the first scene into a .png or .svg, whole or not at all.
+
+    Points bear numbers and the names stand beside: many lie on top of each other.
+    """
+    name, scene = next(iter(result.scenes.items()))
+    candidates = candidates_of(scene)
+    with drawing(path, 15, 6, dpi=130) as figure:
+        left, right, names = figure.subplots(1, 3, width_ratios=(5, 5, 2))
+        figure.suptitle(
+            f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
+            f"{result.host.cpu}, threads: {result.host.threads}", fontsize=10)
+        count = len(scene.backends)
+        _scatter(left, [(point.ms, point.image_error) for point in candidates], count)
+        _scatter(right, [(point.ms, point.gradient_error) for point in candidates], count)
+        left.set_ylabel("image error against float64, RMS")
+        right.set_ylabel("gradient error against float64, relative")
+        lines = [f"{i}  {point.name}" for i, point in enumerate(candidates, start=1)]
+        names.text(0, 1, "\n".join(lines), va="top", fontsize=9, linespacing=1.6)
+        names.axis("off")
+
+
+def _scatter(axes: Any, places: Sequence[tuple[float, float]], backends: int) -> None:
+    """Draws numbered points and a line through those that no other beats; backends come first."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    places = [(ms, max(error, _FLOOR)) for ms, error in places]
+    axes.plot(*zip(*(places[i] for i in pareto_front(places)), strict=True), color="0.7", zorder=1)
+    axes.scatter(*zip(*places, strict=True), zorder=2, s=16,
+                 c=["C1" if i < backends else "C0" for i in range(len(places))])
+    for index, place in enumerate(places, start=1):
+        axes.annotate(str(index), place, xytext=(4, 3), textcoords="offset points", fontsize=8)
+    axes.set(xscale="log", yscale="log", xlabel="forward + backward, ms")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="0.92")

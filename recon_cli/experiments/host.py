@@ -1,4 +1,7 @@
-"""What the machine could do at best, and how much of it a pair of Gaussian and pixel needs."""
+"""Timing on this machine: stopwatch, alternating rounds, memory, and the arithmetic peak.
+
+And how much of that peak a pair of Gaussian and pixel needs.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +33,10 @@ Samples = dict[str, list[float]]  # name of a part -> its milliseconds, round by
 
 @dataclass(frozen=True)
 class Timing:
-    """A measured time.
+    """A measured time."""
 
-    Attributes:
-        ms: median over the rounds.
-        iqr_ms: from the first to the third quartile; 0 for a single round.
-    """
-
-    ms: float
-    iqr_ms: float
+    ms: float  # median over the rounds
+    iqr_ms: float  # from the first to the third quartile; 0 for a single round
 
 
 def timing_of(samples: Sequence[float]) -> Timing:
@@ -52,7 +50,7 @@ def timing_of(samples: Sequence[float]) -> Timing:
 
 
 class Stopwatch:
-    """Books the time between marks; waits for the device at each of them."""
+    """Counts the time between marks; waits for the device at each of them."""
 
     def __init__(self, device: str) -> None:
         self._device = device
@@ -60,7 +58,7 @@ class Stopwatch:
         self._last = self._now()
 
     def mark(self, name: str) -> None:
-        """Books what has passed since the last mark under `name`."""
+        """Adds the time since the last mark to that of `name`."""
         now = self._now()
         self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now - self._last)
         self._last = now
@@ -86,40 +84,29 @@ def alternate(
         rounds: counted runs of each.
         on_round: called after each round, that ahead included.
     """
-    found: dict[str, Samples] = {name: {} for name in works}
+    samples: dict[str, Samples] = {name: {} for name in works}
     for number in range(rounds + 1):
         for name, work in works.items():
             time.sleep(_SETTLE_SECONDS)
             parts = work()
             if number:
                 for part, ms in parts.items():
-                    found[name].setdefault(part, []).append(ms)
+                    samples[name].setdefault(part, []).append(ms)
         on_round()
-    return found
+    return samples
 
 
 @dataclass(frozen=True)
 class Host:
-    """A machine and its programs.
+    """A machine and its programs."""
 
-    Attributes:
-        cpu: model name.
-        cores: that this process may use.
-        threads: that the work was given.
-        lanes: float32 in a vector of the kernels.
-        peak_gflops: float32 multiply-adds of one thread, measured; an addition and a
-            multiplication count as two.
-        device: "cpu", or the GPU's model name.
-        versions: of Python and the packages.
-    """
-
-    cpu: str
-    cores: int
-    threads: int
-    lanes: int
-    peak_gflops: float
-    device: str
-    versions: dict[str, str]
+    cpu: str  # model name
+    cores: int  # that this process may use
+    threads: int  # that the work was given
+    lanes: int  # float32 in a vector of the kernels
+    peak_gflops: float  # multiply-adds of one thread, measured in float32; each counts as two
+    device: str  # "cpu", or the GPU's model name
+    versions: dict[str, str]  # of Python and the packages
 
     @property
     def line(self) -> str:
@@ -219,9 +206,9 @@ _ITERATIONS = 2_000_000  # 3 ms on a core with AVX-512
 _ATTEMPTS = 9
 
 
-def counted() -> list[tuple[str, int, int]]:
-    """Returns the count line by line: what, operations forward, operations backward."""
-    return [(what, *numbers) for what, numbers in _COUNT.items()]
+def operations_per_pair() -> list[tuple[str, int, int]]:
+    """Returns the count line by line: its name, operations forward, operations backward."""
+    return [(name, *numbers) for name, numbers in _COUNT.items()]
 
 
 @kernel

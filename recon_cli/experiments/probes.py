@@ -1,4 +1,4 @@
-"""Looks into a backend while it renders: the time of each stage, and the pairs evaluated.
+"""Probes of a backend while it renders: the time of each stage, and the pairs evaluated.
 
 A probe changes nothing that is computed. A backend without one is timed from outside only.
 """
@@ -18,14 +18,10 @@ COMPOSITE, DECOMPOSE = "composite", "decompose"  # the stages whose pairs are co
 
 
 class Probe:
-    """What is seen of a backend while `watching`.
-
-    Attributes:
-        ms: milliseconds by stage since `collect` was last called.
-    """
+    """Measures a backend while `watching`."""
 
     def __init__(self) -> None:
-        self.ms: dict[str, float] = {}
+        self.ms: dict[str, float] = {}  # by stage, since `collect` was last called
 
     @contextmanager
     def watching(self) -> Iterator[None]:
@@ -34,8 +30,8 @@ class Probe:
 
     def collect(self) -> dict[str, float]:
         """Returns the milliseconds since the last call and starts anew."""
-        found, self.ms = self.ms, {}
-        return found
+        collected, self.ms = self.ms, {}
+        return collected
 
     def pairs(self, output: RenderOutput) -> tuple[int, int] | None:  # noqa: ARG002
         """Returns pairs forward and backward of an output that has been through both passes."""
@@ -46,7 +42,7 @@ class Probe:
 
 
 class NumbaProbe(Probe):
-    """Listens to the crew, which runs every parallel kernel."""
+    """Observes the thread pool, which runs every parallel kernel."""
 
     @contextmanager
     def watching(self) -> Iterator[None]:

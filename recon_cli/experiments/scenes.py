@@ -8,15 +8,14 @@ from functools import cached_property
 from pathlib import Path
 
 from recon_cli.config.settings import Settings, build, merge
-from recon_cli.config.stages import ComputeConfig, IngestConfig, RunConfig, SfmConfig
+from recon_cli.config.stages import ComputeConfig, IngestConfig, SfmConfig
 from recon_cli.context import StageInputs
-from recon_cli.errors import ConfigError, InputError, ReconstructionError
-from recon_cli.evaluation.reference_views import held_out_names, load_scene
+from recon_cli.errors import ConfigError, InputError
+from recon_cli.evaluation.reference_views import held_out_names
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.progress import Progress
-from recon_cli.scene.scene import Scene
 from recon_cli.workspace.digests import digest_file, sha256_json
 from recon_cli.workspace.layout import Workspace
 
@@ -24,20 +23,11 @@ _READ = ("images", "denoised", "masks", "sparse")  # below sfm/undistorted, what
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """The finished folders of a scene.
-
-    Attributes:
-        name: for tables and files.
-        inputs: folders of ingest and sfm.
-    """
+class SceneFolders:
+    """The finished folders of ingest and sfm of a scene, under its name in tables and files."""
 
     name: str
     inputs: StageInputs
-
-    def load(self, config: RunConfig) -> Scene:
-        """Returns the views, split as for a run with these options, and the points."""
-        return load_scene(self.inputs, validation=config.validation)
 
     @cached_property
     def digest(self) -> str:
@@ -51,7 +41,7 @@ class Place:
             "held_out": sorted(held_out_names(self.inputs.folders["ingest"]))})
 
 
-def checked(paths: Sequence[Path]) -> dict[str, Path]:
+def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
     """Returns the paths by the names of their scenes, once each can be one.
 
     Raises:
@@ -63,19 +53,19 @@ def checked(paths: Sequence[Path]) -> dict[str, Path]:
         raise ConfigError(
             "No scene was given.",
             hint="Give workspaces with cameras or data sets with poses after --scenes.")
-    found: dict[str, Path] = {}
+    scenes: dict[str, Path] = {}
     for path in paths:
         name = path.resolve().name
-        if name in found:
+        if name in scenes:
             raise ConfigError(
-                f"{found[name]} and {path} are both called {name}.",
-                hint="Rename one of the folders: tables tell scenes by their names.")
-        found[name] = path
+                f"{scenes[name]} and {path} are both called {name}.",
+                hint="Rename one of the folders: tables tell scenes apart by their names.")
+        scenes[name] = path
         if Workspace(path).holds_results:
             plan.require_fresh(Job(Workspace(path)), ("ingest", "sfm"))
         else:
             _refuse_unposed(path)
-    return found
+    return scenes
 
 
 def _refuse_unposed(path: Path) -> None:
@@ -89,10 +79,10 @@ def _refuse_unposed(path: Path) -> None:
                  "that workspace.")
 
 
-def opened(
+def open_scene(
     name: str, path: Path, scratch: Path, settings: Settings, compute: ComputeConfig,
     progress: Progress,
-) -> Place:
+) -> SceneFolders:
     """Returns the folders of a scene; a data set is read and mapped with the poses it has.
 
     Args:
@@ -106,33 +96,13 @@ def opened(
     Raises:
         ReconError: whatever the stages raise.
     """
-    root = path
-    if not Workspace(path).holds_results:
-        root = scratch / name
+    workspace = Workspace(path)
+    if not workspace.holds_results:
+        workspace = Workspace(scratch / name)
         values = merge([settings, {"sfm": {"poses": "keep"}}])
         stages = {part: values[part] for part in ("ingest", "denoise", "sfm")}
-        job = Job(Workspace(root), stages, compute, progress)
-        plan.run(job, "ingest and sfm", [
+        plan.run(Job(workspace, stages, compute, progress), "ingest and sfm", [
             Target("ingest", build(IngestConfig, stages), (path,)),
             Target("sfm", build(SfmConfig, stages))])
-    workspace = Workspace(root)
-    return Place(name, StageInputs({
+    return SceneFolders(name, StageInputs({
         stage: workspace.folder(stage) for stage in ("ingest", "sfm")}))
-
-
-def refuse_unscored(place: Place, scene: Scene, *, test: bool) -> None:
-    """Raises ReconstructionError or ConfigError unless a scene has views that can be scored.
-
-    Args:
-        place: for the message.
-        scene: its views.
-        test: the held-out views are scored; otherwise the validation views.
-    """
-    if test and not scene.test:
-        raise ReconstructionError(
-            f"No held-out view of {place.name} has a camera.",
-            hint="Run `recon ingest` with a --holdout such as every:8.")
-    if not test and not scene.validation:
-        raise ConfigError(
-            f"{place.name} has no validation views.",
-            hint="Use --set train.validation=0.1, or give a scene with more views.")

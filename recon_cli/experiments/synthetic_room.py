@@ -1,4 +1,4 @@
-"""The approximations that are tried: what each leaves out, and how it is rendered."""
+"""What the benchmark draws: Gaussians of a synthetic room, and approximations of the renderer."""
 
 from __future__ import annotations
 
@@ -23,16 +23,10 @@ _THINNESS = 0.15  # of the axis across the wall: trained Gaussians lie flat on s
 
 @dataclass(frozen=True)
 class SceneSize:
-    """How much there is to draw.
-
-    Attributes:
-        gaussians: in the room.
-        width: of the image in pixels.
-        height: of the image in pixels.
-    """
+    """How much there is to draw."""
 
     gaussians: int
-    width: int
+    width: int  # of the image in pixels
     height: int
 
 
@@ -42,21 +36,14 @@ QUICK = SceneSize(1_500, 160, 90)
 
 @dataclass(frozen=True, eq=False)
 class BenchScene:
-    """What every candidate renders.
+    """What every candidate renders."""
 
-    Attributes:
-        splats: N Gaussians, float32.
-        camera: inside the room.
-        background: [3].
-        sh_degree: 0 to 3.
-        weights: [H, W, 3] seeded normal numbers; the loss whose gradients are compared is their
-            sum with the image.
-    """
-
-    splats: Splats
-    camera: Camera
-    background: Tensor
+    splats: Splats  # N Gaussians, float32
+    camera: Camera  # inside the room
+    background: Tensor  # [3]
     sh_degree: int
+    # [H, W, 3] seeded normal numbers; the loss whose gradients are compared is the sum over the
+    # image times these
     weights: Tensor
 
 
@@ -117,20 +104,14 @@ def _camera(width: int, height: int) -> Camera:
 
 
 @dataclass(frozen=True)
-class Variant:
-    """One way to be cheaper, or more careful, than the contract.
+class RendererVariant:
+    """One way to be cheaper, or more careful, than the contract."""
 
-    Attributes:
-        name: what the tables show.
-        approximation: of the rasterizer.
-        sh_degree: the harmonics are cut at this degree; None keeps those of the scene.
-        half_colors: the SH coefficients are rounded to float16 first. The kernels have no float16
-            arithmetic, so this shows an error and can save no time.
-    """
-
-    name: str
-    approximation: Approximation = field(default=EXACT)
-    sh_degree: int | None = None
+    name: str  # in the tables
+    approximation: Approximation = field(default=EXACT)  # of the rasterizer
+    sh_degree: int | None = None  # the harmonics are cut here; None keeps those of the scene
+    # The SH coefficients are rounded to float16 first. The kernels have no float16 arithmetic, so
+    # this shows an error and can save no time.
     half_colors: bool = False
 
     @property
@@ -139,28 +120,28 @@ class Variant:
         return not self.half_colors
 
 
-CONTRACT = Variant("contract")
+CONTRACT = RendererVariant("contract")
 _ALL = (
-    Variant("tiles by the 3-sigma square", Approximation(square=True)),
-    *(Variant(f"stop at T < {value:g}", Approximation(transmittance_min=value))
+    RendererVariant("tiles by the 3-sigma square", Approximation(square=True)),
+    *(RendererVariant(f"stop at T < {value:g}", Approximation(transmittance_min=value))
       for value in (1e-2, 1e-3, 1e-5)),
-    Variant("no early stop", Approximation(transmittance_min=0.0)),
-    *(Variant(f"alpha >= {name}", Approximation(alpha_min=factor * ALPHA_MIN))
+    RendererVariant("no early stop", Approximation(transmittance_min=0.0)),
+    *(RendererVariant(f"alpha >= {name}", Approximation(alpha_min=factor * ALPHA_MIN))
       for name, factor in (("4/255", 4.0), ("2/255", 2.0), ("1/510", 0.5), ("1/2550", 0.1))),
-    *(Variant(f"SH degree {degree}", sh_degree=degree) for degree in (0, 1, 2)),
-    Variant("float16 colours", half_colors=True),
+    *(RendererVariant(f"SH degree {degree}", sh_degree=degree) for degree in (0, 1, 2)),
+    RendererVariant("float16 colours", half_colors=True),
 )
 
 
-def variants_for(backend: str, sh_degree: int) -> list[Variant]:
+def variants_for(backend: str, sh_degree: int) -> list[RendererVariant]:
     """Returns the approximations that a backend can draw of a scene with this SH degree."""
     return [
-        one for one in _ALL
-        if (one.approximation == EXACT or backend == "numba")
-        and (one.sh_degree is None or one.sh_degree < sh_degree)]
+        variant for variant in _ALL
+        if (variant.approximation == EXACT or backend == "numba")
+        and (variant.sh_degree is None or variant.sh_degree < sh_degree)]
 
 
-def renderer_of(variant: Variant, backend: str) -> Renderer:
+def renderer_of(variant: RendererVariant, backend: str) -> Renderer:
     """Returns a backend's render function with the variant's approximation built in."""
     if variant.approximation == EXACT:
         draw = registry.renderer(backend)
@@ -178,13 +159,10 @@ def renderer_of(variant: Variant, backend: str) -> Renderer:
     ) -> RenderOutput:
         if variant.half_colors:
             splats = _rounded(splats)
-        return draw(splats, camera, background, _cut(variant, sh_degree), scores, mask)
+        degree = sh_degree if variant.sh_degree is None else variant.sh_degree
+        return draw(splats, camera, background, degree, scores, mask)
 
     return render
-
-
-def _cut(variant: Variant, sh_degree: int) -> int:
-    return sh_degree if variant.sh_degree is None else variant.sh_degree
 
 
 def _rounded(splats: Splats) -> Splats:

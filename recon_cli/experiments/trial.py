@@ -1,4 +1,8 @@
-"""One run of one arm on one scene: trained, stopped here and there, scored off the clock."""
+"""One training run of one variant on one scene: stopped here and there, and scored off the clock.
+
+Scores are of the model as its .ply holds it, on views with their original pixels that it was not
+trained on.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +20,17 @@ import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError
-from recon_cli.evaluation.reference_views import MASK_HINT, load_reference_views, mean_score
-from recon_cli.experiments.scenes import Place, refuse_unscored
-from recon_cli.experiments.variants import Arm, Prune
+from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.evaluation.reference_views import (
+    MASK_HINT,
+    MeanScore,
+    ReferenceView,
+    load_reference_views,
+    load_scene,
+    mean_score,
+)
+from recon_cli.experiments.scenes import SceneFolders
+from recon_cli.experiments.variants import MidPrune, Variant
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
@@ -44,9 +55,12 @@ from recon_cli.train.runner import load_task
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 
+PILOT_STEPS = 200  # the count changes twice in them at the usual hundred steps
+_WARM_STEPS = 10  # caches and threads; the kernels are compiled before
+
 
 class TrainingClock:
-    """Counts wall and CPU seconds from its making on, but for its pauses.
+    """Counts wall and CPU seconds from its creation on, but for its pauses.
 
     Args:
         device: "cpu" or "cuda", whose queue is waited for.
@@ -57,7 +71,7 @@ class TrainingClock:
         self._zero = self._now()
 
     def seconds(self) -> tuple[float, float]:
-        """Returns the seconds on the wall, and those of all threads of this process."""
+        """Returns the wall seconds, and the CPU seconds of all threads of this process."""
         wall, cpu = self._now()
         return wall - self._zero[0], cpu - self._zero[1]
 
@@ -78,146 +92,42 @@ class TrainingClock:
 
 
 @dataclass(frozen=True)
-class Score:
-    """How good and how large a model is.
-
-    Attributes:
-        psnr_db: mean over the views.
-        ssim: mean over the views.
-        gaussians: count.
-        bytes: of its .ply.
-    """
-
-    psnr_db: float
-    ssim: float
-    gaussians: int
-    bytes: int
-
-
-def score(splats: Splats, views: Sequence[TrainView], sh_degree: int, ctx: StageContext) -> Score:
-    """Returns the scores of a model as its .ply holds it.
-
-    Args:
-        splats: the model.
-        views: to score.
-        sh_degree: in use.
-        ctx: backend and device.
-    """
-    with tempfile.TemporaryDirectory(prefix="recon-score-") as folder:
-        path = Path(folder) / "splats.ply"
-        write_ply(path, splats)
-        size = path.stat().st_size
-        written = read_ply(path).map(lambda tensor: tensor.to(ctx.device))
-    mean = mean_score(written, views, sh_degree, ctx.backend)
-    return Score(mean.psnr_db, mean.ssim, len(splats), size)
-
-
-class Advance(Protocol):
-    """Trains a state by a task up to a step; the scores of its steps go into `importance`."""
-
-    def __call__(self, task: Task, until: int, importance: Importance | None = None) -> None:
-        """Trains."""
-
-
-def prune_rest(
-    state: TrainState, task: Task, prune: Prune, until: int, advance: Advance
-) -> None:
-    """Removes the Gaussians that matter least to the training views and trains the rest.
-
-    Args:
-        state: changed in place.
-        task: views and plan of the run.
-        prune: which Gaussians go.
-        until: step at which the run ends.
-        advance: trains the state.
-    """
-    config, first = prune.config, state.iteration
-    recovery = until - first
-    calm = task
-    if prune.restarts:
-        plan = Recovery(task.schedule.config, first=first, until=until)
-        calm = dataclasses.replace(task, schedule=plan)
-    rounds = config.rounds or rounds_within(recovery, len(task.train))
-    n, ratio = len(state.splats), RATIO if config.ratio is None else config.ratio
-    for removal in removals(n, remaining(n, ratio), rounds, recovery):
-        score = scored(
-            state, calm, first + removal.after, name=config.score, beta=config.beta,
-            advance=lambda _state, to, importance: advance(calm, to, importance))
-        remove(state, survivors(score, removal.count))
-    advance(calm, until)
-
-
-PILOT_STEPS = 200  # the count changes twice in them at the usual hundred steps
-_WARM_STEPS = 10  # caches and threads; the kernels are compiled before
-
-
-@dataclass(frozen=True)
-class Point:
-    """How a run stands at one step.
-
-    Attributes:
-        iteration: steps done.
-        seconds: of training alone, on the wall.
-        cpu_seconds: of training alone, of all threads.
-        gaussians: count.
-        bytes: of the .ply that would be written.
-        psnr_db: mean over the scored views.
-        ssim: mean over the scored views.
-    """
+class CurvePoint:
+    """The state of a run after some steps."""
 
     iteration: int
-    seconds: float
-    cpu_seconds: float
+    seconds: float  # of training alone, on the wall
+    cpu_seconds: float  # of training alone, of all threads
     gaussians: int
-    bytes: int
-    psnr_db: float
+    bytes: int  # of the .ply that would be written
+    psnr_db: float  # mean over the scored views
     ssim: float
 
 
 @dataclass(frozen=True)
-class Run:
-    """What is run: one arm from one seed for so many steps.
+class TrainingRun:
+    """What is run: one variant from one seed for so many steps."""
 
-    Attributes:
-        arm: how it is trained.
-        base: options that all arms share.
-        iterations: steps.
-        seed: of every random choice.
-    """
-
-    arm: Arm
-    base: RunConfig
+    variant: Variant
+    base: RunConfig  # options that all variants share
     iterations: int
     seed: int
 
     @property
     def config(self) -> RunConfig:
         """The options of this run."""
-        return self.arm.config(self.base, iterations=self.iterations, seed=self.seed)
+        return self.variant.config(self.base, iterations=self.iterations, seed=self.seed)
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
-    """A scene in memory, ready to be trained on by any arm.
+class LoadedScene:
+    """A scene in memory, ready to be trained on by any variant."""
 
-    Attributes:
-        place: its folders.
-        scene: its views and points.
-        scored: the views that scores come from, with their original pixels.
-        base: options that all arms share.
-        ctx: where to compute.
-    """
-
-    place: Place
+    folders: SceneFolders
     scene: Scene
-    scored: Sequence[TrainView]
-    base: RunConfig
+    scored: Sequence[ReferenceView]
+    base: RunConfig  # options that all variants share
     ctx: StageContext
-
-    @property
-    def name(self) -> str:
-        """Of the scene."""
-        return self.place.name
 
     @cached_property
     def parts(self) -> dict[str, Any]:
@@ -225,13 +135,13 @@ class Stand:
         task = self._loaded(self.base)
         return model_parts(parts_needed(task, self.scene, self.ctx, harmonics=True).config)
 
-    def task(self, run: Run) -> Task:
+    def task(self, run: TrainingRun) -> Task:
         """Returns the task of a run; training itself looks at no view that it does not fit."""
         config = run.config
-        left = [name for name in PARTS if getattr(config, name) == "auto"]
-        left += ["sh_degree"] if run.arm.tries_degree else []
-        if left:  # not before it is asked for: it may take trials
-            config = dataclasses.replace(config, **{name: self.parts[name] for name in left})
+        undecided = [name for name in PARTS if getattr(config, name) == "auto"]
+        undecided += ["sh_degree"] if run.variant.tries_degree else []
+        if undecided:  # only then, because it may take trials
+            config = dataclasses.replace(config, **{name: self.parts[name] for name in undecided})
         return dataclasses.replace(
             self._loaded(config), validation=[], schedule=Schedule(config))
 
@@ -246,57 +156,114 @@ class Stand:
         return {}
 
 
-def stand(place: Place, scored: str, base: RunConfig, ctx: StageContext) -> Stand:
+def load_for_training(
+    folders: SceneFolders, split: str, base: RunConfig, ctx: StageContext
+) -> LoadedScene:
     """Returns a scene with the views in memory that scores come from.
 
     Args:
-        place: its folders.
-        scored: "test" or "validation": which views are scored.
-        base: options that all arms share.
+        folders: of the scene.
+        split: "test" or "validation": which views are scored.
+        base: options that all variants share.
         ctx: where to compute.
 
     Raises:
         ReconstructionError: no held-out view has a camera.
         ConfigError: there are no validation views, the views are too small, or masks leave none.
     """
-    scene = place.load(base)
-    refuse_unscored(place, scene, test=scored == "test")
+    scene = load_scene(folders.inputs, validation=base.validation)
+    if split == "test" and not scene.test:
+        raise ReconstructionError(
+            f"No held-out view of {folders.name} has a camera.",
+            hint="Run `recon ingest` with a --holdout such as every:8.")
+    if split == "validation" and not scene.validation:
+        raise ConfigError(
+            f"{folders.name} has no validation views.",
+            hint="Use --set train.validation=0.1, or give a scene with more views.")
     views = load_reference_views(
-        scene.test if scored == "test" else scene.validation, base.max_size, ctx)
+        scene.test if split == "test" else scene.validation, base.max_size, ctx)
     if not views:
-        raise ConfigError(f"The masks of {place.name} leave no view to score.", hint=MASK_HINT)
-    return Stand(place, scene, views, base, ctx)
+        raise ConfigError(f"The masks of {folders.name} leave no view to score.", hint=MASK_HINT)
+    return LoadedScene(folders, scene, views, base, ctx)
+
+
+def score_as_ply(
+    splats: Splats, views: Sequence[TrainView], sh_degree: int, ctx: StageContext
+) -> tuple[MeanScore, int]:
+    """Returns the scores of a model as its .ply holds it, and the bytes of that file."""
+    with tempfile.TemporaryDirectory(prefix="recon-score-") as folder:
+        path = Path(folder) / "splats.ply"
+        write_ply(path, splats)
+        size = path.stat().st_size
+        written = read_ply(path).map(lambda tensor: tensor.to(ctx.device))
+    return mean_score(written, views, sh_degree, ctx.backend), size
+
+
+class Advance(Protocol):
+    """Trains a state by a task up to a step; the scores of its steps go into `importance`."""
+
+    def __call__(self, task: Task, until: int, importance: Importance | None = None) -> None:
+        """Trains."""
+
+
+def prune_rest(
+    state: TrainState, task: Task, prune: MidPrune, until: int, advance: Advance
+) -> None:
+    """Removes the Gaussians that matter least to the training views and trains the rest.
+
+    Args:
+        state: changed in place.
+        task: views and plan of the run.
+        prune: which Gaussians go.
+        until: step at which the run ends.
+        advance: trains the state.
+    """
+    config, first = prune.config, state.iteration
+    recovery = until - first
+    if prune.restarts:
+        plan = Recovery(task.schedule.config, first=first, until=until)
+        task = dataclasses.replace(task, schedule=plan)
+    rounds = config.rounds or rounds_within(recovery, len(task.train))
+    n, ratio = len(state.splats), RATIO if config.ratio is None else config.ratio
+    for removal in removals(n, remaining(n, ratio), rounds, recovery):
+        score = scored(
+            state, task, first + removal.after, name=config.score, beta=config.beta,
+            advance=lambda _state, to, importance: advance(task, to, importance))
+        remove(state, survivors(score, removal.count))
+    advance(task, until)
 
 
 def run_trial(
-    where: Stand, run: Run, looks: Sequence[int], *, on_step: Callable[[], None]
-) -> tuple[Point, ...]:
-    """Trains and returns how the run stood after the steps in `looks`, and at its end.
+    loaded: LoadedScene, run: TrainingRun, score_at: Sequence[int], *, on_step: Callable[[], None]
+) -> tuple[CurvePoint, ...]:
+    """Trains and returns the state of the run after the steps in `score_at`, and at its end.
 
     Args:
-        where: the scene.
+        loaded: the scene.
         run: what is trained.
-        looks: steps after which the model is scored; 0 is before the first.
+        score_at: steps after which the model is scored; 0 is before the first.
         on_step: called after each step.
 
     Raises:
         TrainingError: memory is short, or training diverged.
     """
-    task = where.task(run)
+    task = loaded.task(run)
     state = first_state(
-        task, where.scene.points, where.scene.colors,
-        most=first_count(task.schedule.config, len(where.scene.points)))
-    stops = sorted({*looks, run.iterations})
-    points: list[Point] = []
-    clock = TrainingClock(where.ctx.device)
+        task, loaded.scene.points, loaded.scene.colors,
+        most=first_count(task.schedule.config, len(loaded.scene.points)))
+    stops = sorted({*score_at, run.iterations})
+    points: list[CurvePoint] = []
+    clock = TrainingClock(loaded.ctx.device)
 
-    def look() -> None:
-        seconds, cpu_seconds = clock.seconds()
+    def take_score() -> None:
+        wall, cpu = clock.seconds()
         with clock.paused():
-            found = _score(where, state, task)
-        points.append(Point(
-            state.iteration, round(seconds, 3), round(cpu_seconds, 3), found.gaussians,
-            found.bytes, found.psnr_db, found.ssim))
+            splats = state.splats.map(lambda tensor: tensor.detach())
+            degree = task.schedule.sh_degree(max(1, state.iteration))
+            score, size = score_as_ply(splats, loaded.scored, degree, loaded.ctx)
+        points.append(CurvePoint(
+            state.iteration, round(wall, 3), round(cpu, 3), len(splats), size, score.psnr_db,
+            score.ssim))
 
     def advance(task: Task, until: int, importance: Importance | None = None) -> None:
         while state.iteration < until:
@@ -304,34 +271,25 @@ def run_trial(
             fit(state, task, stop, on_step=lambda _state: on_step(),
                 on_report=lambda _report: None, importance=importance)
             if stop in stops:
-                look()
+                take_score()
 
     if 0 in stops:
-        look()
-    if run.arm.prune is not None:
-        advance(task, _cut(run.arm.prune, run.iterations))
-        prune_rest(state, task, run.arm.prune, run.iterations, advance)
+        take_score()
+    prune = run.variant.prune
+    if prune is not None:  # at least one step is left for recovery
+        advance(task, min(run.iterations - 1, round(prune.at * run.iterations)))
+        prune_rest(state, task, prune, run.iterations, advance)
     else:
         advance(task, run.iterations)
     return tuple(points)
 
 
-def _cut(prune: Prune, iterations: int) -> int:
-    """Returns the step after which an arm prunes; at least one is left to recover."""
-    return min(iterations - 1, round(prune.at * iterations))
-
-
-def _score(where: Stand, state: TrainState, task: Task) -> Score:
-    return score(
-        state.splats.map(lambda tensor: tensor.detach()), where.scored,
-        task.schedule.sh_degree(max(1, state.iteration)), where.ctx)
-
-
-def pilot(where: Stand, arm: Arm, base: RunConfig, *, on_step: Callable[[], None]) -> Point:
-    """Returns the end of a short run, whose seconds say what a step of the arm costs here.
+def run_pilot(loaded: LoadedScene, variant: Variant) -> CurvePoint:
+    """Returns the end of a short run, whose seconds say what a step of the variant costs here.
 
     It goes through the whole plan of the recipe. A few steps ahead warm the caches.
     """
     for iterations in (_WARM_STEPS, PILOT_STEPS):
-        found = run_trial(where, Run(arm, base, iterations, 0), (), on_step=on_step)
-    return found[-1]
+        points = run_trial(
+            loaded, TrainingRun(variant, loaded.base, iterations, 0), (), on_step=lambda: None)
+    return points[-1]

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture import denoise_comparison
 from recon_cli.capture.filters import FILTERS
 from recon_cli.capture.noise import estimate_noise
 from recon_cli.capture.video import frames_at
+from recon_cli.experiments import filter_comparison
 
 LEVELS = (5.0, 10.0, 15.0, 20.0)
 LARGE = 1000  # pixels
@@ -34,7 +34,7 @@ STRENGTH = 4.0
 def load(path: Path) -> NDArray[np.uint8]:
     """Returns an image, [H, W, 3], halved where it is large."""
     rgb = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-    return denoise_comparison.halved(rgb) if max(rgb.shape) > LARGE else rgb
+    return filter_comparison.halved(rgb) if max(rgb.shape) > LARGE else rgb
 
 
 def images(folder: Path) -> list[Path]:
@@ -59,7 +59,7 @@ def print_added(folders: Sequence[Path]) -> None:
     for folder in folders:
         found = images(folder)
         truths += [load(found[int(place * len(found))]) for place in PLACES]
-    scores = denoise_comparison.compare(truths, LEVELS, step=lambda: None)
+    scores = filter_comparison.score_filters(truths, LEVELS, on_run=lambda: None)
     for name, strength in dict.fromkeys((score.filter, score.strength) for score in scores):
         own = [one for one in scores if (one.filter, one.strength) == (name, strength)]
         figures = "  ".join(f"{one.psnr_db:.2f} {one.edges_kept:.3f}" for one in own)

@@ -21,9 +21,8 @@ import click
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_reference_views
-from recon_cli.experiments.scenes import Place
-from recon_cli.experiments.trial import score
+from recon_cli.evaluation.reference_views import load_reference_views, load_scene
+from recon_cli.experiments.trial import score_as_ply
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.fit import Task, fit
@@ -93,7 +92,7 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
         state = trained(run, scene)
         seconds = time.process_time() - begin
         splats = state.splats.map(lambda tensor: tensor.detach())
-        test, train = (score(splats, views, run.schedule.config.sh_degree, ctx)
+        test, train = (score_as_ply(splats, views, run.schedule.config.sh_degree, ctx)[0]
                        for views in (held_out, shown))
         found.append((test.psnr_db, test.ssim, train.psnr_db, seconds, len(splats)))
     middle = [statistics.mean(column) for column in zip(*found, strict=True)]
@@ -127,8 +126,8 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
     click.echo("| scene | change | PSNR / SSIM | deviation | training views | Gaussians | CPU s |\n"
                "|---|---|---:|---:|---:|---:|---:|")
     for workspace in workspaces:
-        scene = Place(workspace.name, StageInputs(
-            {name: workspace / name for name in ("ingest", "sfm")})).load(base)
+        inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
+        scene = load_scene(inputs, validation=base.validation)
         task = load_task(scene, base, ctx)
         trained(planned(task, {"iterations": WARM}, 0), scene)
         for changes in ({}, *map(parsed, changed)):

@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 from noisy_room import noisy, plain_room, psnr
 
-from recon_cli.capture.denoise_comparison import edges_kept
 from recon_cli.capture.filters import FILTERS
 from recon_cli.capture.noise import estimate_noise
 from recon_cli.config.fields import option_info
 from recon_cli.config.stages import DenoiseConfig
+from recon_cli.experiments.filter_comparison import edges_kept
 
 STRENGTH = DenoiseConfig().strength
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from recon_cli.cli import main
-from recon_cli.experiments import bench_compare
+from recon_cli.experiments import outputs
 from recon_cli.experiments.accuracy import Answer, accuracy, answer, oracle
 from recon_cli.experiments.bench_result import FIGURES
 from recon_cli.experiments.probes import probe_for
@@ -36,7 +36,7 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     tmp_path: Path, capsys: Said
 ) -> None:
     figures, text = tmp_path / "bench.json", tmp_path / "page.md"
-    text.write_text(f"mine\n{bench_compare.BEGIN}\n{bench_compare.END}\nmine too\n")
+    text.write_text(f"mine\n{outputs.BEGIN}\n{outputs.END}\nmine too\n")
     words = ["bench", "--quick", "--rounds", "1", "--threads", "1", "--device", "cpu",
              "--gaussians", "300", "--size", "64x48"]
     assert main([*words, "--json", str(figures), "--markdown", str(text)]) == 0

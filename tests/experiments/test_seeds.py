@@ -8,7 +8,7 @@ import pytest
 from posed_sets import make_replica
 
 from recon_cli.cli import main
-from recon_cli.experiments.seeds import Spread
+from recon_cli.evaluation.intervals import Spread
 
 OPTIONS = ["--iterations", "30", "--max-gaussians", "200", "--validation", "0.2", "--seed", "4"]
 
@@ -114,6 +114,6 @@ def test_without_a_model_the_command_to_type_is_named(tmp_path, capsys):
 
 
 def test_one_seed_has_no_deviation():
-    assert Spread((2.0,)).deviation is None
-    assert Spread((1.0, 3.0)).deviation == pytest.approx(2**0.5)
-    assert Spread((2.0,)).shown(".1f") == "2.0"
+    assert Spread.of((2.0,)).deviation is None
+    assert Spread.of((1.0, 3.0)).deviation == pytest.approx(2**0.5)
+    assert Spread.of((2.0,)).text(".1f") == "2.0"

@@ -12,14 +12,19 @@ from recon_cli.cli import main
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
-from recon_cli.experiments import records as records_module
-from recon_cli.experiments import study_run as work_module
-from recon_cli.experiments import trial
-from recon_cli.experiments.records import FILE, Record, Records, key_of
-from recon_cli.experiments.scenes import Place
-from recon_cli.experiments.study_result import ARMS, EQUAL_SECONDS, EQUAL_STEPS, Request
-from recon_cli.experiments.study_run import Ground, Work, corrected, equal_seconds
-from recon_cli.experiments.trial import Run, stand
+from recon_cli.experiments import runner, trial
+from recon_cli.experiments.runner import RECORDS_FILE, Record, Records, key_of
+from recon_cli.experiments.scenes import SceneFolders
+from recon_cli.experiments.study import (
+    EQUAL_SECONDS,
+    EQUAL_STEPS,
+    VARIANTS,
+    Study,
+    StudyRequest,
+    corrected_steps,
+    equal_seconds,
+)
+from recon_cli.experiments.trial import CurvePoint, TrainingRun, load_for_training
 from recon_cli.progress import NullProgress
 
 STEPS = 20
@@ -29,9 +34,9 @@ COSTS = {"reference": 0.5, "paper": 0.4, "budget": 0.25, "budget-pruned": 0.2}  
 
 
 @pytest.fixture
-def ground(tmp_path):
-    place = Place("tiny", make_inputs(tmp_path / "tiny"))
-    return Ground(stand(place, "test", BASE, StageContext(backend="numba")), place.digest)
+def scene(tmp_path):
+    folders = SceneFolders("tiny", make_inputs(tmp_path / "tiny"))
+    return load_for_training(folders, "test", BASE, StageContext(backend="numba"))
 
 
 @pytest.fixture
@@ -42,23 +47,24 @@ def made(monkeypatch):
 
     found = Made()
 
-    def run_timed(where, run, looks, *, on_step):
+    def run_timed(loaded, run, score_at, *, on_step):
         if len(found) == found.stop_at:
             raise KeyboardInterrupt
-        found.append((run.arm.name, run.iterations, run.seed))
-        points = trial.run_trial(where, run, looks, on_step=on_step)
-        seconds = COSTS[run.arm.name] * run.iterations
+        found.append((run.variant.name, run.iterations, run.seed))
+        points = trial.run_trial(loaded, run, score_at, on_step=on_step)
+        seconds = COSTS[run.variant.name] * run.iterations
         return tuple(dataclasses.replace(point, seconds=seconds, cpu_seconds=2 * seconds)
                      for point in points)
 
-    monkeypatch.setattr(work_module, "run_trial", run_timed)
+    monkeypatch.setattr(runner, "run_trial", run_timed)
     return found
 
 
 def work(folder, seeds=2, **changes):
     folder.mkdir(exist_ok=True)
-    request = Request((), seeds, STEPS, BASE, folder)
-    return Work(dataclasses.replace(request, **changes), Records(folder), "a machine")
+    request = StudyRequest(
+        scenes=(), seeds=seeds, iterations=STEPS, base=BASE, out=folder, **changes)
+    return Study(request, Records(folder), NullProgress(), "a machine")
 
 
 # ---- equal seconds ----
@@ -70,54 +76,54 @@ def test_cheaper_steps_give_more_of_them():
 
 def test_a_guess_is_corrected_on_the_line_through_two_runs():
     # 100 steps in 4 s and 250 in 13 s: 6 s for 100 steps, so that 10 s hold 200
-    assert corrected(100, 250, 4.0, 13.0, 10.0) == 200
-    assert corrected(100, 250, 4.0, 10.4, 10.0) == 250  # near enough
-    assert corrected(100, 100, 10.0, 12.0, 10.0) == 100  # the slowest arm
-    assert corrected(100, 250, 4.0, 3.0, 10.0) == 250  # a line that falls says nothing
+    assert corrected_steps(100, 250, 4.0, 13.0, 10.0) == 200
+    assert corrected_steps(100, 250, 4.0, 10.4, 10.0) == 250  # near enough
+    assert corrected_steps(100, 100, 10.0, 12.0, 10.0) == 100  # the slowest arm
+    assert corrected_steps(100, 250, 4.0, 3.0, 10.0) == 250  # a line that falls says nothing
 
 
 @pytest.mark.integration
 def test_arms_whose_steps_grow_dearer_still_take_the_same_seconds(
-    ground, made, tmp_path, monkeypatch
+    scene, made, tmp_path, monkeypatch
 ):
     class Dearer(float):
         def __mul__(self, steps):  # 0.25 s a step at first, 0.5 s after the first 20
             return 0.25 * steps + 0.25 * max(0, steps - STEPS)
 
     monkeypatch.setitem(COSTS, "budget", Dearer())
-    found = work(tmp_path / "out", seeds=2).done(ground, NullProgress())
-    assert found.values(EQUAL_SECONDS, ARMS[2], "steps") == [30, 30]
-    assert found.values(EQUAL_SECONDS, ARMS[2], "seconds") == pytest.approx([10.0, 10.0])
+    found = work(tmp_path / "out", seeds=2).run_scene(scene)
+    assert found.values(EQUAL_SECONDS, VARIANTS[2], "steps") == [30, 30]
+    assert found.values(EQUAL_SECONDS, VARIANTS[2], "seconds") == pytest.approx([10.0, 10.0])
     assert made.count(("budget", 40, 0)) == 1  # the guess
 
 
-def test_arms_take_the_steps_that_fit_into_the_seconds_of_the_slowest(ground, made, tmp_path):
-    found = work(tmp_path / "out", seeds=1).done(ground, NullProgress())
+def test_arms_take_the_steps_that_fit_into_the_seconds_of_the_slowest(scene, made, tmp_path):
+    found = work(tmp_path / "out", seeds=1).run_scene(scene)
     expected = {"reference": 20, "paper": 25, "budget": 40, "budget-pruned": 50}
-    for arm in ARMS:
-        assert found.values(EQUAL_STEPS, arm, "steps") == [STEPS]
-        assert found.values(EQUAL_SECONDS, arm, "steps") == [expected[arm.name]]
-        assert found.values(EQUAL_SECONDS, arm, "seconds") == pytest.approx([10.0])
+    for variant in VARIANTS:
+        assert found.values(EQUAL_STEPS, variant, "steps") == [STEPS]
+        assert found.values(EQUAL_SECONDS, variant, "steps") == [expected[variant.name]]
+        assert found.values(EQUAL_SECONDS, variant, "seconds") == pytest.approx([10.0])
     # the slowest arm's run serves both comparisons
     assert made.count(("reference", STEPS, 0)) == 1
     assert len(made) == 7
 
 
 def test_steps_at_equal_seconds_stay_fixed_when_seeds_are_added(
-    ground, made, tmp_path, monkeypatch
+    scene, made, tmp_path, monkeypatch
 ):
-    work(tmp_path / "out", seeds=1).done(ground, NullProgress())
+    work(tmp_path / "out", seeds=1).run_scene(scene)
     monkeypatch.setitem(COSTS, "budget", 0.1)  # a quieter hour
-    found = work(tmp_path / "out", seeds=2).done(ground, NullProgress())
-    assert found.values(EQUAL_SECONDS, ARMS[2], "steps") == [40, 40]
+    found = work(tmp_path / "out", seeds=2).run_scene(scene)
+    assert found.values(EQUAL_SECONDS, VARIANTS[2], "steps") == [40, 40]
     assert [one[2] for one in made] == [0] * 7 + [1] * 7
 
 
-def test_the_seconds_that_are_made_equal_can_be_chosen(ground, made, tmp_path):
+def test_the_seconds_that_are_made_equal_can_be_chosen(scene, made, tmp_path):
     for clock in ("wall", "cpu"):
-        work(tmp_path / "out", seeds=1, clock=clock).done(ground, NullProgress())
+        work(tmp_path / "out", seeds=1, clock=clock).run_scene(scene)
     assert len(made) == 7  # the same ratios: steps are fixed anew, runs are taken again
-    lines = (tmp_path / "out" / FILE).read_text().splitlines()
+    lines = (tmp_path / "out" / RECORDS_FILE).read_text().splitlines()
     assert sum("steps" in json.loads(line)["value"] for line in lines) == 2
 
 
@@ -125,79 +131,81 @@ def test_the_seconds_that_are_made_equal_can_be_chosen(ground, made, tmp_path):
 
 @pytest.mark.integration
 @pytest.mark.parametrize("stop_at", [0, 3, 10, 13])
-def test_a_study_that_was_killed_gives_the_same_figures(ground, made, tmp_path, stop_at):
-    whole = work(tmp_path / "whole").done(ground, NullProgress())
+def test_a_study_that_was_killed_gives_the_same_figures(scene, made, tmp_path, stop_at):
+    whole = work(tmp_path / "whole").run_scene(scene)
     once = list(made)
     made.clear()
     made.stop_at = stop_at
     with pytest.raises(KeyboardInterrupt):
-        work(tmp_path / "killed").done(ground, NullProgress())
+        work(tmp_path / "killed").run_scene(scene)
     made.stop_at = None
-    assert work(tmp_path / "killed").done(ground, NullProgress()).runs == whole.runs
+    assert work(tmp_path / "killed").run_scene(scene).runs == whole.runs
     assert sorted(made) == sorted(once)  # nothing twice
 
 
 @pytest.mark.integration
-def test_what_is_kept_is_announced(ground, made, tmp_path):
-    before = work(tmp_path / "out", seeds=1).announced([ground], NullProgress())
+def test_what_is_kept_is_announced(scene, made, tmp_path):
+    before = work(tmp_path / "out", seeds=1).announcement([scene])
     assert before.startswith("about 8 runs are to be made, 0 are kept from before; about")
-    work(tmp_path / "out", seeds=1).done(ground, NullProgress())
-    after = work(tmp_path / "out", seeds=1).announced([ground], NullProgress())
+    work(tmp_path / "out", seeds=1).run_scene(scene)
+    after = work(tmp_path / "out", seeds=1).announcement([scene])
     assert after == "all 8 runs are kept from before"
     assert made
 
 
 @pytest.mark.integration
-def test_a_line_that_a_kill_cut_short_is_dropped(ground, made, tmp_path):
+def test_a_line_that_a_kill_cut_short_is_dropped(scene, made, tmp_path):
     one = work(tmp_path / "out", seeds=1)
-    first = one.done(ground, NullProgress())
-    path = tmp_path / "out" / FILE
+    first = one.run_scene(scene)
+    path = tmp_path / "out" / RECORDS_FILE
     text = path.read_text()
     lines = text.splitlines(True)
     path.write_text("".join(lines[:-2]) + lines[-2][:40])  # the last one holds the fixed steps
     made.clear()
-    assert work(tmp_path / "out", seeds=1).done(ground, NullProgress()).runs == first.runs
+    assert work(tmp_path / "out", seeds=1).run_scene(scene).runs == first.runs
     assert len(made) == 1
     assert path.read_text() == text
 
 
 def test_a_line_that_is_damaged_inside_is_refused(tmp_path):
-    (tmp_path / FILE).write_text("{}\n")
+    (tmp_path / RECORDS_FILE).write_text("{}\n")
     with pytest.raises(FormatError, match="line 1"):
         Records(tmp_path)
 
 
-def test_a_key_tells_everything_apart_that_decides(ground, monkeypatch):
-    run = Run(ARMS[0], BASE, 20, 0)
+def test_a_key_tells_everything_apart_that_decides(scene, monkeypatch):
+    run = TrainingRun(VARIANTS[0], BASE, 20, 0)
     others = [
         dataclasses.replace(run, seed=1), dataclasses.replace(run, iterations=21),
-        dataclasses.replace(run, arm=ARMS[1]),
+        dataclasses.replace(run, variant=VARIANTS[1]),
         dataclasses.replace(run, base=dataclasses.replace(BASE, ssim_weight=0.1))]
-    keys = {key_of(ground.stand, "a", one) for one in (run, *others)}
-    keys.add(key_of(ground.stand, "b", run))
-    torch = dataclasses.replace(ground.stand, ctx=StageContext(backend="torch"))
-    keys.add(key_of(torch, "a", run))
-    monkeypatch.setattr(records_module, "__version__", "another")
-    keys.add(key_of(ground.stand, "a", run))
+    keys = {key_of(scene, one) for one in (run, *others)}
+    folders = SceneFolders("other", scene.folders.inputs)
+    folders.__dict__["digest"] = "of other images"
+    keys.add(key_of(dataclasses.replace(scene, folders=folders), run))
+    keys.add(key_of(dataclasses.replace(scene, ctx=StageContext(backend="torch")), run))
+    monkeypatch.setattr(runner, "__version__", "another")
+    keys.add(key_of(scene, run))
     assert len(keys) == 8
     monkeypatch.undo()
-    threads = dataclasses.replace(ground.stand, ctx=StageContext(backend="numba", threads=9))
-    assert key_of(threads, "a", run) == key_of(ground.stand, "a", run)
+    threads = dataclasses.replace(scene, ctx=StageContext(backend="numba", threads=9))
+    assert key_of(threads, run) == key_of(scene, run)
 
 
 def test_a_record_comes_back_as_it_was(tmp_path):
-    point = trial.Point(1, 2.0, 3.0, 4, 5, 6.789, 0.123)
-    record = Record(point, "a machine", "original images, far")
-    Records(tmp_path).add_run("key", record, Run(ARMS[0], BASE, 1, 0), "tiny")
+    point = CurvePoint(1, 2.0, 3.0, 4, 5, 6.789, 0.123)
+    record = Record((point,), "a machine", "original images, far")
+    Records(tmp_path).add_run("key", record, TrainingRun(VARIANTS[0], BASE, 1, 0), "tiny")
     assert Records(tmp_path).run("key") == record
     assert Records(tmp_path).run("other") is None
 
 
 def test_the_arms_are_those_of_the_paper_and_ours():
-    configs = {arm.name: arm.config(BASE, iterations=30_000, seed=0) for arm in ARMS}
-    assert [configs[arm.name].densify for arm in ARMS] == [
+    configs = {
+        variant.name: variant.config(BASE, iterations=30_000, seed=0) for variant in VARIANTS}
+    assert [configs[variant.name].densify for variant in VARIANTS] == [
         "reference", "reference", "budget", "budget"]
-    paper = ARMS[1].prune
+    paper = VARIANTS[1].prune
     assert round(paper.at * 30_000) == 20_000
     assert (paper.config.ratio, paper.config.score) == (0.6, "paper")
 
@@ -235,7 +243,7 @@ def test_the_command_leaves_tables_figures_and_a_picture(studied):
 @pytest.mark.integration
 def test_a_second_call_runs_nothing_and_says_the_same(studied, capsys, monkeypatch):
     base, words = studied
-    monkeypatch.setattr(work_module, "run_trial", lambda *_, **__: pytest.fail("ran"))
+    monkeypatch.setattr(runner, "run_trial", lambda *_, **__: pytest.fail("ran"))
     before = (base / "out" / "study.md").read_bytes()
     assert main(words) == 0
     said = capsys.readouterr()
@@ -251,8 +259,8 @@ def test_an_interrupted_study_says_so(studied, tmp_path, capsys, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(work_module, "run_trial", interrupt)
-    monkeypatch.setattr(work_module, "pilot", lambda *_, **__: trial.Point(1, 1, 1, 1, 1, 1, 1))
+    monkeypatch.setattr(runner, "run_trial", interrupt)
+    monkeypatch.setattr(runner, "run_pilot", lambda *_: CurvePoint(1, 1, 1, 1, 1, 1, 1))
     assert main([*words, "--out", str(tmp_path / "new")]) == 130
     assert "run the same command again to resume" in capsys.readouterr().err
     assert not (tmp_path / "new" / "study.json").exists()
@@ -266,14 +274,14 @@ def test_an_interrupted_study_says_so(studied, tmp_path, capsys, monkeypatch):
     (["--scenes", "room", "--set", "train.validation=0.2"], 2, "has no effect here"),
     (["--scenes", "room", "--set", "compute.threads=2"], 2, "has no effect here"),
     (["--scenes", "room", "--out", "file"], 2, "--out"),
-    (["--scenes", "room", "--out", "file/below"], 7, "cannot be made"),
+    (["--scenes", "room", "--out", "file/below"], 7, "cannot be created"),
     (["--scenes", "room", "--set", "ingest.holdout=none"], 5, "No held-out view"),
 ])
 def test_what_cannot_be_done_is_refused_before_training(
     words, code, said, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("recon_cli.experiments.study_run.Work.done", lambda *_: pytest.fail("ran"))
+    monkeypatch.setattr(Study, "run_scene", lambda *_: pytest.fail("ran"))
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
     make_replica(tmp_path / "room", tests=0)

@@ -5,46 +5,46 @@ import json
 import pytest
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.experiments import study_plot, study_report
+from recon_cli.experiments import study_report
 from recon_cli.experiments.host import Host
-from recon_cli.experiments.records import Record
-from recon_cli.experiments.study_plot import TABLE_I, published
-from recon_cli.experiments.study_result import (
-    ARMS,
+from recon_cli.experiments.runner import Record
+from recon_cli.experiments.study import (
     COMPARISONS,
     EQUAL_SECONDS,
     EQUAL_STEPS,
     MEAN,
     PAIRS,
-    Result,
-    SceneResult,
+    VARIANTS,
+    StudiedScene,
+    StudyResult,
 )
-from recon_cli.experiments.trial import Point
+from recon_cli.experiments.study_report import TABLE_I, published
+from recon_cli.experiments.trial import CurvePoint
 
 HOST = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
 NOISE = (0.0, 0.3, -0.3)  # of the seeds, the same for all arms
 
 
 def scene(base_db, gains, machine="A CPU"):
-    """Figures that are known: 3DGS has base_db and each arm its gain; seed noise is common.
+    """Figures that are known: 3DGS has base_db and each variant its gain; seed noise is common.
 
-    The last arm has noise of its own, so that its interval is wide.
+    The last variant has noise of its own, so that its interval is wide.
     """
     runs = {}
     for comparison in COMPARISONS:
         runs[comparison] = {}
-        for arm, gain in zip(ARMS, gains, strict=True):
-            own = (0.5, -0.5, 0.0) if arm is ARMS[-1] else (0.0, 0.0, 0.0)
-            runs[comparison][arm.name] = tuple(
-                Record(Point(100, 10.0, 20.0, 5000, 1_240_000, base_db + gain + noise + extra,
-                             (base_db + gain + noise + extra) / 50), machine,
-                       "original images" + (", far" if arm in ARMS[2:] else ""))
+        for variant, gain in zip(VARIANTS, gains, strict=True):
+            own = (0.5, -0.5, 0.0) if variant is VARIANTS[-1] else (0.0, 0.0, 0.0)
+            runs[comparison][variant.name] = tuple(
+                Record((CurvePoint(100, 10.0, 20.0, 5000, 1_240_000, base_db + gain + noise + extra,
+                             (base_db + gain + noise + extra) / 50),), machine,
+                       "original images" + (", far" if variant in VARIANTS[2:] else ""))
                 for noise, extra in zip(NOISE, own, strict=True))
-    return SceneResult(4, 600, 340, "digest", runs)
+    return StudiedScene(4, 600, 340, "digest", runs)
 
 
 def result(**scenes):
-    return Result(HOST, 3, RunConfig(), "wall", scenes or {
+    return StudyResult(HOST, 3, RunConfig(), "wall", scenes or {
         "office0": scene(30.0, (0.0, 0.5, 1.0, 0.1)), "home": scene(20.0, (0.0, -0.1, 1.0, 0.1))})
 
 
@@ -54,8 +54,8 @@ def rows(table):
 
 def test_every_scene_and_the_mean_has_a_row_for_each_arm():
     found = rows(study_report.scores(result(), EQUAL_STEPS))
-    assert list(found) == [f"{row}, {arm.label}"
-                           for row in ("office0", "home", MEAN) for arm in ARMS]
+    assert list(found) == [f"{row}, {variant.label}"
+                           for row in ("office0", "home", MEAN) for variant in VARIANTS]
     assert found["office0, 3DGS"] == (
         "30.00", "0.30", "0.6000", "0.0060", "100", "5,000", "1.2", "10.0", "20.0")
     assert found[f"{MEAN}, paper"][0] == "25.20"
@@ -87,8 +87,8 @@ def test_the_words_say_whether_an_interval_contains_zero():
     assert "several machines" not in text
     assert ("home: original images (3DGS and paper), original images, far (ours and ours pruned)."
             in text)
-    one = Result(HOST, 1, RunConfig(), "wall", {"home": SceneResult(1, 9, 9, "", {
-        name: {arm: records[:1] for arm, records in arms.items()}
+    one = StudyResult(HOST, 1, RunConfig(), "wall", {"home": StudiedScene(1, 9, 9, "", {
+        name: {variant: records[:1] for variant, records in arms.items()}
         for name, arms in scene(20.0, (0.0, 1.0, 1.0, 1.0)).runs.items()})})
     assert "one seed shows no interval" in study_report.text(one)
 
@@ -126,6 +126,6 @@ def test_the_record_holds_every_seed_and_is_json():
 
 def test_the_picture_is_drawn(tmp_path):
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    study_plot.draw(result(), tmp_path / "study.svg")
+    study_report.draw(result(), tmp_path / "study.svg")
     assert (tmp_path / "study.svg").stat().st_size > 5000
     assert list(tmp_path.iterdir()) == [tmp_path / "study.svg"]

@@ -6,10 +6,9 @@ import pytest
 from posed_sets import make_replica
 
 from recon_cli.cli import main
-from recon_cli.commands.prune_sweep import table
 from recon_cli.config.stages import PRUNE_SCORES
 from recon_cli.evaluation.reference_views import MeanScore
-from recon_cli.experiments.sweep import NONE, Trial, trials
+from recon_cli.experiments.sweep import NONE, SweepTrial, count_trials, table
 
 RATIOS = (0.5, 0.9)
 
@@ -38,7 +37,7 @@ def swept(workspace):
 def test_every_score_meets_every_ratio_and_the_controls_stand_beside(swept):
     _, code, found = swept
     assert code == 0
-    assert len(found["trials"]) == trials(RATIOS)
+    assert len(found["trials"]) == count_trials(RATIOS)
     for ratio in RATIOS:
         names = [one["score"] for one in found["trials"] if one["ratio"] == ratio]
         assert names == [*PRUNE_SCORES, NONE]
@@ -107,9 +106,9 @@ def test_ratios_that_are_none_are_a_usage_error(ratios, capsys):
 def test_a_table_says_what_is_equal_in_each_control():
     good = MeanScore(30.0, 0.9)
     text = table([
-        Trial(NONE, None, 100, 60, 6.0, None, good),
-        Trial("loo", 0.8, 20, 60, 3.0, MeanScore(20.0, 0.5), good),
-        Trial(NONE, 0.8, 100, 30, 3.0, None, good)], "loo")
+        SweepTrial(NONE, None, 100, 60, 6.0, None, good),
+        SweepTrial("loo", 0.8, 20, 60, 3.0, MeanScore(20.0, 0.5), good),
+        SweepTrial(NONE, 0.8, 100, 30, 3.0, None, good)], "loo")
     lines = text.splitlines()
     assert "equal steps" in lines[1]
     assert "80%" in lines[2]

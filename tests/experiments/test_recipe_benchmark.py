@@ -15,23 +15,37 @@ from recon_cli.cli import main
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
-from recon_cli.experiments import bench_compare, train_plot, train_report, trial
-from recon_cli.experiments import train_run as module
-from recon_cli.experiments import trial as clock
+from recon_cli.experiments import outputs, runner, trial
+from recon_cli.experiments import recipe_benchmark as module
 from recon_cli.experiments.host import Host
-from recon_cli.experiments.scenes import Place, checked
-from recon_cli.experiments.train_result import (
-    ArmResult,
-    Request,
-    Result,
-    SceneResult,
-    SeedRun,
+from recon_cli.experiments.recipe_benchmark import (
+    CurvesResult,
+    RecipeRequest,
+    SceneCurves,
     common_target,
-    looks,
+    median_cell,
+    score_steps,
     seconds_to,
 )
-from recon_cli.experiments.trial import Point, Run, TrainingClock, run_trial, stand
-from recon_cli.experiments.variants import BUDGET, PAPER, REFERENCE, Arm, parse, parse_all
+from recon_cli.experiments.runner import Record, Runner
+from recon_cli.experiments.scenes import SceneFolders, check_scenes
+from recon_cli.experiments.trial import (
+    CurvePoint,
+    LoadedScene,
+    TrainingClock,
+    TrainingRun,
+    load_for_training,
+    run_trial,
+)
+from recon_cli.experiments.variants import (
+    BUDGET,
+    PAPER,
+    REFERENCE,
+    Variant,
+    parse_recipe,
+    parse_recipes,
+)
+from recon_cli.progress import NullProgress
 
 Said = pytest.CaptureFixture[str]
 BASE = RunConfig(iterations=1, max_size=48, max_gaussians=90, densify_every=10, validation=0.2)
@@ -41,18 +55,19 @@ def nothing() -> None:
     """Reports to nobody."""
 
 
-def point(seconds: float, psnr_db: float) -> Point:
-    return Point(int(100 * seconds), seconds, 2 * seconds, 1000, 250_000, psnr_db, psnr_db / 40)
+def point(seconds: float, psnr_db: float) -> CurvePoint:
+    return CurvePoint(
+        int(100 * seconds), seconds, 2 * seconds, 1000, 250_000, psnr_db, psnr_db / 40)
 
 
-def wall(one: Point) -> float:
+def wall(one: CurvePoint) -> float:
     return one.seconds
 
 
 @pytest.fixture
-def tiny(tmp_path: Path) -> trial.Stand:
-    place = Place("tiny", make_inputs(tmp_path))
-    return stand(place, "validation", BASE, StageContext(backend="numba"))
+def tiny(tmp_path: Path) -> LoadedScene:
+    place = SceneFolders("tiny", make_inputs(tmp_path))
+    return load_for_training(place, "validation", BASE, StageContext(backend="numba"))
 
 
 # ---- curves ----
@@ -74,20 +89,20 @@ def test_all_runs_reach_the_common_target() -> None:
 
 
 def test_looks_are_evenly_spread_from_the_start_to_the_end() -> None:
-    assert looks(100, 4) == (0, 25, 50, 75, 100)
-    assert looks(3, 20) == (0, 1, 2, 3)
+    assert score_steps(100, 4) == (0, 25, 50, 75, 100)
+    assert score_steps(3, 20) == (0, 1, 2, 3)
 
 
 def test_a_median_says_how_many_runs_it_is_of() -> None:
-    assert train_report.middle([1.0, 2.0, 3.0]) == "2 (1)"
-    assert train_report.middle([1.0, None, 3.0]) == "2 (1), 2 of 3"
-    assert train_report.middle([1.0, None]) == "-"
+    assert median_cell([1.0, 2.0, 3.0]) == "2 (1)"
+    assert median_cell([1.0, None, 3.0]) == "2 (1), 2 of 3"
+    assert median_cell([1.0, None]) == "-"
 
 
 def test_the_clock_stands_still_in_its_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     walls, cpus = iter([1.0, 3.0, 10.0, 11.0]), iter([5.0, 9.0, 20.0, 20.5])
-    monkeypatch.setattr(clock.time, "perf_counter", lambda: next(walls))
-    monkeypatch.setattr(clock.time, "process_time", lambda: next(cpus))
+    monkeypatch.setattr(trial.time, "perf_counter", lambda: next(walls))
+    monkeypatch.setattr(trial.time, "process_time", lambda: next(cpus))
     found = TrainingClock("cpu")
     with found.paused():  # from 3 to 10, and from 9 to 20
         pass
@@ -97,29 +112,29 @@ def test_the_clock_stands_still_in_its_pauses(monkeypatch: pytest.MonkeyPatch) -
 # ---- recipes ----
 
 def test_a_recipe_may_change_options_of_training() -> None:
-    arm = parse("budget+sh_degree=1+ssim_weight=0.5")
+    arm = parse_recipe("budget+sh_degree=1+ssim_weight=0.5")
     config = arm.config(BASE, iterations=7, seed=3)
     assert (config.densify, config.sh_degree, config.ssim_weight) == ("budget", 1, 0.5)
     assert (config.iterations, config.seed, config.max_size) == (7, 3, 48)
-    assert parse("paper") is not PAPER
-    assert parse("paper").prune == PAPER.prune
-    assert [one.name for one in parse_all(("reference, budget", "mcmc"))] == [
+    assert parse_recipe("paper") is not PAPER
+    assert parse_recipe("paper").prune == PAPER.prune
+    assert [one.name for one in parse_recipes(("reference, budget", "mcmc"))] == [
         "reference", "budget", "mcmc"]
 
 
 @pytest.mark.parametrize("text", [
     "none", "budget+nothing=1", "budget+sh_degree", "budget+sh_degree=9", "budget+iterations=5",
-    "budget,budget"])
+    "budget,budget", ","])
 def test_a_recipe_that_means_nothing_is_refused(text: str) -> None:
     with pytest.raises(ConfigError):
-        parse_all((text,))
+        parse_recipes((text,))
 
 
 # ---- one run ----
 
-def test_looking_changes_nothing_about_a_run(tiny: trial.Stand) -> None:
-    run = Run(REFERENCE, BASE, 40, 0)
-    often = run_trial(tiny, run, looks(40, 8), on_step=nothing)
+def test_looking_changes_nothing_about_a_run(tiny: LoadedScene) -> None:
+    run = TrainingRun(REFERENCE, BASE, 40, 0)
+    often = run_trial(tiny, run, score_steps(40, 8), on_step=nothing)
     once = run_trial(tiny, run, (), on_step=nothing)
     assert [one.iteration for one in often] == list(range(0, 41, 5))
     assert len(once) == 1
@@ -130,26 +145,26 @@ def test_looking_changes_nothing_about_a_run(tiny: trial.Stand) -> None:
     assert often[-1].bytes > 248 * often[-1].gaussians  # 62 float32 each, and a header
 
 
-def test_every_step_is_reported_once(tiny: trial.Stand) -> None:
+def test_every_step_is_reported_once(tiny: LoadedScene) -> None:
     steps: list[int] = []
-    run_trial(tiny, Run(PAPER, BASE, 30, 0), (7,), on_step=lambda: steps.append(1))
+    run_trial(tiny, TrainingRun(PAPER, BASE, 30, 0), (7,), on_step=lambda: steps.append(1))
     assert len(steps) == 30
 
 
-def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: trial.Stand) -> None:
+def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: LoadedScene) -> None:
     assert PAPER.prune
     assert (PAPER.prune.config.ratio, PAPER.prune.config.score) == (0.6, "paper")
     points = {one.iteration: one for one in run_trial(
-        tiny, Run(PAPER, BASE, 60, 0), (40, 41, 60), on_step=nothing)}
+        tiny, TrainingRun(PAPER, BASE, 60, 0), (40, 41, 60), on_step=nothing)}
     before, after = points[40].gaussians, points[41].gaussians
     assert after == before - int(0.6 * before)
     assert points[60].gaussians == after  # nothing grows back
-    other = run_trial(tiny, Run(REFERENCE, BASE, 60, 0), (40,), on_step=nothing)
+    other = run_trial(tiny, TrainingRun(REFERENCE, BASE, 60, 0), (40,), on_step=nothing)
     assert other[0].psnr_db == points[40].psnr_db  # the same run up to there
 
 
-def test_a_run_trains_on_no_view_that_is_scored(tiny: trial.Stand) -> None:
-    task = tiny.task(Run(BUDGET, BASE, 5, 0))
+def test_a_run_trains_on_no_view_that_is_scored(tiny: LoadedScene) -> None:
+    task = tiny.task(TrainingRun(BUDGET, BASE, 5, 0))
     assert len(task.train) == len(tiny.scene.train)
     assert task.validation == []
     assert {view.name for view in tiny.scene.validation}.isdisjoint(
@@ -159,19 +174,19 @@ def test_a_run_trains_on_no_view_that_is_scored(tiny: trial.Stand) -> None:
 # ---- scenes ----
 
 def test_a_digest_is_of_what_a_scene_holds(tmp_path: Path) -> None:
-    one = Place("one", make_inputs(tmp_path / "a"))
-    two = Place("two", make_inputs(tmp_path / "b"))
+    one = SceneFolders("one", make_inputs(tmp_path / "a"))
+    two = SceneFolders("two", make_inputs(tmp_path / "b"))
     assert one.digest == two.digest
     image = tmp_path / "b" / "sfm" / "undistorted" / "denoised" / "000003.png"
     image.write_bytes(image.read_bytes() + b"\0")
-    assert Place("two", two.inputs).digest != one.digest
+    assert SceneFolders("two", two.inputs).digest != one.digest
 
 
 def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
     for parent in ("a", "b"):
         make_replica(tmp_path / parent / "room")
     with pytest.raises(ConfigError, match="both called room"):
-        checked([tmp_path / "a" / "room", tmp_path / "b" / "room"])
+        check_scenes([tmp_path / "a" / "room", tmp_path / "b" / "room"])
 
 
 # ---- the command ----
@@ -180,7 +195,7 @@ def test_the_command_writes_curves_tables_and_the_picture(tmp_path: Path, capsys
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     make_replica(tmp_path / "room", frames=8, tests=2)
     text = tmp_path / "page.md"
-    text.write_text(f"{bench_compare.BEGIN}\n{bench_compare.END}\n")
+    text.write_text(f"{outputs.BEGIN}\n{outputs.END}\n")
     words = ["bench", "train", "--recipes", "reference,paper", "--iterations", "20", "--seeds", "2",
              "--max-size", "32", "--max-gaussians", "200", "--threads", "1", "--device", "cpu",
              "--json", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.svg"),
@@ -199,7 +214,7 @@ def test_the_command_writes_curves_tables_and_the_picture(tmp_path: Path, capsys
     for number, run in enumerate(recipe["runs"]):
         assert run["seed"] == number
         assert [one["iteration"] for one in run["points"]] == list(range(21))
-        assert run["points"][-1].keys() == {item.name for item in dataclasses.fields(Point)}
+        assert run["points"][-1].keys() == {item.name for item in dataclasses.fields(CurvePoint)}
     assert "### room:" in text.read_text()
     assert (tmp_path / "a.svg").stat().st_size > 5000
     assert {path.name for path in tmp_path.iterdir()} == {"a.json", "a.svg", "page.md", "room"}
@@ -221,7 +236,7 @@ def test_what_cannot_be_done_is_refused_before_training(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("recon_cli.experiments.train_run._measured", lambda *_: pytest.fail("ran"))
+    monkeypatch.setattr(module, "measure", lambda *_: pytest.fail("ran"))
     (tmp_path / "empty").mkdir()
     make_replica(tmp_path / "room")
     assert main(["bench", "train", *words]) == code
@@ -249,23 +264,24 @@ def test_options_of_the_rasterizers_mean_nothing_to_training(
 
 
 def test_seconds_become_steps_by_a_pilot(
-    tiny: trial.Stand, monkeypatch: pytest.MonkeyPatch
+    tiny: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "pilot", lambda *_, **__: point(4.0, 20.0))
-    request = Request((), (REFERENCE,), None, 10.0, 1, (), BASE)
-    assert module._steps(tiny, REFERENCE, request) == round(trial.PILOT_STEPS * 10 / 4)
+    monkeypatch.setattr(runner, "run_pilot", lambda *_: point(4.0, 20.0))
+    a_step = Runner(BASE, NullProgress()).pilot_seconds(tiny, [REFERENCE])["reference"]
+    request = RecipeRequest(scenes=(), seeds=1, base=BASE, recipes=(REFERENCE,), seconds=10.0)
+    assert module.steps_of(request, a_step) == round(trial.PILOT_STEPS * 10 / 4)
     given = dataclasses.replace(request, iterations=77, seconds=None)
-    assert module._steps(tiny, REFERENCE, given) == 77
+    assert module.steps_of(given, a_step) == 77
 
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    runs = tuple(SeedRun(seed, (point(0, 10), point(1, 20 + seed))) for seed in range(2))
-    scene = SceneResult(3, 64, 48, {
-        name: ArmResult(Arm(name, name), 100, runs) for name in ("one", "two")})
+    records = tuple(Record((point(0, 10), point(1, 20 + seed)), "") for seed in range(2))
+    recipes = {name: Variant(name, name) for name in ("one", "two")}
+    scene = SceneCurves(3, 64, 48, recipes, dict.fromkeys(recipes, records))
     host = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
-    found = Result(host, 2, BASE, (), {"a": scene, "b": scene})
-    train_plot.draw(found, tmp_path / "a.png")
+    found = CurvesResult(host, 2, BASE, (), {"a": scene, "b": scene})
+    module.draw(found, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 5000
-    assert train_report.tables(found)[0].rows[0][0] == "one"
-    assert "s to 20 dB" in train_report.tables(found)[0].header
+    assert module.tables(found)[0].rows[0][0] == "one"
+    assert "s to 20 dB" in module.tables(found)[0].header

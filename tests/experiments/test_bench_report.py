@@ -10,32 +10,36 @@ import pytest
 
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
 from recon_cli.evaluation.tables import TitledTable, number, percent
-from recon_cli.experiments import bench_compare, bench_plot
+from recon_cli.experiments import bench_report, outputs
 from recon_cli.experiments.accuracy import Accuracy
-from recon_cli.experiments.bench_compare import check_comparable, compared, other_machine, ratio
 from recon_cli.experiments.bench_report import head, tables
 from recon_cli.experiments.bench_result import (
     FIGURES,
     SCHEMA,
     BackendResult,
-    Result,
-    SceneResult,
+    BenchedScene,
+    BenchResult,
     Speed,
     VariantResult,
+    check_comparable,
+    comparison_table,
+    machine_difference,
+    ratio,
     read_record,
 )
-from recon_cli.experiments.bench_run import Request, pixels
+from recon_cli.experiments.bench_run import BenchRequest, parse_size
 from recon_cli.experiments.host import (
     FLOPS_BACKWARD,
     FLOPS_FORWARD,
     Host,
     Timing,
     alternate,
-    counted,
+    operations_per_pair,
     peak_fraction,
     rate,
     timing_of,
 )
+from recon_cli.experiments.outputs import OutputFiles
 from recon_cli.machine import cpu_model
 
 EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)
@@ -54,15 +58,15 @@ def backend(ms: float) -> BackendResult:
     return BackendResult(speed(2, ms), speed(1, 1.5 * ms), EXACT, (4_000_000, 3_000_000), 10**7)
 
 
-def result(numba_ms: float = 10.0, torch_ms: float = 80.0) -> Result:
+def result(numba_ms: float = 10.0, torch_ms: float = 80.0) -> BenchResult:
     host = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
     variants = [
         VariantResult("contract", Timing(30.0, 0.0), EXACT),
         VariantResult("rough", Timing(20.0, 0.0), ROUGH), VariantResult("untimed", None, ROUGH)]
-    scene = SceneResult(
+    scene = BenchedScene(
         1000, 64, 48, 3, {"numba": backend(numba_ms), "torch": backend(torch_ms)},
         {"torch": Timing(9.0, 0.0), "fused": Timing(3.0, 0.0)}, "numba", variants)
-    return Result(host, 7, {"room": scene})
+    return BenchResult(host, 7, {"room": scene})
 
 
 # ---- medians and rates ----
@@ -104,7 +108,7 @@ def test_rates_and_fractions_of_the_peak() -> None:
 
 def test_the_operations_of_a_pair_are_the_sum_of_their_table_in_the_docs() -> None:
     text = (Path(__file__).resolve().parents[2] / "docs" / "bench.md").read_text(encoding="utf-8")
-    for what, forward, backward in [*counted(), ("sum", FLOPS_FORWARD, FLOPS_BACKWARD)]:
+    for what, forward, backward in [*operations_per_pair(), ("sum", FLOPS_FORWARD, FLOPS_BACKWARD)]:
         assert f"| {what} | {forward} | {backward} |" in text
 
 
@@ -180,7 +184,7 @@ def test_a_file_of_another_schema_is_refused(text: str, tmp_path: Path) -> None:
 
 def test_a_comparison_is_old_over_new_figure_by_figure() -> None:
     old, new = result(20.0).record(), result(10.0).record()
-    rows = {row[0]: row[1:] for row in compared(old, new).rows}
+    rows = {row[0]: row[1:] for row in comparison_table(old, new).rows}
     assert rows["room numba forward_ms"] == ("20", "10", "2")
     assert rows["room torch step_ms"] == ("320", "320", "1")
     assert rows["room numba peak_fraction_backward"] == ("-", "-", "-")
@@ -192,7 +196,7 @@ def test_a_comparison_is_old_over_new_figure_by_figure() -> None:
 def test_a_backend_that_the_old_file_lacks_has_no_ratio() -> None:
     old = result().record()
     del old["scenes"]["room"]["backends"]["torch"]
-    rows = compared(old, result().record()).rows
+    rows = comparison_table(old, result().record()).rows
     assert {row[0].split()[1] for row in rows} == {"numba"}
 
 
@@ -211,9 +215,9 @@ def test_only_runs_of_the_same_scene_are_compared() -> None:
 
 def test_another_machine_is_named() -> None:
     old = result().record()
-    assert other_machine(old, old) == ""
+    assert machine_difference(old, old) == ""
     new = {**old, "machine": {**old["machine"], "cpu": "Another"}}
-    assert other_machine(old, new) == "cpu A CPU there, Another here"
+    assert machine_difference(old, new) == "cpu A CPU there, Another here"
 
 
 def test_the_model_of_the_cpu_is_read_from_cpuinfo(tmp_path: Path) -> None:
@@ -225,43 +229,47 @@ def test_the_model_of_the_cpu_is_read_from_cpuinfo(tmp_path: Path) -> None:
 
 # ---- the page ----
 
-PAGE = f"# Title\n\nby hand\n{bench_compare.BEGIN}\nold\n{bench_compare.END}\nby hand too\n"
+PAGE = f"# Title\n\nby hand\n{outputs.BEGIN}\nold\n{outputs.END}\nby hand too\n"
+
+
+def write(path: Path, text: str) -> None:
+    path.write_text(outputs.replace_between_marks(path.read_text(), text))
 
 
 def test_only_what_stands_between_the_marks_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "page.md"
     path.write_text(PAGE)
-    bench_compare.write_page(path, "\nnew\ntext\n")
+    write(path, "\nnew\ntext\n")
     assert path.read_text() == PAGE.replace("old", "\nnew\ntext\n")
-    bench_compare.write_page(path, "old")
+    write(path, "old")
     assert path.read_text() == PAGE.replace("old", "\nold\n")
 
 
 @pytest.mark.parametrize("text", [
-    "", bench_compare.BEGIN, f"{bench_compare.END}\n{bench_compare.BEGIN}\n", PAGE + PAGE])
+    "", outputs.BEGIN, f"{outputs.END}\n{outputs.BEGIN}\n", PAGE + PAGE])
 def test_a_page_without_its_marks_is_refused_and_left_alone(text: str, tmp_path: Path) -> None:
     path = tmp_path / "page.md"
     path.write_text(text)
     with pytest.raises(FormatError, match="recon bench: begin"):
-        bench_compare.write_page(path, "new")
+        OutputFiles(markdown=path).write({}, "head", [], lambda _path: None)
     assert path.read_text() == text
 
 
 def test_a_page_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="cannot be read"):
-        bench_compare.check_page(tmp_path / "none.md")
+        OutputFiles(markdown=tmp_path / "none.md").check()
 
 
 # ---- the picture ----
 
 def test_the_front_holds_what_nothing_else_beats() -> None:
     points = [(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (2.0, 2.0), (4.0, 1.0)]
-    assert bench_plot.front(points) == [1, 3, 0]
-    assert bench_plot.front([]) == []
+    assert bench_report.pareto_front(points) == [1, 3, 0]
+    assert bench_report.pareto_front([]) == []
 
 
 def test_the_points_are_backends_and_timed_approximations() -> None:
-    points = bench_plot.points_of(next(iter(result().scenes.values())))
+    points = bench_report.candidates_of(next(iter(result().scenes.values())))
     assert [(p.name, p.ms, p.image_error) for p in points] == [
         ("numba", 30.0, 1e-7), ("torch", 240.0, 1e-7), ("rough", 20.0, 0.01)]
 
@@ -270,44 +278,43 @@ def test_the_points_are_backends_and_timed_approximations() -> None:
 def test_the_picture_is_drawn(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     path = tmp_path / f"front{suffix}"
-    bench_plot.draw(result(), path)
+    bench_report.draw(result(), path)
     assert path.stat().st_size > 5000
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_without_matplotlib_the_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_plot.importlib.util, "find_spec", lambda _name: None)
+    monkeypatch.setattr(outputs.importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(ConfigError) as caught:
-        bench_plot.check_picture(Path("front.svg"))
+        OutputFiles(plot=Path("front.svg")).check()
     assert "pip install 'recon-cli[plot]'" in caught.value.hint
 
 
 def test_a_picture_of_another_format_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"\.png or \.svg"):
-        bench_plot.check_picture(Path("front.pdf"))
+        OutputFiles(plot=Path("front.pdf")).check()
 
 
 # ---- what is asked ----
 
-def request(**changes: object) -> Request:
-    return dataclasses.replace(
-        Request("room", None, None, 3, (), "cpu", 1, None, False), **changes)
+def request(**changes: object) -> BenchRequest:
+    return BenchRequest(device="cpu", threads=1, **changes)
 
 
-def test_a_size_is_two_numbers_of_pixels() -> None:
-    assert pixels("640x360") == (640, 360)
+def test_a_size_is_two_numbers_of_parse_size() -> None:
+    assert parse_size("640x360") == (640, 360)
     for text in ("640", "0x3", "3x0", "-1x2", "1x2x3", "axb", ""):
         with pytest.raises(ConfigError, match="WIDTHxHEIGHT"):
-            pixels(text)
+            parse_size(text)
     with pytest.raises(ReconError):
         request(size="large")
 
 
 def test_quick_takes_fewer_rounds_unless_told() -> None:
-    assert request().count > request(quick=True).count
-    assert request(quick=True, rounds=5).count == 5
+    assert request().plan().rounds > request(quick=True).plan().rounds
+    assert request(quick=True, rounds=5).plan().rounds == 5
 
 
 def test_an_output_needs_its_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        request(json_file=tmp_path / "none" / "a.json")
+        request(outputs=OutputFiles(tmp_path / "none" / "a.json"))

@@ -1,0 +1,282 @@
+"""`recon denoise --compare`: what each noise filter would gain and lose on the frames of a capture.
+
+The truth is not known, so it is made: the capture's own frames, halved by area, which leaves half
+of their noise, and noise of known levels added to those. Compression, which follows noise in a
+video, is not imitated; on a video the figures are therefore what a filter could do at best.
+Nothing is filtered: compare.json lies beside the stages, so that no result turns stale.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.capture.filters import FILTERS
+from recon_cli.capture.noise import estimate_noise
+from recon_cli.config.stages import DenoiseConfig
+from recon_cli.evaluation.tables import Table
+from recon_cli.experiments.variants import run_grid
+from recon_cli.io.frames import FOLDER, read_frame_list, read_png
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.execute import Job
+from recon_cli.workspace import atomic
+from recon_cli.workspace.layout import disk_errors
+
+RESULT = "compare.json"
+_SAMPLES = 3  # frames, spread over the capture: 20 s in all at 1080x1920 on one core
+_MEASURED = 16  # frames whose noise is measured: 3 s
+_LEAST_NOISE = 0.5  # 1/255; rounding to 8 bits alone makes .3
+LEVELS = (3.0, 5.0, 10.0, 15.0, 20.0)  # 1/255; 3 is the default threshold, 20 a phone at night
+_SAME_LEVEL = 0.1  # a measured level this close to one of those tells nothing of its own
+STRENGTHS = (2.0, 3.0, 4.0, 5.0)
+# Edges: the 5% of pixels with the steepest slope, where a blur is seen first.
+_STEEPEST = 95
+# The slope is taken after a blur of one pixel; without it noise would make edges of its own.
+_SLOPE_BLUR = 1.0
+# A filter that loses more than this fraction of the edges is no default, however flat the walls.
+_MAX_EDGE_LOSS = 0.05
+
+Pixels = NDArray[np.uint8]  # [H, W, 3]
+
+
+@dataclass(frozen=True)
+class FilterVariant:
+    """A filter at a strength, which is its range as a multiple of the noise."""
+
+    filter: str  # "none" leaves the frame as it is
+    strength: float  # 0 where there is none
+    apply: Callable[[Pixels, float], Pixels]  # (frame, noise in 1/255)
+
+    @property
+    def offered(self) -> bool:
+        """Whether `recon denoise --filter` takes it."""
+        return self.filter == "none" or self.filter in FILTERS
+
+
+@dataclass(frozen=True)
+class FilterScore:
+    """What one filter does at one level of noise; means over the frames."""
+
+    filter: str
+    strength: float
+    offered: bool
+    noise_255: float  # standard deviation of the noise that was added
+    psnr_db: float  # against the frame without it
+    edges_kept: float  # see `edges_kept`
+    seconds_per_megapixel: float  # of the filter, on this machine
+
+
+def _guided(rgb: Pixels, noise: float) -> Pixels:
+    return np.asarray(cv2.ximgproc.guidedFilter(rgb, rgb, 2, (1.5 * noise) ** 2), np.uint8)
+
+
+def _non_local_means(rgb: Pixels, noise: float) -> Pixels:
+    return np.asarray(
+        cv2.fastNlMeansDenoisingColored(rgb, None, 0.8 * noise, 0.8 * noise, 5, 15), np.uint8)
+
+
+VARIANTS = (
+    FilterVariant("none", 0.0, lambda rgb, _noise: rgb),
+    *(FilterVariant(name, strength, partial(function, strength=strength))
+      for name, function in FILTERS.items() for strength in STRENGTHS),
+    # not offered, each at the strength that was best on fox and the rendered rooms
+    FilterVariant("guided", 1.5, _guided),
+    FilterVariant("non-local means", 0.8, _non_local_means))
+
+
+def compare_filters(job: Job, config: DenoiseConfig) -> str:
+    """Writes compare.json into the workspace and returns its table and what follows from it.
+
+    Args:
+        job: whose workspace holds the frames.
+        config: the options that `recon denoise` would run with.
+
+    Raises:
+        StageError: there are no fresh frames.
+        WorkspaceError: the workspace is in use or cannot be written.
+        FormatError: a frame cannot be read.
+    """
+    root, frames = job.workspace.root, job.workspace.folder("ingest") / FOLDER
+    plan.plan(job.inspect(), "denoise")
+    with disk_errors(root, "comparing filters"), job.workspace.writing("denoise --compare"):
+        names = [frame.name for frame in read_frame_list(frames.parent).frames]
+        noise = float(np.median([estimate_noise(read_png(frames / name))
+                                 for name in _spread(names, _MEASURED)]))
+        samples = _spread(names, _SAMPLES)
+        truths = [halved(read_png(frames / name)) for name in samples]
+        levels = levels_with(noise)
+        total = len(levels) * len(VARIANTS) * len(truths)
+        with job.progress.bar("compare", total, unit="run") as bar:
+            scores = score_filters(truths, levels, on_run=bar.advance)
+        atomic.write_json(root / RESULT, {
+            "measured_noise_255": noise,
+            "frames": samples,
+            "reduced": "by area to half the size, before noise was added",
+            "opencv_threads": cv2.getNumThreads(),
+            "scores": [asdict(score) for score in scores],
+        })
+    heading = (
+        f"PSNR in dB and share of the edges kept, {len(samples)} frames at half their size with "
+        "white noise added (in 1/255)")
+    return "\n\n".join([heading, _table(scores), _advice(config, noise, scores)])
+
+
+def _spread(names: Sequence[str], count: int) -> list[str]:
+    """Returns up to `count` names, evenly spread."""
+    count = min(count, len(names))
+    return [names[(2 * place + 1) * len(names) // (2 * count)] for place in range(count)]
+
+
+def halved(frame: Pixels) -> Pixels:
+    """Returns a frame at half its size by area, which halves noise that is independent."""
+    height, width = frame.shape[:2]
+    return np.asarray(
+        cv2.resize(frame, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def levels_with(measured: float) -> tuple[float, ...]:
+    """Returns the stated levels and the measured one, ascending, in 1/255."""
+    own = round(measured, 1)
+    near = any(abs(own - level) <= _SAME_LEVEL * level for level in LEVELS)
+    return LEVELS if near or own < _LEAST_NOISE else tuple(sorted((own, *LEVELS)))
+
+
+def score_filters(
+    truths: Sequence[Pixels], levels: Sequence[float], *, on_run: Callable[[], None]
+) -> tuple[FilterScore, ...]:
+    """Returns a score for each filter and level of noise, by filter, then by level.
+
+    Args:
+        truths: frames that are taken as noiseless, each [H, W, 3].
+        levels: standard deviations of the noise to add, in 1/255.
+        on_run: called after each filter, level and frame.
+    """
+    megapixels = sum(truth.shape[0] * truth.shape[1] for truth in truths) / 1e6
+
+    def measure(variant: FilterVariant, noisy: tuple[float, int]) -> tuple[float, float, float]:
+        level, number = noisy
+        frame = with_noise(truths[number], level, seed=number)
+        start = time.perf_counter()
+        result = variant.apply(frame, level)
+        seconds = time.perf_counter() - start
+        on_run()
+        return cv2.PSNR(truths[number], result), edges_kept(truths[number], result), seconds
+
+    def mean(variant: FilterVariant, level: float) -> FilterScore:
+        psnr_db, edges, seconds = zip(*(
+            values for noisy, values in zip(grid, results[_key(variant)], strict=True)
+            if noisy[0] == level), strict=True)
+        return FilterScore(
+            variant.filter, variant.strength, variant.offered, level, float(np.mean(psnr_db)),
+            float(np.mean(edges)), 0.0 if variant.filter == "none" else sum(seconds) / megapixels)
+
+    grid = [(level, number) for level in levels for number in range(len(truths))]
+    results = run_grid({_key(variant): variant for variant in VARIANTS}, grid, measure)
+    return tuple(mean(variant, level) for variant in VARIANTS for level in levels)
+
+
+def _key(variant: FilterVariant) -> str:
+    return f"{variant.filter} {variant.strength:g}"
+
+
+def with_noise(
+    rgb: Pixels,  # [H, W, 3]
+    noise: float,
+    *,
+    seed: int,
+) -> Pixels:
+    """Returns a frame with white Gaussian noise of a level in 1/255, clipped to what fits."""
+    random = np.random.default_rng(seed)
+    noisy = rgb + random.normal(0.0, noise, rgb.shape)
+    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+def edges_kept(truth: Pixels, image: Pixels) -> float:
+    """Returns how much of the slope across the edges of `truth` is left in `image`.
+
+    The mean slope of the image along the true gradient over the steepest 5% of the pixels, divided
+    by that of the truth: 1 where all edges stand, less where they are washed out. Noise, whose
+    slope points anywhere, cancels out.
+
+    Args:
+        truth: without noise, [H, W, 3].
+        image: filtered, of the same size.
+    """
+    across, down = _slopes(truth)
+    steepness = np.hypot(across, down)
+    edge = steepness >= max(np.percentile(steepness, _STEEPEST), np.finfo(np.float32).tiny)
+    if not edge.any():
+        return 1.0
+    image_across, image_down = _slopes(image)
+    along = (across * image_across + down * image_down)[edge] / steepness[edge]
+    return float(along.sum() / steepness[edge].sum())
+
+
+def _slopes(image: Pixels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    smooth = cv2.GaussianBlur(gray, (0, 0), _SLOPE_BLUR)
+    return cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+
+
+def best(scores: Sequence[FilterScore], level: float) -> FilterScore:
+    """Returns the best score among the offered filters, at the compared level nearest to `level`.
+
+    Best is the highest PSNR among those that lose few edges; doing nothing is offered too.
+    """
+    near = min((score.noise_255 for score in scores), key=lambda noise: abs(noise - level))
+    usable = [
+        score for score in scores
+        if score.noise_255 == near and score.offered
+        and score.edges_kept >= _unfiltered(scores, near).edges_kept - _MAX_EDGE_LOSS]
+    return max(usable, key=lambda score: score.psnr_db)
+
+
+def gain_db(scores: Sequence[FilterScore], score: FilterScore) -> float:
+    """Returns by how many dB a filter comes closer to the truth than doing nothing."""
+    return score.psnr_db - _unfiltered(scores, score.noise_255).psnr_db
+
+
+def _unfiltered(scores: Sequence[FilterScore], level: float) -> FilterScore:
+    return next(
+        score for score in scores if score.filter == "none" and score.noise_255 == level)
+
+
+def _table(scores: Sequence[FilterScore]) -> str:
+    levels = sorted({score.noise_255 for score in scores})
+    by_variant: Mapping[tuple[str, float], list[FilterScore]] = {
+        (score.filter, score.strength): [] for score in scores}
+    for score in scores:
+        by_variant[score.filter, score.strength].append(score)
+    return Table(
+        ("filter", "strength", *(f"noise {level:g}" for level in levels), "s/MP"),
+        tuple((name if own[0].offered else f"({name})", f"{strength:g}" if strength else "-",
+               *(f"{score.psnr_db:.1f} {score.edges_kept:4.0%}" for score in own),
+               f"{sum(score.seconds_per_megapixel for score in own) / len(own):.2f}")
+              for (name, strength), own in by_variant.items())).text()
+
+
+def _advice(config: DenoiseConfig, noise: float, scores: Sequence[FilterScore]) -> str:
+    """Returns what the frames' own noise calls for, in words."""
+    lines = [f"The noise of the frames is {noise:.1f}/255 (median)."]
+    chosen = best(scores, noise) if noise >= _LEAST_NOISE else None
+    if chosen is None:
+        lines.append("That is no more than rounding to 8 bits leaves: there is nothing to remove.")
+    elif chosen.filter == "none":
+        lines.append("Doing nothing is best at that level; recon denoise --off does that.")
+    else:
+        lines.append(
+            f"Best at {chosen.noise_255:g}/255: --filter {chosen.filter} --strength "
+            f"{chosen.strength:g}, {gain_db(scores, chosen):+.1f} dB if that noise is white, and "
+            f"{chosen.edges_kept:.0%} of the edges kept.")
+    unfiltered = noise < config.threshold and config.mode == "auto"
+    lines.append(
+        f"recon denoise leaves frames below --threshold {config.threshold:g} as they are."
+        if unfiltered else
+        f"recon denoise would use --filter {config.filter} --strength {config.strength:g}.")
+    return "\n".join(lines)

@@ -1,0 +1,130 @@
+"""Files that an experiment writes beside what it prints: JSON, a picture, tables in a page.
+
+matplotlib is an extra and imported only while a picture is drawn. In a Markdown page only what
+stands between two marks is replaced; the text around it stays.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recon_cli.errors import ConfigError, FormatError, InputError
+from recon_cli.evaluation.tables import TitledTable
+from recon_cli.workspace import atomic
+
+BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"
+_PICTURE_FORMATS = (".png", ".svg")
+
+logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True)
+class OutputFiles:
+    """The files that are wanted, None where one is not."""
+
+    json_file: Path | None = None
+    plot: Path | None = None
+    markdown: Path | None = None
+
+    def check(self) -> None:
+        """Raises ReconError unless all of them can be written."""
+        for path in (self.json_file, self.plot):
+            if path is not None and not path.absolute().parent.is_dir():
+                raise InputError(
+                    f"The folder of {path} does not exist.", hint=f"mkdir -p {path.parent}")
+        if self.plot is not None:
+            _check_picture(self.plot)
+        if self.markdown is not None:
+            _with_text(self.markdown, "")
+
+    def write(
+        self, record: Mapping[str, Any], head: str, tables: Sequence[TitledTable],
+        draw: Callable[[Path], None],
+    ) -> None:
+        """Writes them.
+
+        Args:
+            record: for the JSON file.
+            head: line above the tables.
+            tables: for the page.
+            draw: draws the picture into a path.
+        """
+        if self.json_file is not None:
+            atomic.write_json(self.json_file, record)
+        if self.plot is not None:
+            draw(self.plot)
+        if self.markdown is not None:
+            text = "\n\n".join([head + ".", *(table.markdown() for table in tables)])
+            atomic.write_bytes(self.markdown, _with_text(self.markdown, text).encode())
+
+
+def _check_picture(path: Path) -> None:
+    if path.suffix.lower() not in _PICTURE_FORMATS:
+        raise ConfigError(
+            f"--plot is {path}, but it must end in .png or .svg.",
+            hint=f"Try --plot {path.with_suffix('.svg').name}.")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigError(
+            "--plot needs matplotlib, which is not installed.",
+            hint="pip install 'recon-cli[plot]'")
+
+
+def draw_if_possible(draw: Callable[[Path], None], path: Path) -> None:
+    """Draws a picture, or warns that matplotlib is missing."""
+    if importlib.util.find_spec("matplotlib") is None:
+        logger.warning("%s is not drawn: matplotlib is not installed; "
+                       "pip install 'recon-cli[plot]'", path.name)
+    else:
+        draw(path)
+
+
+@contextmanager
+def drawing(path: Path, width: float, height: float, *, dpi: int = 110) -> Iterator[Any]:
+    """Opens a figure of some inches and saves it after the block, whole or not at all."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    yield figure
+    with atomic.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
+
+
+def add_legend(figure: Any, axes: Any) -> None:
+    """Adds the legend of one panel below all of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
+
+
+def replace_between_marks(page: str, text: str) -> str:
+    """Returns the page with `text` between its two marks.
+
+    Raises:
+        ValueError: the page lacks a mark, or they are not in order.
+    """
+    lines = page.splitlines()
+    begins = [i for i, line in enumerate(lines) if line.strip() == BEGIN]
+    ends = [i for i, line in enumerate(lines) if line.strip() == END]
+    if len(begins) != 1 or len(ends) != 1 or ends[0] < begins[0]:
+        raise ValueError("the marks are missing, repeated or out of order")
+    inner = ["", *text.strip("\n").splitlines(), ""]  # a table ends at a blank line
+    return "\n".join([*lines[: begins[0] + 1], *inner, *lines[ends[0] :]]) + "\n"
+
+
+def _with_text(path: Path, text: str) -> str:
+    """Returns what the page at `path` is with `text` between its marks."""
+    try:
+        return replace_between_marks(path.read_text(encoding="utf-8"), text)
+    except OSError as error:
+        raise FormatError(
+            f"{path} cannot be read: {error.strerror}.",
+            hint=f"Create it with the lines {BEGIN} and {END}.") from error
+    except ValueError as error:
+        raise FormatError(
+            f"{path} does not hold the lines {BEGIN} and {END}, once each and in this order.",
+            hint="Add both lines where the tables should stand.") from error

@@ -1,0 +1,249 @@
+"""`recon bench train`: curves of quality over time for recipes of training."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon_cli.config.stages import RunConfig
+from recon_cli.errors import ConfigError
+from recon_cli.evaluation.tables import TitledTable, number
+from recon_cli.experiments.host import Host, examine, timing_of
+from recon_cli.experiments.outputs import OutputFiles, add_legend, drawing
+from recon_cli.experiments.runner import STEPS, ExperimentRequest, Runner, Runs, shared_options
+from recon_cli.experiments.scenes import check_scenes
+from recon_cli.experiments.trial import CurvePoint, LoadedScene
+from recon_cli.experiments.variants import Variant
+from recon_cli.pipeline.execute import rendering
+from recon_cli.progress import Progress
+
+SCHEMA, VERSION = "recon-bench-train", 1
+_SCORES = 20  # along a run: each is of all validation views
+_INCH = 3.2  # of a panel
+
+Figure = Callable[[CurvePoint], float]
+_WALL: tuple[str, Figure] = ("wall s", lambda point: point.seconds)
+_CPU: tuple[str, Figure] = ("CPU s", lambda point: point.cpu_seconds)
+_PSNR: tuple[str, Figure] = ("PSNR dB", lambda point: point.psnr_db)
+_SSIM: tuple[str, Figure] = ("SSIM", lambda point: point.ssim)
+_PANELS = (
+    (_WALL, _PSNR), (_CPU, _PSNR), (_WALL, _SSIM), (_CPU, _SSIM),
+    (_WALL, ("thousand Gaussians", lambda point: point.gaussians / 1e3)),
+    (_WALL, ("MB", lambda point: point.bytes / 1e6)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipeRequest(ExperimentRequest):
+    """The options of `recon bench train`.
+
+    Raises:
+        ConfigError: steps and seconds are both given.
+        ReconError: an output cannot be written.
+    """
+
+    recipes: tuple[Variant, ...]
+    iterations: int | None = None  # of every run; None where seconds or neither are given
+    seconds: float | None = None  # of every run instead
+    targets_db: tuple[float, ...] = ()  # PSNR to reach; empty for what all runs of a scene reach
+    outputs: OutputFiles = field(default_factory=OutputFiles)
+
+    def __post_init__(self) -> None:
+        if self.iterations is not None and self.seconds is not None:
+            raise ConfigError(
+                "--iterations and --seconds exclude each other.", hint="Leave one out.")
+        self.outputs.check()
+
+
+@dataclass(frozen=True)
+class SceneCurves:
+    """All recipes on one scene."""
+
+    views: int  # that were scored
+    width: int  # of the first of them in pixels
+    height: int
+    recipes: Mapping[str, Variant]
+    runs: Runs
+
+
+@dataclass(frozen=True)
+class CurvesResult:
+    """A run of the benchmark."""
+
+    host: Host
+    seeds: int
+    base: RunConfig
+    targets_db: tuple[float, ...]  # that were asked for
+    scenes: Mapping[str, SceneCurves]
+
+    def targets_of(self, scene: SceneCurves) -> tuple[float, ...]:
+        """Returns the targets of a scene: those asked for, or what all its runs reach."""
+        return self.targets_db or (common_target(
+            [record.points for records in scene.runs.values() for record in records]),)
+
+    def record(self) -> dict[str, Any]:
+        """Returns what the JSON file holds."""
+        return {
+            "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
+            "seeds": self.seeds, "base": shared_options(self.base),
+            "scenes": {name: {
+                "views": scene.views, "width": scene.width, "height": scene.height,
+                "recipes": {recipe: self._recipe(scene, recipe) for recipe in scene.recipes},
+            } for name, scene in self.scenes.items()},
+        }
+
+    def _recipe(self, scene: SceneCurves, recipe: str) -> dict[str, Any]:
+        records, targets = scene.runs[recipe], self.targets_of(scene)
+        return {
+            **scene.recipes[recipe].record(), "iterations": records[0].last.iteration,
+            **{key: {f"{db:g}": [seconds_to(record.points, db, clock) for record in records]
+                     for db in targets}
+               for key, (_, clock) in (("seconds_to", _WALL), ("cpu_seconds_to", _CPU))},
+            "runs": [{"seed": seed, "points": [asdict(point) for point in record.points]}
+                     for seed, record in enumerate(records)],
+        }
+
+
+def run(request: RecipeRequest, progress: Progress) -> str:
+    """Trains what was asked for, writes the files, and returns what the terminal shows.
+
+    Raises:
+        ReconError: something cannot be done; what can be known is found before training.
+    """
+    paths = check_scenes(request.scenes)
+    ctx = rendering(request.compute, progress)
+    host = examine(ctx.threads, ctx.device)
+    runner = Runner(request.base, progress)
+    with tempfile.TemporaryDirectory(prefix="recon-bench-") as scratch:
+        scenes = request.load(paths, Path(scratch), "validation", ctx)
+        result = CurvesResult(host, request.seeds, request.base, request.targets_db, {
+            loaded.folders.name: measure(loaded, request, runner) for loaded in scenes})
+    request.outputs.write(
+        result.record(), head(result), tables(result), lambda path: draw(result, path))
+    return "\n\n".join([head(result), *(table.text() for table in tables(result))])
+
+
+def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> SceneCurves:
+    """Returns the curves of every recipe; pilots warm up, and turn seconds into steps."""
+    seconds = runner.pilot_seconds(loaded, request.recipes)
+    steps = {name: steps_of(request, step) for name, step in seconds.items()}
+    runs = runner.run_all(
+        loaded, request.recipes, request.seeds, steps, label=loaded.folders.name,
+        score_at=score_steps)
+    camera = loaded.scored[0].camera
+    return SceneCurves(
+        len(loaded.scored), camera.width, camera.height,
+        {recipe.name: recipe for recipe in request.recipes}, runs)
+
+
+def steps_of(request: RecipeRequest, seconds_a_step: float) -> int:
+    """Returns how many steps every run of a recipe takes."""
+    if request.seconds is None:
+        return request.iterations or STEPS
+    return max(1, round(request.seconds / max(seconds_a_step, 1e-12)))
+
+
+def score_steps(iterations: int, count: int = _SCORES) -> tuple[int, ...]:
+    """Returns the steps to score after: 0, and `count` evenly spread ones up to the last."""
+    return tuple(sorted({round(i * iterations / count) for i in range(count + 1)}))
+
+
+def seconds_to(points: Sequence[CurvePoint], target_db: float, clock: Figure) -> float | None:
+    """Returns when a curve first reaches a PSNR, on straight lines between its points.
+
+    Args:
+        points: of one run, in order.
+        target_db: to reach.
+        clock: seconds of a point: on the wall or of the CPU.
+
+    Returns:
+        Seconds; None where no point reaches the target.
+    """
+    before: CurvePoint | None = None
+    for point in points:
+        if point.psnr_db >= target_db:
+            if before is None:
+                return clock(point)
+            fraction = (target_db - before.psnr_db) / (point.psnr_db - before.psnr_db)
+            return clock(before) + fraction * (clock(point) - clock(before))
+        before = point
+    return None
+
+
+def common_target(runs: Sequence[Sequence[CurvePoint]]) -> float:
+    """Returns the PSNR that every run reaches, down to a tenth of a dB."""
+    best = min(max(point.psnr_db for point in points) for points in runs)
+    return math.floor(10 * best) / 10
+
+
+def head(result: CurvesResult) -> str:
+    """Returns the lines about machine and method that stand above the tables."""
+    return (f"{result.host.line}; medians of {result.seeds} seeds, interquartile range in "
+            "brackets; scored on validation views, scoring not timed")
+
+
+def tables(result: CurvesResult) -> list[TitledTable]:
+    """Returns one table a scene."""
+    return [_table(name, scene, result) for name, scene in result.scenes.items()]
+
+
+def median_cell(values: Sequence[float | None], digits: int = 3) -> str:
+    """Returns median and interquartile range; "-" where half of the runs have no value."""
+    known = [value for value in values if value is not None]
+    if 2 * len(known) <= len(values):
+        return "-"
+    timing = timing_of(known)
+    cell = f"{number(timing.ms, digits)} ({number(timing.iqr_ms, 2)})"
+    return cell if len(known) == len(values) else f"{cell}, {len(known)} of {len(values)}"
+
+
+def _table(name: str, scene: SceneCurves, result: CurvesResult) -> TitledTable:
+    targets = result.targets_of(scene)
+    header = ("recipe", *(f"{kind} to {db:g} dB" for db in targets for kind in ("s", "CPU s")),
+              "PSNR dB", "SSIM", "Gaussians", "MB", "steps", "s", "CPU s")
+    title = (f"{name}: {scene.views} validation views at {scene.width}x{scene.height}, "
+             f"at most {result.base.max_gaussians:,} Gaussians")
+    return TitledTable(title, header, [_row(recipe, scene, targets) for recipe in scene.recipes])
+
+
+def _row(recipe: str, scene: SceneCurves, targets: Sequence[float]) -> tuple[str, ...]:
+    records = scene.runs[recipe]
+
+    def last(figure: Figure, digits: int = 3) -> str:
+        return median_cell([figure(record.last) for record in records], digits)
+
+    reached = [median_cell([seconds_to(record.points, db, clock) for record in records])
+               for db in targets for _, clock in (_WALL, _CPU)]
+    return (
+        recipe, *reached, last(_PSNR[1], 4), last(_SSIM[1], 4),
+        last(lambda point: point.gaussians), last(lambda point: point.bytes / 1e6),
+        f"{records[0].last.iteration:,}", last(_WALL[1]), last(_CPU[1]))
+
+
+def draw(result: CurvesResult, path: Path) -> None:
+    """Draws a row of panels a scene into a .png or .svg, whole or not at all.
+
+    A line is the median over the seeds; the band reaches from the lowest to the highest.
+    """
+    rows = len(result.scenes)
+    with drawing(path, _INCH * len(_PANELS), _INCH * rows + 0.5) as figure:
+        panels = figure.subplots(rows, len(_PANELS), squeeze=False)
+        for line, (name, scene) in zip(panels, result.scenes.items(), strict=True):
+            for axes, (across, up) in zip(line, _PANELS, strict=True):
+                for recipe, records in scene.runs.items():
+                    x, y = (np.array([[value(point) for point in record.points]
+                                      for record in records]) for _, value in (across, up))
+                    curve, = axes.plot(
+                        np.median(x, axis=0), np.median(y, axis=0), label=recipe, linewidth=1.2)
+                    axes.fill_between(np.median(x, axis=0), y.min(axis=0), y.max(axis=0),
+                                      color=curve.get_color(), alpha=0.2)
+                axes.set(xlabel=across[0], ylabel=up[0])
+                axes.grid(color="0.92")
+            line[0].set_title(name, fontsize=10)
+        add_legend(figure, panels[0][0])
+        figure.suptitle(f"{result.host.cpu}, threads: {result.host.threads}", fontsize=9)

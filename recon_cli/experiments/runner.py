@@ -1,0 +1,268 @@
+"""The runner of training experiments: variants x seeds on a scene, as records that resume.
+
+`recon bench train` and `recon study` differ in what they run and in how they show it; both load
+their scenes and make their runs here. A finished run is one line of runs.jsonl, flushed before the
+next run starts, so that a kill loses the run at hand and no other.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from recon_cli import __version__
+from recon_cli.config.settings import Settings
+from recon_cli.config.stages import ComputeConfig, RunConfig
+from recon_cli.context import StageContext
+from recon_cli.errors import ConfigError, FormatError
+from recon_cli.experiments.scenes import open_scene
+from recon_cli.experiments.trial import (
+    PILOT_STEPS,
+    CurvePoint,
+    LoadedScene,
+    TrainingRun,
+    load_for_training,
+    run_pilot,
+    run_trial,
+)
+from recon_cli.experiments.variants import Variant, run_grid
+from recon_cli.progress import Progress
+from recon_cli.stages import stage
+from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.digests import sha256_json
+
+RECORDS_FILE = "runs.jsonl"
+_VERSION = 1  # of the lines
+# A run of this many steps takes about half a minute on two cores and tells recipes apart.
+STEPS = 3000
+SECTIONS = ("ingest", "denoise", "sfm", "train")  # that --set may reach
+# training options that have command-line options of their own here, or no effect
+_OWN = {"iterations", "max_size", "max_gaussians", "seed", "densify", "mid", "checkpoint_every",
+        "quality", "minutes", "early_stop", "sh_degree"}
+
+
+@dataclass(frozen=True)
+class ExperimentRequest:
+    """What every training experiment is asked for."""
+
+    scenes: tuple[Path, ...]  # workspaces or data sets with poses
+    seeds: int  # runs of each variant
+    base: RunConfig  # options that all variants share, size and cap included
+    settings: Settings = field(default_factory=dict)  # of ingest, denoise and sfm for data sets
+    compute: ComputeConfig = field(default_factory=ComputeConfig)
+
+    def load(
+        self, paths: Mapping[str, Path], scratch: Path, split: str, ctx: StageContext
+    ) -> list[LoadedScene]:
+        """Returns the scenes of `scenes.check_scenes`, data sets made into workspaces first."""
+        return [
+            load_for_training(open_scene(
+                name, path, scratch, self.settings, self.compute, ctx.progress), split, self.base,
+                ctx)
+            for name, path in paths.items()]
+
+
+def base_config(
+    settings: Settings, *, max_size: int, max_gaussians: int, validation: float | None = None
+) -> RunConfig:
+    """Returns the options that all variants share.
+
+    Args:
+        settings: what --set set.
+        max_size: longest side of the images in pixels.
+        max_gaussians: cap of the count.
+        validation: fraction of the views that is not trained on; None where --set may say so.
+
+    Raises:
+        ConfigError: --set reaches a stage that is not run, or what has an option of its own.
+    """
+    for section in settings.keys() - set(SECTIONS):
+        if settings[section]:
+            raise ConfigError(
+                f"--set {section}.{next(iter(settings[section]))} has no effect here.",
+                hint=f"Options of {', '.join(SECTIONS)} can be set.")
+    values: dict[str, Any] = dict(settings.get("train", {}))
+    own = _OWN if validation is None else _OWN | {"validation"}
+    for name in sorted(own & values.keys()):
+        raise ConfigError(
+            f"--set train.{name} has no effect here.",
+            hint="See --help for sizes, steps and seeds; recipes say how to densify.")
+    if validation is not None:
+        values["validation"] = validation
+    return RunConfig(
+        **values, iterations=STEPS, max_size=max_size, max_gaussians=max_gaussians,
+        early_stop=False)  # every run takes the steps that it is said to take
+
+
+def shared_options(base: RunConfig) -> dict[str, Any]:
+    """Returns the options that all variants share, without those that each run has of its own."""
+    return {name: value for name, value in base.hashed_fields().items()
+            if name not in _OWN - {"max_size", "max_gaussians", "sh_degree"}}
+
+
+@dataclass(frozen=True)
+class Record:
+    """One finished run."""
+
+    points: tuple[CurvePoint, ...]  # in order of steps; of a run that was read, its end alone
+    machine: str  # that it ran on; seconds of two machines do not compare
+    parts: str = ""  # optional parts of the model that were on, and the pixels trained on
+
+    @property
+    def last(self) -> CurvePoint:
+        """How it ended."""
+        return self.points[-1]
+
+
+Runs = Mapping[str, tuple[Record, ...]]  # by variant, then by seed
+
+
+def key_of(loaded: LoadedScene, run: TrainingRun) -> str:
+    """Returns the key of a run: everything that decides about its outcome.
+
+    Threads and the machine are left out: they change the seconds alone.
+    """
+    versions = [__version__, *(stage(name).version for name in ("train", "prune", "evaluate"))]
+    return sha256_json({
+        "scene": loaded.folders.digest, "arm": run.variant.record(),
+        "config": run.config.hashed_fields(), "versions": versions, "backend": loaded.ctx.backend,
+        "device": loaded.ctx.device})
+
+
+class Records:
+    """The lines of a folder, by key.
+
+    Args:
+        folder: an existing one. A last line that a kill cut short is dropped.
+
+    Raises:
+        FormatError: the file holds something else.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / RECORDS_FILE
+        text = self._path.read_text(encoding="utf-8") if self._path.exists() else ""
+        lines = [line for line in text.splitlines(True) if line.endswith("\n")]
+        if text != "".join(lines):
+            write_bytes(self._path, "".join(lines).encode())
+        self._values = dict(self._read(lines))
+
+    def _read(self, lines: list[str]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        for number, line in enumerate(lines, start=1):
+            try:
+                entry = json.loads(line)
+                if entry["version"] == _VERSION:
+                    yield entry["key"], entry["value"]
+            except (ValueError, KeyError, TypeError) as error:
+                raise FormatError(
+                    f"{self._path}, line {number}, is not a record of a run.",
+                    hint="Remove that line; its run is then made again.") from error
+
+    def run(self, key: str) -> Record | None:
+        """Returns a finished run, None where there is none."""
+        value = self._values.get(key)
+        return None if value is None else Record(
+            (CurvePoint(**value["point"]),), value["machine"], value["parts"])
+
+    def steps(self, key: str) -> Mapping[str, int] | None:
+        """Returns steps that were fixed by variant, None where they were not."""
+        value = self._values.get(key)
+        return None if value is None else value["steps"]
+
+    def add_run(self, key: str, record: Record, run: TrainingRun, scene: str) -> None:
+        """Appends a finished run; scene, variant and seed stand beside it for readers."""
+        self._add(key, {
+            "point": asdict(record.last), "machine": record.machine, "parts": record.parts,
+            "scene": scene, "arm": run.variant.name, "seed": run.seed})
+
+    def add_steps(self, key: str, steps: Mapping[str, int]) -> None:
+        """Appends the steps that variants take in the same seconds."""
+        self._add(key, {"steps": dict(steps)})
+
+    def _add(self, key: str, value: Mapping[str, Any]) -> None:
+        line = json.dumps({"version": _VERSION, "key": key, "value": value}) + "\n"
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+        self._values[key] = value
+
+
+class Runner:
+    """Makes the runs that are missing from the records and returns all of them.
+
+    Args:
+        base: options that all variants share.
+        progress: opens bars.
+        machine: that runs are made on, in words.
+        records: of earlier runs; None where nothing is recorded.
+    """
+
+    def __init__(
+        self, base: RunConfig, progress: Progress, machine: str = "",
+        records: Records | None = None,
+    ) -> None:
+        self._base, self._progress = base, progress
+        self._machine, self._records = machine, records
+
+    def pilot_seconds(
+        self, loaded: LoadedScene, variants: Sequence[Variant]
+    ) -> dict[str, float]:
+        """Returns about how long a step takes by variant, from pilots, which warm caches too."""
+        seconds = {}
+        label = f"{loaded.folders.name}: pilots"
+        with self._progress.bar(label, len(variants), unit="variant") as bar:
+            for variant in variants:
+                seconds[variant.name] = run_pilot(loaded, variant).seconds / PILOT_STEPS
+                bar.advance()
+        return seconds
+
+    def run_all(
+        self, loaded: LoadedScene, variants: Sequence[Variant], seeds: int,
+        steps: Mapping[str, int], *, label: str,
+        score_at: Callable[[int], Sequence[int]] = lambda _steps: (),
+    ) -> Runs:
+        """Returns the runs of every variant with every seed.
+
+        Args:
+            loaded: the scene.
+            variants: to run.
+            seeds: how many, from 0 on.
+            steps: of each run, by variant.
+            label: of the progress bar.
+            score_at: for the steps of a run, those after which it is scored, beside its end.
+        """
+        with self._progress.bar(label, seeds * sum(steps.values()), unit="step") as bar:
+
+            def measure(variant: Variant, seed: int) -> Record:
+                bar.note(f"{variant.label}, seed {seed}")
+                run = TrainingRun(variant, self._base, steps[variant.name], seed)
+                record = self.recorded(loaded, run)
+                if record is None:
+                    return self.make(loaded, run, score_at(run.iterations), bar.advance)
+                bar.advance(run.iterations)
+                return record
+
+            return run_grid({variant.name: variant for variant in variants}, range(seeds), measure)
+
+    def recorded(self, loaded: LoadedScene, run: TrainingRun) -> Record | None:
+        """Returns a run of earlier, None where it was not made or nothing is recorded."""
+        return self._records.run(key_of(loaded, run)) if self._records else None
+
+    def make(
+        self, loaded: LoadedScene, run: TrainingRun, score_at: Sequence[int],
+        on_step: Callable[[], None],
+    ) -> Record:
+        """Makes and records a run."""
+        points = run_trial(loaded, run, score_at, on_step=on_step)
+        config = loaded.task(run).schedule.config
+        parts = [f"{config.images} images", f"degree {config.sh_degree}",
+                 *(name for name in ("far", "exposure", "poses") if getattr(config, name) == "on")]
+        record = Record(points, self._machine, ", ".join(parts))
+        if self._records:
+            self._records.add_run(key_of(loaded, run), record, run, loaded.folders.name)
+        return record

@@ -1,1 +1,0 @@
-"""`recon study`: the paper's experiment, repeated over seeds, with intervals."""
