@@ -40,7 +40,7 @@ from recon_cli.progress import Bar, Progress
 from recon_cli.render import registry
 from recon_cli.render.contract import Renderer, RenderOutput
 from recon_cli.render.numba.loss import C1, C2, MAPS, RADIUS, photometric, taps
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.losses import photometric_loss
@@ -210,13 +210,13 @@ def _label(backend: str, threads: int) -> str:
 @contextmanager
 def _threads(count: int, backend: str = "torch") -> Iterator[None]:
     """Lets a backend use `count` threads within the block, in the way that training does."""
-    before, crew_before = torch.get_num_threads(), crew.threads
+    before, pool_before = torch.get_num_threads(), pool.threads
     registry.use_threads(backend, count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
-        crew.threads = crew_before
+        pool.threads = pool_before
 
 
 def _render(scene: BenchScene, draw: Renderer) -> RenderOutput:

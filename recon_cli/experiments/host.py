@@ -22,8 +22,7 @@ from recon_cli import machine
 from recon_cli.render import registry
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import fill, fma
-from recon_cli.render.numba.simd_memory import store
+from recon_cli.render.numba.simd_functions import fill, fma, store
 
 # OpenMP's threads of the candidate before spin on for some milliseconds after their last work.
 _SETTLE_SECONDS = 0.03

@@ -11,10 +11,12 @@ from typing import Any
 
 from recon_cli.experiments.host import Stopwatch
 from recon_cli.render.contract import RenderOutput
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import blocks, tiles
 
 COMPOSITE, DECOMPOSE = "composite", "decompose"  # the stages whose pairs are counted
+# what results on disk call these kernels
+_STAGES = {"composite_backward": DECOMPOSE, "project_backward": "unproject"}
 
 
 class Probe:
@@ -47,16 +49,17 @@ class NumbaProbe(Probe):
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Measures kernels within the block."""
-        crew.observer = lambda name, seconds: self._add(name, 1e3 * seconds)
+        pool.observer = lambda name, seconds: self._add(
+            _STAGES.get(name, name), 1e3 * seconds)
         try:
             yield
         finally:
-            crew.observer = None
+            pool.observer = None
 
     def pairs(self, output: RenderOutput) -> tuple[int, int] | None:
         """Returns what the kernels counted: a row of a tile counts all its pixels."""
-        frame = output.rgb.grad_fn.lease.frame  # type: ignore[union-attr]
-        return frame.pairs_forward, frame.pairs_backward
+        view_pass = output.rgb.grad_fn.lease.view_pass  # type: ignore[union-attr]
+        return view_pass.pairs_forward, view_pass.pairs_backward
 
 
 class TorchProbe(Probe):

@@ -11,7 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.scene.camera import Camera
@@ -116,6 +118,41 @@ class RenderOutput:
     alpha: Tensor
     depth: Tensor
     statistics: Statistics
+
+
+@dataclass(frozen=True, eq=False)
+class TargetImage:
+    """What a training step compares a rendered view with.
+
+    Attributes:
+        pixels: [H, W, 3].
+        mask: [H, W] True where a pixel counts; None where all do.
+        gain: [3] by which the rendered channels are multiplied first; None for ones.
+    """
+
+    pixels: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+    gain: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """What a training step without autograd computes.
+
+    Attributes:
+        sh_degree: highest in use, as in `recon_cli.render.registry.render`.
+        ssim_weight: w in [0, 1] of the loss (1 - w) L1 + w (1 - SSIM).
+        details: the statistics absolute_grad and variance are wanted too.
+        scores: hits and blend weights too, over the pixels that the mask counts; without it they
+            mean nothing.
+        loo: loo too, likewise.
+    """
+
+    sh_degree: int
+    ssim_weight: float
+    details: bool = False
+    scores: bool = False
+    loo: bool = False
 
 
 class Renderer(Protocol):

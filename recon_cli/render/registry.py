@@ -90,21 +90,21 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
 def use_threads(backend: str, threads: int) -> None:
     """Lets a backend compute with `threads` CPU threads from now on."""
     if backend == "numba":
-        from recon_cli.render.numba.thread_pool import crew
+        from recon_cli.render.numba.thread_pool import pool
 
-        crew.threads = threads
+        pool.threads = threads
         # torch's own threads spin after each operation and would take the cores from the kernels
         threads = 1
     torch.set_num_threads(threads)
 
 
 def kernels_to_compile(backend: str) -> int:
-    """Returns how many kernels a backend must compile on this machine before its first picture."""
+    """Returns how many kernels a backend must compile on this machine before its first image."""
     if backend != "numba":
         return 0
-    from recon_cli.render.numba import warm
+    from recon_cli.render.numba import backend as numba_backend
 
-    return 0 if warm.is_warm() else warm.KERNELS
+    return 0 if numba_backend.is_warm() else numba_backend.KERNELS
 
 
 def prepare(backend: str, on_kernel: Callable[[], None]) -> float:
@@ -116,9 +116,9 @@ def prepare(backend: str, on_kernel: Callable[[], None]) -> float:
     """
     if backend != "numba":
         return 0.0
-    from recon_cli.render.numba import warm
+    from recon_cli.render.numba.backend import warm_up
 
-    return warm.warm_up(on_kernel)
+    return warm_up(on_kernel)
 
 
 def renderer(backend: str) -> Renderer:

@@ -147,7 +147,7 @@ class _Batch:
 
     def __init__(self, compute: DeferredStep, views: int) -> None:
         self._compute, self._views = compute, views
-        like = compute.ledger.numbers
+        like = compute.status.numbers
         # of several views: losses of this step, and steps that came to nothing
         self._loss, self._skipped = like.new_zeros(()), like.new_zeros(())
 
@@ -157,7 +157,7 @@ class _Batch:
             return
         self._gathered = Gathered.zeros(len(state.splats), state.splats.means.device)
         self._seen = torch.zeros_like(self._compute.counted)
-        self._before = self._compute.ledger.skipped.clone()
+        self._before = self._compute.status.skipped.clone()
         self._loss.zero_()
 
     def add(
@@ -171,14 +171,14 @@ class _Batch:
         if several:
             state.optimizer.keep(1 / self._views, sh_rest=moves_sh)
             self._seen |= self._compute.counted
-            self._loss += self._compute.ledger.loss
+            self._loss += self._compute.status.loss
 
     def end(self, state: TrainState, *, gathers: bool, moves_sh: bool) -> Tensor:
         """Leaves the mean gradient, and returns [1] int32 whether the step counts."""
         if self._views == 1:
             return self._compute.counted
-        ledger = self._compute.ledger
-        going, sound = ledger.going, ledger.skipped == self._before
+        status = self._compute.status
+        going, sound = status.going, status.skipped == self._before
         state.optimizer.kept(sh_rest=moves_sh)
         if gathers:  # of a step that is taken again nothing may stay
             state.gathered.join(self._gathered.times(going))
@@ -192,10 +192,10 @@ class _Batch:
             The loss of the last step, the steps that came to nothing for theirs, and how many steps
             happened before one was stopped; None where all did.
         """
-        account = self._compute.close()
-        happened = None if account.stopped is None else account.stopped // self._views
+        report = self._compute.close()
+        happened = None if report.stopped is None else report.stopped // self._views
         if self._views == 1:
-            return account.loss, account.skipped, happened
+            return report.loss, report.skipped, happened
         loss, skipped = torch.stack([self._loss / self._views, self._skipped]).tolist()
         self._skipped.zero_()
         return loss, int(skipped), happened

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render import Statistics, render
+from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.losses import photometric_loss
@@ -17,7 +18,7 @@ from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import camera_gradient
 
 if TYPE_CHECKING:
-    from recon_cli.render.triton.step_status import Account, Ledger
+    from recon_cli.render.triton.step_status import StepReport, StepStatus
 
 
 
@@ -63,8 +64,8 @@ class DeferredStep(GradientStep, Protocol):
         """[1] int32 on the device: zero where the last view came to nothing."""
 
     @property
-    def ledger(self) -> Ledger:
-        """What the device writes down of each view."""
+    def status(self) -> StepStatus:
+        """What the device records of each view."""
 
     def start(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
@@ -72,7 +73,7 @@ class DeferredStep(GradientStep, Protocol):
     ) -> Statistics:
         """Starts the work on one view and returns its statistics, zeros where it counts nothing."""
 
-    def close(self) -> Account:
+    def close(self) -> StepReport:
         """Waits for the work, and tells what became of the views since it was last called."""
 
 
@@ -92,7 +93,6 @@ class _FusedStep:
         from recon_cli.render.numba.step import PhotometricStep
 
         self._compute = PhotometricStep()
-        self._background = torch.zeros(3)
 
     @property
     def log_gain_gradient(self) -> NDArray[np.float64]:
@@ -103,9 +103,9 @@ class _FusedStep:
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
     ) -> NDArray[np.float64]:
         """Returns the gradient [6] of a turn and a move of the camera."""
-        from recon_cli.render.numba.camera_gradient import pull_of_scene
+        from recon_cli.render.numba.step import camera_gradient as numba_camera_gradient
 
-        return -pull_of_scene(optimizer.splats, optimizer.gradients, camera, sh_degree)
+        return numba_camera_gradient(optimizer.splats, optimizer.gradients, camera, sh_degree)
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
@@ -114,9 +114,9 @@ class _FusedStep:
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
-            optimizer.splats, optimizer.gradients, view.camera, view.image, self._background,
-            sh_degree, ssim_weight, mask=view.mask, gain=gain, details=variance,
-            scores=scores, loo=loo)
+            optimizer.splats, optimizer.gradients, view.camera,
+            TargetImage(view.image, view.mask, gain),
+            StepOptions(sh_degree, ssim_weight, details=variance, scores=scores, loo=loo))
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -135,9 +135,9 @@ class _DeviceStep:
         return self._compute.counted
 
     @property
-    def ledger(self) -> Ledger:
-        """What the device writes down of each view."""
-        return self._compute.ledger
+    def status(self) -> StepStatus:
+        """What the device records of each view."""
+        return self._compute.status
 
     def camera_gradient(
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
@@ -151,19 +151,13 @@ class _DeviceStep:
         loo: bool = False,
     ) -> Statistics:
         """Starts the work on one view and returns its statistics."""
-        from recon_cli.render.triton.step import Photograph
-
-        splats = optimizer.splats.map(lambda tensor: tensor.detach())
-        photograph = Photograph(
-            torch.from_numpy(view.image),
-            None if view.mask is None else torch.from_numpy(view.mask),
-            None if gain is None else torch.from_numpy(gain).to(splats.means.device))
         self._compute(
-            splats, optimizer.gradients, view.camera, photograph, sh_degree, ssim_weight,
-            details=variance, scores=scores, loo=loo)
+            optimizer.splats.map(lambda tensor: tensor.detach()), optimizer.gradients, view.camera,
+            TargetImage(view.image, view.mask, gain),
+            StepOptions(sh_degree, ssim_weight, details=variance, scores=scores, loo=loo))
         return self._compute.statistics
 
-    def close(self) -> Account:
+    def close(self) -> StepReport:
         """Waits for the work, and tells what became of it."""
         return self._compute.close()
 
@@ -177,12 +171,12 @@ class _DeviceStep:
             statistics = self.start(
                 optimizer, view, sh_degree, ssim_weight, variance=variance, gain=gain,
                 scores=scores, loo=loo)
-            account = self.close()
-            if account.stopped is None:  # else there is room for it now
+            report = self.close()
+            if report.stopped is None:  # else there is room for it now
                 break
         if gain is not None:
             self.log_gain_gradient = self._compute.log_gain_gradient.cpu().numpy()
-        return account.loss, statistics if account.seen else None
+        return report.loss, statistics if report.seen else None
 
 
 class _AutogradStep:

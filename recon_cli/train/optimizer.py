@@ -196,12 +196,12 @@ class SplatOptimizer:
             self._step_torch(names)
 
     def _groups(self, names: list[str]) -> tuple[Any, ...]:
-        """Returns values, gradients, moments and rates, each as a list over all parameters."""
-        roles = ([self._view(name, role).reshape(-1) for name in self._buffers]
-                 for role in _ROLES)
+        """Returns values, gradients, pair of moments and rates, as lists over all parameters."""
+        values, gradients, first, second = (
+            [self._view(name, role).reshape(-1) for name in self._buffers] for role in _ROLES)
         rates = [self._factor * self._rates[name] if name in names else None
                  for name in self._buffers]
-        return (*roles, rates)
+        return values, gradients, (first, second), rates
 
     @torch.no_grad()
     def _step_torch(self, names: list[str]) -> None:

@@ -14,6 +14,7 @@ import torch
 
 from recon_cli.experiments.synthetic_room import room
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.render.numba.step import PhotometricStep
 
 _COPIED = 200_000_000  # bytes; far more than any cache holds
@@ -39,7 +40,7 @@ def main() -> None:
     statistics = render(splats, camera, black, 3, backend="numba", scores=True).statistics
     step = PhotometricStep()
     truth = np.zeros((camera.height, camera.width, 3), np.uint8)
-    step(splats, splats.map(torch.empty_like), camera, truth, black, 3, 0.2)
+    step(splats, splats.map(torch.empty_like), camera, TargetImage(truth), StepOptions(3, 0.2))
     click.echo(f"seen            {int((statistics.radii > 0).sum()):,} Gaussians")
     click.echo(f"instances       {step.instances:,}")
     click.echo(f"contributing    {int(statistics.hits.sum()) / 1e6:.1f}M pairs")

@@ -13,7 +13,7 @@ from torch import Tensor
 from recon_cli.experiments.synthetic_room import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.render.triton import step as triton_step
-from recon_cli.render.triton.step_status import Account
+from recon_cli.render.triton.step_status import StepReport
 from recon_cli.train import async_trainer
 
 _IMAGE, _GRADIENT = 1e-5, 1e-3  # greatest rms of a picture, relative error of a gradient
@@ -99,9 +99,9 @@ def _counted(work: Callable[..., None], calls: list[int]) -> Callable[..., None]
 
 def _moved(
     size: SceneSize, device: str, **options: object
-) -> tuple[dict[str, Tensor], list[Account]]:
+) -> tuple[dict[str, Tensor], list[StepReport]]:
     """Returns parameters and moments after steps across a densification."""
-    accounts: list[Account] = []
+    accounts: list[StepReport] = []
     with photometric(accounts, **options):
         state, task = training(size, device, still=False)
         take = stretch(state, task, GATHERING + 100 - _STEPS // 2, _STEPS)

@@ -43,8 +43,8 @@ from gpu_scene import AFTER, photometric, training, without_graphs
 from recon_cli.experiments.synthetic_room import SceneSize
 from recon_cli.render import render
 from recon_cli.render.contract import TILE
+from recon_cli.render.triton import passes
 from recon_cli.render.triton import step as triton_step
-from recon_cli.render.triton import tile_lists
 from recon_cli.train.gradient import gradient_step
 
 SHARE = Goal(0, 40)  # percent of the floor; the least is to be known
@@ -87,23 +87,23 @@ class Stage:
 _AREA = TILE * TILE
 STAGES = {
     "project": Stage(
-        ((triton_step, "project"),), lambda c: 52 * c.N + 264 * c.S),
+        ((triton_step, "project_splats"),), lambda c: 52 * c.N + 264 * c.S),
     "prefix sum, admit": Stage(
-        ((tile_lists, "before_each"), (triton_step, "admitted")), lambda c: 8 * c.N),
-    "list_tiles": Stage(((tile_lists, "keyed"),), lambda c: 4 * c.N + 40 * c.S + 12 * c.E),
-    "sort": Stage(((tile_lists, "in_order"),), lambda c: 20 * c.E),
-    "place": Stage(((tile_lists, "placed"),), lambda c: 28 * c.E + 28 * c.S),
-    "tile ranges": Stage(((tile_lists, "by_tile"),), lambda c: 8 * c.E + 8 * c.T),
+        ((passes, "prefix_sums"), (triton_step, "admit_step")), lambda c: 8 * c.N),
+    "list_tiles": Stage(((passes, "list_instances"),), lambda c: 4 * c.N + 40 * c.S + 12 * c.E),
+    "sort": Stage(((passes, "sort_keys"),), lambda c: 20 * c.E),
+    "place": Stage(((passes, "place_instances"),), lambda c: 28 * c.E + 28 * c.S),
+    "tile ranges": Stage(((passes, "tile_ranges"),), lambda c: 8 * c.E + 8 * c.T),
     "composite": Stage(
-        ((triton_step, "composited"),),
+        ((triton_step, "composite_tiles"),),
         lambda c: 12 * c.E + 32 * c.S + 20 * c.P + 8 * _AREA * c.T, lambda c: 31 * c.Q),
     "loss": Stage(
         ((triton_step, "loss_and_gradient"),), lambda c: 27 * c.P, lambda c: 3 * 360 * c.P),
     "decompose": Stage(
-        ((triton_step, "decomposed"),),
+        ((triton_step, "composite_tiles_backward"),),
         lambda c: 52 * c.E + 32 * c.S + 12 * c.P + 8 * _AREA * c.T, lambda c: 49 * c.Q),
     "unproject": Stage(
-        ((triton_step, "unprojected"),), lambda c: 36 * c.E + 248 * c.N + 268 * c.S),
+        ((triton_step, "project_splats_backward"),), lambda c: 36 * c.E + 248 * c.N + 268 * c.S),
     "adam": Stage((), lambda c: 28 * 59 * c.N),
 }
 

@@ -18,7 +18,7 @@ import torch
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments.synthetic_room import SceneSize, room
 from recon_cli.render.triton import step as triton_step
-from recon_cli.render.triton.step_status import Account
+from recon_cli.render.triton.step_status import StepReport
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import async_trainer
@@ -89,7 +89,7 @@ def stretch(
 
 
 @contextmanager
-def photometric(accounts: list[Account], **options: Any) -> Iterator[None]:
+def photometric(accounts: list[StepReport], **options: Any) -> Iterator[None]:
     """Lets steps that are made within the block have other options, and notes their accounts."""
     original = triton_step.PhotometricStep
 
@@ -97,7 +97,7 @@ def photometric(accounts: list[Account], **options: Any) -> Iterator[None]:
         def __init__(self, device: torch.device) -> None:
             super().__init__(device, **options)
 
-        def close(self) -> Account:
+        def close(self) -> StepReport:
             accounts.append(super().close())
             return accounts[-1]
 

@@ -21,7 +21,7 @@ from recon_cli.experiments.synthetic_room import (
     variants_for,
 )
 from recon_cli.render import registry
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import tiles
 
 Said = pytest.CaptureFixture[str]
@@ -60,7 +60,7 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
         assert f"\n### {table} (room" in text.read_text()
     assert text.read_text().startswith("mine\n")
     assert text.read_text().endswith("mine too\n")
-    assert crew.observer is None
+    assert pool.observer is None
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [
@@ -103,7 +103,7 @@ def test_a_probe_changes_nothing_and_leaves_nothing_behind(backend: str) -> None
     assert probe.collect() == {}
     assert before == (
         tiles.alphas, tiles.project, vars(tiles._Rasterize)["forward"])
-    assert crew.observer is None
+    assert pool.observer is None
 
 
 def test_the_room_is_the_same_for_the_same_seed() -> None:

@@ -18,26 +18,24 @@ from scenes import camera_at, leaves, random_splats
 
 from recon_cli.render import render
 from recon_cli.render.numba import (
+    backend,
     binning,
     composite_backward,
-    composite_forward,
+    compositing,
     kernel,
     loss,
     optimizer,
     project_backward,
     projection,
     soa,
-    warm,
+    step,
 )
-from recon_cli.render.numba import (
-    projection as culling,
-)
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 
 STATISTICS = ("radii", "hits", "blend_sum", "blend_max", "means2d_grad", "absolute_grad",
               "variance", "loo")
-_MODULES = (binning, culling, loss, optimizer, projection, project_backward, composite_backward,
-            composite_forward)
+_MODULES = (binning, loss, optimizer, projection, project_backward, composite_backward,
+            compositing, step)
 
 
 def picture(backend: str) -> dict[str, np.ndarray]:
@@ -65,15 +63,15 @@ def kernels() -> dict[str, Any]:
 def main(out: Path) -> None:
     """Writes the report of this process to `out`."""
     torch.set_num_threads(1)
-    crew.threads = 1
+    pool.threads = 1
     ready: list[int] = []
-    was_warm = warm.is_warm()
-    seconds = warm.warm_up(lambda: ready.append(1))
+    was_warm = backend.is_warm()
+    seconds = backend.warm_up(lambda: ready.append(1))
     np.savez(out / "picture.npz", **picture("numba"))
     folder = kernel.cache_folder()
     used = kernels()
     (out / "report.json").write_text(json.dumps({
-        "was_warm": was_warm, "is_warm": warm.is_warm(), "kernels_ready": len(ready),
+        "was_warm": was_warm, "is_warm": backend.is_warm(), "kernels_ready": len(ready),
         "seconds": seconds, "folder": str(folder) if folder else None,
         "lanes": soa.LANES, "tile": [soa.TILE_WIDTH, soa.TILE_HEIGHT],
         "hits": {name: sum(one.stats.cache_hits.values()) for name, one in used.items()},

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon_cli.render.numba import kernel, warm
+from recon_cli.render.numba import backend, kernel
 
 HERE = Path(__file__).parent
 # What every CPU with AVX2 has; numba takes the name and the features together.
@@ -82,7 +82,7 @@ def compile_for_avx2(folder: Path) -> None:
 
 def _copy_damaged(target: Path) -> None:
     """Copies this process's own cache, so that nothing is compiled for it, and cuts the files."""
-    warm.warm_up()
+    backend.warm_up()
     source = kernel.cache_folder()
     if source is None:
         pytest.skip("there is no place to keep compiled kernels, see RECON_CACHE_DIR")

@@ -19,8 +19,9 @@ from backends import (
 )
 from scenes import camera_at, joined, one_splat, random_splats, with_harmonics
 
+from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.render.numba.step import PhotometricStep
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.splats import TERMS, with_rows
 
 N = 70
@@ -126,7 +127,8 @@ def guarded(splats, guard):
 def step_of(splats, gradients, degree):
     camera = camera_at(60, 41)
     truth = np.random.default_rng(0).integers(0, 256, (41, 60, 3), np.uint8)
-    return PhotometricStep()(splats, gradients, camera, truth, torch.zeros(3), degree, 0.2)
+    return PhotometricStep()(
+        splats, gradients, camera, TargetImage(truth), StepOptions(degree, 0.2))
 
 
 @every_degree
@@ -151,7 +153,7 @@ def test_kernels_give_the_same_bits_with_any_number_of_threads(degree, colored, 
     splats = with_harmonics(random_splats(3000, dtype=torch.float32), degree, colored)
     found = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(crew, "threads", threads)
+        monkeypatch.setattr(pool, "threads", threads)
         gradients = splats.map(torch.empty_like)
         loss = step_of(splats, gradients, 3)
         found.append((loss, gradients))

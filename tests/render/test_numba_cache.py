@@ -13,8 +13,8 @@ from numba_runs import HASWELL
 
 from recon_cli.pipeline.execute import Job, context_for
 from recon_cli.render import registry
-from recon_cli.render.numba import kernel, simd, warm
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba import backend, kernel, simd
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.stages import STAGES
 from recon_cli.workspace.layout import Workspace
 
@@ -73,7 +73,7 @@ def test_machine_code_from_the_cache_computes_the_same_bits(
 
 def test_the_progress_counts_every_kernel_that_threads_share(damaged_run, repaired_run):
     for run in (damaged_run, repaired_run):
-        assert run.report["kernels_ready"] == warm.KERNELS
+        assert run.report["kernels_ready"] == backend.KERNELS
 
 
 # ---- another CPU ----
@@ -143,7 +143,7 @@ def test_without_a_place_for_a_cache_kernels_are_compiled_and_run(fresh_folder, 
     with caplog.at_level(logging.WARNING, "recon"):
         compiled = kernel.kernel(double)
     assert "RECON_CACHE_DIR" in caplog.text
-    assert not warm.is_warm()
+    assert not backend.is_warm()
     values = np.ones(3, np.float32)
     compiled(values)
     assert values.tolist() == [2, 2, 2]
@@ -210,12 +210,12 @@ def test_files_that_a_crash_left_without_the_mark_of_a_full_cache_are_cleared(
         if cut.exists():
             raise EOFError("Ran out of input")
 
-    monkeypatch.setattr(warm, "_run_all", run_all)
+    monkeypatch.setattr(backend, "_run_all", run_all)
     with caplog.at_level(logging.WARNING, "recon"):
-        warm.warm_up()
+        backend.warm_up()
     assert calls == [True, False]
     assert "compiling them again" in caplog.text
-    assert warm.is_warm()
+    assert backend.is_warm()
 
 
 def test_a_fault_of_the_kernels_themselves_is_no_damage(fresh_folder, tmp_path, monkeypatch):
@@ -224,10 +224,10 @@ def test_a_fault_of_the_kernels_themselves_is_no_damage(fresh_folder, tmp_path, 
     def run_all():
         raise ValueError("a bug")
 
-    monkeypatch.setattr(warm, "_run_all", run_all)
+    monkeypatch.setattr(backend, "_run_all", run_all)
     with pytest.raises(ValueError, match="a bug"):
-        warm.warm_up()
-    assert not warm.is_warm()
+        backend.warm_up()
+    assert not backend.is_warm()
 
 
 # ---- what the user sees ----
@@ -249,7 +249,7 @@ class Bars:
 
 
 def stage_context(tmp_path, monkeypatch):
-    monkeypatch.setattr(crew, "threads", 1)
+    monkeypatch.setattr(pool, "threads", 1)
     bars = Bars()
     row = next(row for row in STAGES if row.name == "train")
     context_for(Job(Workspace(tmp_path), progress=bars), row, lambda *_: None)
@@ -257,20 +257,20 @@ def stage_context(tmp_path, monkeypatch):
 
 
 def test_a_cold_start_shows_a_bar_and_says_how_long_it_took(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(registry, "kernels_to_compile", lambda _: warm.KERNELS)
+    monkeypatch.setattr(registry, "kernels_to_compile", lambda _: backend.KERNELS)
     with caplog.at_level(logging.INFO, "recon"):
         bars = stage_context(tmp_path, monkeypatch)
-    assert bars.opened == [("compile for this CPU, once", warm.KERNELS, "kernel")]
-    assert bars.steps == warm.KERNELS
+    assert bars.opened == [("compile for this CPU, once", backend.KERNELS, "kernel")]
+    assert bars.steps == backend.KERNELS
     assert "kernels compiled in" in caplog.text
 
 
 def test_a_warm_start_shows_no_bar(tmp_path, monkeypatch):
-    monkeypatch.setattr(warm, "is_warm", lambda: True)
+    monkeypatch.setattr(backend, "is_warm", lambda: True)
     prepared = []
-    monkeypatch.setattr(warm, "warm_up", lambda on_kernel: prepared.append(on_kernel) or 0.0)
+    monkeypatch.setattr(backend, "warm_up", lambda on_kernel: prepared.append(on_kernel) or 0.0)
     assert stage_context(tmp_path, monkeypatch).opened == []
     assert len(prepared) == 1  # what is in the cache may be damaged: it is looked at first
-    monkeypatch.setattr(warm, "is_warm", lambda: False)
-    assert registry.kernels_to_compile("numba") == warm.KERNELS
+    monkeypatch.setattr(backend, "is_warm", lambda: False)
+    assert registry.kernels_to_compile("numba") == backend.KERNELS
     assert registry.kernels_to_compile("torch") == 0

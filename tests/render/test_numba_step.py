@@ -9,6 +9,7 @@ from scenes import camera_at, leaves, random_splats
 
 from recon_cli.experiments.synthetic_room import room
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.render.numba import backend
 from recon_cli.render.numba.step import PhotometricStep
 from recon_cli.train.losses import photometric_loss
@@ -20,8 +21,8 @@ MOST_BUFFERS = 60e6  # bytes, for 100,000 Gaussians at 640x360
 def test_the_buffers_of_a_step_stay_small():
     splats, camera = room(100_000, 640, 360)
     step = PhotometricStep()
-    step(splats, splats.map(torch.empty_like), camera, np.zeros((360, 640, 3), np.uint8), BLACK,
-         3, 0.2)
+    step(splats, splats.map(torch.empty_like), camera,
+         TargetImage(np.zeros((360, 640, 3), np.uint8)), StepOptions(3, 0.2))
     assert step.bytes <= MOST_BUFFERS
 
 
@@ -31,7 +32,7 @@ def test_the_fused_step_gives_the_gradients_of_autograd():
     splats = leaves(random_splats(200, seed=13, dtype=torch.float32))
     gradients = splats.map(lambda tensor: torch.full_like(tensor, torch.nan))
     step = PhotometricStep()
-    loss = step(splats, gradients, camera, truth, BLACK, 3, 0.2)
+    loss = step(splats, gradients, camera, TargetImage(truth), StepOptions(3, 0.2))
     output = render(splats, camera, BLACK, 3, backend="numba")
     expected = photometric_loss(output.rgb, torch.from_numpy(truth).float() / 255, 0.2)
     expected.backward()
@@ -43,7 +44,7 @@ def test_the_fused_step_gives_the_gradients_of_autograd():
     assert (mine - theirs).norm() <= 1e-5 * theirs.norm()
 
 
-def test_a_frame_comes_back_when_the_picture_goes(monkeypatch):
+def test_the_buffers_of_a_view_are_free_again_when_its_image_goes(monkeypatch):
     held = []
 
     class Watched(backend.Lease):
@@ -71,7 +72,7 @@ def test_a_read_only_photograph_is_taken():
     truth.flags.writeable = False
     splats = random_splats(5, dtype=torch.float32)
     assert np.isfinite(PhotometricStep()(
-        splats, splats.map(torch.empty_like), camera, truth, BLACK, 0, 0.2))
+        splats, splats.map(torch.empty_like), camera, TargetImage(truth), StepOptions(0, 0.2)))
 
 
 def test_the_fused_step_gives_the_scores_of_the_renderer():
@@ -81,8 +82,8 @@ def test_the_fused_step_gives_the_scores_of_the_renderer():
     splats = leaves(random_splats(200, seed=13, dtype=torch.float32))
     step = PhotometricStep()
     for counting in (None, mask, None):  # one after the other: nothing adds up
-        step(splats, splats.map(torch.empty_like), camera, truth, BLACK, 3, 0.2, mask=counting,
-             scores=True, loo=True)
+        step(splats, splats.map(torch.empty_like), camera, TargetImage(truth, counting),
+             StepOptions(3, 0.2, scores=True, loo=True))
         output = render(splats, camera, BLACK, 3, backend="numba", scores=True,
                         mask=None if counting is None else torch.from_numpy(counting))
         output.rgb.sum().backward()
@@ -99,6 +100,7 @@ def test_asking_for_scores_changes_no_gradient():
     for scores in (False, True):
         gradients = splats.map(torch.empty_like)
         PhotometricStep()(
-            splats, gradients, camera, truth, BLACK, 3, 0.2, scores=scores, loo=scores)
+            splats, gradients, camera, TargetImage(truth),
+            StepOptions(3, 0.2, scores=scores, loo=scores))
         found.append(gradients.parameters().values())
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))

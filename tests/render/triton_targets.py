@@ -24,9 +24,6 @@ from recon_cli.render.triton import (
     projection,
     step_status,
 )
-from recon_cli.render.triton import (
-    compositing as raster_forward,
-)
 
 TARGETS = (75, 90)  # Turing, the oldest that triton compiles for, and Hopper
 TYPES = {
@@ -44,7 +41,7 @@ TYPES = {
     "counting": "*u8", "hits": "*i32", "weights": "*fp32", "peaks": "*fp32", "grad_rgb": "*fp32",
     "grad_alpha": "*fp32", "grad_depth": "*fp32", "sums": "*fp32", "starts": "*i32",
     "count": "i32", "total_hits": "*i64", "blend_sum": "*fp32",
-    "blend_max": "*fp32", "ends": "*i64", "room": "i32", "ledger": "*fp64", "fits": "*i32",
+    "blend_max": "*fp32", "ends": "*i64", "room": "i32", "status": "*fp64", "fits": "*i32",
     "loss": "*fp64", "counted": "*i32", "taken": "*i64", "keep1": "fp32", "keep2": "fp32",
     "add1": "fp32", "add2": "fp32", "log2_keep1": "fp32", "log2_keep2": "fp32", "epsilon": "fp32",
     **{f"{role}{k}": "*fp32" for role in "pgmv" for k in range(6)},
@@ -52,26 +49,26 @@ TYPES = {
 }  # fmt: skip
 # what is compiled, with the constants and the warps that the backend starts it with
 KERNELS = (
-    (raster_forward.composite, {"SCORES": False, "MASKED": False, "CHUNK": 16}, 1),
-    (raster_forward.composite, {"SCORES": True, "MASKED": True, "CHUNK": 16}, 1),
-    (raster_forward.tally, {"BLOCK": 128}, 4),
-    (compositing.decompose,
+    (compositing.composite, {"SCORES": False, "MASKED": False, "CHUNK": 16}, 1),
+    (compositing.composite, {"SCORES": True, "MASKED": True, "CHUNK": 16}, 1),
+    (compositing.tally, {"BLOCK": 128}, 4),
+    (compositing.composite_backward,
      {"PLAIN": True, "DETAILS": False, "SCORES": False, "MASKED": False}, 1),
-    (compositing.decompose,
+    (compositing.composite_backward,
      {"PLAIN": True, "DETAILS": True, "SCORES": False, "MASKED": False}, 1),
-    (compositing.decompose,
+    (compositing.composite_backward,
      {"PLAIN": False, "DETAILS": True, "SCORES": True, "MASKED": True}, 1),
     (projection.project, {"STRIDE": 45, "TERMS": 15, "BLOCK": 128}, 4),
     (projection.list_tiles, {"BLOCK": 128}, 4),
     (projection.place, {"BLOCK": 128}, 4),
-    (project_backward.unproject,
+    (project_backward.project_backward,
      {"STRIDE": 45, "TERMS": 15, "GATED": True, "PLAIN": True, "DETAILS": False, "SCORES": False,
       "BLOCK": 128}, 4),
-    (project_backward.unproject,
+    (project_backward.project_backward,
      {"STRIDE": 45, "TERMS": 15, "GATED": False, "PLAIN": False, "DETAILS": True, "SCORES": True,
       "BLOCK": 128}, 4),
-    (step_status.admit, {"BLOCK": 256}, 4),
-    (step_status.note, {}, 4),
+    (step_status.admit_kernel, {"BLOCK": 256}, 4),
+    (step_status.record_kernel, {}, 4),
     (optimizer.adam, {"GATED": True, "BLOCK": 1024}, 4),
     (optimizer.adam, {"GATED": False, "BLOCK": 1024}, 4),
     (loss.blur_products, {"MASKED": True, "BLOCK": 256}, 4),

@@ -8,7 +8,7 @@ from scenes import camera_at, random_splats
 from recon_cli.config.stages import TrainConfig
 from recon_cli.io.images import painted
 from recon_cli.render import render
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.gradient import gradient_step
@@ -116,7 +116,7 @@ def test_a_gain_of_one_changes_no_gradient(backend):
 def test_any_number_of_threads_gives_the_same_gradient_of_the_gain(monkeypatch):
     splats, found = random_splats(200, seed=13, dtype=torch.float32), []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(crew, "threads", threads)
+        monkeypatch.setattr(pool, "threads", threads)
         found.append(step_of(splats, masked_view(), "numba", GAIN)[2])
     assert np.array_equal(found[0], found[1])
     assert np.array_equal(found[0], found[2])

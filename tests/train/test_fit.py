@@ -19,7 +19,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.io.images import painted
 from recon_cli.render import available_backends, render
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit import fit, validation_psnr
 from recon_cli.train.gradient import gradient_step
@@ -73,7 +73,7 @@ def test_two_runs_with_one_seed_give_the_same_bits(backend, device):
 def test_any_number_of_threads_trains_to_the_same_bits(monkeypatch, config):
     states = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(crew, "threads", threads)
+        monkeypatch.setattr(pool, "threads", threads)
         states.append(first_state(config, backend="numba"))
         run(states[-1], tiny_task(config, backend="numba"), 30)
     assert same(states[0], states[1])

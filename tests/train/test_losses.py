@@ -6,7 +6,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from recon_cli.render.numba.loss import MAPS, MIN_WIDTH, photometric
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.train.losses import blur, photometric_loss
 
 # The fused loss computes in float32. Measured 5e-7, and 3e-6 for the gradient.
@@ -204,7 +204,7 @@ def test_any_number_of_threads_gives_the_same_bits_of_the_loss(size, monkeypatch
     image, truth = bytes_and_render(*size)
     found = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(crew, "threads", threads)
+        monkeypatch.setattr(pool, "threads", threads)
         loss, gradient = fused(image, truth, 0.2)
         found.append((loss, gradient.tobytes()))
     assert found[0] == found[1] == found[2]

@@ -16,7 +16,7 @@ from adam_runs import (
 from scenes import joined, random_splats
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.splats import Splats
 from recon_cli.train.optimizer import SplatOptimizer
 
@@ -92,7 +92,7 @@ def test_fused_steps_equal_those_of_torch(n, backend):
 def test_fused_steps_have_the_same_bits_with_any_number_of_threads(monkeypatch):
     found = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(crew, "threads", threads)
+        monkeypatch.setattr(pool, "threads", threads)
         optimizer = optimizer_of(1200, backend="numba")  # several blocks of the largest group
         walk(optimizer, 2)
         found.append(held(optimizer))

@@ -7,7 +7,7 @@ from scenes import camera_at, leaves, one_splat, random_splats
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.render import render
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
@@ -127,7 +127,7 @@ def test_any_number_of_threads_gives_the_same_gradient(backend, monkeypatch):
     found, before = [], torch.get_num_threads()
     try:
         for threads in (1, 2, 3):
-            monkeypatch.setattr(crew, "threads", threads)
+            monkeypatch.setattr(pool, "threads", threads)
             torch.set_num_threads(threads)
             found.append(compute.camera_gradient(state.optimizer, camera_at(), 3))
     finally:

@@ -1,16 +1,52 @@
-"""The numba backend behind the contract: float32 on the CPU, differentiable by autograd."""
+"""The numba backend behind the contract: float32 on the CPU, differentiable by autograd.
+
+Its kernels are loaded from the cache, or compiled with a progress to look at, before the first use.
+"""
 
 from __future__ import annotations
 
+import logging
+import pickle
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from recon_cli.render.contract import EXACT, Approximation, RenderOutput, Statistics
-from recon_cli.render.numba.view_pass import Lease, Parameters, flat
+from recon_cli.render.contract import (
+    EXACT,
+    Approximation,
+    RenderOutput,
+    Statistics,
+    StepOptions,
+    TargetImage,
+)
+from recon_cli.render.numba.kernel import cache_folder
+from recon_cli.render.numba.optimizer import step
+from recon_cli.render.numba.step import PhotometricStep, camera_gradient
+from recon_cli.render.numba.thread_pool import pool
+from recon_cli.render.numba.view_pass import (
+    ImageBuffers,
+    Lease,
+    PackedSplats,
+    RenderSettings,
+    flat,
+)
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+
+KERNELS = 12  # that threads share; the progress counts these
+_SCIPY = "scipy.linalg"
+_READY = "ready"  # file in the cache folder once every kernel is there
+_DAMAGE = (pickle.UnpicklingError, EOFError, ImportError, AttributeError, IndexError, KeyError,
+           ValueError, TypeError, RuntimeError)
+logger = logging.getLogger("recon")
 
 
 def render(
@@ -29,9 +65,11 @@ def render(
     statistics = Statistics.zeros(splats.means)
     tensors = list(splats.parameters().values())
     if min(sh_degree, splats.sh_degree) == 0:
-        tensors[5] = tensors[5].detach()  # no part of the picture
-    rgb, alpha, depth = _Render.apply(
-        *tensors, background, camera, sh_degree, scores, mask, statistics, approximation)
+        tensors[5] = tensors[5].detach()  # not used by the image
+    settings = RenderSettings(
+        flat(background).copy(), sh_degree, scores,
+        None if mask is None else mask.contiguous().numpy(), approximation)
+    rgb, alpha, depth = _Render.apply(background, camera, settings, statistics, *tensors)
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
@@ -40,26 +78,19 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor,
-        sh_dc: Tensor, sh_rest: Tensor, background: Tensor, camera: Camera, sh_degree: int,
-        scores: bool, mask: Tensor | None, statistics: Statistics, approximation: Approximation,
+        ctx: Any, background: Tensor, camera: Camera, settings: RenderSettings,
+        statistics: Statistics, *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        tensors = means, quats, log_scales, logit_opacities, sh_dc, sh_rest
         size = camera.height, camera.width
-        rgb, alpha, depth = (means.new_empty(*size, 3), means.new_empty(size),
-                             means.new_empty(size))
+        rgb, alpha, depth = (background.new_empty(*size, 3), background.new_empty(size),
+                             background.new_empty(size))
         lease = Lease()
-        lease.frame.forward(
-            Parameters.of(tensors), camera, flat(background).copy(), sh_degree,
-            rgb=flat(rgb), alpha=flat(alpha), depth=flat(depth), radii=flat(statistics.radii),
-            approximation=approximation, scores=scores,
-            counting=None if mask is None else mask.contiguous().numpy())
-        statistics.broken = lease.frame.broken
-        if scores:
-            lease.frame.tally(statistics)
+        lease.view_pass.forward(
+            PackedSplats.of(tensors), camera, settings,
+            ImageBuffers(flat(rgb), flat(alpha), flat(depth)), statistics)
         ctx.save_for_backward(*tensors)
-        ctx.lease, ctx.statistics, ctx.scores = lease, statistics, scores
-        # the output itself would hold its own graph, and with it the frame, for ever
+        ctx.lease, ctx.statistics, ctx.scores = lease, statistics, settings.scores
+        # the output itself would hold its own graph, and with it the lease, for ever
         ctx.alpha = alpha.detach()
         return rgb, alpha, depth
 
@@ -67,17 +98,97 @@ class _Render(torch.autograd.Function):
     def backward(
         ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor, grad_depth: Tensor
     ) -> tuple[Tensor | None, ...]:
-        tensors, statistics = ctx.saved_tensors, ctx.statistics
+        tensors = ctx.saved_tensors
         gradients = [torch.empty_like(tensor, memory_format=torch.contiguous_format)
                      for tensor in tensors]
-        ctx.lease.frame.backward(
-            Parameters.of(tensors), Parameters.of(gradients), grad_rgb=flat(grad_rgb),
-            grad_alpha=flat(grad_alpha), grad_depth=flat(grad_depth), details=True,
-            scores=ctx.scores, means2d_grad=flat(statistics.means2d_grad),
-            absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
-            loo=flat(statistics.loo))
-        background = None
-        if ctx.needs_input_grad[6]:
-            left = 1 - ctx.alpha
-            background = (grad_rgb * left[..., None]).sum((0, 1))
-        return (*gradients, background, None, None, None, None, None, None)
+        ctx.lease.view_pass.backward(
+            PackedSplats.of(tensors), PackedSplats.of(gradients),
+            ImageBuffers(flat(grad_rgb), flat(grad_alpha), flat(grad_depth)), ctx.statistics,
+            details=True, loo=ctx.scores)
+        grad_background = None
+        if ctx.needs_input_grad[0]:
+            grad_background = (grad_rgb * (1 - ctx.alpha)[..., None]).sum((0, 1))
+        return (grad_background, None, None, None, *gradients)
+
+
+def is_warm() -> bool:
+    """Tells whether machine code for this CPU is there."""
+    folder = cache_folder()
+    return folder is not None and (folder / _READY).exists()
+
+
+def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
+    """Loads or compiles every kernel by running a tiny scene, and returns the seconds it took.
+
+    Args:
+        on_kernel: called after each of the KERNELS kernels is ready.
+    """
+    start = time.perf_counter()
+    ready: set[str] = set()
+
+    def observe(name: str, _seconds: float) -> None:
+        if name not in ready:
+            ready.add(name)
+            on_kernel()
+
+    folder = cache_folder()
+    # _READY may be missing although there are files: a crash can lose it and cut them short
+    has_files = folder is not None and any(folder.rglob("*.nbi"))
+    before, pool.observer = pool.observer, observe
+    try:
+        with _without_scipy():
+            _run_all()
+    except _DAMAGE:
+        if folder is None or not has_files:
+            raise
+        logger.warning("the compiled kernels in %s cannot be read; compiling them again", folder)
+        _clear(folder)
+        _run_all()
+    finally:
+        pool.observer = before
+    if folder is not None:
+        (folder / _READY).touch()
+    return time.perf_counter() - start
+
+
+@contextmanager
+def _without_scipy() -> Iterator[None]:
+    """Keeps numba from importing scipy.linalg, which takes longer than loading all kernels.
+
+    numba looks for BLAS there when it sets itself up; no kernel multiplies matrices with it.
+    """
+    if _SCIPY in sys.modules:
+        yield
+        return
+    sys.modules[_SCIPY] = None  # type: ignore[assignment]  # an import of it fails at once
+    try:
+        yield
+    finally:
+        del sys.modules[_SCIPY]
+
+
+def _clear(folder: Path) -> None:
+    """Deletes what a folder holds; another process may do so at the same time."""
+    for path in folder.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _run_all() -> None:
+    """Runs every kernel once, on three Gaussians and an image of 20x20 pixels."""
+    n = 3
+    splats = Splats(
+        means=torch.tensor([[0.0, 0.0, 2.0]] * n), quats=torch.tensor([[1.0, 0, 0, 0]] * n),
+        log_scales=torch.full((n, 3), -2.0), logit_opacities=torch.zeros(n),
+        sh_dc=torch.zeros(n, 3), sh_rest=torch.zeros(n, 15, 3))
+    camera = Camera(20, 20, 20.0, 20.0, 10.0, 10.0, np.eye(4))
+    gradients = splats.map(torch.zeros_like)
+    photograph = TargetImage(np.zeros((20, 20, 3), np.uint8))
+    PhotometricStep()(splats, gradients, camera, photograph, StepOptions(3, 0.2))
+    camera_gradient(splats, gradients, camera, 3)
+    render(splats, camera, torch.zeros(3), 3, scores=True)
+    groups = [tensor.reshape(-1) for tensor in gradients.parameters().values()]
+    step(groups, groups, (groups, groups), [0.0] * len(groups), count=1, betas=(0.9, 0.999),
+         epsilon=1e-15)

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.simd_memory import fetch_add
+from recon_cli.render.numba.simd_functions import fetch_add
 from recon_cli.render.numba.soa import (
     BLOCK,
     EXTENT_X,
@@ -55,15 +55,9 @@ def row_starts(rows, starts):
 def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
     """Writes for each row of tiles of each Gaussian the first tile and the end.
 
-    Args:
-        counter: [1] shared; blocks already taken.
-        records: [M * 16].
-        rows: [M * 2] first row of tiles, number of rows.
-        starts: [M + 1] where the spans of each begin.
-        tiles_x: tiles in a row.
-        square: the whole box counts, not the ellipse in it.
-        spans: [S * 2] out.
-        tiles: [M] out, number of tiles of each Gaussian.
+    `rows` [M * 2] are first row of tiles and number of rows, `starts` [M + 1] where the spans of
+    each begin. With `square` the whole box counts, not the ellipse in it. Written are `spans`
+    [S * 2] and `tiles` [M], the number of tiles of each Gaussian.
     """
     n = len(tiles)
     blocks = (n + BLOCK - 1) // BLOCK
@@ -72,7 +66,7 @@ def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
         if block >= blocks:
             break
         for j in range(block * BLOCK, min((block + 1) * BLOCK, n)):
-            at, found = j * RECORD, 0
+            at, count = j * RECORD, 0
             mean_x, mean_y = records[at + MEAN_X], records[at + MEAN_Y]
             extent_x, extent_y = records[at + EXTENT_X], records[at + EXTENT_Y]
             per_u = _ONE / records[at + U_X]
@@ -106,8 +100,8 @@ def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
                             end = high_pixel // TILE_WIDTH + 1
                 spans[2 * (starts[j] + k)] = first
                 spans[2 * (starts[j] + k) + 1] = end
-                found += end - first
-            tiles[j] = found
+                count += end - first
+            tiles[j] = count
 
 
 @kernel

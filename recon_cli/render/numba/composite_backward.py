@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon_cli.render.numba.batches import (
+from recon_cli.render.numba.compositing import (
     BATCH_FLOATS,
     END_ROW,
     FIRST_ROW,
@@ -30,22 +30,25 @@ from recon_cli.render.numba.batches import (
     L_V_Y,
     LOCAL,
     load_batch,
+    log2_alpha,
 )
-from recon_cli.render.numba.composite_forward import log2_alpha
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     absolute,
+    broadcast,
     exp2,
+    fetch_add,
     fill,
     fma,
     lane_numbers,
     largest,
+    load,
     minimum,
     select,
+    store,
     totals,
 )
-from recon_cli.render.numba.simd_memory import fetch_add, load, spread, store
 from recon_cli.render.numba.soa import (
     BATCH,
     LOG2_ALPHA_MAX,
@@ -63,33 +66,20 @@ BACKWARD_FLOATS = _BATCH + BATCH_FLOATS
 
 
 @kernel
-def decompose(counter, tile_start, members, slots, records, width, height, tiles_x, cutoff,
-              background, final, last, grad_rgb, grad_alpha, grad_depth, details, scores, counting,
-              sums, evaluated, scratch):
+def composite_backward(counter, tile_start, members, slots, records, width, height, tiles_x,
+                       cutoff, background, final, last, grad_rgb, grad_alpha, grad_depth, details,
+                       scores, counting, sums, evaluated, scratch):
     """Sums the gradients of every instance over the pixels of its tile.
+
+    The arguments are those of `compositing.composite`, and
 
     Args:
         counter: [1] shared; tiles already taken.
-        tile_start: [tiles + 1] where the instances of each tile begin.
-        members: [E] Gaussian of each instance, by tile and depth.
-        slots: [E] slot of each instance.
-        records: [M * 16].
-        width: of the image in pixels.
-        height: of the image in pixels.
-        tiles_x: tiles in a row.
-        cutoff: log2 of the least alpha of a fragment.
-        background: [3].
-        final: [tiles * TILE_PIXELS] T at the end, of the forward pass.
-        last: [tiles * TILE_PIXELS] number of the last instance that contributed.
         grad_rgb: [H * W * 3] dL/drgb.
-        grad_alpha: [H * W] dL/dalpha, or empty for zeros.
-        grad_depth: [H * W] dL/ddepth, or empty for zeros.
+        grad_alpha: [H * W] dL/dalpha, or empty for zeros; so is grad_depth.
         details: also sum |s u|, |s y|, s^2 and the number of fragments.
-        scores: also sum what leaving one out would change.
-        counting: [H * W] which pixels count in that, or empty for all.
-        sums: [E * 16] out by slot, see layout.
-        evaluated: [1] pairs of an instance and a pixel are added.
-        scratch: of the thread.
+        scores: also sum what leaving one out would change, over the pixels in `counting`.
+        sums: [E * 16] out by slot, see `soa`.
     """
     has_alpha, has_depth = len(grad_alpha) > 0, len(grad_depth) > 0
     tiles = len(tile_start) - 1
@@ -133,9 +123,9 @@ def decompose(counter, tile_start, members, slots, records, width, height, tiles
                     for plane in (_G_RED, _G_GREEN, _G_BLUE, _R, _G_DEPTH, _COUNTS):
                         scratch[plane + at + i] = np.float32(0)
             if scores:
-                store(scratch, _BEHIND_RED + at, spread(background, 0))
-                store(scratch, _BEHIND_GREEN + at, spread(background, 1))
-                store(scratch, _BEHIND_BLUE + at, spread(background, 2))
+                store(scratch, _BEHIND_RED + at, broadcast(background, 0))
+                store(scratch, _BEHIND_GREEN + at, broadcast(background, 1))
+                store(scratch, _BEHIND_BLUE + at, broadcast(background, 2))
         end = begin + np.int64(deepest)
         for e in range(end, tile_start[tile + 1]):
             for i in range(0, SLOT, LANES):
@@ -165,12 +155,12 @@ def decompose(counter, tile_start, members, slots, records, width, height, tiles
                     weight = a * T
                     red, green = load(scratch, _G_RED + at), load(scratch, _G_GREEN + at)
                     blue = load(scratch, _G_BLUE + at)
-                    shade = fma(red, spread(batch, i + L_RED),
-                                fma(green, spread(batch, i + L_GREEN),
-                                    blue * spread(batch, i + L_BLUE)))
+                    shade = fma(red, broadcast(batch, i + L_RED),
+                                fma(green, broadcast(batch, i + L_GREEN),
+                                    blue * broadcast(batch, i + L_BLUE)))
                     if has_depth:
                         z = load(scratch, _G_DEPTH + at)
-                        shade = fma(z, spread(batch, i + L_DEPTH), shade)
+                        shade = fma(z, broadcast(batch, i + L_DEPTH), shade)
                         g_depth = fma(weight, z, g_depth)
                     R = load(scratch, _R + at)
                     slope = shade - R
@@ -184,26 +174,26 @@ def decompose(counter, tile_start, members, slots, records, width, height, tiles
                     if details:
                         abs_x = abs_x + absolute(su)
                         abs_y = abs_y + absolute(fma(
-                            su, spread(batch, i + L_U_Y), sv * spread(batch, i + L_V_Y)))
+                            su, broadcast(batch, i + L_U_Y), sv * broadcast(batch, i + L_V_Y)))
                         squared = fma(s, s, squared)
                         hits = hits + select(part, 1.0, zero)
                     if scores:
                         behind = load(scratch, _BEHIND_RED + at)
-                        away = spread(batch, i + L_RED) - behind
+                        away = broadcast(batch, i + L_RED) - behind
                         store(scratch, _BEHIND_RED + at, fma(a, away, behind))
                         error = away * away
                         behind = load(scratch, _BEHIND_GREEN + at)
-                        away = spread(batch, i + L_GREEN) - behind
+                        away = broadcast(batch, i + L_GREEN) - behind
                         store(scratch, _BEHIND_GREEN + at, fma(a, away, behind))
                         error = fma(away, away, error)
                         behind = load(scratch, _BEHIND_BLUE + at)
-                        away = spread(batch, i + L_BLUE) - behind
+                        away = broadcast(batch, i + L_BLUE) - behind
                         store(scratch, _BEHIND_BLUE + at, fma(a, away, behind))
                         error = fma(away, away, error)
                         loo = fma(weight * weight * load(scratch, _COUNTS + at), error, loo)
                 pairs += (r1 - r0) * TILE_WIDTH
                 to = np.int64(slots[first + k]) * SLOT
-                abs_x = abs_x * spread(batch, i + L_U_X)
+                abs_x = abs_x * broadcast(batch, i + L_U_X)
                 if LANES == 16:
                     store(sums, to, totals((
                         g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu, s_uv, s_vv,

@@ -28,9 +28,7 @@ import numba
 from numba.core import config
 
 logger = logging.getLogger("recon")
-
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
-
 Compiled = Callable[..., Any]
 
 

@@ -17,9 +17,20 @@ from numpy.typing import NDArray
 
 from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import absolute, fill, fma, lane_numbers, select, total
-from recon_cli.render.numba.simd_memory import fetch_add, load, load_bytes, spread, store
-from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, crew
+from recon_cli.render.numba.simd_functions import (
+    absolute,
+    broadcast,
+    fetch_add,
+    fill,
+    fma,
+    lane_numbers,
+    load,
+    load_bytes,
+    select,
+    store,
+    total,
+)
+from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, pool
 
 RADIUS = 5
 CHANNELS = 3
@@ -72,20 +83,20 @@ def photometric(
     if (len(image), len(truth), len(gradient), len(maps)) != (size, size, size, MAPS * size):
         raise ValueError(f"arrays that do not fit an image of {width}x{height}")
     similar, apart = np.zeros(height), np.zeros(height)
-    crew.run(similarity, image, truth, width, height, _WINDOW, maps, similar)
-    crew.run(loss_gradient, image, truth, width, height, _WINDOW, maps, ssim_weight, gradient,
+    pool.run(similarity, image, truth, width, height, _WINDOW, maps, similar)
+    pool.run(loss_gradient, image, truth, width, height, _WINDOW, maps, ssim_weight, gradient,
              apart)
     ssim, l1 = float(similar.sum()) / size, float(apart.sum()) / size
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
 
 
 @inlined
-def blurred_across(scratch, plane, column, window):
+def blur_row(scratch, plane, column, window):
     """Returns one plane blurred along the row, LANES numbers from `column` of the block on."""
     at = plane * _WIDTH + LANES + column
-    result = spread(window, _PAD) * load(scratch, at)
+    result = broadcast(window, _PAD) * load(scratch, at)
     for k in range(1, 2 * RADIUS + 1):
-        result = fma(spread(window, _PAD + k), load(scratch, at + CHANNELS * k), result)
+        result = fma(broadcast(window, _PAD + k), load(scratch, at + CHANNELS * k), result)
     return result
 
 
@@ -117,8 +128,8 @@ def moments_down(image, truth, top, height, n, column, window, scratch, to):
         x, t = load(image, y * n + column), load_bytes(truth, y * n + column) * _STEP
         squares, product = fma(x, x, t * t), x * t
         k = y - top + RADIUS + _PAD  # tap of the first row; one less for each row below
-        w0, w1 = spread(window, k), spread(window, k - 1)
-        w2, w3 = spread(window, k - 2), spread(window, k - 3)
+        w0, w1 = broadcast(window, k), broadcast(window, k - 1)
+        w2, w3 = broadcast(window, k - 2), broadcast(window, k - 3)
         x0, x1, x2, x3 = fma(w0, x, x0), fma(w1, x, x1), fma(w2, x, x2), fma(w3, x, x3)
         t0, t1, t2, t3 = fma(w0, t, t0), fma(w1, t, t1), fma(w2, t, t2), fma(w3, t, t3)
         s0, s1 = fma(w0, squares, s0), fma(w1, squares, s1)
@@ -138,8 +149,8 @@ def map_down(maps, base, plane, top, height, n, column, window, scratch, to):
     for y in range(max(top - RADIUS, 0), min(top + _ROWS + RADIUS, height)):
         value = load(maps, base + y * n + column)
         k = y - top + RADIUS + _PAD
-        a, b = fma(spread(window, k), value, a), fma(spread(window, k - 1), value, b)
-        c, d = fma(spread(window, k - 2), value, c), fma(spread(window, k - 3), value, d)
+        a, b = fma(broadcast(window, k), value, a), fma(broadcast(window, k - 1), value, b)
+        c, d = fma(broadcast(window, k - 2), value, c), fma(broadcast(window, k - 3), value, d)
     keep_rows(scratch, plane, to, a, b, c, d)
 
 
@@ -149,8 +160,7 @@ def similarity(counter, image, truth, width, height, window, maps, row_sums, scr
 
     Args:
         counter: [1] shared; groups of rows already taken.
-        image: [H * W * 3] float32.
-        truth: [H * W * 3] uint8.
+        image: [H * W * 3] float32; truth is uint8.
         width: of the image in pixels, at least MIN_WIDTH.
         height: in pixels.
         window: taps with _PAD zeros at both ends.
@@ -186,10 +196,10 @@ def compare_row(scratch, plane, c0, c1, n, window, maps, base, size):
     for i in range(c0, c1, LANES):
         column = min(i, n - LANES)
         at, to = column - c0, base + column
-        mx, my = blurred_across(scratch, plane, at, window), blurred_across(
+        mx, my = blur_row(scratch, plane, at, window), blur_row(
             scratch, plane + 1, at, window)
-        squares = blurred_across(scratch, plane + 2, at, window)
-        products = blurred_across(scratch, plane + 3, at, window)
+        squares = blur_row(scratch, plane + 2, at, window)
+        products = blur_row(scratch, plane + 3, at, window)
         means = fma(mx, mx, my * my)
         a1, a2 = 2.0 * mx * my + C1, 2.0 * (products - mx * my) + C2
         b1, b2 = means + C1, (squares - means) + C2
@@ -241,9 +251,9 @@ def slope_row(scratch, plane, c0, c1, n, window, image, truth, base, by_l1, by_s
         column = min(i, n - LANES)
         at, to = column - c0, base + column
         x, t = load(image, to), load_bytes(truth, to) * _STEP
-        slope = blurred_across(scratch, plane, at, window)
-        slope = fma(2.0 * x, blurred_across(scratch, plane + 1, at, window), slope)
-        slope = fma(t, blurred_across(scratch, plane + 2, at, window), slope)
+        slope = blur_row(scratch, plane, at, window)
+        slope = fma(2.0 * x, blur_row(scratch, plane + 1, at, window), slope)
+        slope = fma(t, blur_row(scratch, plane + 2, at, window), slope)
         off = x - t
         sign = select(off > 0.0, 1.0, select(off < 0.0, -1.0, fill(0.0)))
         store(gradient, to, fma(by_ssim, slope, by_l1 * sign))

@@ -13,26 +13,33 @@ from torch import Tensor
 
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import absolute, fill, fma, select, square_root
-from recon_cli.render.numba.simd_memory import fetch_add, load, store
-from recon_cli.render.numba.thread_pool import crew
+from recon_cli.render.numba.simd_functions import (
+    absolute,
+    fetch_add,
+    fill,
+    fma,
+    load,
+    select,
+    square_root,
+    store,
+)
+from recon_cli.render.numba.thread_pool import pool
 
 BLOCK = 1 << 14  # numbers that a thread takes at a time
 _VANISHED = np.float32(1e-37)  # moments under this are dropped: denormal numbers are slow
 
 
 def step(
-    values: Sequence[Tensor], gradients: Sequence[Tensor], first: Sequence[Tensor],
-    second: Sequence[Tensor], rates: Sequence[float | None], *, count: int,
-    betas: tuple[float, float], epsilon: float,
+    values: Sequence[Tensor], gradients: Sequence[Tensor],
+    moments: tuple[Sequence[Tensor], Sequence[Tensor]], rates: Sequence[float | None], *,
+    count: int, betas: tuple[float, float], epsilon: float,
 ) -> None:
     """Takes one step of Adam in place.
 
     Args:
         values: flat contiguous float32 tensors on the CPU, one for each group of parameters.
         gradients: of the same sizes.
-        first: moving averages of the gradients.
-        second: moving averages of their squares.
+        moments: moving averages of the gradients, and of their squares.
         rates: learning rate of each group; None leaves the group alone.
         count: steps taken, this one included.
         betas: decay of the two averages.
@@ -42,32 +49,21 @@ def step(
                       for value, rate in zip(values, rates, strict=True)], np.int64)
     numbers = np.array([rate or 0.0 for rate in rates], np.float32)
     arrays = (tuple(tensor.numpy() for tensor in group)
-              for group in (values, gradients, first, second))
-    crew.run(adam, sizes, numbers, *arrays, *betas, 1 - betas[0] ** count, 1 - betas[1] ** count,
+              for group in (values, gradients, *moments))
+    pool.run(adam, sizes, numbers, *arrays, *betas, 1 - betas[0] ** count, 1 - betas[1] ** count,
              epsilon, scratch=False)
 
 
 @kernel
 def adam(counter, sizes, rates, values, gradients, first, second, beta1, beta2, correction1,
          correction2, epsilon):
-    """Moves `values` against `gradients`.
+    """Moves `values` against `gradients`; each of the four is a tuple of G flat arrays.
 
         m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2,
-        p <- p - rate (m / c1) / (sqrt(v / c2) + epsilon)
+        p <- p - rate (m / c1) / (sqrt(v / c2) + epsilon),  c1 = 1 - b1^t,  c2 = 1 - b2^t
 
-    Args:
-        counter: [1] shared; blocks already taken.
-        sizes: [G] numbers of each group to move.
-        rates: [G] float32 learning rates.
-        values: tuple of G flat arrays.
-        gradients: tuple of G flat arrays.
-        first: m, tuple of G flat arrays.
-        second: v, tuple of G flat arrays.
-        beta1: decay of m.
-        beta2: decay of v.
-        correction1: c1 = 1 - beta1^t.
-        correction2: c2 = 1 - beta2^t.
-        epsilon: keeps the quotient finite.
+    `counter` [1] is shared: blocks already taken. `sizes` [G] numbers of each group move, by the
+    learning rates `rates` [G].
     """
     keep1, keep2 = np.float32(beta1), np.float32(beta2)
     add1, add2 = np.float32(1 - beta1), np.float32(1 - beta2)

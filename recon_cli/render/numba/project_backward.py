@@ -10,17 +10,22 @@ import numpy as np
 
 from recon_cli.render.contract import DILATION
 from recon_cli.render.numba.kernel import inlined, kernel
+from recon_cli.render.numba.projection import C0, direction_gradient, write_basis
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
+    copy,
     exp2,
+    fetch_add,
     fill,
     fma,
+    load,
     maximum,
     minimum,
     select,
     square_root,
+    store,
+    transpose,
 )
-from recon_cli.render.numba.simd_memory import copy, fetch_add, load, store, transpose
 from recon_cli.render.numba.soa import (
     ABS_X,
     ABS_Y,
@@ -67,7 +72,6 @@ from recon_cli.render.numba.soa import (
     terms_of_group,
     unit_quaternion,
 )
-from recon_cli.render.numba.spherical_harmonics import C0, direction_gradient, write_basis
 
 _F = np.float32
 _WHITE = _F(2 / LOG2_E)  # u and v hold sqrt(log2(e) / 2)
@@ -83,7 +87,7 @@ GRADIENT_FLOATS = (_PULL + 15) * LANES
 
 
 @kernel
-def unproject(counter, ids, block_starts, slot_start, sums, depths, means, quats, log_scales,
+def project_backward(counter, ids, block_starts, slot_start, sums, depths, means, quats, log_scales,
               logits, sh_dc, sh_rest, stride, terms, view, records, g_means, g_quats,
               g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad, absolute_grad, variance,
               loo, scratch):

@@ -2,6 +2,9 @@
 
 EWA splatting (Zwicker et al. 2002, eqs. 24 to 31; Kerbl et al. 2023, eq. 5): the covariance on the
 image is V V^T + 0.3 I with V = J W R S, J the Jacobian of the pinhole projection at the mean.
+
+Basis, signs and order of the spherical harmonics are those of INRIA's 3DGS (after Sloan 2013,
+"Efficient Spherical Harmonic Evaluation"), as in recon_cli.scene.harmonics.
 """
 
 from __future__ import annotations
@@ -16,17 +19,21 @@ from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     absolute,
     bits,
+    copy,
     count_bits,
     exp2,
+    fetch_add,
     fill,
     lane_numbers,
+    load,
     log2,
     lowest_bit,
     maximum,
     minimum,
     square_root,
+    store,
+    transpose,
 )
-from recon_cli.render.numba.simd_memory import copy, fetch_add, load, store, transpose
 from recon_cli.render.numba.soa import (
     BLOCK,
     BLUE,
@@ -75,11 +82,20 @@ from recon_cli.render.numba.soa import (
     terms_of_group,
     unit_quaternion,
 )
-from recon_cli.render.numba.spherical_harmonics import C0, write_basis
 
 INFINITE = np.float32(3e38)
 _CULL_SLACK = 1e-3  # culling keeps what rounding leaves in doubt
 _F = np.float32
+_SLACK = np.float32(1e-3)  # in q; culling keeps what rounding leaves in doubt
+_LARGEST = np.float32(1e30)  # a determinant beyond it has no useful inverse
+# spherical harmonics
+C0 = np.float32(0.28209479177387814)
+_C1 = np.float32(0.4886025119029199)
+_C20, _C21, _C22 = np.float32(1.0925484305920792), np.float32(0.31539156525252005), np.float32(
+    0.5462742152960396)
+_C30, _C31, _C32, _C33, _C34 = (np.float32(c) for c in (
+    0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154,
+    1.445305721320277))
 
 
 @kernel
@@ -125,18 +141,18 @@ def cull(counter, means, log_scales, logits, view, alpha_min, candidates, counts
             radius = square_root(reach * (
                 jacobian * jacobian * (2.0 + tan_x * tan_x + tan_y * tan_y) + DILATION)) + 1.0
             mean_x, mean_y = u * _F(view.fx) + _F(view.cx), v * _F(view.fy) + _F(view.cy)
-            given = lane_numbers() < count
+            valid = lane_numbers() < count
             finite = (absolute(x) + absolute(y) + absolute(z) + absolute(
                 load(scratch, 4 * LANES)) + absolute(load(scratch, 5 * LANES)) < INFINITE)
-            bad += count - count_bits(bits(finite & given))
-            seen = ((z > NEAR) & (load(scratch, 4 * LANES) >= logit_min)
+            bad += count - count_bits(bits(finite & valid))
+            visible = ((z > NEAR) & (load(scratch, 4 * LANES) >= logit_min)
                     & (mean_x + radius > 0.0) & (mean_x - radius < _F(view.width))
                     & (mean_y + radius > 0.0) & (mean_y - radius < _F(view.height))
-                    & given & finite)
-            found = bits(seen)
-            while found != 0:
-                candidates[to] = first + lowest_bit(found)
-                found &= found - np.uint64(1)
+                    & valid & finite)
+            remaining = bits(visible)
+            while remaining != 0:
+                candidates[to] = first + lowest_bit(remaining)
+                remaining &= remaining - np.uint64(1)
                 to += 1
         counts[block] = to - block * BLOCK
     fetch_add(broken, 0, bad)
@@ -150,10 +166,6 @@ def compact(candidates, counts, ids):
         for k in range(counts[block]):
             ids[to] = candidates[block * BLOCK + k]
             to += 1
-
-
-_SLACK = np.float32(1e-3)  # in q; culling keeps what rounding leaves in doubt
-_LARGEST = np.float32(1e30)  # a determinant beyond it has no useful inverse
 
 
 @kernel
@@ -289,3 +301,63 @@ def shape(scratch, view, alpha_min, square):
              & (absolute(mean_x) < _LARGEST) & (absolute(mean_y) < _LARGEST)
              & (above >= 0.0))
     return bits(sound)
+
+
+@inlined
+def write_basis(to, at, x, y, z, terms):
+    """Writes the first `terms` functions after the constant one to planes of `to` from `at` on."""
+    if terms < 3:
+        return
+    store(to, at, -_C1 * y)
+    store(to, at + LANES, _C1 * z)
+    store(to, at + 2 * LANES, -_C1 * x)
+    if terms < 8:
+        return
+    xx, yy, zz = x * x, y * y, z * z
+    store(to, at + 3 * LANES, _C20 * x * y)
+    store(to, at + 4 * LANES, -_C20 * y * z)
+    store(to, at + 5 * LANES, _C21 * (2.0 * zz - xx - yy))
+    store(to, at + 6 * LANES, -_C20 * x * z)
+    store(to, at + 7 * LANES, _C22 * (xx - yy))
+    if terms < 15:
+        return
+    store(to, at + 8 * LANES, -_C30 * y * (3.0 * xx - yy))
+    store(to, at + 9 * LANES, _C31 * x * y * z)
+    store(to, at + 10 * LANES, -_C32 * y * (4.0 * zz - xx - yy))
+    store(to, at + 11 * LANES, _C33 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy))
+    store(to, at + 12 * LANES, -_C32 * x * (4.0 * zz - xx - yy))
+    store(to, at + 13 * LANES, _C34 * z * (xx - yy))
+    store(to, at + 14 * LANES, -_C30 * x * (xx - 3.0 * yy))
+
+
+@inlined
+def direction_gradient(pull, at, x, y, z, terms):
+    """Returns the gradient with respect to (x, y, z) of sum_k pull_k basis_k(x, y, z).
+
+    `pull` holds planes from `at` on; x, y, z are taken as independent.
+    """
+    p0, p1, p2 = load(pull, at), load(pull, at + LANES), load(pull, at + 2 * LANES)
+    gx, gy, gz = -_C1 * p2, -_C1 * p0, _C1 * p1
+    if terms >= 8:
+        p3, p4, p5 = load(pull, at + 3 * LANES), load(pull, at + 4 * LANES), load(
+            pull, at + 5 * LANES)
+        p6, p7 = load(pull, at + 6 * LANES), load(pull, at + 7 * LANES)
+        p5, p7 = 2.0 * _C21 * p5, 2.0 * _C22 * p7
+        gx = gx + _C20 * (y * p3 - z * p6) - x * p5 + x * p7
+        gy = gy + _C20 * (x * p3 - z * p4) - y * p5 - y * p7
+        gz = gz - _C20 * (y * p4 + x * p6) + 2.0 * z * p5
+    if terms >= 15:
+        xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+        p8, p9, p10 = load(pull, at + 8 * LANES), load(pull, at + 9 * LANES), load(
+            pull, at + 10 * LANES)
+        p11, p12 = load(pull, at + 11 * LANES), load(pull, at + 12 * LANES)
+        p13, p14 = load(pull, at + 13 * LANES), load(pull, at + 14 * LANES)
+        p8, p9, p10, p11 = _C30 * p8, _C31 * p9, _C32 * p10, _C33 * p11
+        p12, p13, p14 = _C32 * p12, _C34 * p13, 3.0 * _C30 * p14
+        gx = (gx - 6.0 * xy * p8 + yz * p9 + 2.0 * xy * p10 - 6.0 * xz * p11
+              - (4.0 * zz - 3.0 * xx - yy) * p12 + 2.0 * xz * p13 - (xx - yy) * p14)
+        gy = (gy - 3.0 * (xx - yy) * p8 + xz * p9 - (4.0 * zz - xx - 3.0 * yy) * p10
+              - 6.0 * yz * p11 + 2.0 * xy * p12 - 2.0 * yz * p13 + 2.0 * xy * p14)
+        gz = (gz + xy * p9 - 8.0 * yz * p10 + (6.0 * zz - 3.0 * xx - 3.0 * yy) * p11
+              - 8.0 * xz * p12 + (xx - yy) * p13)
+    return gx, gy, gz

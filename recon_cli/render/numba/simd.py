@@ -29,7 +29,6 @@ def vector_width() -> int:
 
 
 LANES = vector_width()
-
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 VECTOR = ir.VectorType(_FLOAT, LANES)
 INTS = ir.VectorType(_INT, LANES)

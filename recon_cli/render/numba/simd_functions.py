@@ -1,4 +1,7 @@
-"""Functions of lanes: choice, fused arithmetic, powers and logarithms, sums across lanes."""
+"""Functions of SIMD lanes: selection, arithmetic, sums across lanes, loads and stores.
+
+Loads and stores address flat arrays and check no bounds.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from numba.extending import intrinsic
 
 from recon_cli.render.numba.simd import INTS, LANES, VECTOR, constant, lanes_type, mask_type, splat
 
-# Minimax polynomials by Remez' exchange; test_numba_lanes checks the errors.
+# Minimax polynomials by Remez' exchange; test_numba_simd checks the errors.
 # 2^f on [-1/2, 1/2], relative error 7.5e-8.
 _EXP2 = (1.0000001192092896, 0.6931469440460205, 0.24022120237350464, 0.05550713092088699,
          0.009675540961325169, 0.0013276472454890609)
@@ -30,10 +33,11 @@ def _call(builder: Any, name: str, *args: Any) -> Any:
     return builder.call(function, args)
 
 
-def _cast(context: Any, builder: Any, sig: Any, args: Any) -> list[Any]:
+def _cast(context: Any, builder: Any, kinds: Any, args: Any) -> list[Any]:
+    """Emits casts of numbers to vectors; vectors stay as they are."""
     return [value if kind == lanes_type
             else splat(builder, context.cast(builder, value, kind, types.float32))
-            for value, kind in zip(args, sig.args, strict=True)]
+            for value, kind in zip(args, kinds, strict=True)]
 
 
 def _integers(value: int) -> Any:
@@ -44,7 +48,7 @@ def _integers(value: int) -> Any:
 def fill(_typing: Any, value: Any) -> Any:
     """Returns the number `value` in every lane."""
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _cast(context, builder, sig, args)[0]
+        return _cast(context, builder, sig.args, args)[0]
 
     return lanes_type(value), emit
 
@@ -62,10 +66,7 @@ def lane_numbers(_typing: Any) -> Any:
 def select(_typing: Any, mask: Any, yes: Any, no: Any) -> Any:
     """Returns `yes` in the lanes where the mask holds and `no` elsewhere."""
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pair = [value if kind == lanes_type
-                else splat(builder, context.cast(builder, value, kind, types.float32))
-                for value, kind in zip(args[1:], sig.args[1:], strict=True)]
-        return builder.select(args[0], *pair)
+        return builder.select(args[0], *_cast(context, builder, sig.args[1:], args[1:]))
 
     return lanes_type(mask_type, yes, no), emit
 
@@ -109,14 +110,14 @@ def count_bits(_typing: Any, number: Any) -> Any:
 def fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
     """Returns a * b + c, rounded once where the CPU can: the same bits wherever it is called."""
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, "llvm.fmuladd", *_cast(context, builder, sig, args))
+        return _call(builder, "llvm.fmuladd", *_cast(context, builder, sig.args, args))
 
     return lanes_type(a, b, c), emit
 
 
 def _choice(sign: str) -> Any:
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        a, b = _cast(context, builder, sig, args)
+        a, b = _cast(context, builder, sig.args, args)
         return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
     return emit
@@ -134,31 +135,29 @@ def maximum(_typing: Any, a: Any, b: Any) -> Any:
     return lanes_type(a, b), _choice(">")
 
 
+def _unary(name: str) -> Any:
+    def emit(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
+        return _call(builder, name, *args)
+
+    return lanes_type(lanes_type), emit
+
+
 @intrinsic
 def absolute(_typing: Any, value: Any) -> Any:
     """Returns |value|."""
-    def emit(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-        return _call(builder, "llvm.fabs", *args)
-
-    return lanes_type(lanes_type), emit
+    return _unary("llvm.fabs")
 
 
 @intrinsic
 def square_root(_typing: Any, value: Any) -> Any:
     """Returns the square root."""
-    def emit(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-        return _call(builder, "llvm.sqrt", *args)
-
-    return lanes_type(lanes_type), emit
+    return _unary("llvm.sqrt")
 
 
 @intrinsic
 def floor(_typing: Any, value: Any) -> Any:
     """Returns the greatest integer that is not greater."""
-    def emit(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-        return _call(builder, "llvm.floor", *args)
-
-    return lanes_type(lanes_type), emit
+    return _unary("llvm.floor")
 
 
 def _polynomial(builder: Any, coefficients: Sequence[float], x: Any) -> Any:
@@ -212,16 +211,21 @@ def log2(_typing: Any, value: Any) -> Any:
 
 # ---- across lanes ----
 
+def _butterfly(builder: Any, value: Any, combine: Any) -> Any:
+    """Emits the reduction of all lanes, pairwise, in an order that is always the same."""
+    step = LANES // 2
+    while step:
+        moved = builder.shuffle_vector(
+            value, value, ir.Constant(INTS, [i ^ step for i in range(LANES)]))
+        value, step = combine(value, moved), step // 2
+    return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+
+
 @intrinsic
 def total(_typing: Any, value: Any) -> Any:
-    """Returns the sum of all lanes, pairwise, in an order that is always the same."""
+    """Returns the sum of all lanes."""
     def emit(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-        value, step = args[0], LANES // 2
-        while step:
-            moved = builder.shuffle_vector(
-                value, value, ir.Constant(INTS, [i ^ step for i in range(LANES)]))
-            value, step = builder.fadd(value, moved), step // 2
-        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+        return _butterfly(builder, args[0], builder.fadd)
 
     return types.float32(lanes_type), emit
 
@@ -230,13 +234,10 @@ def total(_typing: Any, value: Any) -> Any:
 def largest(_typing: Any, value: Any) -> Any:
     """Returns the largest lane."""
     def emit(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-        value, step = args[0], LANES // 2
-        while step:
-            moved = builder.shuffle_vector(
-                value, value, ir.Constant(INTS, [i ^ step for i in range(LANES)]))
-            value = builder.select(builder.fcmp_ordered(">", value, moved), value, moved)
-            step //= 2
-        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+        def larger(a: Any, b: Any) -> Any:
+            return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+        return _butterfly(builder, args[0], larger)
 
     return types.float32(lanes_type), emit
 
@@ -266,3 +267,141 @@ def totals(_typing: Any, values: Any) -> Any:
         return level[0]
 
     return lanes_type(values), emit
+
+
+# ---- memory ----
+
+def _flat(array: Any, dtype: Any, index: Any) -> bool:
+    return (isinstance(array, types.Array) and array.dtype == dtype and array.ndim == 1
+            and isinstance(index, types.Integer))
+
+
+def _address(context: Any, builder: Any, sig: Any, args: Any, first: int = 0) -> Any:
+    """Returns the address of array[index], two operands from number `first` on."""
+    data = context.make_array(sig.args[first])(context, builder, value=args[first]).data
+    index = context.cast(builder, args[first + 1], sig.args[first + 1], types.int64)
+    return builder.gep(data, [index])
+
+
+def _as(builder: Any, address: Any, kind: Any) -> Any:
+    return builder.bitcast(address, kind.as_pointer())
+
+
+@intrinsic
+def load(_typing: Any, array: Any, index: Any) -> Any:
+    """Returns array[index : index + LANES] of float32."""
+    if not _flat(array, types.float32, index):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = _as(builder, _address(context, builder, sig, args), VECTOR)
+        return builder.load(at, align=4, typ=VECTOR)
+
+    return lanes_type(array, index), emit
+
+
+@intrinsic
+def load_bytes(_typing: Any, array: Any, index: Any) -> Any:
+    """Returns array[index : index + LANES] of uint8 as float32."""
+    if not _flat(array, types.uint8, index):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.VectorType(ir.IntType(8), LANES)
+        at = _as(builder, _address(context, builder, sig, args), kind)
+        return builder.uitofp(builder.load(at, align=1, typ=kind), VECTOR)
+
+    return lanes_type(array, index), emit
+
+
+@intrinsic
+def store(_typing: Any, array: Any, index: Any, value: Any) -> Any:
+    """Writes `value` to array[index : index + LANES] of float32."""
+    if not (_flat(array, types.float32, index) and value == lanes_type):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = _as(builder, _address(context, builder, sig, args), VECTOR)
+        builder.store(args[2], at, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, index, value), emit
+
+
+@intrinsic
+def broadcast(_typing: Any, array: Any, index: Any) -> Any:
+    """Returns array[index] of float32 in every lane."""
+    if not _flat(array, types.float32, index):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return splat(builder, builder.load(_address(context, builder, sig, args)))
+
+    return lanes_type(array, index), emit
+
+
+@intrinsic
+def fetch_add(_typing: Any, array: Any, index: Any, amount: Any) -> Any:
+    """Adds to array[index] of int64 in one step that no other thread can split; returns before."""
+    if not _flat(array, types.int64, index):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = context.cast(builder, args[2], sig.args[2], types.int64)
+        return builder.atomic_rmw("add", _address(context, builder, sig, args), value, "monotonic")
+
+    return types.int64(array, index, amount), emit
+
+
+@intrinsic
+def transpose(_typing: Any, source: Any, at: Any, target: Any, to: Any) -> Any:
+    """Writes the LANES x LANES block source[at : at + LANES^2] transposed to target[to : ...]."""
+    if not (_flat(source, types.float32, at) and _flat(target, types.float32, to)):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        def row(base: Any, k: int) -> Any:
+            shifted = builder.gep(base, [ir.Constant(ir.IntType(64), k * LANES)])
+            return _as(builder, shifted, VECTOR)
+
+        begin = _address(context, builder, sig, args)
+        end = _address(context, builder, sig, args, 2)
+        rows = [builder.load(row(begin, k), align=4, typ=VECTOR) for k in range(LANES)]
+        step = 1
+        while step < LANES:  # exchanges the off-diagonal squares of every 2 step x 2 step block
+            low = ir.Constant(INTS, [
+                (i - step + LANES if i & step else i) for i in range(LANES)])
+            high = ir.Constant(INTS, [
+                (i + LANES if i & step else i + step) for i in range(LANES)])
+            rows = _exchange(builder, rows, step, low, high)
+            step *= 2
+        for k in range(LANES):
+            builder.store(rows[k], row(end, k), align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, at, target, to), emit
+
+
+def _exchange(builder: Any, rows: list[Any], step: int, low: Any, high: Any) -> list[Any]:
+    result = list(rows)
+    for k in range(LANES):
+        if not k & step:
+            a, b = rows[k], rows[k + step]
+            result[k] = builder.shuffle_vector(a, b, low)
+            result[k + step] = builder.shuffle_vector(a, b, high)
+    return result
+
+
+@intrinsic
+def copy(_typing: Any, source: Any, at: Any, target: Any, to: Any) -> Any:
+    """Copies LANES numbers from source[at] to target[to]."""
+    if not (_flat(source, types.float32, at) and _flat(target, types.float32, to)):
+        return None
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        begin = _as(builder, _address(context, builder, sig, args), VECTOR)
+        end = _as(builder, _address(context, builder, sig, args, 2), VECTOR)
+        builder.store(builder.load(begin, align=4, typ=VECTOR), end, align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, at, target, to), emit

@@ -15,18 +15,20 @@ from recon_cli.render.numba.kernel import inlined
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     absolute,
+    copy,
     fill,
+    load,
     maximum,
     minimum,
     select,
     square_root,
+    store,
+    transpose,
 )
-from recon_cli.render.numba.simd_memory import copy, load, store, transpose
 
 TILE_WIDTH = LANES  # one vector is one row of pixels of a tile
 TILE_HEIGHT = 16
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-
 RECORD = 16  # floats a Gaussian
 MEAN_X, MEAN_Y = 0, 1  # pixels
 U_X, U_Y, V_Y = 2, 3, 4
@@ -39,21 +41,15 @@ EXTENT_X, EXTENT_Y = 10, 11
 SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
 # What float32 drops of the mean: at 640 pixels it is 3e-5, and decides who reaches alpha = 1/255.
 MEAN_X_LOW, MEAN_Y_LOW = 14, 15
-
 FAR = 1e9  # pixels; the half of an ellipse that only its box cuts
-
 BATCH = 32  # instances of a tile that are prepared at a time
-
 # What the backward pass sums over the pixels of an instance, one slot of 16 numbers for each;
 # s = alpha dL/dalpha.
 SLOT = 16
 (GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_DEPTH, S, S_U, S_V, S_UU, S_UV, S_VV,
  ABS_X, ABS_Y, S_SQUARED, COUNT, LEAVE_ONE_OUT) = range(15)
-
 LOG2_E = math.log2(math.e)
 LOG2_ALPHA_MAX = math.log2(0.99)
-
-
 BLOCK = 1024  # Gaussians that a thread takes at a time
 _F = np.float32
 
@@ -132,14 +128,14 @@ def unit_quaternion(scratch):
     w, x = load(scratch, P_QW * LANES), load(scratch, P_QX * LANES)
     y, z = load(scratch, P_QY * LANES), load(scratch, P_QZ * LANES)
     top = maximum(maximum(absolute(w), absolute(x)), maximum(absolute(y), absolute(z)))
-    given = top > 1e-30
-    top = select(given, top, 1.0)
+    nonzero = top > 1e-30
+    top = select(nonzero, top, 1.0)
     per_top = 1.0 / top
     w, x, y, z = w * per_top, x * per_top, y * per_top, z * per_top
-    w = select(given, w, 1.0)
+    w = select(nonzero, w, 1.0)
     per_length = 1.0 / square_root(w * w + x * x + y * y + z * z)
     return (w * per_length, x * per_length, y * per_length, z * per_length,
-            select(given, per_length * per_top, 0.0))
+            select(nonzero, per_length * per_top, 0.0))
 
 
 @inlined

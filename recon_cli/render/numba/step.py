@@ -1,121 +1,118 @@
-"""Loss and gradients of one training view without autograd: the inner half of a training step.
+"""One training view without autograd: its loss, the gradients, and the camera's gradient.
 
-Everything between the parameters and their gradients lies in buffers that are used again, so a
+Everything between the parameters and their gradients lies in buffers that are reused, so that a
 step allocates next to nothing.
 """
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from recon_cli.render.contract import Statistics
+from recon_cli.render.contract import Statistics, StepOptions, TargetImage
+from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
-from recon_cli.render.numba.view_pass import Frame, Parameters, flat
+from recon_cli.render.numba.simd_functions import fetch_add
+from recon_cli.render.numba.thread_pool import pool
+from recon_cli.render.numba.view_pass import (
+    ImageBuffers,
+    PackedSplats,
+    RenderSettings,
+    ViewPass,
+    flat,
+)
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.harmonics import generators
 from recon_cli.scene.splats import Splats
 
 _FROM_BYTE = np.float32(1 / 255)  # the very factor that loss.py takes
 
 
 class PhotometricStep:
-    """Renders a view, compares it with the truth and carries the gradient back.
+    """Renders a view over black, compares it with its photograph and runs the backward pass.
 
     Attributes:
-        statistics: of the last view; its tensors are written anew by each call.
-        log_gain_gradient: [3] float64 of the last view that was given a gain.
+        statistics: of the last view; its tensors are overwritten by each call.
+        log_gain_gradient: [3] float64 of the last view that had a gain.
     """
 
     def __init__(self) -> None:
-        self._frame = Frame()
+        self._pass = ViewPass()
+        self._black = np.zeros(CHANNELS, np.float32)
         self.statistics = Statistics.zeros(torch.zeros(0, 3))
         self.log_gain_gradient = np.zeros(CHANNELS)
 
     @property
     def instances(self) -> int:
         """Gaussian-tile pairs of the last view; 0 where nothing was seen."""
-        return len(self._frame.members)
+        return len(self._pass.members)
 
     @property
     def bytes(self) -> int:
         """Memory of the buffers."""
-        return self._frame.bytes
+        return self._pass.bytes
 
     def __call__(
-        self, splats: Splats, gradients: Splats, camera: Camera, truth: NDArray[np.uint8],
-        background: Tensor, sh_degree: int, ssim_weight: float, *,
-        mask: NDArray[np.bool_] | None = None, gain: NDArray[np.float32] | None = None,
-        details: bool = False, scores: bool = False, loo: bool = False,
+        self, splats: Splats, gradients: Splats, camera: Camera, target: TargetImage,
+        options: StepOptions,
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
-        A pixel that the mask ignores counts as one without error, and gets no gradient.
+        A masked pixel counts as one without error, and gets no gradient.
 
         Args:
             splats: N Gaussians, float32 on the CPU.
             gradients: tensors of the same shapes; sh_rest is left alone at degree 0.
             camera: of the view.
-            truth: [H, W, 3], contiguous.
-            background: [3].
-            sh_degree: highest in use, as in `recon_cli.render.registry.render`.
-            ssim_weight: w in [0, 1].
-            mask: [H, W], True where a pixel counts; None where all do.
-            details: the statistics absolute_grad and variance are wanted too.
-            scores: hits and blend weights too, over the pixels that count; without it they mean
-                nothing.
-            loo: loo too, likewise.
-            gain: [3], what the rendered channels are multiplied by before they are compared; its
-                gradient is left in `log_gain_gradient`. None for ones.
+            target: the photograph; its pixels are contiguous.
+            options: of the step.
         """
-        height, width, n = camera.height, camera.width, len(splats)
+        height, width, truth = camera.height, camera.width, target.pixels
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
             raise ValueError(f"truth has shape {truth.shape}, needed {(height, width, 3)}")
-        if len(self.statistics.radii) != n:
+        if len(self.statistics.radii) != len(splats):
             self.statistics = Statistics.zeros(splats.means.detach())
-        statistics, frame, pixels = self.statistics, self._frame, height * width
-        statistics.radii.zero_()
-        rgb = frame.take("rgb", CHANNELS * pixels)
-        ours = Parameters.of(splats.parameters().values())
-        frame.forward(
-            ours, camera, flat(background), sh_degree, rgb=rgb, alpha=frame.take("alpha", pixels),
-            depth=frame.take("depth", pixels), radii=flat(statistics.radii), scores=scores,
-            counting=mask if scores or loo else None)
-        statistics.broken = frame.broken
-        if scores:
-            frame.tally(statistics)
-        if gain is not None:
-            rgb.reshape(height, -1)[:] *= np.tile(gain, width)  # whole rows: ten times faster
-        grad_rgb = frame.take("grad_rgb", CHANNELS * pixels)
+        view, pixels = self._pass, height * width
+        rgb = view.take("rgb", CHANNELS * pixels)
+        packed = PackedSplats.of(splats.parameters().values())
+        settings = RenderSettings(
+            self._black, options.sh_degree, options.scores,
+            counting=target.mask if options.scores or options.loo else None)
+        image = ImageBuffers(rgb, view.take("alpha", pixels), view.take("depth", pixels))
+        view.forward(packed, camera, settings, image, self.statistics)
+        if target.gain is not None:
+            # whole rows: ten times faster
+            rgb.reshape(height, -1)[:] *= np.tile(target.gain, width)
+        grad_rgb = view.take("grad_rgb", CHANNELS * pixels)
         if not truth.flags.writeable:  # would be another type, and kernels compiled once more
             truth = truth.copy()
         # numbers and not pixels: a flat mask is twice as fast as one of rows
-        ignored = None if mask is None else np.repeat(~mask.reshape(-1), CHANNELS)
+        ignored = None if target.mask is None else np.repeat(~target.mask.reshape(-1), CHANNELS)
         if ignored is not None:  # the loss's own product, so that no error is left
             rgb[ignored] = truth.reshape(-1)[ignored] * _FROM_BYTE
         loss = photometric(
-            rgb, truth.reshape(-1), width, height, ssim_weight,
-            maps=frame.take("maps", MAPS * len(rgb)), gradient=grad_rgb)
+            rgb, truth.reshape(-1), width, height, options.ssim_weight,
+            maps=view.take("maps", MAPS * len(rgb)), gradient=grad_rgb)
         if ignored is not None:
             grad_rgb[ignored] = 0
-        if gain is not None:
-            self._through_gain(
-                rgb.reshape(height, -1), grad_rgb.reshape(height, -1), np.tile(gain, width))
-        nothing = frame.take("nothing", 0)
-        frame.backward(
-            ours, Parameters.of(gradients.parameters().values()), grad_rgb=grad_rgb,
-            grad_alpha=nothing, grad_depth=nothing, details=details, scores=loo,
-            means2d_grad=flat(statistics.means2d_grad),
-            absolute_grad=flat(statistics.absolute_grad), variance=flat(statistics.variance),
-            loo=flat(statistics.loo))
+        if target.gain is not None:
+            self._gain_backward(rgb.reshape(height, -1), grad_rgb.reshape(height, -1),
+                                np.tile(target.gain, width))
+        nothing = view.take("nothing", 0)
+        view.backward(
+            packed, PackedSplats.of(gradients.parameters().values()),
+            ImageBuffers(grad_rgb, nothing, nothing), self.statistics, details=options.details,
+            loo=options.loo)
         return loss
 
-    def _through_gain(
+    def _gain_backward(
         self, image: NDArray[np.float32], gradient: NDArray[np.float32],
         gain: NDArray[np.float32],
     ) -> None:
-        """Carries the gradient of y = g x back to x in place, and keeps that of log g.
+        """Carries the gradient of y = g x back to x in place, and stores that of log g.
 
         dL/dlog g = g dL/dg = sum over pixels of y dL/dy. Under a mask y is the truth, but dL/dy 0.
         `image` and `gradient` are [H, W * 3], `gain` is [W * 3].
@@ -123,3 +120,86 @@ class PhotometricStep:
         columns = np.multiply(image, gradient).sum(axis=0, dtype=np.float64)
         self.log_gain_gradient = columns.reshape(-1, CHANNELS).sum(axis=0)
         gradient *= gain
+
+
+_SUM_BLOCK = 1 << 11  # Gaussians that are summed together, whichever thread takes them
+
+
+def camera_gradient(
+    splats: Splats, gradients: Splats, camera: Camera, sh_degree: int
+) -> NDArray[np.float64]:
+    """Returns the gradient [6] of a turn and a move of the camera, from those of the Gaussians.
+
+    The derivation stands in recon_cli.train.poses, with a reference in torch. Here the torque of
+    the colours is sum (G_i sh_rest) . dL/dsh_rest with the generators G_i, which needs no direction
+    and no derivative of the basis. Each block of Gaussians has sums of its own: the same bits
+    whatever the number of threads.
+
+    Args:
+        splats: float32 on the CPU.
+        gradients: of the same shapes; sh_rest is not read at degree 0.
+        camera: that they were rendered with.
+        sh_degree: in use.
+    """
+    sums = np.zeros((-(-len(splats) // _SUM_BLOCK), 6))
+    sh_degree = min(sh_degree, splats.sh_degree)
+    axes, rows, columns, factors = _generator_entries((sh_degree + 1) ** 2 - 1)
+    values, slopes = (
+        [flat(getattr(parameters, name)) for name in ("means", "quats", "sh_rest")]
+        for parameters in (splats, gradients))
+    pool.run(torque_and_force, np.ascontiguousarray(camera.center, np.float64), axes, rows,
+             columns, factors, *values, *slopes, flat(gradients.sh_dc),
+             3 * splats.sh_rest.shape[1], sums, scratch=False)
+    return np.asarray(-sums.sum(axis=0))
+
+
+@cache
+def _generator_entries(terms: int) -> tuple[NDArray[np.int64], ...]:
+    """Returns axis, row, column and value of the generators above the diagonal, of some terms."""
+    matrices = torch.triu(generators()[:, :terms, :terms]).numpy()
+    axes, rows, columns = np.nonzero(matrices)
+    return axes, 3 * rows, 3 * columns, matrices[axes, rows, columns]
+
+
+@kernel
+def torque_and_force(counter, center, axes, rows, columns, factors, means, quats, sh_rest, g_means,
+                     g_quats, g_sh_rest, g_sh_dc, stride, sums):
+    """Adds up torque and force on the scene of each block of Gaussians: [blocks, 6] float64.
+
+    `axes`, `rows`, `columns` and `factors` [E] are the generators' entries above the diagonal, by
+    the numbers of the coefficients in sh_rest; those below are the negatives. E = 0 at degree 0.
+    """
+    n = len(means) // 3
+    torque = np.empty(3)
+    while True:
+        block = fetch_add(counter, 0, 1)
+        if block >= len(sums):
+            break
+        for i in range(block * _SUM_BLOCK, min((block + 1) * _SUM_BLOCK, n)):
+            a, b, c = 3 * i, 3 * i + 1, 3 * i + 2
+            gx, gy, gz = (np.float64(g_means[a]), np.float64(g_means[b]), np.float64(g_means[c]))
+            dark = g_sh_dc[a] == 0 and g_sh_dc[b] == 0 and g_sh_dc[c] == 0
+            if dark and gx == 0 and gy == 0 and gz == 0:
+                continue
+            x, y, z = means[a] - center[0], means[b] - center[1], means[c] - center[2]
+            q = 4 * i
+            s, u, v, w = (np.float64(quats[q]), np.float64(quats[q + 1]),
+                          np.float64(quats[q + 2]), np.float64(quats[q + 3]))
+            gs, gu, gv, gw = g_quats[q], g_quats[q + 1], g_quats[q + 2], g_quats[q + 3]
+            torque[0] = y * gz - z * gy + 0.5 * (s * gu - gs * u + v * gw - w * gv)
+            torque[1] = z * gx - x * gz + 0.5 * (s * gv - gs * v + w * gu - u * gw)
+            torque[2] = x * gy - y * gx + 0.5 * (s * gw - gs * w + u * gv - v * gu)
+            if not dark and stride * (i + 1) <= len(sh_rest):
+                for e in range(len(axes)):
+                    row, column = stride * i + rows[e], stride * i + columns[e]
+                    turned = np.float64(0)
+                    for channel in range(3):
+                        turned += (
+                            np.float64(g_sh_rest[row + channel]) * sh_rest[column + channel]
+                            - np.float64(g_sh_rest[column + channel]) * sh_rest[row + channel])
+                    torque[axes[e]] += factors[e] * turned
+            for axis in range(3):
+                sums[block, axis] += torque[axis]
+            sums[block, 3] += gx
+            sums[block, 4] += gy
+            sums[block, 5] += gz

@@ -20,11 +20,10 @@ import torch
 from numpy.typing import NDArray
 
 SCRATCH_FLOATS = 1 << 13  # 32 KB: no kernel needs more, and it stays in the first-level cache
-
 Kernel = Callable[..., Any]
 
 
-def aligned(size: int, dtype: Any = np.float32) -> NDArray[Any]:
+def empty_aligned(size: int, dtype: Any = np.float32) -> NDArray[Any]:
     """Returns an uninitialised flat array that begins on a cache line."""
     kind = np.dtype(dtype)
     raw = np.empty(size * kind.itemsize + 64, np.uint8)
@@ -32,7 +31,7 @@ def aligned(size: int, dtype: Any = np.float32) -> NDArray[Any]:
     return raw[shift : shift + size * kind.itemsize].view(kind)
 
 
-class Crew:
+class ThreadPool:
     """A pool of threads that waits for kernels.
 
     Attributes:
@@ -107,7 +106,7 @@ class Crew:
         if self._process != os.getpid():  # threads do not survive a fork
             self._inboxes, self._wake, self._process = [], SimpleQueue(), os.getpid()
         while len(self._scratch) < count:
-            self._scratch.append(aligned(SCRATCH_FLOATS))
+            self._scratch.append(empty_aligned(SCRATCH_FLOATS))
         while len(self._inboxes) < count - 1:
             inbox: SimpleQueue[Callable[[], None]] = SimpleQueue()
             self._inboxes.append(inbox)
@@ -130,4 +129,4 @@ def _failure_of(call: Callable[[int], None], number: int) -> BaseException | Non
     return None
 
 
-crew = Crew()
+pool = ThreadPool()

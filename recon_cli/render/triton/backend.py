@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from recon_cli.render.contract import RenderOutput, Statistics
-from recon_cli.render.triton.ellipse import view_numbers
-from recon_cli.render.triton.passes import Picture, Wanted, composited, decomposed, unprojected
-from recon_cli.render.triton.tile_lists import listed, project
+from recon_cli.render.triton.gaussian import camera_buffer
+from recon_cli.render.triton.passes import (
+    BackwardOptions,
+    ViewInput,
+    build_tile_lists,
+    composite_tiles,
+    composite_tiles_backward,
+    project_splats,
+    project_splats_backward,
+)
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import TERMS, Splats
 
@@ -31,9 +39,11 @@ def render(
     statistics = Statistics.zeros(splats.means)
     tensors = list(splats.parameters().values())
     if min(sh_degree, splats.sh_degree) == 0:
-        tensors[5] = tensors[5].detach()  # no part of the picture
+        tensors[5] = tensors[5].detach()  # not used by the image
+    counting = None if mask is None else mask.contiguous().to(torch.uint8)
     rgb, alpha, depth = _Render.apply(
-        *tensors, background, camera, sh_degree, scores, mask, statistics)
+        background, camera, TERMS[min(sh_degree, splats.sh_degree)], scores, counting, statistics,
+        *tensors)
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
@@ -42,41 +52,40 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor,
-        sh_dc: Tensor, sh_rest: Tensor, background: Tensor, camera: Camera, sh_degree: int,
-        scores: bool, mask: Tensor | None, statistics: Statistics,
+        ctx: Any, background: Tensor, camera: Camera, terms: int, scores: bool,
+        counting: Tensor | None, statistics: Statistics, *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        splats = Splats(*(tensor.contiguous() for tensor in (
-            means, quats, log_scales, logit_opacities, sh_dc, sh_rest)))
-        terms = TERMS[min(sh_degree, splats.sh_degree)]
-        view = view_numbers(camera, means.device)
-        seen = project(splats, view, terms)
+        splats = Splats(*(tensor.contiguous() for tensor in tensors))
+        view = camera_buffer(camera, background.device)
+        projected = project_splats(ViewInput(splats, view, terms))
         # the one wait for the device: how much memory the instances take
-        instances, statistics.broken = torch.stack([seen.ends[-1], seen.broken.sum()]).tolist()
-        statistics.radii = seen.radii
-        lists = listed(seen, seen.ends.int(), camera, view, instances)
-        counting = None if mask is None else mask.contiguous().to(torch.uint8)
+        instances, statistics.broken = torch.stack(
+            [projected.ends[-1], projected.broken.sum()]).tolist()
+        statistics.radii = projected.radii
+        lists = build_tile_lists(projected, projected.ends.int(), camera, view, instances)
         background = background.contiguous()
-        made = composited(lists, camera, background, counting, statistics if scores else None)
-        # the output itself would hold its own graph, and with it everything here, for ever
-        kept = Picture(made.rgb.detach(), made.alpha.detach(), made.depth.detach(), made.final,
-                       made.last)
+        image = composite_tiles(
+            lists, camera, background, counting, statistics if scores else None)
         ctx.save_for_backward(*splats.parameters().values(), view, background)
-        ctx.rest = lists, kept, statistics, terms, scores, counting
-        return made.rgb, made.alpha, made.depth
+        # the outputs themselves would hold their own graph, and with it everything here, for ever
+        detached = replace(image, rgb=image.rgb.detach(), alpha=image.alpha.detach(),
+                           depth=image.depth.detach())
+        ctx.rest = lists, detached, statistics, terms, scores, counting
+        return image.rgb, image.alpha, image.depth
 
     @staticmethod
     def backward(
         ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor, grad_depth: Tensor
     ) -> tuple[Tensor | None, ...]:
         *tensors, view, background = ctx.saved_tensors
-        lists, made, statistics, terms, scores, counting = ctx.rest
-        splats, wanted = Splats(*tensors), Wanted(loo=scores)
+        lists, image, statistics, terms, scores, counting = ctx.rest
+        splats, options = Splats(*tensors), BackwardOptions(loo=scores)
         grad_rgb = grad_rgb.contiguous()
-        sums = decomposed(
-            lists, made, background, counting, wanted, grad_rgb, grad_alpha.contiguous(),
+        sums = composite_tiles_backward(
+            lists, image, background, counting, options, grad_rgb, grad_alpha.contiguous(),
             grad_depth.contiguous())
         gradients = splats.map(torch.empty_like)
-        unprojected(splats, view, lists, sums, wanted, terms, gradients, statistics)
-        grad_background = (grad_rgb * (1 - made.alpha)[..., None]).sum((0, 1))
-        return (*gradients.parameters().values(), grad_background, None, None, None, None, None)
+        project_splats_backward(
+            ViewInput(splats, view, terms), lists, sums, options, gradients, statistics)
+        grad_background = (grad_rgb * (1 - image.alpha)[..., None]).sum((0, 1))
+        return (grad_background, None, None, None, None, None, *gradients.parameters().values())

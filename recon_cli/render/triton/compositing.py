@@ -22,8 +22,7 @@ from recon_cli.render.contract import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_
 
 PIXELS = TILE * TILE
 RECORD = 8  # floats a Gaussian: U_X, U_Y, V_Y, log2 o, red, green, blue, depth
-SUMS = 16  # floats an instance, see `raster_backward.decompose`
-
+SUMS = 16  # floats an instance, see `composite_backward`
 LOG2_E = math.log2(math.e)
 # Kernels see globals only as constants of this type.
 SIDE = tl.constexpr(TILE)
@@ -68,22 +67,15 @@ def composite(order, first, members, offsets, records, background, width, height
         offsets: [E, 2] u and v at the tile's first pixel.
         records: [M, FLOATS].
         background: [3].
-        width: of the image in pixels.
-        height: of the image in pixels.
+        width: of the image in pixels; so is height.
         tiles_x: tiles in a row.
-        rgb: [H, W, 3] out.
-        alpha: [H, W] out.
-        depth: [H, W] out.
+        rgb: [H, W, 3] out; alpha and depth are [H, W].
         final: [tiles, AREA] out, transmittance behind the last fragment.
         last: [tiles, AREA] int32 out, number in the tile of the last fragment, from 1.
         slots: [E] int64, where the scores of an instance go.
-        counting: [H, W] uint8, pixels that count in the scores.
-        hits: [E] int32 out.
-        weights: [E] out, sum of alpha T.
-        peaks: [E] out, greatest alpha T.
-        SCORES: also take the scores.
-        MASKED: of the pixels in `counting` alone.
-        CHUNK: see above.
+        counting: [H, W] uint8, pixels that count in the scores, with MASKED.
+        hits: [E] int32 out with SCORES; so are weights, the sum of alpha T, and peaks, the greatest
+            alpha T.
     """
     tile = tl.load(order + tl.program_id(0))
     begin, end = tl.load(first + tile), tl.load(first + tile + 1)
@@ -94,7 +86,7 @@ def composite(order, first, members, offsets, records, background, width, height
     at = y * width + x
     # a pixel beyond the image is stopped from the start
     T = tl.where(inside, 1.0, 0.0)
-    kept = T
+    final_T = T
     red, green, blue, z = T * 0.0, T * 0.0, T * 0.0, T * 0.0
     latest = pixel * 0
     counts = inside
@@ -111,7 +103,7 @@ def composite(order, first, members, offsets, records, background, width, height
             T = T * (1.0 - a)
             live = T >= T_MIN
             weight = tl.where(live, weight, 0.0)
-            kept = tl.where(live, T, kept)
+            final_T = tl.where(live, T, final_T)
             red = tl.fma(weight, tl.load(record + 4), red)
             green = tl.fma(weight, tl.load(record + 5), green)
             blue = tl.fma(weight, tl.load(record + 6), blue)
@@ -125,12 +117,12 @@ def composite(order, first, members, offsets, records, background, width, height
                 tl.store(weights + slot, tl.sum(counted))
                 tl.store(peaks + slot, tl.max(counted))
             e += 1
-    tl.store(final + tile * AREA + pixel, kept)
+    tl.store(final + tile * AREA + pixel, final_T)
     tl.store(last + tile * AREA + pixel, latest)
-    tl.store(rgb + 3 * at, tl.fma(kept, tl.load(background), red), mask=inside)
-    tl.store(rgb + 3 * at + 1, tl.fma(kept, tl.load(background + 1), green), mask=inside)
-    tl.store(rgb + 3 * at + 2, tl.fma(kept, tl.load(background + 2), blue), mask=inside)
-    tl.store(alpha + at, 1.0 - kept, mask=inside)
+    tl.store(rgb + 3 * at, tl.fma(final_T, tl.load(background), red), mask=inside)
+    tl.store(rgb + 3 * at + 1, tl.fma(final_T, tl.load(background + 1), green), mask=inside)
+    tl.store(rgb + 3 * at + 2, tl.fma(final_T, tl.load(background + 2), blue), mask=inside)
+    tl.store(alpha + at, 1.0 - final_T, mask=inside)
     tl.store(depth + at, z, mask=inside)
 
 
@@ -139,16 +131,8 @@ def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
           BLOCK: tl.constexpr):
     """Sums hits and weights and takes the greatest peak over the slots of each Gaussian.
 
-    Args:
-        starts: [M + 1] int32, first slot of each Gaussian.
-        hits: [E] int32.
-        weights: [E].
-        peaks: [E].
-        count: M.
-        total_hits: [M] int64 out.
-        blend_sum: [M] out.
-        blend_max: [M] out.
-        BLOCK: Gaussians a program.
+    `hits`, `weights` and `peaks` are those of `composite`, `starts` [count + 1] int32 the first
+    slot of each Gaussian; written are [count] int64 hits and float32 sums and maxima.
     """
     j = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = j < count
@@ -166,37 +150,24 @@ def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
 
 
 @triton.jit
-def decompose(order, first, members, offsets, records, background, width, height, tiles_x,
+def composite_backward(order, first, members, offsets, records, background, width, height, tiles_x,
               final, last, grad_rgb, grad_alpha, grad_depth, slots, counting, sums,
               PLAIN: tl.constexpr, DETAILS: tl.constexpr, SCORES: tl.constexpr,
               MASKED: tl.constexpr):
     """Sums the gradients of every instance of a tile over its pixels.
 
+    The arguments are those of `composite`, and
+
     Args:
-        order: [tiles] int32, as in the forward pass; so are the next eight and the last ones.
-        first: [tiles + 1] int32.
-        members: [E] int32.
-        offsets: [E, 2].
-        records: [M, FLOATS].
-        background: [3].
-        width: of the image in pixels.
-        height: of the image in pixels.
-        tiles_x: tiles in a row.
-        final: [tiles, AREA] transmittance behind the last fragment.
-        last: [tiles, AREA] int32, number of the last fragment.
         grad_rgb: [H, W, 3] dL/drgb.
-        grad_alpha: [H, W] dL/dalpha; not read with PLAIN, nor is the next.
-        grad_depth: [H, W] dL/ddepth.
-        slots: [E] int64.
-        counting: [H, W] uint8.
+        grad_alpha: [H, W] dL/dalpha; not read with PLAIN, nor is grad_depth.
         sums: [E, SLOT] out by slot, zeros before: dL/d(red, green, blue, depth), then the sums of
             s times 1, u, v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back,
             without its factor), of s^2, the fragments, and what leaving the instance out would
             change.
         PLAIN: the loss depends on colours alone.
         DETAILS: also |s y|, s^2 and the fragments.
-        SCORES: also the last of these.
-        MASKED: that one of the pixels in `counting` alone.
+        SCORES: also the last of these, over the pixels in `counting`.
     """
     tile = tl.load(order + tl.program_id(0))
     begin = tl.load(first + tile)

@@ -13,10 +13,8 @@ from typing import Protocol
 import torch
 
 logger = logging.getLogger("recon")
-
 _BEFORE = 2  # times that work is done as it is: kernels are compiled, and few steps need no more
 _MOST = 8  # recordings that are kept at a time
-
 Work = Callable[[], None]
 
 

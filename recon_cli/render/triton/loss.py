@@ -18,7 +18,6 @@ _SIGMA, _RADIUS = 1.5, 5
 _WINDOW = [math.exp(-0.5 * (shift / _SIGMA) ** 2) for shift in range(_RADIUS + 1)]
 _TOTAL = _WINDOW[0] + 2 * sum(_WINDOW[1:])
 _BLOCK = 256  # numbers a program
-
 RADIUS = tl.constexpr(_RADIUS)
 W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight / _TOTAL) for weight in _WINDOW)
 C1, C2 = tl.constexpr(0.01**2), tl.constexpr(0.03**2)  # for images in [0, 1]
@@ -54,17 +53,10 @@ def pair(image, truth, mask, at, here, MASKED: tl.constexpr):
 @triton.jit
 def blur_products(image, truth, mask, width, count, maps, MASKED: tl.constexpr,
                   BLOCK: tl.constexpr):
-    """Blurs x, y, xx, yy and xy along rows.
+    """Blurs x, y, xx, yy and xy along rows into `maps` [5, H, W, 3]; `count` is 3 H W.
 
-    Args:
-        image: [H, W, 3] rendered.
-        truth: [H, W, 3] uint8.
-        mask: [H, W] uint8, pixels that count.
-        width: W.
-        count: 3 H W.
-        maps: [5, H, W, 3] out.
-        MASKED: there is a mask.
-        BLOCK: numbers a program.
+    x is `image` [H, W, 3], y `truth` [H, W, 3] uint8, and `mask` [H, W] uint8 says which pixels
+    count, where there is one (MASKED).
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here, column = at < count, at // 3 % width
@@ -88,15 +80,9 @@ def blur_products(image, truth, mask, width, count, maps, MASKED: tl.constexpr,
 
 @triton.jit
 def similarity(maps, width, count, slopes, parts, BLOCK: tl.constexpr):
-    """Blurs down columns; SSIM, and its slopes by blurred x, xx and xy.
+    """Blurs `maps` [5, H, W, 3] down columns; writes SSIM's slopes and the sum of each program.
 
-    Args:
-        maps: [5, H, W, 3].
-        width: W.
-        count: 3 H W.
-        slopes: [3, H, W, 3] out.
-        parts: [programs] out, sums of SSIM.
-        BLOCK: numbers a program.
+    `slopes` [3, H, W, 3] are those by blurred x, xx and xy; `parts` [programs] sums of SSIM.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = at < count
@@ -142,22 +128,11 @@ def blur_slopes(slopes, width, count, maps, BLOCK: tl.constexpr):
 @triton.jit
 def gradient_of(image, truth, mask, maps, width, count, by_error, by_ssim, gradient, parts,
                 MASKED: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr):
-    """Blurs down columns and joins both terms.
+    """Blurs `maps` [3, H, W, 3] of `blur_slopes` down columns and adds the terms of the gradient.
 
-    Args:
-        image: [H, W, 3] rendered.
-        truth: [H, W, 3] uint8.
-        mask: [H, W] uint8, pixels that count.
-        maps: [3, H, W, 3] of `blur_slopes`.
-        width: W.
-        count: 3 H W.
-        by_error: slope of the loss by the sum of absolute errors.
-        by_ssim: slope of the loss by the sum of SSIM.
-        gradient: [H, W, 3] out.
-        parts: [programs] out, sums of absolute errors.
-        MASKED: there is a mask.
-        SSIM: it is part of the loss.
-        BLOCK: numbers a program.
+    `by_error` and `by_ssim` are the slopes of the loss by the sums of absolute errors and of SSIM;
+    without SSIM the latter is no part of it. Written are `gradient` [H, W, 3] and `parts`
+    [programs], sums of absolute errors.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = at < count

@@ -20,28 +20,14 @@ GROUPS = 6  # means, quats, log_scales, logit_opacities, sh_dc, sh_rest
 @triton.jit
 def move(value, gradient, first, second, i, here, rate, keep1, keep2, add1, add2, root1, root2,
          epsilon, WHOLE: tl.constexpr):
-    """Moves a block of one group against its gradient.
+    """Moves numbers i [BLOCK] of one group against its gradient; changes the moments, too.
 
         m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2,
         p <- p - rate (m / c1) / (sqrt(v / c2) + epsilon)
 
-    Args:
-        value: numbers that are changed, as are the moments.
-        gradient: of them.
-        first: m.
-        second: v.
-        i: [BLOCK] which.
-        here: [BLOCK] whether there is such a number; not looked at with WHOLE, which lets a lane
-            take four numbers at a time.
-        rate: learning rate.
-        keep1: b1.
-        keep2: b2.
-        add1: 1 - b1, which would cancel in float32.
-        add2: 1 - b2.
-        root1: 1 / c1.
-        root2: 1 / sqrt(c2).
-        epsilon: keeps the quotient finite.
-        WHOLE: all are there.
+    `keep` are b1 and b2, `add` 1 - b1 and 1 - b2, which would cancel in float32, `root1` 1 / c1 and
+    `root2` 1 / sqrt(c2). `here` says which numbers there are; with WHOLE all of them are, and a
+    lane takes four at a time.
     """
     mask = None if WHOLE else here
     g = tl.load(gradient + i, mask=mask)
@@ -73,24 +59,9 @@ def adam(p0, p1, p2, p3, p4, p5, g0, g1, g2, g3, g4, g5, m0, m1, m2, m3, m4, m5,
          GATED: tl.constexpr, BLOCK: tl.constexpr):
     """Moves six groups; a program has a block of one of them.
 
-    Args:
-        p0: [n0] values of the first group; so p1 to p5.
-        g0: gradients.
-        m0: first moments.
-        v0: second moments.
-        n0: numbers in the group that are to be moved; all or none.
-        r0: its learning rate.
-        taken: [1] int64, steps taken, this one included.
-        counted: [1] int32; with GATED nothing moves where it is zero.
-        keep1: decay of the first moments.
-        keep2: of the second ones.
-        add1: 1 - keep1.
-        add2: 1 - keep2.
-        log2_keep1: logarithm of keep1.
-        log2_keep2: of keep2.
-        epsilon: keeps the quotient finite.
-        GATED: see `counted`.
-        BLOCK: numbers in a block.
+    For each group k: values `p`, gradients `g`, moments `m` and `v`, how many numbers `n` are to be
+    moved (all or none) and the learning rate `r`. `taken` [1] int64 counts the steps, this one
+    included. With GATED nothing moves where `counted` [1] int32 is zero. The rest is as in `move`.
     """
     going = 1
     if GATED:
@@ -127,17 +98,16 @@ def adam(p0, p1, p2, p3, p4, p5, g0, g1, g2, g3, g4, g5, m0, m1, m2, m3, m4, m5,
 
 
 def step(
-    values: Sequence[Tensor], gradients: Sequence[Tensor], first: Sequence[Tensor],
-    second: Sequence[Tensor], rates: Sequence[float | None], *, taken: Tensor,
-    counted: Tensor | None, betas: tuple[float, float], epsilon: float,
+    values: Sequence[Tensor], gradients: Sequence[Tensor],
+    moments: tuple[Sequence[Tensor], Sequence[Tensor]], rates: Sequence[float | None], *,
+    taken: Tensor, counted: Tensor | None, betas: tuple[float, float], epsilon: float,
 ) -> None:
     """Takes one step of Adam in place; nothing waits for the device.
 
     Args:
         values: six contiguous float32 tensors, one for each group of parameters.
         gradients: of the same sizes.
-        first: moving averages of the gradients.
-        second: moving averages of their squares.
+        moments: moving averages of the gradients, and of their squares.
         rates: learning rate of each group; None leaves the group alone.
         taken: [1] int64, steps taken; one more where this one counts.
         counted: [1] int32, zero where the step comes to nothing; None where it counts anyway.
@@ -151,6 +121,6 @@ def step(
              for value, rate in zip(values, rates, strict=True)]
     programs = sum(triton.cdiv(size, BLOCK) for size in sizes)
     adam[(programs,)](
-        *values, *gradients, *first, *second, *sizes, *(rate or 0.0 for rate in rates), taken,
-        counted, *betas, 1 - betas[0], 1 - betas[1], math.log2(betas[0]), math.log2(betas[1]),
-        epsilon, GATED=counted is not None, BLOCK=BLOCK)
+        *values, *gradients, *moments[0], *moments[1], *sizes, *(rate or 0.0 for rate in rates),
+        taken, counted, *betas, 1 - betas[0], 1 - betas[1], math.log2(betas[0]),
+        math.log2(betas[1]), epsilon, GATED=counted is not None, BLOCK=BLOCK)

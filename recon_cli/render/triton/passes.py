@@ -1,4 +1,7 @@
-"""The kernels of a view in their order, host side: compositing, its gradients, the chain rule."""
+"""The kernels of a view in their order, host side: projection, tile lists, compositing, gradients.
+
+Nothing here waits for the device.
+"""
 
 from __future__ import annotations
 
@@ -9,62 +12,178 @@ import triton
 from torch import Tensor
 
 from recon_cli.render.contract import Statistics
-from recon_cli.render.triton.compositing import CHUNK, PIXELS, SUMS, composite, decompose, tally
-from recon_cli.render.triton.project_backward import unproject
+from recon_cli.render.triton import projection as kernels
+from recon_cli.render.triton.compositing import (
+    CHUNK,
+    PIXELS,
+    RECORD,
+    SIDE,
+    SUMS,
+    composite,
+    composite_backward,
+    tally,
+)
+from recon_cli.render.triton.project_backward import project_backward
 from recon_cli.render.triton.projection import BLOCK
-from recon_cli.render.triton.tile_lists import Lists
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import TERMS, Splats
 
 _WARPS = 1  # a tile is one warp: no barrier in its sums
+_DEPTH_RANGE = 1 << 32  # a key is a tile times this, and the bits of a depth
+_LAST_KEY = (1 << 63) - 1  # sorts behind all others
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """What compositing leaves.
+class ViewInput:
+    """What the kernels over the Gaussians of a view read."""
 
-    Attributes:
-        rgb: [H, W, 3].
-        alpha: [H, W].
-        depth: [H, W].
-        final: [tiles, PIXELS] transmittance behind the last fragment.
-        last: [tiles, PIXELS] int32, number in the tile of the last fragment, from 1.
-    """
+    splats: Splats  # contiguous
+    view: Tensor  # see `gaussian.camera_buffer`
+    terms: int  # coefficients a channel that are in use
 
-    rgb: Tensor
-    alpha: Tensor
-    depth: Tensor
-    final: Tensor
-    last: Tensor
+
+@dataclass(frozen=True, eq=False)
+class ProjectedSplats:
+    """N Gaussians as a view sees them; see `projection.project`."""
+
+    records: Tensor  # [N, RECORD]
+    shapes: Tensor  # [N, SHAPES]
+    centers: Tensor  # [N, 2] float64, pixels
+    depths: Tensor  # [N]
+    radii: Tensor  # [N]
+    ends: Tensor  # [N + 1] int64, tiles of the Gaussians before each; at the end of all of them
+    broken: Tensor  # [programs] int32
+
+
+@dataclass(frozen=True, eq=False)
+class TileLists:
+    """Instances of Gaussians, each in a tile, with room for E of them."""
+
+    tiles_x: int  # tiles in a row
+    records: Tensor  # [N, RECORD]
+    starts: Tensor  # [N + 1] int32, first slot of each Gaussian; the last one is the count
+    order: Tensor  # [tiles] int32, longest list first
+    first: Tensor  # [tiles + 1] int32, where the instances of each tile begin
+    members: Tensor  # [E] int32, Gaussian of each instance, by tile and depth
+    slots: Tensor  # [E] int64, its place in the order by Gaussian
+    offsets: Tensor  # [E, 2] u and v at the first pixel of the tile
+
+
+@dataclass(frozen=True, eq=False)
+class CompositedImage:
+    """The result of compositing."""
+
+    rgb: Tensor  # [H, W, 3]
+    alpha: Tensor  # [H, W]
+    depth: Tensor  # [H, W]
+    final: Tensor  # [tiles, PIXELS] transmittance behind the last fragment
+    last: Tensor  # [tiles, PIXELS] int32, number in the tile of the last fragment, from 1
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What the backward pass is for.
+class BackwardOptions:
+    """What the backward pass computes beside the gradients."""
 
-    Attributes:
-        plain: the loss depends on colours alone.
-        details: absolute_grad and variance are wanted.
-        loo: loo is wanted.
-    """
-
-    plain: bool = False
-    details: bool = True
+    plain: bool = False  # the loss depends on colours alone
+    details: bool = True  # absolute_grad and variance are wanted
     loo: bool = False
 
 
-def composited(
-    lists: Lists, camera: Camera, background: Tensor, counting: Tensor | None,
+def project_splats(source: ViewInput) -> ProjectedSplats:
+    """Projects the Gaussians into a view and counts the tiles that each meets."""
+    splats, like = source.splats, source.splats.means
+    n, programs = len(splats), triton.cdiv(len(splats), BLOCK)
+    records, shapes = like.new_empty(n, RECORD), like.new_empty(n, kernels.SHAPES)
+    centers, depths = like.new_empty(n, 2, dtype=torch.float64), like.new_empty(n)
+    touched, radii = like.new_empty(n, dtype=torch.int32), like.new_empty(n)
+    broken = like.new_zeros(programs, dtype=torch.int32)
+    if n:
+        kernels.project[(programs,)](
+            *splats.parameters().values(), source.view, n, len(splats.sh_rest), records, shapes,
+            centers, depths, touched, radii, broken, STRIDE=3 * TERMS[splats.sh_degree],
+            TERMS=source.terms, BLOCK=BLOCK)
+    return ProjectedSplats(records, shapes, centers, depths, radii, prefix_sums(touched), broken)
+
+
+def prefix_sums(touched: Tensor) -> Tensor:
+    """Returns the tiles [N + 1] int64 that the Gaussians before each meet, and in all."""
+    return torch.nn.functional.pad(torch.cumsum(touched, 0), (1, 0))
+
+
+def build_tile_lists(
+    projected: ProjectedSplats, starts: Tensor, camera: Camera, view: Tensor, room: int
+) -> TileLists:
+    """Returns the lists of a view.
+
+    Args:
+        projected: into the view.
+        starts: [N + 1] int32, first slot of each Gaussian; those without slots are left out.
+        camera: whose size is taken.
+        view: see `gaussian.camera_buffer`.
+        room: instances that there is memory for; `starts` ends there or before.
+    """
+    tiles_x, tiles_y = triton.cdiv(camera.width, SIDE.value), triton.cdiv(camera.height, SIDE.value)
+    keys, owners = list_instances(projected, starts, view, tiles_x, room)
+    keys, slots = sort_keys(keys)
+    members, offsets = place_instances(projected, starts, keys, slots, owners, tiles_x)
+    first, order = tile_ranges(keys, tiles_x * tiles_y)
+    return TileLists(tiles_x, projected.records, starts, order, first, members, slots, offsets)
+
+
+def list_instances(
+    projected: ProjectedSplats, starts: Tensor, view: Tensor, tiles_x: int, room: int
+) -> tuple[Tensor, Tensor]:
+    """Returns key [room] int64 and Gaussian [room] int32 of each instance, by slot."""
+    n, device = len(projected.depths), projected.depths.device
+    keys = torch.full((room,), _LAST_KEY, dtype=torch.int64, device=device)
+    owners = torch.empty(room, dtype=torch.int32, device=device)
+    if n and room:
+        kernels.list_tiles[(triton.cdiv(n, BLOCK),)](
+            projected.shapes, projected.centers, projected.depths, starts, view, n, tiles_x, keys,
+            owners, BLOCK=BLOCK)
+    return keys, owners
+
+
+def sort_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the keys in order, and the slot [room] int64 of each."""
+    # slots ascend with the Gaussians, so that a stable sort leaves ties in order of index
+    ordered, slots = torch.sort(keys, stable=True)
+    return ordered, slots
+
+
+def place_instances(
+    projected: ProjectedSplats, starts: Tensor, keys: Tensor, slots: Tensor, owners: Tensor,
+    tiles_x: int,
+) -> tuple[Tensor, Tensor]:
+    """Returns members and offsets of `TileLists`, by keys in order."""
+    n, room = len(projected.depths), len(keys)
+    members, offsets = torch.empty_like(owners), projected.depths.new_empty(room, 2)
+    if n and room:
+        kernels.place[(triton.cdiv(room, BLOCK),)](
+            keys, slots, owners, projected.centers, projected.records, starts, n, tiles_x, members,
+            offsets, BLOCK=BLOCK)
+    return members, offsets
+
+
+def tile_ranges(keys: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
+    """Returns first and order of `TileLists`, by keys in order."""
+    numbers = torch.arange(tiles + 1, device=keys.device)
+    first = torch.searchsorted(keys, numbers * _DEPTH_RANGE).int()
+    return first, torch.argsort(first[1:] - first[:-1], descending=True, stable=True).int()
+
+
+def composite_tiles(
+    lists: TileLists, camera: Camera, background: Tensor, counting: Tensor | None,
     scores: Statistics | None,
-) -> Picture:
-    """Returns the picture.
+) -> CompositedImage:
+    """Composites all tiles.
 
     Args:
         lists: of the view.
         camera: whose size is taken.
         background: [3], contiguous.
         counting: [H, W] uint8, pixels that count in the scores; None where all do.
-        scores: gets hits, blend_sum and blend_max; None where nobody asks.
+        scores: gets hits, blend_sum and blend_max; None where they are not wanted.
     """
     like, height, width = lists.records, camera.height, camera.width
     rgb, alpha, depth = (like.new_empty(height, width, 3), like.new_empty(height, width),
@@ -84,58 +203,50 @@ def composited(
         tally[(triton.cdiv(n, BLOCK),)](
             lists.starts, *tallied, n, scores.hits, scores.blend_sum, scores.blend_max,
             BLOCK=BLOCK)
-    return Picture(rgb, alpha, depth, final, last)
+    return CompositedImage(rgb, alpha, depth, final, last)
 
 
-def decomposed(
-    lists: Lists, picture: Picture, background: Tensor, counting: Tensor | None, wanted: Wanted,
-    grad_rgb: Tensor, grad_alpha: Tensor | None = None, grad_depth: Tensor | None = None,
+def composite_tiles_backward(
+    lists: TileLists, image: CompositedImage, background: Tensor, counting: Tensor | None,
+    options: BackwardOptions, grad_rgb: Tensor, grad_alpha: Tensor | None = None,
+    grad_depth: Tensor | None = None,
 ) -> Tensor:
-    """Returns the sums [E, SUMS] of every instance, see `raster_backward.decompose`.
+    """Returns the sums [E, SUMS] of every instance, see `compositing.composite_backward`.
 
-    Args:
-        lists: of the view.
-        picture: what they were composited to.
-        background: [3], contiguous.
-        counting: as in `composited`.
-        wanted: what for.
-        grad_rgb: [H, W, 3] dL/drgb, contiguous, as are the others.
-        grad_alpha: [H, W]; None where `wanted` is plain.
-        grad_depth: [H, W]; likewise.
+    `grad_rgb` [H, W, 3], `grad_alpha` and `grad_depth` [H, W] are contiguous; the latter two may be
+    None where `options` are plain. The other arguments are those of `composite_tiles`.
     """
-    height, width = picture.alpha.shape
+    height, width = image.alpha.shape
     sums = lists.records.new_zeros(len(lists.members), SUMS)
-    decompose[(len(lists.order),)](
+    composite_backward[(len(lists.order),)](
         lists.order, lists.first, lists.members, lists.offsets, lists.records, background,
-        width, height, lists.tiles_x, picture.final, picture.last, grad_rgb, grad_alpha,
-        grad_depth, lists.slots, counting, sums, PLAIN=wanted.plain, DETAILS=wanted.details,
-        SCORES=wanted.loo, MASKED=counting is not None, num_warps=_WARPS)
+        width, height, lists.tiles_x, image.final, image.last, grad_rgb, grad_alpha,
+        grad_depth, lists.slots, counting, sums, PLAIN=options.plain, DETAILS=options.details,
+        SCORES=options.loo, MASKED=counting is not None, num_warps=_WARPS)
     return sums
 
 
-def unprojected(
-    splats: Splats, view: Tensor, lists: Lists, sums: Tensor, wanted: Wanted, terms: int,
+def project_splats_backward(
+    source: ViewInput, lists: TileLists, sums: Tensor, options: BackwardOptions,
     gradients: Splats, statistics: Statistics, *, counted: Tensor | None = None,
 ) -> None:
     """Writes the gradients of the raw parameters, and the statistics of the backward pass.
 
     Args:
-        splats: N Gaussians, contiguous.
-        view: its numbers, see `view.view_numbers`.
+        source: as it was projected.
         lists: of the view.
-        sums: of `decomposed`.
-        wanted: the same.
-        terms: coefficients a channel that are in use.
+        sums: of `composite_tiles_backward`.
+        options: the same.
         gradients: tensors of the shapes of the parameters; sh_rest is left alone at degree 0.
         statistics: changed in place.
         counted: [1] int32; where it is zero, all is written as zero. None where it always counts.
     """
-    n = len(splats)
+    splats, n = source.splats, len(source.splats)
     if n:
-        unproject[(triton.cdiv(n, BLOCK),)](
+        project_backward[(triton.cdiv(n, BLOCK),)](
             splats.means, splats.quats, splats.log_scales, splats.logit_opacities, splats.sh_rest,
-            view, n, len(splats.sh_rest), lists.records, lists.starts, sums, counted,
+            source.view, n, len(splats.sh_rest), lists.records, lists.starts, sums, counted,
             *gradients.parameters().values(), statistics.means2d_grad, statistics.absolute_grad,
-            statistics.variance, statistics.loo, STRIDE=3 * TERMS[splats.sh_degree], TERMS=terms,
-            GATED=counted is not None, PLAIN=wanted.plain, DETAILS=wanted.details,
-            SCORES=wanted.loo, BLOCK=BLOCK)
+            statistics.variance, statistics.loo, STRIDE=3 * TERMS[splats.sh_degree],
+            TERMS=source.terms, GATED=counted is not None, PLAIN=options.plain,
+            DETAILS=options.details, SCORES=options.loo, BLOCK=BLOCK)

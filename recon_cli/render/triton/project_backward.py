@@ -12,23 +12,25 @@ import triton
 import triton.language as tl
 
 from recon_cli.render.triton.compositing import FLOATS, LOG2E, SLOT, UNIT
-from recon_cli.render.triton.ellipse import (
+from recon_cli.render.triton.gaussian import (
     BOTTOM,
+    C0,
     FX,
     FY,
     LEFT,
     RIGHT,
     TOP,
+    basis,
     direction,
     image_axes,
     number,
     position,
-    projected_axes,
+    project_axes,
     rotation,
+    slope,
     standard_deviations,
     unit_quaternion,
 )
-from recon_cli.render.triton.harmonics import C0, basis, slope
 from recon_cli.render.triton.projection import LOW_PASS
 
 AT_ONCE = tl.constexpr(4)  # slots; a Gaussian as large as the image has thousands
@@ -36,43 +38,18 @@ WHITE = tl.constexpr(1.0 / UNIT.value)  # u and v hold sqrt(log2(e) / 2)
 
 
 @triton.jit(do_not_specialize=("count", "colored"))
-def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, records, starts,
-              sums, counted, g_means, g_quats, g_log_scales, g_logits, g_sh_dc, g_sh_rest,
-              means2d_grad, absolute_grad, variance, loo, STRIDE: tl.constexpr, TERMS: tl.constexpr,
-              GATED: tl.constexpr, PLAIN: tl.constexpr, DETAILS: tl.constexpr,
-              SCORES: tl.constexpr, BLOCK: tl.constexpr):
+def project_backward(means, quats, log_scales, logits, sh_rest, view, count, colored, records,
+                     starts, sums, counted, g_means, g_quats, g_log_scales, g_logits, g_sh_dc,
+                     g_sh_rest, means2d_grad, absolute_grad, variance, loo, STRIDE: tl.constexpr,
+                     TERMS: tl.constexpr, GATED: tl.constexpr, PLAIN: tl.constexpr,
+                     DETAILS: tl.constexpr, SCORES: tl.constexpr, BLOCK: tl.constexpr):
     """Writes the gradients of all Gaussians, zero for those that no pixel shows.
 
-    Args:
-        means: [N, 3], as are the next six in the forward pass.
-        quats: [N, 4].
-        log_scales: [N, 3].
-        logits: [N].
-        sh_rest: [M, STRIDE / 3, 3].
-        view: see `view.view_numbers`.
-        count: N.
-        colored: M.
-        records: [N, FLOATS].
-        starts: [N + 1] int32, first slot of each Gaussian.
-        sums: [E, SLOT], see `raster_backward.decompose`.
-        counted: [1] int32; with GATED, everything that is written is zero where this is.
-        g_means: [N, 3] out, and so on for every parameter.
-        g_quats: [N, 4] out.
-        g_log_scales: [N, 3] out.
-        g_logits: [N] out.
-        g_sh_dc: [N, 3] out.
-        g_sh_rest: [M, STRIDE / 3, 3] out; not written at degree 0.
-        means2d_grad: [N, 2] out, see `Statistics`; so the next three.
-        absolute_grad: [N, 2] out with DETAILS.
-        variance: [N] out with DETAILS.
-        loo: [N] out with SCORES.
-        STRIDE: numbers in a row of sh_rest.
-        TERMS: coefficients a channel that are in use.
-        GATED: see `counted`.
-        PLAIN: `sums` hold nothing of depths.
-        DETAILS: `sums` hold what the statistics are made of.
-        SCORES: `sums` hold what leaving each out would change.
-        BLOCK: Gaussians a program.
+    Read are the parameters, `view`, `records` and `starts` as in the forward pass, and `sums`
+    [E, SLOT] of `compositing.composite_backward`. Written are the gradients `g_*` of all parameters
+    (g_sh_rest not at degree 0) and the statistics, see `contract.Statistics`: absolute_grad and
+    variance with DETAILS, loo with SCORES. With GATED all of them are zero where `counted` [1]
+    int32 is. With PLAIN `sums` hold nothing of depths.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -150,8 +127,8 @@ def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, r
     if DETAILS:
         tl.store(absolute_grad + 2 * i, abs_x * (WHITE * WHITE), mask=here)
         tl.store(absolute_grad + 2 * i + 1, abs_y * (WHITE * WHITE), mask=here)
-        spread = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
-        tl.store(variance + i, tl.maximum(spread, 0.0).to(tl.float32), mask=here)
+        total = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
+        tl.store(variance + i, tl.maximum(total, 0.0).to(tl.float32), mask=here)
     if SCORES:
         tl.store(loo + i, left_out, mask=here)
     odds = tl.exp2(tl.minimum(-tl.load(logits + i, mask=drawn, other=0.0) * LOG2E, 126.0))
@@ -165,8 +142,8 @@ def unproject(means, quats, log_scales, logits, sh_rest, view, count, colored, r
     w, x, y, z, per_norm = unit_quaternion(quats, i, drawn)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(w, x, y, z)
     t0, t1, t2 = standard_deviations(log_scales, i, drawn)
-    v00, v01, v02 = projected_axes(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-    v10, v11, v12 = projected_axes(b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    v00, v01, v02 = project_axes(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    v10, v11, v12 = project_axes(b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
     v00, v01, v02, v10, v11, v12 = v00 * t0, v01 * t1, v02 * t2, v10 * t0, v11 * t1, v12 * t2
     # P = U_X (c vx - b vy) / c cancels; c vx - b vy = .3 vx + vy x (vx x vy) does not
     w0, w1, w2 = v01 * v12 - v02 * v11, v02 * v10 - v00 * v12, v00 * v11 - v01 * v10

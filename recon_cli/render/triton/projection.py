@@ -12,26 +12,25 @@ import triton.language as tl
 
 from recon_cli.render.contract import DILATION, NEAR
 from recon_cli.render.triton.compositing import FLOATS, LOG2_ALPHA_MIN, LOG2E, SIDE, UNIT
-from recon_cli.render.triton.ellipse import (
+from recon_cli.render.triton.gaussian import (
     CX,
     CY,
     FX,
     FY,
     HEIGHT,
     WIDTH,
+    colors,
     direction,
     image_axes,
     position,
-    projected_axes,
+    project_axes,
     rotation,
     standard_deviations,
     unit_quaternion,
 )
-from recon_cli.render.triton.harmonics import colors
 
 BLOCK = 128  # Gaussians a program
 SHAPES = 8  # floats a Gaussian that only binning reads
-
 CLIP = tl.constexpr(NEAR)
 LOW_PASS = tl.constexpr(DILATION)
 SHAPE = tl.constexpr(SHAPES)
@@ -46,26 +45,17 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
             STRIDE: tl.constexpr, TERMS: tl.constexpr, BLOCK: tl.constexpr):
     """Projects Gaussians and counts the tiles that each meets.
 
+    Read are the raw parameters of `count` Gaussians, of which `colored` have a row of STRIDE
+    numbers in sh_rest, TERMS a channel in use, and the camera buffer `view`. Written are, by row
+
     Args:
-        means: [N, 3].
-        quats: [N, 4].
-        log_scales: [N, 3].
-        logits: [N].
-        sh_dc: [N, 3].
-        sh_rest: [M, STRIDE / 3, 3].
-        view: see `view.view_numbers`.
-        count: N.
-        colored: M.
-        records: [N, FLOATS] out, see `fragments`.
-        shapes: [N, SHAPE] out: half width, half height, b / a, b / c and sqrt(reach det / c).
-        centers: [N, 2] float64 out, pixels.
-        depths: [N] out.
-        touched: [N] int32 out, tiles.
-        radii: [N] out, see `Statistics`.
-        broken: [programs] int32 out, Gaussians that hold or become what is not finite.
-        STRIDE: numbers in a row of sh_rest.
-        TERMS: coefficients a channel that are in use.
-        BLOCK: Gaussians a program.
+        records: [N, FLOATS], see `compositing`.
+        shapes: [N, SHAPE]: half width, half height, b / a, b / c and sqrt(reach det / c).
+        centers: [N, 2] float64, pixels.
+        depths: [N].
+        touched: [N] int32, tiles.
+        radii: [N], see `Statistics`.
+        broken: [programs] int32, Gaussians that hold or become what is not finite.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -81,9 +71,9 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     finite = raw < INFINITE
     odds = tl.exp2(tl.minimum(-logit * LOG2E, 126.0))
     log2_opacity = -tl.log2(1.0 + odds)
-    # the negated comparisons of NaN are false: what is not a number is not seen
-    seen = here & finite & (z > CLIP) & (log2_opacity >= LOG2_ALPHA_MIN)
-    z = tl.where(seen, z, 1.0)
+    # the negated comparisons of NaN are false: what is not a number is not visible
+    visible = here & finite & (z > CLIP) & (log2_opacity >= LOG2_ALPHA_MIN)
+    z = tl.where(visible, z, 1.0)
     center_x = tl.load(view + FX) * x / z + tl.load(view + CX)
     center_y = tl.load(view + FY) * y / z + tl.load(view + CY)
     per_z = (1.0 / z).to(tl.float32)
@@ -91,8 +81,8 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
         view, (x / z).to(tl.float32), (y / z).to(tl.float32), per_z)
     qw, qx, qy, qz, _ = unit_quaternion(quats, i, here)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
-    v00, v01, v02 = projected_axes(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-    v10, v11, v12 = projected_axes(b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    v00, v01, v02 = project_axes(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+    v10, v11, v12 = project_axes(b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
     v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
     square_x, b = v00 * v00 + v01 * v01 + v02 * v02, v00 * v10 + v01 * v11 + v02 * v12
     square_y = v10 * v10 + v11 * v11 + v12 * v12
@@ -105,12 +95,12 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
 
     to_x, to_y, to_z, _ = direction(means, view, i, here)
     red, green, blue = colors(
-        sh_dc, sh_rest, i, here, seen & (i < colored), to_x, to_y, to_z, STRIDE, TERMS)
+        sh_dc, sh_rest, i, here, visible & (i < colored), to_x, to_y, to_z, STRIDE, TERMS)
     lit = tl.abs(red) + tl.abs(green) + tl.abs(blue) < INFINITE
-    whole = tl.where(seen, finite & lit & sound, finite & lit)
+    whole = tl.where(visible, finite & lit & sound, finite & lit)
     tl.store(broken + tl.program_id(0), tl.sum(tl.where(here & (whole == 0), 1, 0)))
-    seen = seen & sound & lit
-    center_x, center_y = tl.where(seen, center_x, 0.0), tl.where(seen, center_y, 0.0)
+    visible = visible & sound & lit
+    center_x, center_y = tl.where(visible, center_x, 0.0), tl.where(visible, center_y, 0.0)
 
     reach = (log2_opacity - LOG2_ALPHA_MIN) * (2.0 / LOG2E)  # 2 ln(255 o)
     reach = tl.maximum(reach, 0.0) * (1.0 + SLACK) + SLACK
@@ -138,7 +128,7 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     tl.store(depths + i, z.to(tl.float32), mask=here)
 
     low, high = rows_of(center_y, extent_y, view)
-    low, high = tl.where(seen, low, 0), tl.where(seen, high, -1)
+    low, high = tl.where(visible, low, 0), tl.where(visible, high, -1)
     tiles, row = low * 0, low
     while tl.max(high - row) >= 0:
         first, last = span(extent_x, extent_y, slope_y, slope_x, half, center_x, center_y, row,
@@ -148,7 +138,7 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     tl.store(touched + i, tiles, mask=here)
     middle, apart = 0.5 * (a + c), 0.5 * (a - c)
     radius = 3.0 * tl.sqrt(middle + tl.sqrt(apart * apart + b * b))
-    inside = seen & (center_x + extent_x > 0.0) & (
+    inside = visible & (center_x + extent_x > 0.0) & (
         center_x - extent_x < tl.load(view + WIDTH)) & (center_y + extent_y > 0.0) & (
         center_y - extent_y < tl.load(view + HEIGHT))
     tl.store(radii + i, tl.where(inside, radius, 0.0), mask=here)
@@ -170,19 +160,7 @@ def span(extent_x, extent_y, slope_y, slope_x, half, center_x, center_y, row, vi
     """Returns the first and the last tile of a row that ellipses meet; last < first for none.
 
     Between two heights the ellipse reaches farthest right at its rightmost point, or at the height
-    that is nearest to it.
-
-    Args:
-        extent_x: half width; so the next four as `project` writes them into `shapes`.
-        extent_y: half height.
-        slope_y: b / a.
-        slope_x: b / c.
-        half: sqrt(reach det / c).
-        center_x: pixels.
-        center_y: pixels.
-        row: of tiles.
-        view: see `view.view_numbers`.
-        here: whose spans are wanted.
+    that is nearest to it. The first five arguments are what `project` writes into `shapes`.
     """
     top = (row * SIDE + 0.5 - center_y).to(tl.float32)
     low, high = tl.maximum(top, -extent_y), tl.minimum(top + (SIDE - 1), extent_y)
@@ -209,17 +187,9 @@ def list_tiles(shapes, centers, depths, starts, view, count, tiles_x, keys, owne
                BLOCK: tl.constexpr):
     """Writes the instances of each Gaussian into its slots.
 
-    Args:
-        shapes: [N, SHAPE].
-        centers: [N, 2] float64.
-        depths: [N].
-        starts: [N + 1] int32, first slot of each; without slots a Gaussian is left out.
-        view: see `view.view_numbers`.
-        count: N.
-        tiles_x: tiles in a row.
-        keys: [E] int64 out: tile, and in the lower half the bits of the depth, which is positive.
-        owners: [E] int32 out, the Gaussian.
-        BLOCK: Gaussians a program.
+    `starts` [N + 1] int32 is the first slot of each; without slots a Gaussian is left out. Written
+    are `keys` [E] int64: tile, and in the lower half the bits of the depth, which is positive; and
+    `owners` [E] int32, the Gaussian.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -266,7 +236,6 @@ def place(keys, slots, owners, centers, records, starts, count, tiles_x, members
         tiles_x: tiles in a row.
         members: [E] int32 out, Gaussian.
         offsets: [E, 2] out, u and v at the tile's first pixel.
-        BLOCK: instances a program.
     """
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = e < tl.load(starts + count)

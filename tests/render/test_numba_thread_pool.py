@@ -6,16 +6,16 @@ import time
 
 import pytest
 
-from recon_cli.render.numba.thread_pool import Crew
+from recon_cli.render.numba.thread_pool import ThreadPool
 
 WAIT = 0.3  # seconds; long against a switch of threads, short for a test
 
 
 @pytest.fixture
-def crew():
-    made = Crew()
-    made.threads = 3
-    return made
+def pool():
+    pool = ThreadPool()
+    pool.threads = 3
+    return pool
 
 
 def on_workers(work):
@@ -29,35 +29,35 @@ def on_workers(work):
     return kernel
 
 
-def test_the_caller_gets_what_went_wrong_in_a_thread(crew):
+def test_the_caller_gets_what_went_wrong_in_a_thread(pool):
     def fail():
         raise MemoryError("no room")
 
     with pytest.raises(MemoryError, match="no room"):
-        crew.run(on_workers(fail))
+        pool.run(on_workers(fail))
     done = []
-    crew.run(on_workers(lambda: done.append(1)))  # and the threads work on
+    pool.run(on_workers(lambda: done.append(1)))  # and the threads work on
     assert len(done) == 2
 
 
-def test_an_interrupt_waits_until_no_thread_writes_any_more(crew):
+def test_an_interrupt_waits_until_no_thread_writes_any_more(pool):
     done = []
 
     def write_late():
         time.sleep(WAIT)
         done.append(1)
 
-    crew.run(on_workers(lambda: None))  # starts the threads
+    pool.run(on_workers(lambda: None))  # starts the threads
     timer = threading.Timer(WAIT / 3, _thread.interrupt_main)
     timer.start()
     with pytest.raises(KeyboardInterrupt):
-        crew.run(on_workers(write_late))
+        pool.run(on_workers(write_late))
     assert len(done) == 2
     timer.join()
 
 
-def test_the_observer_hears_each_kernel_by_name(crew):
+def test_the_observer_hears_each_kernel_by_name(pool):
     heard = []
-    crew.observer = lambda name, seconds: heard.append((name, seconds >= 0))
-    crew.run(on_workers(lambda: None), scratch=False)
+    pool.observer = lambda name, seconds: heard.append((name, seconds >= 0))
+    pool.run(on_workers(lambda: None), scratch=False)
     assert heard == [("kernel", True)]
