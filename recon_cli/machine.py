@@ -1,9 +1,11 @@
-"""The machine that a stage runs on: its threads, the memory it took, the programs' versions."""
+"""The machine that a stage runs on: threads, memory, the packages' versions, the cache folder."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import platform
+import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -24,18 +26,18 @@ _PACKAGES = {
     "scikit-image": "scikit-image",
 }
 _CPUINFO = Path("/proc/cpuinfo")
-_SAMPLE_SECONDS = 0.5  # a look at all children takes about 5 ms
+_SAMPLE_SECONDS = 0.5  # a sample of all children takes about 5 ms
 
 
 def versions() -> dict[str, str]:
     """Returns the versions of Python and of the packages that a result depends on."""
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name, package in _PACKAGES.items():
         try:
-            found[name] = importlib.metadata.version(package)
+            versions[name] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[name] = "missing"
-    return found
+            versions[name] = "missing"
+    return versions
 
 
 def usable_threads() -> int:
@@ -65,7 +67,7 @@ def free_memory_bytes(limits: Sequence[tuple[str, str]] = _LIMITS) -> int:
 
 
 def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
-    """Returns the model name that Linux tells, or what Python knows elsewhere."""
+    """Returns the CPU's model name from Linux's /proc/cpuinfo, or what Python knows elsewhere."""
     if cpuinfo.exists():
         for line in cpuinfo.read_text(encoding="utf-8").splitlines():
             key, _, value = line.partition(":")
@@ -74,14 +76,26 @@ def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
     return platform.processor() or platform.machine()
 
 
+def cache_root() -> Path:
+    """Returns the folder for what recon keeps between runs: RECON_CACHE_DIR, or the platform's."""
+    folder = os.environ.get("RECON_CACHE_DIR")
+    if folder:
+        return Path(folder)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "recon"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "recon" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "recon"
+
+
 class Meter:
     """Measures the time and the peak memory of a block of work.
 
-    Memory is the resident set of this process and its children together, looked at twice a second:
+    Memory is the resident set of this process and its children together, sampled twice a second:
     the operating system's own peak covers the whole life of a process, not one stage of it.
 
     Attributes:
-        peak_memory_bytes: largest sum seen.
+        peak_memory_bytes: largest sum of all samples.
     """
 
     def __init__(self) -> None:
@@ -108,17 +122,17 @@ class Meter:
     ) -> None:
         self._done.set()
         self._thread.join()
-        self._look()
+        self._sample()
 
     def _watch(self) -> None:
         while not self._done.wait(_SAMPLE_SECONDS):
-            self._look()
+            self._sample()
 
-    def _look(self) -> None:
+    def _sample(self) -> None:
         process, total = psutil.Process(), 0
-        for one in [process, *process.children(recursive=True)]:
+        for each in [process, *process.children(recursive=True)]:
             try:
-                total += one.memory_info().rss
+                total += each.memory_info().rss
             except psutil.Error:  # it ended meanwhile
                 continue
         self.peak_memory_bytes = max(self.peak_memory_bytes, total)

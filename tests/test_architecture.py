@@ -28,7 +28,7 @@ ALLOWED: dict[str, set[str]] = {
     "workspace": {"errors"},
     "config": {"errors", "workspace"},
     "context": {"progress", "scene"},
-    "render": {"errors", "scene"},
+    "render": {"errors", "machine", "scene"},
     "io": {"errors", "workspace", "scene"},
     "capture": READ,
     "sfm": READ,

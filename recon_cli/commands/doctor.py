@@ -19,6 +19,7 @@ from recon_cli.commands.options import Call, pass_call, verb
 
 if TYPE_CHECKING:  # at run time it would import torch
     from recon_cli.render.registry import BackendStatus
+    from recon_cli.render.self_check import Verdict
 
 
 @verb("doctor")
@@ -46,6 +47,7 @@ class Findings:
         disk_free_bytes: where the workspace lies or would lie.
         workspace: its path.
         writable: whether files can be made there.
+        self_check: of the triton kernels on this GPU; None where they cannot run.
     """
 
     versions: dict[str, str]
@@ -57,13 +59,14 @@ class Findings:
     disk_free_bytes: int
     workspace: str
     writable: bool
+    self_check: Verdict | None
 
 
 def examine(workspace: Path) -> Findings:
-    """Returns what was found on this machine and at `workspace`, which need not exist."""
+    """Returns what this machine has, and `workspace`, which need not exist."""
     import torch
 
-    from recon_cli.render.registry import available_backends
+    from recon_cli.render.registry import available_backends, cuda_verdict
 
     root = workspace.absolute()
     place = next(path for path in (root, *root.parents) if path.exists())
@@ -78,6 +81,7 @@ def examine(workspace: Path) -> Findings:
         disk_free_bytes=shutil.disk_usage(place).free,
         workspace=str(root),
         writable=place.is_dir() and os.access(place, os.W_OK | os.X_OK),
+        self_check=cuda_verdict(),
     )
 
 
@@ -89,6 +93,11 @@ def findings_text(findings: Findings) -> str:
         state = f"missing: {backend.missing}" if backend.missing else (
             "runs on " + ", ".join(backend.devices))
         lines.append(f"{'backend':<13} {backend.name}: {state}")
+    check = findings.self_check
+    if check is not None:
+        outcome = f"passed in {check.seconds:.1f} s" if check.passed else (
+            f"FAILED, torch is used instead: {check.failure}")
+        lines.append(f"{'self-check':<13} {check.backend} on {check.device}: {outcome}")
     writable = "writable" if findings.writable else "NOT writable"
     lines += [
         f"{'cores':<13} {findings.cores}",

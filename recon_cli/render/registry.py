@@ -1,11 +1,12 @@
-"""Which rasterizers there are, and which one is meant by a name."""
+"""The rasterizer backends: which can run here, which one `auto` takes, and the function of each."""
 
 from __future__ import annotations
 
 import importlib.util
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,6 +15,9 @@ from recon_cli.errors import BackendError
 from recon_cli.render.contract import Renderer, RenderOutput, check_inputs
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+
+if TYPE_CHECKING:
+    from recon_cli.render.self_check import Verdict
 
 _OLDEST_GPU = (7, 5)  # compute capability, of Turing: what triton's kernels are compiled for
 
@@ -39,52 +43,83 @@ def available_backends() -> tuple[BackendStatus, ...]:
     """Returns every known backend, fastest first, each with the reason if it cannot run."""
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
     missing = "" if importlib.util.find_spec("numba") else "the package numba is not installed"
-    return (BackendStatus("triton", ("cuda",), _lacking_for_triton()),
+    return (BackendStatus("triton", ("cuda",), _why_no_triton()),
             BackendStatus("numba", ("cpu",), missing), BackendStatus("torch", devices))
 
 
-def _lacking_for_triton() -> str:
+def _why_no_triton() -> str:
     """Returns why triton's kernels cannot run here; empty where they can."""
     if not torch.cuda.is_available():
         return "torch finds no CUDA device"
     if not importlib.util.find_spec("triton"):
         return "the package triton is not installed (it comes with torch for CUDA, on Linux)"
-    found = torch.cuda.get_device_capability()
-    if found < _OLDEST_GPU:
-        return (f"the GPU has compute capability {'.'.join(map(str, found))}, needed "
+    capability = torch.cuda.get_device_capability()
+    if capability < _OLDEST_GPU:
+        return (f"the GPU has compute capability {'.'.join(map(str, capability))}, needed "
                 f"{'.'.join(map(str, _OLDEST_GPU))}")
     return ""
+
+
+def cuda_verdict() -> Verdict | None:
+    """Returns the self-check of triton on this GPU, run now if it never was; None without one."""
+    if _why_no_triton():
+        return None
+    from recon_cli.render.self_check import verdict_for
+
+    return verdict_for("triton", torch.device("cuda"))
 
 
 def resolve(backend: str, device: str) -> tuple[str, str]:
     """Returns (backend, device) with every `auto` replaced by what will run.
 
+    On CUDA `auto` takes triton only where its kernels passed the self-check on this GPU. A backend
+    that was named runs even where it failed, with a warning: it may be the check that is wrong.
+
     Raises:
-        BackendError: what was asked for by name is not there; nothing else is used in its place.
+        BackendError: what was named cannot run; nothing else is used instead.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendError(
             "CUDA was asked for, but torch finds no CUDA device.",
             hint="Leave --device out, or run `recon doctor`.")
-    chosen_device = device
     if device == "auto":
-        chosen_device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     known = {status.name: status for status in available_backends()}
     if backend == "auto":
-        able = [one for one in known.values() if chosen_device in one.devices]
-        backend = next(one.name for one in able if not one.missing)
-        for one in able[:[other.name for other in able].index(backend)]:
-            logger.warning(
-                "%s is used in place of %s: %s", backend, one.name, one.missing)
-        logger.info("rasterizer: %s on %s (chosen automatically)", backend, chosen_device)
+        return _fastest(known.values(), device), device
     if backend not in known:
         raise BackendError(
             f"There is no backend {backend!r}.", hint="Known are " + ", ".join(known) + ".")
     status = known[backend]
-    if chosen_device not in status.devices or status.missing:
-        reason = status.missing or f"it does not run on {chosen_device}"
+    if device not in status.devices or status.missing:
+        reason = status.missing or f"it does not run on {device}"
         raise BackendError(f"Backend {backend} cannot be used: {reason}.", hint="See recon doctor.")
-    return backend, chosen_device
+    verdict = cuda_verdict() if backend == "triton" else None
+    if verdict is not None and not verdict.passed:
+        logger.warning(
+            "the triton kernels failed their self-check on %s (%s): results may be wrong. "
+            "`--backend torch` is slower and safe.", verdict.device, verdict.failure)
+    return backend, device
+
+
+def _fastest(backends: Iterable[BackendStatus], device: str) -> str:
+    """Returns the first backend that can be used on a device, and logs why others cannot."""
+    reasons = {}
+    for status in backends:
+        if device not in status.devices:
+            continue
+        reason = status.missing
+        if not reason and status.name == "triton":
+            verdict = cuda_verdict()
+            if verdict is not None and not verdict.passed:
+                reason = f"its self-check on {verdict.device} failed: {verdict.failure}"
+        if not reason:
+            break
+        reasons[status.name] = reason
+    for name, reason in reasons.items():
+        logger.warning("%s is used in place of %s: %s", status.name, name, reason)
+    logger.info("rasterizer: %s on %s (chosen automatically)", status.name, device)
+    return status.name
 
 
 def use_threads(backend: str, threads: int) -> None:

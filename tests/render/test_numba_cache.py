@@ -180,20 +180,6 @@ def test_a_new_folder_is_open_to_its_owner_alone(fresh_folder, tmp_path):
     assert folder.stat().st_mode & 0o077 == 0
 
 
-def test_the_folder_follows_the_custom_of_the_platform(monkeypatch, tmp_path):
-    monkeypatch.delenv("RECON_CACHE_DIR", raising=False)
-    monkeypatch.setattr(kernel.sys, "platform", "linux")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert kernel.cache_root() == tmp_path / "recon"
-    monkeypatch.setattr(kernel.sys, "platform", "darwin")
-    assert kernel.cache_root() == Path.home() / "Library" / "Caches" / "recon"
-    monkeypatch.setattr(kernel.sys, "platform", "win32")
-    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
-    assert kernel.cache_root() == tmp_path / "recon" / "cache"
-    monkeypatch.setenv("RECON_CACHE_DIR", str(tmp_path / "mine"))
-    assert kernel.cache_root() == tmp_path / "mine"
-
-
 # ---- damage, without the time to compile ----
 
 def test_files_that_a_crash_left_without_the_mark_of_a_full_cache_are_cleared(

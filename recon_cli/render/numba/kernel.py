@@ -1,12 +1,10 @@
 """How every kernel is compiled, and where the machine code is kept.
 
 Compiling takes seconds, so the machine code is kept in the user's cache folder and loaded by the
-next process. numba stores it by pickle, which runs what the file says: the folder must belong to
-the user alone, or it is not used. Its name holds a digest of the CPU, of the versions and of all
-sources here (numba itself looks only at the file that a kernel stands in, not at what it inlines),
-so that code for another CPU or of another version is never found.
-
-RECON_CACHE_DIR names another folder.
+next process. numba stores it by pickle, which executes what the file says: the folder must belong
+to the user alone, or it is not used. Its name holds a digest of the CPU, the versions and all
+sources here (numba itself checks only the file that a kernel stands in, not what it inlines), so
+that code for another CPU or of another version is never loaded.
 """
 
 from __future__ import annotations
@@ -26,6 +24,8 @@ import llvmlite
 import llvmlite.binding as llvm
 import numba
 from numba.core import config
+
+from recon_cli import machine
 
 logger = logging.getLogger("recon")
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
@@ -53,7 +53,7 @@ def inlined(function: Compiled) -> Compiled:
 @cache
 def cache_folder() -> Path | None:
     """Returns the folder of the machine code; None where there is no place for it."""
-    folder = cache_root() / "kernels" / fingerprint()
+    folder = machine.cache_root() / "kernels" / fingerprint()
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         probe = folder / f".probe-{os.getpid()}"
@@ -61,7 +61,7 @@ def cache_folder() -> Path | None:
         probe.unlink()
     except OSError as error:
         logger.warning(
-            "no place to keep compiled kernels (%s); they are compiled in every run. Set "
+            "compiled kernels cannot be kept (%s); they are compiled in every run. Set "
             "RECON_CACHE_DIR to a folder that can be written.", error)
         return None
     if not _ours_alone(folder):
@@ -70,18 +70,6 @@ def cache_folder() -> Path | None:
             "RECON_CACHE_DIR to a folder of your own.", folder)
         return None
     return folder
-
-
-def cache_root() -> Path:
-    """Returns the folder for what recon keeps between runs, by the platform's custom."""
-    chosen = os.environ.get("RECON_CACHE_DIR")
-    if chosen:
-        return Path(chosen)
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "recon"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "recon" / "cache"
-    return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "recon"
 
 
 def fingerprint() -> str:
@@ -102,5 +90,5 @@ def fingerprint() -> str:
 def _ours_alone(folder: Path) -> bool:
     if not hasattr(os, "getuid"):  # Windows keeps the folder inside the user's profile
         return True
-    found = folder.stat()
-    return found.st_uid == os.getuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    status = folder.stat()
+    return status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
