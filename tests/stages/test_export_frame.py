@@ -231,7 +231,7 @@ def test_a_matrix_with_six_decimals_is_made_a_rotation(inputs):
 
 
 def test_transform_and_up_exclude_each_other():
-    with pytest.raises(ConfigError, match="each decides"):
+    with pytest.raises(ConfigError, match="transform and up"):
         ExportConfig(transform=flat(MOVED), up="y")
 
 
