@@ -91,6 +91,6 @@ def _load_held_out(
         trained = job.inspect().check("train").fresh
         max_size = (read_config(job.workspace.folder("train")) if trained
                     else QUALITIES["normal"]).max_size
-    ctx = execute.context_for(job, stage("evaluate"), lambda _done, _total: None)
+    ctx = execute.stage_context(job, stage("evaluate"), lambda _done, _total: None)
     views = load_held_out_views(load_scene(inputs, validation=0.0), max_size, ctx)
     return job.workspace.root.name, views, ctx

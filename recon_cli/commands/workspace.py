@@ -21,6 +21,7 @@ from recon_cli.pipeline.plan import Job, StageStatus
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.stages import STAGES
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.manifest import describe_progress
 
 logger = logging.getLogger("recon")
 
@@ -53,7 +54,9 @@ def status_table(stages: Sequence[StageStatus]) -> str:
     """Returns stage, state, time, and reasons or summary, one line a stage."""
     rows = [("stage", "state", "time", "")]
     for stage in stages:
-        state = f"partial ({stage.how_far})" if stage.state == "partial" else stage.state
+        state = stage.state
+        if state == "partial":
+            state = f"partial ({describe_progress(stage.done, stage.total)})"
         time = "" if stage.seconds is None else format_duration(stage.seconds)
         rows.append((
             stage.name, state, time, "; ".join(stage.reasons) or summary_text(stage.summary)))

@@ -1,4 +1,4 @@
-"""Where values come from: defaults, recon.toml, --config, the command line; a later layer wins."""
+"""Where options come from: defaults, recon.toml, --config, the command line; later ones win."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ _TRUTH = {"true": True, "false": False}
 
 
 def read_settings(path: Path) -> Settings:
-    """Returns what a recon.toml sets, with every section and field name checked.
+    """Returns what a recon.toml sets, with every section, field and value checked.
 
     Raises:
-        ConfigError: the file is missing or no TOML, or names a section or field that does not
-            exist.
+        ConfigError: the file is missing or no TOML, or sets what does not exist or a value that
+            cannot be used.
     """
     try:
         with path.open("rb") as file:
@@ -61,13 +61,13 @@ def read_settings(path: Path) -> Settings:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid TOML: {error}.", hint="Fix that line.") from error
     for section, values in settings.items():
-        check_section(section, where=str(path))
+        _check_names(section, (), where=str(path))
         if not isinstance(values, dict):
             raise ConfigError(
                 f"{path} sets {section} to {values!r}, but it is a section.",
                 hint=f"Write [{section}] on a line of its own and its fields below it.")
-        for name in values:
-            check_field(section, name, where=str(path))
+        _check_names(section, values, where=str(path))
+        _check_values(section, values, where=f"{path}: {section}.")
     return settings
 
 
@@ -75,56 +75,64 @@ def parse_assignment(text: str) -> Settings:
     """Returns what `section.field=value` sets, the value typed as the field is.
 
     Raises:
-        ConfigError: the text has another form, names no field, or the value has the wrong type.
+        ConfigError: the text has another form, names no field, or the value cannot be used.
     """
-    name, equals, value = text.partition("=")
-    section, dot, field = name.strip().partition(".")
+    path, equals, value = text.partition("=")
+    section, dot, name = path.strip().partition(".")
     if not equals or not dot:
         raise ConfigError(
             f"--set takes section.field=value, but got {text!r}.",
             hint="For example --set train.iterations=1000.")
-    check_section(section, where="--set")
-    check_field(section, field, where="--set")
-    return {section: {field: _typed(section, field, value.strip())}}
+    _check_names(section, [name], where="--set")
+    settings = {section: {name: _parse_value(section, name, value.strip())}}
+    _check_values(section, settings[section], where=f"--set {section}.")
+    return settings
 
 
-def _typed(section: str, name: str, text: str) -> Any:
+def _parse_value(section: str, name: str, text: str) -> Any:
+    """Returns the text after `=` in the type of the field."""
     kind, optional = field_type(SECTIONS[section], name)
     if optional and text == AUTOMATIC:
         return None
+    members = member_types(kind)
     try:
-        if member_types(kind):
-            words = zip(shlex.split(text), member_types(kind), strict=True)
+        if members:
+            words = zip(shlex.split(text), members, strict=True)
             return tuple(member(word) for word, member in words)
         return _TRUTH[text] if kind is bool else kind(text)
     except (KeyError, ValueError) as error:
         needed = "true or false" if kind is bool else f"a value of type {kind.__name__}"
-        if member_types(kind):
-            names = ", ".join(member.__name__ for member in member_types(kind))
-            needed = f"{len(member_types(kind))} values ({names}) with spaces between"
+        if members:
+            names = ", ".join(member.__name__ for member in members)
+            needed = f"{len(members)} values ({names}) with spaces between"
         raise ConfigError(
             f"{section}.{name} is {text!r}, but it must be {needed}.",
             hint="Change it in --set.") from error
 
 
-def check_section(section: str, *, where: str) -> None:
-    """Raises ConfigError unless there is such a section; `where` is named in the message."""
+def _check_names(section: str, names: Iterable[str], *, where: str) -> None:
+    """Raises ConfigError unless the section and its fields exist; `where` sets them."""
     if section not in SECTIONS:
         raise ConfigError(
             f"{where} holds the section {section}, which does not exist.",
-            hint=_suggestion(section, list(SECTIONS), "Sections:"))
+            hint=_suggest(section, list(SECTIONS), "Sections:"))
+    known = [item.name for item in dataclasses.fields(SECTIONS[section])]
+    for name in names:
+        if name not in known:
+            raise ConfigError(
+                f"{where} sets {section}.{name}, which does not exist.",
+                hint=_suggest(name, known, f"Options of [{section}]:"))
 
 
-def check_field(section: str, name: str, *, where: str) -> None:
-    """Raises ConfigError unless `section` has a field `name`; `where` is named in the message."""
-    names = [item.name for item in dataclasses.fields(SECTIONS[section])]
-    if name not in names:
-        raise ConfigError(
-            f"{where} sets {section}.{name}, which does not exist.",
-            hint=_suggestion(name, names, f"Options of [{section}]:"))
+def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> None:
+    """Raises ConfigError, with `where` before its message, unless the values can be used."""
+    try:
+        SECTIONS[section](**values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}{error.message}", hint=error.hint) from error
 
 
-def _suggestion(word: str, known: list[str], lead: str) -> str:
+def _suggest(word: str, known: list[str], lead: str) -> str:
     close = difflib.get_close_matches(word, known, n=1)
     return f"Did you mean {close[0]}?" if close else f"{lead} {', '.join(known)}."
 
@@ -139,7 +147,7 @@ def merge(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
 
 
 def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
-    """Returns the frozen instance of one config class that `settings` describe."""
+    """Returns the config of one class with what `settings` set."""
     return config(**settings.get(section_of(config), {}))
 
 

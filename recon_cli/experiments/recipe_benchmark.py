@@ -20,7 +20,7 @@ from recon_cli.experiments.runner import STEPS, ExperimentRequest, Runner, Runs,
 from recon_cli.experiments.scenes import check_scenes
 from recon_cli.experiments.trial import CurvePoint, LoadedScene
 from recon_cli.experiments.variants import Variant
-from recon_cli.pipeline.execute import rendering
+from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
 
 SCHEMA, VERSION = "recon-bench-train", 1
@@ -116,7 +116,7 @@ def run(request: RecipeRequest, progress: Progress) -> str:
         ReconError: something cannot be done; what can be known is found before training.
     """
     paths = check_scenes(request.scenes)
-    ctx = rendering(request.compute, progress)
+    ctx = render_context(request.compute, progress)
     host = examine(ctx.threads, ctx.device)
     runner = Runner(request.base, progress)
     with tempfile.TemporaryDirectory(prefix="recon-bench-") as scratch:

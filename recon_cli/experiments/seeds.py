@@ -111,7 +111,7 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
     for name in _SEEDED:
         check = inspection.check(name)
         if check.fresh and check.manifest:
-            configs[name] = inspection.config(check.row, check.manifest.basis)
+            configs[name] = inspection.config(check.row, check.manifest.key)
     train = configs.pop("train")
     assert isinstance(train, TrainConfig)
     seeds = tuple(range(train.seed, train.seed + count))

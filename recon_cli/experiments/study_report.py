@@ -32,7 +32,7 @@ from recon_cli.experiments.study import (
     StudyResult,
 )
 from recon_cli.experiments.variants import PAPER, Variant
-from recon_cli.pipeline.execute import rendering
+from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
 from recon_cli.workspace import atomic, lock
 from recon_cli.workspace.layout import disk_errors
@@ -90,8 +90,8 @@ def run(request: StudyRequest, progress: Progress) -> str:
             f"The folder {out} cannot be created: {error.strerror}.",
             hint="Give another folder with --out.") from error
     with (disk_errors(out, "running study"),
-          lock.held(out, "study", other="another folder with --out")):
-        ctx = rendering(request.compute, progress)
+          lock.hold(out, "study", other="another folder with --out")):
+        ctx = render_context(request.compute, progress)
         host = examine(ctx.threads, ctx.device)
         records = Records(out)
         scenes = request.load(paths, out / "scenes", "test", ctx)

@@ -66,7 +66,7 @@ def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
     root, row = job.workspace.root, stage("prune")
     plan.plan(job.inspect(), "prune")
     with disk_errors(root, "sweeping"), job.workspace.writing("prune --sweep"):
-        context = execute.context_for(job, row, lambda _done, _total: None)
+        context = execute.stage_context(job, row, lambda _done, _total: None)
         inputs = StageInputs({name: job.workspace.folder(name) for name in row.needs})
         course = course_of(config, inputs, root, context)
         views, steps = len(course.task.validation), course.until - course.first

@@ -29,7 +29,7 @@ from recon_cli.flythrough.images import (
 from recon_cli.flythrough.request import DEPTH, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
 from recon_cli.flythrough.video import VideoEncoding, check_encoding, encode_video
-from recon_cli.pipeline.execute import Job, rendering
+from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render import render
 from recon_cli.workspace import lock
 from recon_cli.workspace.atomic import (
@@ -151,9 +151,9 @@ def render_frames(request: RenderRequest, job: Job) -> str:
         trained = open_trained_scene(job, request.model)
     plan = plan_cameras(request, trained)
     encoding = _check(request, plan)
-    ctx = rendering(job.compute, job.progress)
+    ctx = render_context(job.compute, job.progress)
     folder = _make_folders(request, plan, job.workspace.root)
-    with disk_errors(folder, "rendering"), lock.held(
+    with disk_errors(folder, "rendering"), lock.hold(
             folder, "render", other="another folder with --out"):
         frames = FrameFolder(folder, list(plan.cameras), request.outputs)
         scale = depth_scale(trained.scene, metres=trained.metres)

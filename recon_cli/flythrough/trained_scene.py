@@ -17,7 +17,7 @@ from recon_cli.io.import_record import Origin
 from recon_cli.io.ply import read_ply
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
-from recon_cli.pipeline.freshness import Inspection
+from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.scene.gravity import camera_up, find_gravity
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
@@ -102,23 +102,23 @@ def _open_viewless(job: Job, model: str, origin: Origin) -> TrainedScene:
         has_views=False)
 
 
-def _require_fresh(inspection: Inspection, name: str, verb: str) -> Manifest:
+def _require_fresh(inspection: WorkspaceCheck, name: str, verb: str) -> Manifest:
     check = inspection.check(name)
     if check.manifest is None or not check.fresh:
         raise StageError(
-            f"{verb} needs {name}, which is {check.described()}.",
+            f"{verb} needs {name}, which is {check.describe()}.",
             hint=f"Run `{plan.command(inspection, check)}` first.")
     return check.manifest
 
 
-def _use_pruned(inspection: Inspection, model: str, verb: str) -> bool:
+def _use_pruned(inspection: WorkspaceCheck, model: str, verb: str) -> bool:
     check = inspection.check("prune")
     if model == "pruned" and not check.fresh:
         raise StageError(
-            f"{verb} needs the pruned model, which is {check.described()}.",
+            f"{verb} needs the pruned model, which is {check.describe()}.",
             hint=f"Run `recon prune` first, or `recon {verb} --model base`.")
     if model == "auto" and check.manifest and not check.fresh:
-        logger.warning("the pruned model is not used: it is %s", check.described())
+        logger.warning("the pruned model is not used: it is %s", check.describe())
     return check.fresh and model != "base"
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from recon_cli.pipeline.execute import Job
-from recon_cli.workspace.layout import disk_errors, matches, remove, size_of
+from recon_cli.workspace.digests import matches
+from recon_cli.workspace.layout import disk_errors, remove, size_of
 
 # Logs are volatile too, but later stages read times from them and they free next to nothing.
 _WORTH_BYTES = 1 << 20

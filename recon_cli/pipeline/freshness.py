@@ -1,8 +1,8 @@
-"""Whether a result is still what it would be if it were made now, and if not, why.
+"""Whether a result is still what a run would make now, and if not, why.
 
-Which options a result is held against: those it was made with, except where recon.toml, --config or
---set say otherwise. After `recon train --iterations 100`, `recon eval` finds the training fresh
-although the default is another; after `iterations = 200` in recon.toml, it does not.
+A result is compared with the options it was made with, except where recon.toml, --config or --set
+say otherwise. After `recon train --iterations 100`, `recon eval` finds the training fresh although
+the default is another; after `iterations = 200` in recon.toml, it does not.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
@@ -21,27 +20,34 @@ from recon_cli.config.settings import Settings
 from recon_cli.errors import ConfigError, ManifestError
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, read_source
-from recon_cli.workspace.layout import Workspace, changed_outputs
-from recon_cli.workspace.manifest import Basis, Manifest, Unfinished, differences, how_far
+from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.manifest import (
+    Manifest,
+    PartialRun,
+    ResultKey,
+    describe_progress,
+    differences,
+    find_changed_outputs,
+)
 
 
 @dataclass(frozen=True)
-class Check:
+class StageCheck:
     """What is known of one stage's result.
 
     Attributes:
         row: the stage.
         manifest: of the finished result; None where there is none.
         reasons: why the result is stale, in words; empty where it is fresh or missing.
-        gone: inputs that were read once and are no longer there; that alone makes nothing stale.
-        unfinished: an interrupted run that the next one would resume.
+        gone: inputs that no longer exist; that alone makes nothing stale.
+        partial_run: an interrupted run that the next one would resume.
     """
 
     row: Stage
     manifest: Manifest | None
     reasons: tuple[str, ...] = ()
     gone: tuple[str, ...] = ()
-    unfinished: Unfinished | None = None
+    partial_run: PartialRun | None = None
 
     @property
     def fresh(self) -> bool:
@@ -53,30 +59,31 @@ class Check:
         """One of fresh, partial, stale, missing."""
         if self.fresh:
             return "fresh"
-        if self.unfinished:
+        if self.partial_run:
             return "partial"
         return "stale" if self.manifest else "missing"
 
-    def described(self) -> str:
+    def describe(self) -> str:
         """Returns the state with its reason or progress, as part of a sentence."""
-        if self.state == "partial" and self.unfinished:
-            return f"unfinished ({how_far(self.unfinished.done, self.unfinished.total)})"
+        partial = self.partial_run
+        if partial and not self.fresh:
+            return f"unfinished ({describe_progress(partial.done, partial.total)})"
         return f"{self.state}: {'; '.join(self.reasons)}" if self.reasons else self.state
 
 
-def is_imported(basis: Basis) -> bool:
-    """Tells whether a result is a scene that was imported: training reads no file of the user's."""
-    return basis.stage == IMPORT.name and bool(basis.sources)
+def is_imported(key: ResultKey) -> bool:
+    """Returns whether a result is an imported scene: training itself reads no file of the user."""
+    return key.stage == IMPORT.name and bool(key.sources)
 
 
-class Inspection:
-    """One look at a workspace. Every stage is checked at most once, and nothing is changed.
+class WorkspaceCheck:
+    """The checks of a workspace as it is now, each made once. Nothing is changed.
 
-    A stage that lies behind a stale one is stale too. One that lies behind a missing one is not:
-    whether its input changed shows when that has been made again.
+    A stage behind a stale one is stale too. One behind a missing one is not: whether its input
+    changed shows once that has been made again.
 
     Args:
-        workspace: where the results lie.
+        workspace: holds the results.
         settings: what recon.toml, --config and --set set.
         table: the stages.
     """
@@ -85,10 +92,10 @@ class Inspection:
         self._workspace = workspace
         self._settings = settings
         self._rows = {row.name: row for row in table}
-        self._checks: dict[str, Check] = {}
+        self._checks: dict[str, StageCheck] = {}
 
     def row(self, name: str) -> Stage:
-        """Returns the row of a stage; what an imported scene spares it is not needed."""
+        """Returns the row of a stage, without the needs that an imported scene spares it."""
         row = self._rows[name]
         if not row.spares or not self._imported:
             return row
@@ -102,10 +109,10 @@ class Inspection:
             manifest = self._workspace.manifest(IMPORT.name)
         except ManifestError:
             return False
-        return manifest is not None and is_imported(manifest.basis)
+        return manifest is not None and is_imported(manifest.key)
 
-    def check(self, name: str) -> Check:
-        """Returns how a stage's result stands, held against the options it was made with.
+    def check(self, name: str) -> StageCheck:
+        """Returns the check of a stage's result against the options it was made with.
 
         Raises:
             ManifestError: its manifest, or one before it, cannot be trusted.
@@ -113,30 +120,31 @@ class Inspection:
         """
         if name not in self._checks:
             row, manifest = self.row(name), self._workspace.manifest(name)
-            if manifest and is_imported(manifest.basis):
+            if manifest and is_imported(manifest.key):
                 row = IMPORT
-            self._checks[name] = self._compared(
-                row, manifest, self.config(row, manifest.basis if manifest else None))
+            config = self.config(row, manifest.key if manifest else None)
+            self._checks[name] = self._compare(row, manifest, config)
         return self._checks[name]
 
     def check_against(
         self, name: str, config: StageConfig, sources: tuple[Source, ...] | None
-    ) -> Check:
-        """Returns how a stage's result stands, held against `config` and, if given, `sources`."""
-        row = self.row(name)
-        return self._compared(row, self._workspace.manifest(name), config, sources)
+    ) -> StageCheck:
+        """Returns the check of a stage's result against `config` and, if given, `sources`."""
+        return self._compare(self.row(name), self._workspace.manifest(name), config, sources)
 
-    def config(self, row: Stage, recorded: Basis | None) -> StageConfig:
-        """Returns the options that a result was made with, overlaid by the settings."""
-        known = {item.name for item in dataclasses.fields(row.config)}
-        before: dict[str, Any] = {}
-        if recorded:
-            before = {key: value for key, value in recorded.config.items() if key in known}
+    def config(self, row: Stage, key: ResultKey | None) -> StageConfig:
+        """Returns the options that a result was made with, overlaid by the settings.
+
+        Options and values that this version does not know are left out.
+        """
+        names = {item.name for item in dataclasses.fields(row.config)} if key else set()
+        stored = {
+            name: value for name, value in (key.config.items() if key else ())
+            if name in names and _accepts(row.config, name, value)}
         try:
             return layers.build(row.config, layers.merge(
-                [{layers.section_of(row.config): before}, self._settings]))
-        except ConfigError:
-            # A newer recon may refuse what an older one took; what is set now must be right.
+                [{layers.section_of(row.config): stored}, self._settings]))
+        except ConfigError:  # stored values that exclude each other or what is set now
             return layers.build(row.config, self._settings)
 
     def upstream(self, row: Stage) -> dict[str, str | None]:
@@ -148,60 +156,65 @@ class Inspection:
             digests[name] = check.manifest.digest if usable and check.manifest else None
         return digests
 
-    def _compared(
-        self,
-        row: Stage,
-        manifest: Manifest | None,
-        config: StageConfig,
+    def _compare(
+        self, row: Stage, manifest: Manifest | None, config: StageConfig,
         sources: tuple[Source, ...] | None = None,
-    ) -> Check:
+    ) -> StageCheck:
         if manifest is None:
-            return Check(row, None, unfinished=self._unfinished(row))
+            return StageCheck(row, None, partial_run=self._resumable(row))
         gone: tuple[str, ...] = ()
         if sources is None:
-            gone, sources = self._read_again(manifest.basis.sources)
-        before = [self.check(need) for need in row.needs]
-        reasons = [f"{one.row.name} is stale" for one in before if one.manifest and not one.fresh]
-        expected = self._expected(row, config, manifest.basis, sources)
-        reasons += differences(
-            manifest.basis, expected, section=layers.section_of(row.config))
-        reasons += changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)
+            gone, sources = self._read_again(manifest.key.sources)
+        needs = [self.check(need) for need in row.needs]
+        reasons = [
+            f"{check.row.name} is stale" for check in needs if check.manifest and not check.fresh]
+        expected = self._expected_key(row, config, manifest.key, sources)
+        reasons += differences(manifest.key, expected, section=layers.section_of(row.config))
+        reasons += find_changed_outputs(
+            self._workspace.folder(row.name), manifest, row.volatile)
         reasons += _unreadable_summary(row, manifest)
-        return Check(row, manifest, tuple(reasons), gone, self._unfinished(row))
+        return StageCheck(row, manifest, tuple(reasons), gone, self._resumable(row))
 
-    def _expected(
-        self, row: Stage, config: StageConfig, recorded: Basis, sources: tuple[Source, ...]
-    ) -> Basis:
-        """Returns the basis that a run would have now."""
+    def _expected_key(
+        self, row: Stage, config: StageConfig, stored: ResultKey, sources: tuple[Source, ...]
+    ) -> ResultKey:
+        """Returns the key that the result of a run would have now."""
         upstream = self.upstream(row)
-        for need in row.needs:  # what is missing now cannot be told from what was there
-            upstream[need] = upstream[need] or recorded.upstream.get(need)
-        return Basis(row.name, row.version, config.hashed_fields(), sources, upstream)
+        for need in row.needs:  # what is missing now may well come out as it was
+            upstream[need] = upstream[need] or stored.upstream.get(need)
+        return ResultKey(row.name, row.version, config.hashed_fields(), sources, upstream)
 
     def _read_again(
-        self, recorded: tuple[Source, ...]
+        self, stored: tuple[Source, ...]
     ) -> tuple[tuple[str, ...], tuple[Source, ...]]:
-        """Returns the sources that cannot be read any more, and all with what they hold by now."""
-        gone = tuple(source.path for source in recorded if not os.access(source.path, os.R_OK))
-        now = tuple(
+        """Returns the paths of sources that cannot be read any more, and all as they are now."""
+        gone = tuple(source.path for source in stored if not os.access(source.path, os.R_OK))
+        return gone, tuple(
             source if source.path in gone else
             read_source(Path(source.path), known=source, without=self._workspace.root)
-            for source in recorded)
-        return gone, now
+            for source in stored)
 
-    def _unfinished(self, row: Stage) -> Unfinished | None:
-        """Returns an interrupted run if it could still be resumed."""
-        unfinished = self._workspace.unfinished(row.name)
-        if unfinished is None:
+    def _resumable(self, row: Stage) -> PartialRun | None:
+        """Returns the interrupted run of a stage if the next run would resume it."""
+        partial = self._workspace.partial_run(row.name)
+        if partial is None:
             return None
-        basis = unfinished.basis
-        _, sources = self._read_again(basis.sources)
-        expected = self._expected(row, self.config(row, basis), basis, sources)
-        return unfinished if expected.fingerprint == basis.fingerprint else None
+        _, sources = self._read_again(partial.key.sources)
+        expected = self._expected_key(row, self.config(row, partial.key), partial.key, sources)
+        return partial if expected.fingerprint == partial.key.fingerprint else None
+
+
+def _accepts(config: type[StageConfig], name: str, value: object) -> bool:
+    """Returns whether a stored value may still be used; a newer recon may know fewer choices."""
+    try:
+        config(**{name: value})
+    except ConfigError:
+        return False
+    return True
 
 
 def _unreadable_summary(row: Stage, manifest: Manifest) -> list[str]:
-    """Returns why the record of a result cannot be read, as that of another version may not be."""
+    """Returns why the summary of a result cannot be read, as that of another version may not be."""
     try:
         if row.summary:
             row.summary.from_json(manifest.run.summary)

@@ -1,7 +1,8 @@
-"""Decides which stages run, and tells how each of them stands.
+"""Decides which stages run, and says how each of them stands.
 
 A verb names its targets. A target that is fresh is left alone. What it needs is run first where the
-table allows that (denoise, sfm); where it does not (ingest, train), the user is told what to type.
+table allows that (denoise, sfm); where it does not (ingest, train), an error names the command to
+type.
 
 Where options come from: a target takes defaults < recon.toml < --config < command line, so that a
 verb does the same whatever was typed before it. Every other stage keeps the options that its result
@@ -23,11 +24,11 @@ from typing import Any
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
 from recon_cli.errors import StageError
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
-from recon_cli.pipeline.freshness import Check, Inspection, is_imported
+from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck, is_imported
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, read_source
 from recon_cli.workspace.layout import LOG, disk_errors
-from recon_cli.workspace.manifest import Manifest, how_far
+from recon_cli.workspace.manifest import Manifest
 
 __all__ = ["Job", "Outcome", "StageStatus", "Target", "plan", "run", "run_stage", "status"]
 
@@ -36,13 +37,7 @@ logger = logging.getLogger("recon")
 
 @dataclass(frozen=True)
 class Target:
-    """A stage that the user asked for.
-
-    Attributes:
-        stage: its name.
-        config: its options.
-        sources: the user's files, for what takes some; empty means those of the last time.
-    """
+    """A stage that the user asked for, its options, and its files; none for the previous ones."""
 
     stage: str
     config: StageConfig
@@ -60,8 +55,8 @@ class StageStatus:
         done: how much of an interrupted run would be resumed; 0 where there is none.
         total: of how much; 0 where there is no interrupted run.
         seconds: that the finished result took; None where there is none.
-        summary: what the stage says about its finished result.
-        notices: what should be known but makes nothing stale.
+        summary: of the finished result.
+        notices: what the user should know but makes nothing stale.
     """
 
     name: str
@@ -73,11 +68,6 @@ class StageStatus:
     summary: dict[str, Any]
     notices: tuple[str, ...]
 
-    @property
-    def how_far(self) -> str:
-        """How far an interrupted run came, in a few words."""
-        return how_far(self.done, self.total)
-
 
 def status(job: Job) -> tuple[StageStatus, ...]:
     """Returns how every stage stands. Takes no lock and changes nothing.
@@ -86,17 +76,17 @@ def status(job: Job) -> tuple[StageStatus, ...]:
         ManifestError: a manifest cannot be trusted.
         ConfigError: the settings hold a value that cannot be used.
     """
-    look = job.inspect()
+    checks = job.inspect()
     with disk_errors(job.workspace.root, "reading the workspace"):
-        return tuple(_status(look.check(row.name)) for row in job.table)
+        return tuple(_status(checks.check(row.name)) for row in job.table)
 
 
-def _status(check: Check) -> StageStatus:
-    run, unfinished = check.manifest and check.manifest.run, check.unfinished
+def _status(check: StageCheck) -> StageStatus:
+    run, partial = check.manifest and check.manifest.run, check.partial_run
     return StageStatus(
         check.row.name, check.state, check.reasons,
-        unfinished.done if unfinished else 0,
-        unfinished.total if unfinished else 0,
+        partial.done if partial else 0,
+        partial.total if partial else 0,
         run.seconds if run else None,
         dict(run.summary) if run else {},
         (*(run.summary.get("notices", ()) if run else ()),
@@ -111,51 +101,51 @@ def run(
 
     Args:
         job: where and how.
-        verb: what the user typed; others who want the workspace are told.
+        verb: what the user typed; named to other processes that want the workspace.
         targets: stages in the order of the table.
         again: run the targets even if they are fresh.
 
     Raises:
         StageError: something that a target needs is missing or stale and is not made implicitly, or
-            a scene would be lost that another verb left.
+            a scene that another verb made would be replaced.
         WorkspaceError: the workspace is in use, full, or not writable.
         ReconError: whatever the stages raise.
     """
     outcomes = []
-    root = job.workspace.root
-    with disk_errors(root, f"running {verb}"), job.workspace.writing(verb), _logged(root / LOG):
-        refuse_missing_backend(job, [target.stage for target in targets])
+    root, stages = job.workspace.root, [target.stage for target in targets]
+    with disk_errors(root, f"running {verb}"), job.workspace.writing(verb), _log_to(root / LOG):
+        refuse_missing_backend(job, stages)
         if not again:
-            _refuse_to_replace(job, verb, [target.stage for target in targets])
+            _refuse_to_replace(job, verb, stages)
         for target in targets:
-            for outcome in _reach(job, target, again=again):
+            for outcome in _bring_up_to_date(job, target, again=again):
                 job.report(outcome)
                 outcomes.append(outcome)
     return tuple(outcomes)
 
 
 def _refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
-    """Raises StageError where training would take the place of an imported scene, or otherwise.
+    """Raises StageError where training would replace an imported scene, or import a trained one.
 
-    A training takes long, and of an imported scene there may be no other copy.
+    A training takes long, and there may be no other copy of an imported scene.
     """
-    rows = [row for row in job.table if row.name == IMPORT.name and row.name in stages]
-    for row in rows:
-        finished, begun = job.workspace.manifest(row.name), job.workspace.unfinished(row.name)
+    for row in [row for row in job.table if row.name == IMPORT.name and row.name in stages]:
+        finished, partial = job.workspace.manifest(row.name), job.workspace.partial_run(row.name)
         importing = row.verb == IMPORT.verb
-        if finished and is_imported(finished.basis) is not importing:
-            name = Path(finished.basis.sources[0].path).name if finished.basis.sources else ""
-            what = f"the scene imported from {name}" if name else "a scene that was trained"
-        elif importing and begun and begun.done and not is_imported(begun.basis):
-            what = f"a training that was interrupted at {begun.done} of {begun.total}"
+        if finished and is_imported(finished.key) is not importing:
+            sources = finished.key.sources
+            scene = (f"the scene imported from {Path(sources[0].path).name}" if sources
+                     else "a scene that was trained")
+        elif importing and partial and partial.done and not is_imported(partial.key):
+            scene = f"a training that was interrupted at {partial.done} of {partial.total}"
         else:
             continue
         raise StageError(
-            f"{job.workspace.root} holds {what}, which `recon {verb}` would replace.",
+            f"{job.workspace.root} holds {scene}, which `recon {verb}` would replace.",
             hint=f"Give another workspace with -w, or replace it by `recon {verb} --again`.")
 
 
-def plan(look: Inspection, stage: str) -> tuple[Stage, ...]:
+def plan(checks: WorkspaceCheck, stage: str) -> tuple[Stage, ...]:
     """Returns the stages that must run before `stage` can, in order.
 
     Raises:
@@ -164,47 +154,47 @@ def plan(look: Inspection, stage: str) -> tuple[Stage, ...]:
     steps: list[Stage] = []
 
     def visit(name: str) -> None:
-        check = look.check(name)
+        check = checks.check(name)
         if check.fresh or check.row in steps:
             return
         if not check.row.auto:
             raise StageError(
-                f"{look.row(stage).verb} needs {name}, which is {check.described()}.",
-                hint=f"Run `{command(look, check)}` first.")
+                f"{checks.row(stage).verb} needs {name}, which is {check.describe()}.",
+                hint=f"Run `{command(checks, check)}` first.")
         for need in check.row.needs:
             visit(need)
         steps.append(check.row)
 
-    for need in look.row(stage).needs:
+    for need in checks.row(stage).needs:
         visit(need)
     return tuple(steps)
 
 
 def require_fresh(job: Job, stages: Sequence[str]) -> None:
     """Raises StageError unless the results of these stages are there and fresh."""
-    look = job.inspect()
-    for check in map(look.check, stages):
+    checks = job.inspect()
+    for check in map(checks.check, stages):
         if not check.fresh:
             raise StageError(
-                f"The {check.row.name} of {job.workspace.root} is {check.described()}.",
-                hint=f"Run `{command(look, check)} -w {job.workspace.root}` first.")
+                f"The {check.row.name} of {job.workspace.root} is {check.describe()}.",
+                hint=f"Run `{command(checks, check)} -w {job.workspace.root}` first.")
 
 
-def command(look: Inspection, check: Check) -> str:
+def command(checks: WorkspaceCheck, check: StageCheck) -> str:
     """Returns what to type to bring a stage up to date with the options it had."""
     words = ["recon", check.row.verb]
-    latest = check.unfinished or check.manifest
+    latest = check.partial_run or check.manifest
     if latest is None:
         return " ".join([*words, check.row.takes] if check.row.takes else words)
-    had, plain = look.config(check.row, latest.basis), look.config(check.row, None)
+    config, default = checks.config(check.row, latest.key), checks.config(check.row, None)
     for item in dataclasses.fields(check.row.config):
-        value, info = getattr(had, item.name), option_info(item)
-        if value not in (None, getattr(plain, item.name)) and info.hashed:
-            words += _typed(item.name, value, info)
+        value, info = getattr(config, item.name), option_info(item)
+        if value not in (None, getattr(default, item.name)) and info.hashed:
+            words += _option_words(item.name, value, info)
     return shlex.join(words)
 
 
-def _typed(name: str, value: Any, info: OptionInfo) -> list[str]:
+def _option_words(name: str, value: Any, info: OptionInfo) -> list[str]:
     """Returns the words that give an option a value."""
     flag = name.replace("_", "-")
     if isinstance(value, bool):
@@ -214,37 +204,37 @@ def _typed(name: str, value: Any, info: OptionInfo) -> list[str]:
     return [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
 
 
-def _reach(job: Job, target: Target, *, again: bool) -> Iterator[Outcome]:
+def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outcome]:
     """Runs what a target needs and then the target, and yields every stage that is done."""
-    look = job.inspect()
-    row = look.row(target.stage)
+    checks = job.inspect()
+    row = checks.row(target.stage)
     sources = _read_sources(job, target)
-    fresh = None if again else _if_fresh(job, look, target, sources)
-    steps = () if fresh else plan(look, row.name)
+    fresh = None if again else _find_fresh(job, checks, target, sources)
+    steps = () if fresh else plan(checks, row.name)
     for step in steps:
         yield from _run_if_needed(job, step)
     if steps:
-        look = job.inspect()
-        plan(look, row.name)  # what was fresh may have become stale by what has just run
-        fresh = None if again else _if_fresh(job, look, target, sources)
+        checks = job.inspect()
+        plan(checks, row.name)  # what was fresh may have become stale by what has just run
+        fresh = None if again else _find_fresh(job, checks, target, sources)
     if fresh is None:
-        yield Outcome(row.name, run_stage(job, look, row, target.config, sources), ran=True)
+        yield Outcome(row.name, run_stage(job, checks, row, target.config, sources), ran=True)
     else:
         yield Outcome(row.name, fresh, ran=False)
 
 
 def _run_if_needed(job: Job, row: Stage) -> Iterator[Outcome]:
     """Runs a stage that nobody asked for, with the options it had, unless it is fresh by now."""
-    look = job.inspect()
-    check = look.check(row.name)
+    checks = job.inspect()
+    check = checks.check(row.name)
     if not check.fresh:
-        logger.info("%s is %s: it runs first", row.name, check.described())
-        config = look.config(row, check.manifest.basis if check.manifest else None)
-        yield Outcome(row.name, run_stage(job, look, row, config), ran=True)
+        logger.info("%s is %s: it runs first", row.name, check.describe())
+        config = checks.config(row, check.manifest.key if check.manifest else None)
+        yield Outcome(row.name, run_stage(job, checks, row, config), ran=True)
 
 
 def _read_sources(job: Job, target: Target) -> tuple[Source, ...] | None:
-    """Returns what the files given with a target hold; None means those of the last time."""
+    """Returns the files given with a target as they are now; None for the previous ones."""
     if not target.sources:
         return None
     known = {source.path: source for source in last_sources(job, target.stage)}
@@ -253,26 +243,26 @@ def _read_sources(job: Job, target: Target) -> tuple[Source, ...] | None:
         for path in target.sources)
 
 
-def _if_fresh(
-    job: Job, look: Inspection, target: Target, sources: tuple[Source, ...] | None
+def _find_fresh(
+    job: Job, checks: WorkspaceCheck, target: Target, sources: tuple[Source, ...] | None
 ) -> Manifest | None:
-    """Returns the result of a target if it is fresh; a moved input is remembered where it is."""
-    check = look.check_against(target.stage, target.config, sources)
-    if check.manifest is None or not check.fresh:
-        if check.manifest:
+    """Returns the result of a target if it is fresh; records where an input was moved to."""
+    check = checks.check_against(target.stage, target.config, sources)
+    manifest = check.manifest
+    if manifest is None or not check.fresh:
+        if manifest:
             logger.info("%s is stale: %s", target.stage, "; ".join(check.reasons))
         return None
-    recorded = check.manifest
-    if sources and sources != recorded.basis.sources:
-        recorded = dataclasses.replace(
-            recorded, basis=dataclasses.replace(recorded.basis, sources=sources))
-        recorded.write(job.workspace.folder(target.stage))
-    return recorded
+    if sources and sources != manifest.key.sources:
+        key = dataclasses.replace(manifest.key, sources=sources)
+        manifest = dataclasses.replace(manifest, key=key)
+        manifest.write(job.workspace.folder(target.stage))
+    return manifest
 
 
 @contextmanager
-def _logged(path: Path) -> Iterator[None]:
-    """Keeps everything that is logged, failures with their traceback, in a file as well."""
+def _log_to(path: Path) -> Iterator[None]:
+    """Writes everything that is logged, failures with their traceback, to a file as well."""
     # File names need not be UTF-8, and a message that names one must not be lost for it.
     handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))

@@ -77,7 +77,7 @@ def _read_thumbs(folder: Path, frames: Sequence[Frame]) -> list[tuple[str, Marku
 def _read_scene(stages: Statuses, frames: Sequence[Frame]) -> Scene:
     """Returns cameras and points, split as training splits them."""
     train = stages["train"].manifest
-    share = train.basis.config.get("validation") if train else None
+    share = train.key.config.get("validation") if train else None
     return read_scene(
         stages["sfm"].folder / "undistorted",
         held_out=frozenset(frame.name for frame in frames if frame.held_out),

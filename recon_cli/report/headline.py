@@ -54,7 +54,7 @@ class Headline:
 def build_headline(stages: Statuses, metrics: Metrics | None) -> Headline:
     """Returns the top of the page of a workspace that has an ingest."""
     ingest = stages["ingest"]
-    sources = ingest.manifest.basis.sources if ingest.manifest else ()
+    sources = ingest.manifest.key.sources if ingest.manifest else ()
     summary = ingest.read_summary(IngestSummary)
     kind = summary.kind if summary else ""
     return Headline(

@@ -47,7 +47,7 @@ def read_provenance(stages: Statuses) -> Provenance:
         tuple((program, *(str(run.versions.get(program, "-")) for run in runs.values()))
               for program in programs),
         tuple((name, stages[name].command) for name in runs),
-        tuple(source.path for source in ingest.basis.sources) if ingest else (),
+        tuple(source.path for source in ingest.key.sources) if ingest else (),
         (("recon", __version__), ("Python", platform.python_version()),
          ("system", platform.platform(terse=True)), ("processor", machine.cpu_model()),
          ("cores", str(machine.usable_threads())),
@@ -68,7 +68,7 @@ def read_decisions(train: StageStatus) -> tuple[Mapping[str, Any], ...]:
 
 def _read_settings(stage: StageStatus) -> StageSettings:
     assert stage.manifest is not None
-    config, damaged = stage.manifest.basis.config, ""
+    config, damaged = stage.manifest.key.config, ""
     chosen: Mapping[str, Any] = {}
     if stage.name == "train":
         try:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from recon_cli.errors import ManifestError, StageError
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
-from recon_cli.pipeline.freshness import Check, Inspection
+from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
 from recon_cli.stages import Stage
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.summaries import JsonRecord
@@ -74,12 +74,12 @@ def inspect_stages(job: Job) -> dict[str, StageStatus]:
     first = inspection.check("ingest")
     if first.manifest is None:
         raise StageError(
-            f"The report needs ingest, which is {first.described()}.",
+            f"The report needs ingest, which is {first.describe()}.",
             hint=f"Run `{_command(inspection, first, job.workspace.root)}` first.")
     return {row.name: _inspect_stage(inspection, row, job) for row in job.table}
 
 
-def _inspect_stage(inspection: Inspection, row: Stage, job: Job) -> StageStatus:
+def _inspect_stage(inspection: WorkspaceCheck, row: Stage, job: Job) -> StageStatus:
     folder, root = job.workspace.folder(row.name), job.workspace.root
     try:
         check = inspection.check(row.name)
@@ -87,17 +87,18 @@ def _inspect_stage(inspection: Inspection, row: Stage, job: Job) -> StageStatus:
         again = f"recon {row.verb} --again -w {shlex.quote(str(root))}"
         return StageStatus(row.name, folder, "damaged", error.message, again)
     why = "; ".join(check.reasons)
-    if check.state == "partial" and check.unfinished:
+    partial = check.partial_run
+    if check.state == "partial" and partial:
         why = "; ".join(filter(None, [
-            f"a run was interrupted at {check.unfinished.done} of {check.unfinished.total}", why]))
+            f"a run was interrupted at {partial.done} of {partial.total}", why]))
     return StageStatus(
         row.name, folder, check.state, why, _command(inspection, check, root), check.manifest,
         check.gone)
 
 
-def _command(inspection: Inspection, check: Check, root: Path) -> str:
+def _command(inspection: WorkspaceCheck, check: StageCheck, root: Path) -> str:
     """Returns the command with its inputs, if the stage reads any, and the workspace."""
-    latest = check.unfinished or check.manifest
-    inputs = [source.path for source in latest.basis.sources] if latest else []
+    latest = check.partial_run or check.manifest
+    inputs = [source.path for source in latest.key.sources] if latest else []
     return " ".join([
         plan.command(inspection, check), *map(shlex.quote, inputs), "-w", shlex.quote(str(root))])

@@ -11,7 +11,7 @@ from recon_cli.context import StageContext
 from recon_cli.evaluation.metrics import leaves_enough, psnr
 from recon_cli.evaluation.reference_views import render_on_black
 from recon_cli.io.images import eight_bit, fitted_camera, fitted_size, read_image, read_masked_image
-from recon_cli.pipeline.execute import Job, rendering
+from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.scene.scene import View
 from recon_cli.scene.splats import Splats
 
@@ -32,7 +32,7 @@ class PhotoPairs:
 
     @cached_property
     def _ctx(self) -> StageContext:
-        return rendering(self._job.compute, self._job.progress)
+        return render_context(self._job.compute, self._job.progress)
 
     def load_photo(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
         """Returns a photo [H, W, 3] at the size of training, painted under its mask [H, W].

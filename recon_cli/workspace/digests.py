@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,3 +96,14 @@ def _files_below(folder: Path, without: Path) -> Iterator[Path]:
             yield from _files_below(path, without)
         elif path.is_file():
             yield path
+
+
+def digest_outputs(outputs: Mapping[str, FileDigest], volatile: Sequence[str]) -> str:
+    """Returns the digest over all outputs but those whose path matches a pattern of `volatile`."""
+    return sha256_json({
+        name: file.sha256 for name, file in outputs.items() if not matches(name, volatile)})
+
+
+def matches(name: str, patterns: Sequence[str]) -> bool:
+    """Returns whether a relative path matches one of some shell patterns."""
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)

@@ -9,19 +9,18 @@ result and completes what was begun.
 from __future__ import annotations
 
 import errno
-import fnmatch
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from recon_cli.errors import ManifestError, ReconError, WorkspaceError
 from recon_cli.workspace import lock, manifest
 from recon_cli.workspace.atomic import clear_leftovers, sync_folder
-from recon_cli.workspace.digests import FileDigest, digest_file, sha256_json
-from recon_cli.workspace.manifest import Basis, Manifest, Unfinished, how_far
+from recon_cli.workspace.digests import FileDigest, digest_file
+from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, describe_progress
 
 LOG = "recon.log"
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
@@ -60,7 +59,7 @@ class Workspace:
 
     @contextmanager
     def writing(self, verb: str) -> Iterator[None]:
-        """Holds the workspace for `verb`, after mending what a crash left half done.
+        """Holds the workspace for `verb`, after recovering from a crash.
 
         Raises:
             WorkspaceError: another process holds it, or it cannot be made.
@@ -71,7 +70,7 @@ class Workspace:
             raise WorkspaceError(
                 f"The workspace {self.root} cannot be made: {error.strerror}.",
                 hint="Give another folder with -w.") from error
-        with lock.held(self.root, verb):
+        with lock.hold(self.root, verb):
             self.recover()
             yield
 
@@ -84,35 +83,36 @@ class Workspace:
         folder = self.folder(stage)
         return Manifest.read(folder) if (folder / manifest.NAME).exists() else None
 
-    def unfinished(self, stage: str) -> Unfinished | None:
+    def partial_run(self, stage: str) -> PartialRun | None:
         """Returns how far an interrupted run of a stage came, or None."""
-        return Unfinished.read(self._record(stage)) if self.partial(stage).is_dir() else None
+        return PartialRun.read(self._record(stage)) if self.partial(stage).is_dir() else None
 
-    def begin(self, basis: Basis) -> tuple[Path, Unfinished]:
+    def begin(self, key: ResultKey) -> tuple[Path, PartialRun]:
         """Returns the folder for a stage to write in, and how far an identical run came before.
 
-        Files of an interrupted run are kept only if that run had the very same basis.
+        Files of an interrupted run are kept only if it had the same key.
 
         Raises:
-            WorkspaceError: the place of the result is taken by a folder that is no result.
+            WorkspaceError: a folder that is no result has the name of the stage.
         """
-        self._refuse_foreign(basis.stage)
-        partial, earlier = self.partial(basis.stage), self.unfinished(basis.stage)
-        if earlier and earlier.basis.fingerprint == basis.fingerprint:
-            logger.info("%s: resuming (%s)", basis.stage, how_far(earlier.done, earlier.total))
+        self._refuse_foreign(key.stage)
+        partial, earlier = self.partial(key.stage), self.partial_run(key.stage)
+        if earlier and earlier.key.fingerprint == key.fingerprint:
+            progress = describe_progress(earlier.done, earlier.total)
+            logger.info("%s: resuming (%s)", key.stage, progress)
             clear_leftovers(partial)
         else:
             if earlier:
-                logger.info("%s: unfinished work for other settings is discarded", basis.stage)
-            self.discard(basis.stage)
-            earlier = Unfinished(basis)
+                logger.info("%s: unfinished work for other settings is discarded", key.stage)
+            self.discard(key.stage)
+            earlier = PartialRun(key)
             partial.mkdir(parents=True)
-            earlier.write(self._record(basis.stage))
+            earlier.write(self._record(key.stage))
         return partial, earlier
 
-    def record(self, unfinished: Unfinished) -> None:
-        """Notes how much of a run would survive a crash."""
-        unfinished.write(self._record(unfinished.basis.stage))
+    def record(self, partial_run: PartialRun) -> None:
+        """Writes how much of a run would survive a crash."""
+        partial_run.write(self._record(partial_run.key.stage))
 
     def discard(self, stage: str) -> None:
         """Removes unfinished work of a stage."""
@@ -132,25 +132,30 @@ class Workspace:
 
     def commit(self, finished: Manifest) -> None:
         """Puts the sealed files of a stage in the place of its old result."""
-        stage = finished.basis.stage
+        stage = finished.key.stage
         finished.write(self.partial(stage))
         sync_folder(self.partial(stage))
         self._swap(stage)
 
     def _swap(self, stage: str) -> None:
         """Renames the old result away and the new one into place; any prefix can be resumed."""
+        self._retire(stage)
+        partial = self.partial(stage)
+        partial.rename(self.folder(stage))
+        sync_folder(self.root)
+        sync_folder(partial.parent)
+        remove(self._record(stage))
+        remove(self._old(stage))
+
+    def _retire(self, stage: str) -> None:
+        """Renames a stage's result to .old/, where it may be removed at any time."""
         self._refuse_foreign(stage)
-        folder, old, partial = self.folder(stage), self._old(stage), self.partial(stage)
+        folder, old = self.folder(stage), self._old(stage)
         if folder.exists():
             old.parent.mkdir(exist_ok=True)
             remove(old)
             folder.rename(old)
             sync_folder(old.parent)
-        partial.rename(folder)
-        sync_folder(self.root)
-        sync_folder(partial.parent)
-        remove(self._record(stage))
-        remove(old)
 
     def recover(self) -> None:
         """Completes or undoes what a crash interrupted, stage by stage."""
@@ -167,21 +172,16 @@ class Workspace:
                 remove(old)
 
     def remove(self, stage: str) -> None:
-        """Removes a stage's result; after a crash on the way it is there or gone, never half.
+        """Removes a stage's result: even after a crash it is there or gone, never half.
 
         Raises:
-            WorkspaceError: what lies there is no result.
+            WorkspaceError: the folder is no result.
         """
-        self._refuse_foreign(stage)
-        folder, old = self.folder(stage), self._old(stage)
-        if folder.exists():
-            old.parent.mkdir(exist_ok=True)
-            remove(old)
-            folder.rename(old)
-            remove(old)
+        self._retire(stage)
+        remove(self._old(stage))
 
     def scraps(self) -> list[Path]:
-        """Returns what serves no finished result: unfinished work, old results, other seeds."""
+        """Returns what no finished result needs: unfinished work, old results, other seeds."""
         return [path for parent in (".partial", ".old", SEEDS)
                 for path in sorted(self.root.glob(f"{parent}/*"))]
 
@@ -190,33 +190,14 @@ class Workspace:
         folder = self.folder(stage)
         if folder.exists() and not (folder / manifest.NAME).exists():
             raise WorkspaceError(
-                f"{folder} is in the way: it holds no {manifest.NAME}, so recon did not make it.",
+                f"{folder} is in the way: recon did not make it, for it holds no {manifest.NAME}.",
                 hint="Move or delete it, or give another workspace with -w.")
 
 
-def combined(outputs: Mapping[str, FileDigest], volatile: Sequence[str]) -> str:
-    """Returns the digest over all outputs but those whose path matches a pattern of `volatile`."""
-    return sha256_json({
-        name: file.sha256 for name, file in outputs.items() if not matches(name, volatile)})
 
 
-def matches(name: str, patterns: Sequence[str]) -> bool:
-    """Returns whether a relative path matches one of some shell patterns."""
-    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def changed_outputs(folder: Path, finished: Manifest, volatile: Sequence[str]) -> list[str]:
-    """Returns in words which outputs are no longer what the stage wrote."""
-    changes = []
-    for name, known in finished.outputs.items():
-        path = folder / name
-        if matches(name, volatile):
-            continue
-        if not path.is_file():
-            changes.append(f"output {name} is missing")
-        elif digest_file(path, known).sha256 != known.sha256:
-            changes.append(f"output {name} was changed by hand")
-    return manifest.counted(changes)
 
 
 def size_of(path: Path) -> int:
@@ -227,7 +208,7 @@ def size_of(path: Path) -> int:
 
 @contextmanager
 def disk_errors(root: Path, doing: str) -> Iterator[None]:
-    """Turns a full or read-only disk into an error that says so.
+    """Turns errors of a full or read-only disk into a WorkspaceError.
 
     Raises:
         WorkspaceError: the block failed for want of space or of permission in the workspace.
@@ -235,10 +216,10 @@ def disk_errors(root: Path, doing: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise _explained(error, root, doing) from error
+        raise _explain(error, root, doing) from error
 
 
-def _explained(error: OSError, root: Path, doing: str) -> ReconError | OSError:
+def _explain(error: OSError, root: Path, doing: str) -> ReconError | OSError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         place = next(path for path in (root, *root.parents) if path.exists())
         free = shutil.disk_usage(place).free / 1e6

@@ -20,13 +20,13 @@ HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read e
 
 
 @contextmanager
-def held(root: Path, verb: str, *, other: str = "another workspace with -w") -> Iterator[None]:
+def hold(root: Path, verb: str, *, other: str = "another workspace with -w") -> Iterator[None]:
     """Holds the lock of the workspace at `root` for as long as the block runs.
 
     Args:
         root: an existing folder.
-        verb: what the user typed, for whoever comes second.
-        other: what to give instead, for the hint.
+        verb: what the user typed, for the message to a second process.
+        other: what to give instead, for its hint.
 
     Raises:
         WorkspaceError: another process holds the lock; the message says which.
@@ -36,7 +36,7 @@ def held(root: Path, verb: str, *, other: str = "another workspace with -w") -> 
         lock.acquire(timeout=0)
     except Timeout as error:
         raise WorkspaceError(
-            f"{root} is in use by {_holder(root)}.",
+            f"{root} is in use by {_describe_holder(root)}.",
             hint=f"Wait until it is done, or give {other}.") from error
     try:
         write_json(root / HOLDER, {
@@ -50,10 +50,10 @@ def held(root: Path, verb: str, *, other: str = "another workspace with -w") -> 
         lock.release()
 
 
-def _holder(root: Path) -> str:
+def _describe_holder(root: Path) -> str:
     try:
-        who = read_json(root / HOLDER)
-        return (f"`recon {who['verb']}`, process {who['pid']} on {who['host']} "
-                f"since {who['since']}")
+        holder = read_json(root / HOLDER)
+        return (f"`recon {holder['verb']}`, process {holder['pid']} on {holder['host']} "
+                f"since {holder['since']}")
     except (FormatError, KeyError, TypeError):
         return "another process"

@@ -1,28 +1,28 @@
 """What a result was made from and how it came about: the record in each stage's folder.
 
-A result is identified by its basis (stage, version, options, inputs, upstream outputs). Whatever
+A result is identified by its key (stage, version, options, inputs, upstream outputs). Whatever
 else a manifest says is for people and takes no part in any decision.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.workspace.atomic import read_json, write_json
-from recon_cli.workspace.digests import FileDigest, Source, sha256_json
+from recon_cli.workspace.digests import FileDigest, Source, digest_file, matches, sha256_json
 
 NAME = "manifest.json"
 SCHEMA = 1
-_SHOWN = 3  # changes of one kind that a reason names; the rest is counted
+_MAX_REASONS = 3  # changes of one kind that are named; the rest is counted
 
 
 @dataclass(frozen=True)
-class Basis:
+class ResultKey:
     """Everything that decides what comes out of a stage.
 
     Attributes:
@@ -61,8 +61,8 @@ class Basis:
         }
 
     @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> Basis:
-        """Returns the basis that `to_json` described."""
+    def from_json(cls, value: Mapping[str, Any]) -> ResultKey:
+        """Returns the key that `to_json` described."""
         sources = tuple(
             Source(item["path"], _digests(item["files"])) for item in value["inputs"])
         return cls(
@@ -99,13 +99,13 @@ class Manifest:
     """A finished result.
 
     Attributes:
-        basis: what it was made from.
+        key: what it was made from.
         outputs: digest of every file, by path relative to the stage's folder.
         digest: of the outputs that later stages may depend on.
         run: how it came about.
     """
 
-    basis: Basis
+    key: ResultKey
     outputs: Mapping[str, FileDigest]
     digest: str
     run: RunRecord
@@ -114,8 +114,8 @@ class Manifest:
         """Writes the manifest into a stage's folder, whole or not at all."""
         content = {
             "schema": SCHEMA,
-            **self.basis.to_json(),
-            "fingerprint": self.basis.fingerprint,
+            **self.key.to_json(),
+            "fingerprint": self.key.fingerprint,
             "outputs": {name: dataclasses.asdict(file) for name, file in self.outputs.items()},
             "digest": self.digest,
             **dataclasses.asdict(self.run),
@@ -130,7 +130,7 @@ class Manifest:
             ManifestError: it is truncated, was edited, or has another schema.
         """
         path = folder / NAME
-        hint = (f"Run the stage again with --again, or delete {folder}.")
+        hint = f"Run the stage again with --again, or delete {folder}."
         try:
             content = read_json(path)
         except FormatError as error:
@@ -144,20 +144,20 @@ class Manifest:
                 f"{path} does not match its own checksum: it was edited or damaged.", hint=hint)
         run = {field.name: content[field.name] for field in dataclasses.fields(RunRecord)}
         return cls(
-            Basis.from_json(content), _digests(content["outputs"]), content["digest"],
+            ResultKey.from_json(content), _digests(content["outputs"]), content["digest"],
             RunRecord(**run))
 
 
-def how_far(done: int, total: int) -> str:
+def describe_progress(done: int, total: int) -> str:
     """Returns how far a run came, in a few words; `total` is 0 before anything was saved."""
     return f"{done}/{total}" if total else "just begun"
 
 
 @dataclass(frozen=True)
-class Unfinished:
+class PartialRun:
     """How far an interrupted run came; lies beside its folder in .partial."""
 
-    basis: Basis
+    key: ResultKey
     done: int = 0
     total: int = 0
     seconds: float = 0.0
@@ -165,28 +165,28 @@ class Unfinished:
     def write(self, path: Path) -> None:
         """Writes the record, whole or not at all."""
         write_json(path, {
-            "fingerprint": self.basis.fingerprint, **self.basis.to_json(),
+            "fingerprint": self.key.fingerprint, **self.key.to_json(),
             "done": self.done, "total": self.total, "seconds": self.seconds,
         })
 
     @classmethod
-    def read(cls, path: Path) -> Unfinished | None:
+    def read(cls, path: Path) -> PartialRun | None:
         """Returns the record, or None where there is none that can be read."""
         try:
             value = read_json(path)
             return cls(
-                Basis.from_json(value), value["done"], value["total"], value["seconds"])
+                ResultKey.from_json(value), value["done"], value["total"], value["seconds"])
         except (FormatError, KeyError, TypeError, AttributeError):
             return None
 
 
-def differences(old: Basis, new: Basis, *, section: str) -> list[str]:
-    """Returns in words what `new` has that `old` was not made from; empty where they agree.
+def differences(old: ResultKey, new: ResultKey, *, section: str) -> list[str]:
+    """Returns in words how the key of a result differs from the one that a run would have now.
 
     Args:
-        old: of a result.
-        new: that a run would have now.
-        section: of recon.toml, which sets the options.
+        old: of the result.
+        new: of a run.
+        section: of recon.toml that sets the options.
     """
     reasons = []
     if old.version != new.version:
@@ -194,27 +194,42 @@ def differences(old: Basis, new: Basis, *, section: str) -> list[str]:
     for name in [*new.config, *(name for name in old.config if name not in new.config)]:
         before, after = old.config.get(name), new.config.get(name)
         if name not in old.config:
-            reasons.append(f"{section}.{name} is new")
+            reasons.append(f"option {section}.{name} is new")
         elif name not in new.config:
-            reasons.append(f"{section}.{name} is no more")
+            reasons.append(f"option {section}.{name} no longer exists")
         elif before != after:
-            reasons.append(f"{section}.{name} changed: {_shown(before)} -> {_shown(after)}")
+            reasons.append(
+                f"{section}.{name} changed: {_value_text(before)} -> {_value_text(after)}")
     reasons += _source_changes(old.sources, new.sources)
     for name in {**new.upstream, **old.upstream}:
         had, has = old.upstream.get(name), new.upstream.get(name)
         if had and has and had != has:
             reasons.append(f"{name}'s output changed")
         elif has and not had:
-            reasons.append(f"{name} was not there")
+            reasons.append(f"{name} was missing")
         elif had and not has:
-            reasons.append(f"{name} is no longer there or no longer fresh")
+            reasons.append(f"{name} is missing or no longer fresh")
     return reasons
 
 
-def counted(texts: list[str]) -> list[str]:
+def find_changed_outputs(folder: Path, finished: Manifest, volatile: Sequence[str]) -> list[str]:
+    """Returns in words which outputs are no longer what the stage wrote."""
+    changes = []
+    for name, known in finished.outputs.items():
+        path = folder / name
+        if matches(name, volatile):
+            continue
+        if not path.is_file():
+            changes.append(f"output {name} is missing")
+        elif digest_file(path, known).sha256 != known.sha256:
+            changes.append(f"output {name} was changed by hand")
+    return _shorten(changes)
+
+
+def _shorten(texts: list[str]) -> list[str]:
     """Returns the first few texts and how many more there are."""
-    more = len(texts) - _SHOWN
-    return texts if more <= 0 else [*texts[:_SHOWN], f"and {more} more like that"]
+    more = len(texts) - _MAX_REASONS
+    return texts if more <= 0 else [*texts[:_MAX_REASONS], f"and {more} more"]
 
 
 def _source_changes(old: tuple[Source, ...], new: tuple[Source, ...]) -> list[str]:
@@ -232,14 +247,14 @@ def _source_changes(old: tuple[Source, ...], new: tuple[Source, ...]) -> list[st
                 changes.append(f"the input {folder}{name} is {'gone' if had else 'new'}")
             elif had.sha256 != has.sha256:
                 changes.append(f"the input {folder}{name} changed")
-    return counted(changes)
+    return _shorten(changes)
 
 
 def _paths(sources: tuple[Source, ...]) -> str:
     return ", ".join(Path(source.path).name for source in sources)
 
 
-def _shown(value: object) -> str:
+def _value_text(value: object) -> str:
     if value is None:
         return "automatic"
     return f"{value:g}" if isinstance(value, float) else str(value)

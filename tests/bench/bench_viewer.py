@@ -44,7 +44,7 @@ from browser import launch_browser, watch_page
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.experiments.synthetic_room import room
 from recon_cli.io.images import eight_bit, fitted_camera
-from recon_cli.pipeline.execute import rendering
+from recon_cli.pipeline.execute import render_context
 from recon_cli.pipeline.plan import Job
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
@@ -131,7 +131,7 @@ def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
     name, shown = next(iter(content.models.items()))
     splats = shown.splats.with_degree(0)
     flat = dataclasses.replace(content, models={name: dataclasses.replace(shown, splats=splats)})
-    ctx = rendering(job.compute, job.progress)
+    ctx = render_context(job.compute, job.progress)
     found = []
     with (serve_scene(flat, None, HOST, None) as (server, address),
           watch_page(chromium, width=WIDTH, height=HEIGHT) as page,

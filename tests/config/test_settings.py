@@ -34,6 +34,8 @@ def test_toml_round_trips_every_section(tmp_path: Path) -> None:
     ("[train]\niteration = 3", "train.iteration,", "Did you mean iterations?"),
     ("[train]\nxyz = 3", "train.xyz", "quality, minutes"),
     ("train = 3", "it is a section", "[train]"),
+    ("[train]\ndensify = 'swarm'", "train.densify is 'swarm'", "--densify"),
+    ("[prune]\nratio = 2", "prune.ratio is 2.0", "--ratio"),
     ("[train\n", "not valid TOML", "Fix"),
 ])
 def test_a_mistake_in_a_file_names_the_file_and_what_was_meant(
@@ -77,6 +79,7 @@ def test_an_assignment_is_typed_as_its_field_is(text: str, expected: object) -> 
     ("sfm.scale_between=a.png 'b.png 2", "3 values (str, str, float)"),
     ("train.iteratons=3", "Did you mean iterations?"),
     ("trains.iterations=3", "Did you mean train?"),
+    ("train.densify=swarm", "--set train.densify is 'swarm'"),
 ])
 def test_a_wrong_assignment_says_what_was_needed(text: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:

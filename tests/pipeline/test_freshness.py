@@ -61,7 +61,7 @@ def test_an_identical_rerun_upstream_makes_nothing_stale(job: Job) -> None:
     after = job.workspace.manifest("sfm")
     assert before
     assert after
-    assert before.basis.fingerprint != after.basis.fingerprint
+    assert before.key.fingerprint != after.key.fingerprint
     assert before.digest == after.digest
     assert stale(job) == {}
 
@@ -98,6 +98,33 @@ def test_a_result_whose_record_another_version_wrote_is_stale(job: Job) -> None:
              for row in job.table]
     reason, = stale(replace(job, table=typed))["ingest"]
     assert reason.startswith("the summary lacks kind, declared_frames")
+
+
+def test_an_option_that_no_longer_exists_makes_its_stage_stale(job: Job) -> None:
+    record_options(job, swarm_size=0.1)
+    changed = stale(job)
+    assert list(changed) == AFTER["train"]
+    assert changed["train"] == ("option train.swarm_size no longer exists",)
+    assert bring(job, "train") == ["train"]
+    assert stale(job) == {}
+
+
+def test_a_choice_that_no_longer_exists_makes_its_stage_stale_and_leaves_the_others(
+    job: Job,
+) -> None:
+    record_options(job, densify="swarm", iterations=100)
+    assert stale(job)["train"] == ("train.densify changed: swarm -> budget",)
+    with pytest.raises(StageError) as caught:
+        bring(job, "evaluate")
+    assert caught.value.hint == "Run `recon train --iterations 100` first."
+
+
+def record_options(job: Job, **options: object) -> None:
+    """Writes options into the manifest of train, as another version of recon might have."""
+    manifest = job.workspace.manifest("train")
+    assert manifest
+    key = replace(manifest.key, config={**manifest.key.config, **options})
+    replace(manifest, key=key).write(job.workspace.folder("train"))
 
 
 def test_a_changed_input_is_named(job: Job, folder: Path) -> None:

@@ -80,7 +80,7 @@ def test_a_verb_does_the_same_whatever_was_typed_before(job: Job) -> None:
     assert bring(job, "train") == ["train"]
     manifest = job.workspace.manifest("train")
     assert manifest
-    assert manifest.basis.config["iterations"] is None
+    assert manifest.key.config["iterations"] is None
 
 
 def test_a_stage_that_runs_implicitly_keeps_its_options(job: Job, folder: Path) -> None:
@@ -90,7 +90,7 @@ def test_a_stage_that_runs_implicitly_keeps_its_options(job: Job, folder: Path) 
     assert bring(job, "train") == ["denoise", "sfm", "train"]
     manifest = job.workspace.manifest("sfm")
     assert manifest
-    assert manifest.basis.config["pairs"] == "exhaustive"
+    assert manifest.key.config["pairs"] == "exhaustive"
 
 
 def test_a_missing_stage_makes_those_behind_it_stale_only_if_it_comes_out_otherwise(
@@ -131,7 +131,7 @@ def test_a_manifest_says_how_the_result_came_about(job: Job) -> None:
     assert manifest.run.peak_memory_bytes > 1e6
     assert (manifest.run.device, manifest.run.backend) != (None, None)
     assert "numpy" in manifest.run.versions
-    assert set(manifest.basis.upstream) == {"ingest", "sfm"}
+    assert set(manifest.key.upstream) == {"ingest", "sfm"}
     other = job.workspace.manifest("sfm")
     assert other
     assert (other.run.device, other.run.backend) == (None, None)
@@ -205,7 +205,7 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
     shutil.rmtree(job.workspace.folder("train"))
     process = subprocess.Popen(
         [sys.executable, fake_stages.__file__, str(job.workspace.root), "train"],
-        env={**os.environ, "SLOW_TRAIN": "0.3"})
+        env={**os.environ, "SLOW_TRAIN": "1"})
     try:
         started = time.monotonic()
         while plan.status(job)[3].done < 2:
@@ -220,7 +220,7 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
     one = plan.status(job)[3]
     assert one.state == "partial"
     assert 2 <= one.done < one.total == STEPS
-    unfinished = job.workspace.unfinished("train")
+    unfinished = job.workspace.partial_run("train")
     assert unfinished
     assert unfinished.seconds >= 0.3  # at least one slow step
     kept = job.workspace.partial("train") / "step1.txt"

@@ -11,7 +11,7 @@ import pytest
 from numba_process import STATISTICS, picture
 from numba_runs import HASWELL
 
-from recon_cli.pipeline.execute import Job, context_for
+from recon_cli.pipeline.execute import Job, stage_context
 from recon_cli.render import registry
 from recon_cli.render.numba import backend, kernel, simd
 from recon_cli.render.numba.thread_pool import pool
@@ -234,18 +234,18 @@ class Bars:
         self.steps += steps
 
 
-def stage_context(tmp_path, monkeypatch):
+def prepare_stage(tmp_path, monkeypatch):
     monkeypatch.setattr(pool, "threads", 1)
     bars = Bars()
     row = next(row for row in STAGES if row.name == "train")
-    context_for(Job(Workspace(tmp_path), progress=bars), row, lambda *_: None)
+    stage_context(Job(Workspace(tmp_path), progress=bars), row, lambda *_: None)
     return bars
 
 
 def test_a_cold_start_shows_a_bar_and_says_how_long_it_took(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(registry, "kernels_to_compile", lambda _: backend.KERNELS)
     with caplog.at_level(logging.INFO, "recon"):
-        bars = stage_context(tmp_path, monkeypatch)
+        bars = prepare_stage(tmp_path, monkeypatch)
     assert bars.opened == [("compile for this CPU, once", backend.KERNELS, "kernel")]
     assert bars.steps == backend.KERNELS
     assert "kernels compiled in" in caplog.text
@@ -255,7 +255,7 @@ def test_a_warm_start_shows_no_bar(tmp_path, monkeypatch):
     monkeypatch.setattr(backend, "is_warm", lambda: True)
     prepared = []
     monkeypatch.setattr(backend, "warm_up", lambda on_kernel: prepared.append(on_kernel) or 0.0)
-    assert stage_context(tmp_path, monkeypatch).opened == []
+    assert prepare_stage(tmp_path, monkeypatch).opened == []
     assert len(prepared) == 1  # what is in the cache may be damaged: it is looked at first
     monkeypatch.setattr(backend, "is_warm", lambda: False)
     assert registry.kernels_to_compile("numba") == backend.KERNELS

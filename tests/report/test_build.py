@@ -16,7 +16,7 @@ from recon_cli.report import build
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import read_source
 from recon_cli.workspace.layout import Workspace
-from recon_cli.workspace.manifest import Manifest, Unfinished
+from recon_cli.workspace.manifest import Manifest, PartialRun
 
 STALE = "The result shown here is out of date"
 
@@ -152,10 +152,10 @@ def test_a_damaged_manifest_is_said_and_a_damaged_first_one_is_7(workspace, caps
 
 def test_an_unfinished_run_is_said(workspace):
     place = Workspace(workspace)
-    basis = Manifest.read(workspace / "train").basis
+    key = Manifest.read(workspace / "train").key
     shutil.rmtree(workspace / "train")
-    place.begin(basis)
-    place.record(Unfinished(basis, 3, 10))
+    place.begin(key)
+    place.record(PartialRun(key, 3, 10))
     training = section(page_of(workspace), "training")
     assert "train is unfinished</strong>: a run was interrupted at 3 of 10." in training
     assert "recon train --iterations 60" in training
@@ -200,8 +200,8 @@ def test_a_page_among_the_inputs_would_be_one_of_them(workspace, tmp_path, capsy
     (tmp_path / "photos").mkdir()
     manifest = Manifest.read(workspace / "ingest")
     source = read_source(tmp_path / "photos", without=workspace)
-    dataclasses.replace(manifest, basis=dataclasses.replace(
-        manifest.basis, sources=(source,))).write(workspace / "ingest")
+    dataclasses.replace(manifest, key=dataclasses.replace(
+        manifest.key, sources=(source,))).write(workspace / "ingest")
     assert report(workspace, "-o", tmp_path / "photos" / "report.html") == 2
     assert "would count as a new input" in capsys.readouterr().err
     assert list((tmp_path / "photos").iterdir()) == []
@@ -209,9 +209,9 @@ def test_a_page_among_the_inputs_would_be_one_of_them(workspace, tmp_path, capsy
 
 def test_a_file_name_that_is_no_utf8_is_shown_as_it_can_be(workspace):
     manifest = Manifest.read(workspace / "ingest")
-    source = dataclasses.replace(manifest.basis.sources[0], path="/gone/b\udcff.mp4")
-    dataclasses.replace(manifest, basis=dataclasses.replace(
-        manifest.basis, sources=(source,))).write(workspace / "ingest")
+    source = dataclasses.replace(manifest.key.sources[0], path="/gone/b\udcff.mp4")
+    dataclasses.replace(manifest, key=dataclasses.replace(
+        manifest.key, sources=(source,))).write(workspace / "ingest")
     page = page_of(workspace)
     assert "The input /gone/b\\udcff.mp4 no longer exists." in section(page, "overview")
     assert "from a video: b\\udcff.mp4" in page

@@ -7,13 +7,13 @@ import summaries
 
 from recon_cli.report.headline import format_facts, judge_poses
 from recon_cli.report.stage_status import StageStatus
-from recon_cli.workspace.manifest import Basis, Manifest, RunRecord
+from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord
 
 
 def sfm(**summary):
     run = RunRecord(1.0, 1, {**summaries.SFM.to_json(), **summary}, {}, None, None, 1, "")
     return StageStatus("sfm", Path("sfm"), "fresh", "", "recon sfm",
-                    Manifest(Basis("sfm", 3, {}, (), {}), {}, "", run))
+                    Manifest(ResultKey("sfm", 3, {}, (), {}), {}, "", run))
 
 
 def test_a_trusted_verdict_is_good():

@@ -154,7 +154,7 @@ def test_processes_share_the_cores_of_their_machine(monkeypatch):
     monkeypatch.setattr(execute.machine, "usable_threads", lambda: 7)
     monkeypatch.setattr(registry, "use_threads", lambda *_: None)
     for local, typed, threads in ((2, None, 3), (9, None, 1), (2, 5, 5), (1, None, 7)):
-        ctx = execute.rendering(
+        ctx = execute.render_context(
             ComputeConfig("cpu", "torch", typed), NullProgress(), Ranks(0, 9, local))
         assert ctx.threads == threads
 
@@ -170,5 +170,5 @@ def test_processes_that_no_view_is_left_for_are_told_of(count, notices, caplog):
 def test_a_process_without_a_gpu_is_named_before_anything_is_done(monkeypatch):
     monkeypatch.setattr(registry, "resolve", lambda *_: ("triton", "cuda"))
     with pytest.raises(BackendError, match="3 processes were started") as raised:
-        execute.rendering(ComputeConfig(), NullProgress(), Ranks(0, 3, 3, lacks_gpu=True))
+        execute.render_context(ComputeConfig(), NullProgress(), Ranks(0, 3, 3, lacks_gpu=True))
     assert "--nproc-per-node gpu" in raised.value.hint

@@ -10,9 +10,15 @@ import pytest
 
 from recon_cli.errors import InputError, ManifestError, WorkspaceError
 from recon_cli.workspace import lock
-from recon_cli.workspace.digests import digest_file, read_source
-from recon_cli.workspace.layout import Workspace, changed_outputs, combined, disk_errors
-from recon_cli.workspace.manifest import Basis, Manifest, RunRecord, differences
+from recon_cli.workspace.digests import digest_file, digest_outputs, read_source
+from recon_cli.workspace.layout import Workspace, disk_errors
+from recon_cli.workspace.manifest import (
+    Manifest,
+    ResultKey,
+    RunRecord,
+    differences,
+    find_changed_outputs,
+)
 
 RUN = RunRecord(1.0, 2, {}, {}, None, None, 1, "2020-01-01T00:00:00+00:00")
 
@@ -21,17 +27,17 @@ class Killed(BaseException):
     """Stands for the end of the process."""
 
 
-def basis(config: int = 1) -> Basis:
-    return Basis("train", 1, {"iterations": config}, (), {"sfm": "abc"})
+def key(config: int = 1) -> ResultKey:
+    return ResultKey("train", 1, {"iterations": config}, (), {"sfm": "abc"})
 
 
 def finish(workspace: Workspace, text: str, config: int = 1) -> Manifest:
     """Writes and commits one result."""
-    out, _ = workspace.begin(basis(config))
+    out, _ = workspace.begin(key(config))
     (out / "sub").mkdir(exist_ok=True)
     (out / "sub" / "data.txt").write_text(text)
     outputs = workspace.seal("train")
-    manifest = Manifest(basis(config), outputs, combined(outputs, ()), RUN)
+    manifest = Manifest(key(config), outputs, digest_outputs(outputs, ()), RUN)
     workspace.commit(manifest)
     return manifest
 
@@ -50,7 +56,7 @@ def test_a_committed_result_is_read_back_as_it_was_written(workspace: Workspace)
         written = finish(workspace, "one")
     assert workspace.manifest("train") == written
     assert list(written.outputs) == ["sub/data.txt"]
-    assert workspace.unfinished("train") is None
+    assert workspace.partial_run("train") is None
     assert workspace.scraps() == []
 
 
@@ -65,7 +71,7 @@ def test_the_fingerprint_ignores_names_and_times_of_inputs_but_not_their_order(
 
     def fingerprint(*paths: Path) -> str:
         sources = tuple(read_source(path, without=tmp_path / "ws") for path in paths)
-        return Basis("ingest", 1, {}, sources, {}).fingerprint
+        return ResultKey("ingest", 1, {}, sources, {}).fingerprint
 
     assert fingerprint(one) == fingerprint(two)
     assert fingerprint(one, three) != fingerprint(three, one)
@@ -98,19 +104,20 @@ def test_a_renamed_photo_is_named_among_the_reasons(tmp_path: Path) -> None:
     (tmp_path / "p").mkdir()
     (tmp_path / "p" / "a.jpg").write_text("1")
     (tmp_path / "p" / "b.jpg").write_text("2")
-    before = Basis("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
+    before = ResultKey("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
     (tmp_path / "p" / "a.jpg").rename(tmp_path / "p" / "c.jpg")
     (tmp_path / "p" / "b.jpg").write_text("changed")
-    after = Basis("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
+    after = ResultKey("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
     assert differences(before, after, section="ingest") == [
         "the input p/a.jpg is gone", "the input p/b.jpg changed", "the input p/c.jpg is new"]
 
 
 def test_options_that_another_version_knew_or_did_not_know_are_named() -> None:
-    before = Basis("export", 1, {"gone": None, "kept": 1.5}, (), {})
-    after = Basis("export", 1, {"kept": 2.0, "crop": None}, (), {})
+    before = ResultKey("export", 1, {"gone": None, "kept": 1.5}, (), {})
+    after = ResultKey("export", 1, {"kept": 2.0, "crop": None}, (), {})
     assert differences(before, after, section="export") == [
-        "export.kept changed: 1.5 -> 2", "export.crop is new", "export.gone is no more"]
+        "export.kept changed: 1.5 -> 2", "option export.crop is new",
+        "option export.gone no longer exists"]
 
 
 def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> None:
@@ -118,14 +125,14 @@ def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> N
         manifest = finish(workspace, "one")
     data = workspace.folder("train") / "sub" / "data.txt"
     os.utime(data, ns=(5, 5))
-    assert changed_outputs(workspace.folder("train"), manifest, ()) == []
+    assert find_changed_outputs(workspace.folder("train"), manifest, ()) == []
     data.write_text("edited")
-    assert changed_outputs(workspace.folder("train"), manifest, ()) == [
+    assert find_changed_outputs(workspace.folder("train"), manifest, ()) == [
         "output sub/data.txt was changed by hand"]
     data.unlink()
-    assert changed_outputs(workspace.folder("train"), manifest, ()) == [
+    assert find_changed_outputs(workspace.folder("train"), manifest, ()) == [
         "output sub/data.txt is missing"]
-    assert changed_outputs(workspace.folder("train"), manifest, ("sub/*",)) == []
+    assert find_changed_outputs(workspace.folder("train"), manifest, ("sub/*",)) == []
 
 
 @pytest.mark.parametrize("damage", ["truncated", "edited", "unsigned", "other schema", "a list"])
@@ -160,7 +167,7 @@ def test_a_crash_at_any_rename_leaves_the_old_or_the_new_result_whole(
         workspace = Workspace(tmp_path / str(step))
         with workspace.writing("train"):
             finish(workspace, "old", config=1)
-            out, _ = workspace.begin(basis(2))
+            out, _ = workspace.begin(key(2))
             (out / "sub").mkdir()
             (out / "sub" / "data.txt").write_text("new")
         calls = 0
@@ -178,7 +185,7 @@ def test_a_crash_at_any_rename_leaves_the_old_or_the_new_result_whole(
                     module, name, lambda *a, _name=name, **k: counted(_name, *a, **k))
             try:
                 outputs = workspace.seal("train")
-                workspace.commit(Manifest(basis(2), outputs, combined(outputs, ()), RUN))
+                workspace.commit(Manifest(key(2), outputs, digest_outputs(outputs, ()), RUN))
             except Killed:
                 crashes += 1
         if calls < step:
@@ -186,10 +193,10 @@ def test_a_crash_at_any_rename_leaves_the_old_or_the_new_result_whole(
         with workspace.writing("train"):  # the next writer mends
             manifest = workspace.manifest("train")
             assert manifest is not None
-            assert changed_outputs(workspace.folder("train"), manifest, ()) == []
+            assert find_changed_outputs(workspace.folder("train"), manifest, ()) == []
             # Only without its manifest, which the first step puts in place, is the new one lost.
             assert content(workspace) == ("old" if step == 1 else "new")
-            assert manifest.basis == basis(1 if step == 1 else 2)
+            assert manifest.key == key(1 if step == 1 else 2)
             assert list((workspace.root / ".old").glob("*")) == []
             finish(workspace, "newer", config=3)
         assert content(workspace) == "newer"
@@ -217,22 +224,22 @@ def test_a_crash_while_mending_loses_nothing(
 
 def test_a_partial_folder_counts_only_for_the_same_basis(workspace: Workspace) -> None:
     with workspace.writing("train"):
-        out, _ = workspace.begin(basis(1))
+        out, _ = workspace.begin(key(1))
         (out / "kept.txt").write_text("x")
         (out / ".kept.txt.tmp123.txt").write_text("half")
-        same, earlier = workspace.begin(basis(1))
+        same, earlier = workspace.begin(key(1))
         assert [path.name for path in same.iterdir()] == ["kept.txt"]
-        assert earlier.basis.fingerprint == basis(1).fingerprint
-        other, _ = workspace.begin(basis(2))
+        assert earlier.key.fingerprint == key(1).fingerprint
+        other, _ = workspace.begin(key(2))
         assert list(other.iterdir()) == []
 
 
 def test_a_partial_folder_without_its_record_is_discarded(workspace: Workspace) -> None:
     with workspace.writing("train"):
-        out, _ = workspace.begin(basis(1))
+        out, _ = workspace.begin(key(1))
         (out / "unknown.txt").write_text("x")
         (workspace.root / ".partial" / "train.json").write_text("{")
-        again, _ = workspace.begin(basis(1))
+        again, _ = workspace.begin(key(1))
         assert list(again.iterdir()) == []
 
 
@@ -241,7 +248,7 @@ def test_a_folder_that_recon_did_not_make_is_not_replaced(workspace: Workspace) 
     (workspace.root / "train" / "thesis.txt").write_text("years of work")
     with workspace.writing("train"):
         with pytest.raises(WorkspaceError, match="in the way"):
-            workspace.begin(basis())
+            workspace.begin(key())
         with pytest.raises(WorkspaceError, match="in the way"):
             workspace.remove("train")
     assert (workspace.root / "train" / "thesis.txt").exists()
@@ -249,7 +256,7 @@ def test_a_folder_that_recon_did_not_make_is_not_replaced(workspace: Workspace) 
 
 def test_the_second_writer_is_told_who_the_first_is(workspace: Workspace) -> None:
     first = workspace.writing("train --prune")
-    with first, pytest.raises(WorkspaceError) as caught, lock.held(workspace.root, "sfm"):
+    with first, pytest.raises(WorkspaceError) as caught, lock.hold(workspace.root, "sfm"):
         pass
     assert f"process {os.getpid()}" in caught.value.message
     assert "recon train --prune" in caught.value.message
