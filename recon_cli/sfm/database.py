@@ -1,8 +1,7 @@
-"""COLMAP's database as seen from outside: whether it can be trusted, and how far it has got.
+"""COLMAP's database through Python's SQLite: whether it is intact, and how much it holds.
 
-This reads the file through Python's SQLite. pycolmap brings an SQLite of its own, and two of them
-in one process drop each other's locks: nothing here may run in a process in which pycolmap has the
-database open.
+pycolmap brings its own SQLite, and two of them in one process drop each other's locks: nothing here
+may run in a process while pycolmap has the database open.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ _HOMOGRAPHIES = (4, 5, 6)  # planar, panoramic, planar or panoramic
 def is_sound(path: Path, names: Sequence[str], cameras: int) -> bool:
     """Returns whether a database is intact and holds so many cameras and exactly these images."""
     try:
-        with closing(_opened(path)) as connection:
+        with closing(_connect(path)) as connection:
             (verdict,), *_ = connection.execute("PRAGMA quick_check")
-            (found,), = connection.execute("SELECT count(*) FROM cameras")
+            (count,), = connection.execute("SELECT count(*) FROM cameras")
             images = sorted(name for name, in connection.execute("SELECT name FROM images"))
     except sqlite3.DatabaseError:
         return False
-    return verdict == "ok" and found == cameras and images == sorted(names)
+    return verdict == "ok" and count == cameras and images == sorted(names)
 
 
 def progress(path: Path, step: str) -> int:
@@ -41,7 +40,7 @@ def progress(path: Path, step: str) -> int:
     That is 0 where the file cannot be read: it is locked, broken or not there yet.
     """
     try:
-        with closing(_opened(path)) as connection:
+        with closing(_connect(path)) as connection:
             (count,), = connection.execute(f"SELECT count(*) FROM {_TABLES[step]}")
     except sqlite3.DatabaseError:
         return 0
@@ -50,29 +49,29 @@ def progress(path: Path, step: str) -> int:
 
 def keypoint_counts(path: Path) -> dict[str, int]:
     """Returns the number of keypoints of each image whose features were found."""
-    with closing(_opened(path)) as connection:
+    with closing(_connect(path)) as connection:
         return dict(connection.execute(
             "SELECT name, rows FROM images JOIN keypoints USING (image_id)"))
 
 
 def keep_coarsest(path: Path, most: int) -> None:
-    """Removes the finest keypoints of images that have more than `most`, all or none of them.
+    """Removes the finest keypoints of images that have more than `most`, in one transaction.
 
-    The coarsest ones are seen from the most places. Of equal ones the first are kept, so that the
-    same image always keeps the same ones.
+    The coarsest ones are seen from the most places. Of equal ones the first stay, so that an image
+    always keeps the same ones.
     """
-    with closing(_opened(path)) as connection, connection:
+    with closing(_connect(path)) as connection, connection:
         many = connection.execute(
             "SELECT image_id, k.data, d.data FROM keypoints k JOIN descriptors d USING (image_id)"
             " WHERE k.rows > ?", (most,)).fetchall()
         for image, keypoints, descriptors in many:
             shapes = np.frombuffer(keypoints, np.float32).reshape(-1, KEYPOINT_COLUMNS)
-            kept = np.sort(np.argsort(-scales(shapes), kind="stable")[:most])
-            rows = np.frombuffer(descriptors, np.uint8).reshape(len(shapes), -1)[kept]
-            for table, data in (("keypoints", shapes[kept]), ("descriptors", rows)):
+            coarsest = np.sort(np.argsort(-scales(shapes), kind="stable")[:most])
+            rows = np.frombuffer(descriptors, np.uint8).reshape(len(shapes), -1)[coarsest]
+            for table, data in (("keypoints", shapes[coarsest]), ("descriptors", rows)):
                 connection.execute(
                     f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
-                    (len(kept), data.tobytes(), image))
+                    (len(coarsest), data.tobytes(), image))
 
 
 def scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -93,7 +92,7 @@ def inlier_counts_by_distance(path: Path) -> list[tuple[int, int, int]]:
 
     Distances without a verified pair are left out.
     """
-    with closing(_opened(path)) as connection:
+    with closing(_connect(path)) as connection:
         images = [image for image, in connection.execute(
             "SELECT image_id FROM images ORDER BY name")]
         rows = connection.execute(
@@ -101,8 +100,8 @@ def inlier_counts_by_distance(path: Path) -> list[tuple[int, int, int]]:
     place = {image: index for index, image in enumerate(images)}
     counts: dict[int, tuple[int, int, int]] = {}
     for pair, config, matches in rows:
-        one, two = (place[image] for image in divmod(pair, _PAIR_BASE))
-        apart = abs(one - two).bit_length()
+        first, second = (place[image] for image in divmod(pair, _PAIR_BASE))
+        apart = abs(first - second).bit_length()
         pairs, total, flat = counts.get(apart, (0, 0, 0))
         counts[apart] = (
             pairs + 1, total + matches, flat + (matches if config in _HOMOGRAPHIES else 0))
@@ -111,7 +110,7 @@ def inlier_counts_by_distance(path: Path) -> list[tuple[int, int, int]]:
 
 def pair_names(path: Path) -> set[tuple[str, str]]:
     """Returns the pairs of images that are finished, verified or not, each in order of names."""
-    with closing(_opened(path)) as connection:
+    with closing(_connect(path)) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images"))
         ids = connection.execute("SELECT pair_id FROM two_view_geometries").fetchall()
     pairs = ((names[pair // _PAIR_BASE], names[pair % _PAIR_BASE]) for pair, in ids)
@@ -124,10 +123,10 @@ def remove(path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
-def _opened(path: Path) -> sqlite3.Connection:
-    """Returns a connection that makes no file.
+def _connect(path: Path) -> sqlite3.Connection:
+    """Returns a connection that creates no file.
 
-    It may write, because the last one to close takes SQLite's side files away, and one that can
-    only read would leave them.
+    It may write: the last connection to close removes SQLite's side files, which a read-only one
+    would leave.
     """
     return sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=1.0)

@@ -1,8 +1,8 @@
 """What a database of matches and a finished model say about the same images, as plain arrays.
 
-Matches are read here, once, and held against the poses; what follows from that is arithmetic. The
-database is opened by pycolmap alone: Python's SQLite must not touch a file that pycolmap has open
-in the same process (see `database`).
+Matches are read here, once, and compared with the poses; the checks are arithmetic on the result.
+The database is opened by pycolmap alone: Python's SQLite must not touch a file that pycolmap has
+open in the same process (see `database`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ MAX_ERROR = 4.0
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Verified matches, and how far a model bears them out; images are indices into names.
+class MatchEvidence:
+    """Verified matches, and how many of them a model confirms; images are indices into names.
 
     Attributes:
         names: of all N images that were given to the mapper.
@@ -33,7 +33,7 @@ class Evidence:
         centers: camera centres, [N, 3] in the model's units; NaN without a camera.
         keypoints: features found in each image, [N].
         seen: which points of the model each image sees, [N, M] bool.
-        tried: pairs that were matched, whether anything came of it or not, [N, N] bool, symmetric.
+        tried: pairs that were matched, successfully or not, [N, N] bool, symmetric.
         pairs: verified pairs of images, [P, 2], first < second, sorted.
         matches: verified matches of each pair, [P].
         agreeing: those within MAX_ERROR of the epipolar lines that the poses give, [P]; zero where
@@ -63,15 +63,15 @@ class Evidence:
     @cached_property
     def shared(self) -> NDArray[np.int64]:
         """Points that two images both see, [N, N], zero on the diagonal."""
-        seen = self.seen.astype(np.float32)  # exact up to 16 million, and many times faster
-        shared = np.asarray(seen @ seen.T, np.int64)
+        visible = self.seen.astype(np.float32)  # exact up to 16 million, and many times faster
+        shared = np.asarray(visible @ visible.T, np.int64)
         np.fill_diagonal(shared, 0)
         return shared
 
 
-def gather(
+def gather_evidence(
     model: pycolmap.Reconstruction, database: Path, names: Sequence[str]
-) -> Evidence:
+) -> MatchEvidence:
     """Returns what the database and the model say about the images `names`.
 
     Raises:
@@ -79,9 +79,9 @@ def gather(
     """
     row = {name: index for index, name in enumerate(names)}
     images = [model.image(i) for i in model.reg_image_ids()]
-    strange = sorted(image.name for image in images if image.name not in row)
-    if strange:
-        raise ValueError(f"the model holds other images: {strange}")
+    unknown = sorted(image.name for image in images if image.name not in row)
+    if unknown:
+        raise ValueError(f"the model holds other images: {unknown}")
     placed = {row[image.name]: image for image in images}
     with pycolmap.Database.open(database) as opened:
         ids = {image.image_id: row[image.name] for image in opened.read_all_images()
@@ -89,25 +89,26 @@ def gather(
         if len(ids) != len(names):
             raise ValueError(f"{database} holds {len(ids)} of {len(names)} images")
         keypoints = {ids[i]: opened.read_keypoints(i)[:, :2].astype(np.float64) for i in ids}
-        tried = _tried(opened, ids)
-        pairs, matches = _verified(opened, ids)
+        tried = _matched_pairs(opened, ids)
+        pairs, matches = _verified_pairs(opened, ids)
     centers = np.full((len(names), 3), np.nan)
     for index, image in placed.items():
         centers[index] = image.projection_center()
-    return Evidence(
+    return MatchEvidence(
         names=tuple(names),
         registered=np.isin(np.arange(len(names)), list(placed)),
         centers=centers,
         keypoints=np.array([len(keypoints[index]) for index in range(len(names))], np.int64),
-        seen=_seen(model, {image.image_id: index for index, image in placed.items()}, len(names)),
+        seen=_seen_points(
+            model, {image.image_id: index for index, image in placed.items()}, len(names)),
         tried=tried,
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
-        agreeing=_agreeing(placed, keypoints, pairs, matches),
+        agreeing=_count_agreeing(placed, keypoints, pairs, matches),
     )
 
 
-def _tried(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
+def _matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
     """Returns which pairs were matched, [N, N]."""
     tried = np.zeros((len(ids), len(ids)), np.bool_)
     for first, second in combinations(ids, 2):
@@ -117,35 +118,35 @@ def _tried(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool
     return tried
 
 
-def _verified(
+def _verified_pairs(
     opened: pycolmap.Database, ids: Mapping[int, int]
 ) -> tuple[list[tuple[int, int]], list[NDArray[np.uint32]]]:
     """Returns the verified pairs, sorted, and which keypoints of each match, [M, 2]."""
-    found = {}
+    inliers = {}
     for pair_id, geometry in zip(*opened.read_two_view_geometries(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
         rows = geometry.inlier_matches
         if not len(rows) or first not in ids or second not in ids:
             continue
         if ids[first] < ids[second]:
-            found[ids[first], ids[second]] = rows
+            inliers[ids[first], ids[second]] = rows
         else:
-            found[ids[second], ids[first]] = rows[:, ::-1]
-    order = sorted(found)
-    return order, [found[pair] for pair in order]
+            inliers[ids[second], ids[first]] = rows[:, ::-1]
+    order = sorted(inliers)
+    return order, [inliers[pair] for pair in order]
 
 
-def _seen(
+def _seen_points(
     model: pycolmap.Reconstruction, rows: Mapping[int, int], count: int
 ) -> NDArray[np.bool_]:
     """Returns which points each image sees, [count, M], the points in the order of their ids."""
-    seen = np.zeros((count, model.num_points3D()), np.bool_)
+    visible = np.zeros((count, model.num_points3D()), np.bool_)
     for column, (_, point) in enumerate(sorted(model.points3D.items())):
-        seen[[rows[element.image_id] for element in point.track.elements], column] = True
-    return seen
+        visible[[rows[element.image_id] for element in point.track.elements], column] = True
+    return visible
 
 
-def _agreeing(
+def _count_agreeing(
     placed: Mapping[int, pycolmap.Image],
     keypoints: Mapping[int, NDArray[np.float64]],
     pairs: Sequence[tuple[int, int]],
@@ -158,12 +159,12 @@ def _agreeing(
     for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
         if first not in placed or second not in placed:
             continue
-        one, two = placed[first], placed[second]
+        image, other = placed[first], placed[second]
         essential = pycolmap.essential_matrix_from_pose(
-            two.cam_from_world() * one.cam_from_world().inverse())
+            other.cam_from_world() * image.cam_from_world().inverse())
         squares = np.array(pycolmap.compute_squared_sampson_error(
             rays[first][rows[:, 0]], rays[second][rows[:, 1]], essential))
-        focal = (one.camera.mean_focal_length() + two.camera.mean_focal_length()) / 2
+        focal = (image.camera.mean_focal_length() + other.camera.mean_focal_length()) / 2
         # Not "<": two cameras in one place have no epipolar lines (NaN) and contradict nothing.
         agreeing[pair] = len(rows) - np.count_nonzero(squares > (MAX_ERROR / focal) ** 2)
     return agreeing

@@ -1,12 +1,12 @@
-"""The ways to a model, from the quickest to the last resort.
+"""The mappers that are tried for a capture, from the quickest to the last resort.
 
-A good capture stops at the first rung. A further one is tried only where the model before it was
-not good enough, and where it is expected to end in time. What was matched stays in the database: a
-further rung adds pairs to it. Of all models that were found the best one is kept.
+A good capture stops at the first. The next one is tried only where the model before it was not good
+enough, and where it is expected to end in time. Matches stay in the database, and a further attempt
+adds pairs to them. The best of all models is the result.
 
-Each rung that is finished is noted, so that an interrupted run goes on behind it. A mapping that
-was interrupted begins again: continued from COLMAP's snapshot of 40 of 75 frames, the sample came
-out with other points, and cameras up to 0.1% of the path elsewhere. It saved 8 s.
+Each finished attempt is recorded, so that an interrupted run continues after it. An interrupted
+mapping starts again: continued from COLMAP's snapshot of 40 of 75 frames, the sample got other
+points, and cameras up to 0.1% of the path elsewhere. That saved 8 s.
 """
 
 from __future__ import annotations
@@ -17,71 +17,61 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import (
-    checks,
-    database,
-    mapper,
-    model_selection,
-    pairs,
-    verdict,
-)
-from recon_cli.sfm import (
-    pairs as retrieval,
-)
-from recon_cli.sfm.job import VERDICT, Job, Reporter
-from recon_cli.sfm.model_selection import Candidate
-from recon_cli.sfm.step_log import Ledger, Result, fresh_folder, publish
-from recon_cli.sfm.weakest_cut import MIN_WEAK_LINK
+from recon_cli.sfm import checks, database, mapper, matching, merge_models
+from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, StepLog, fresh_folder, publish
+from recon_cli.sfm.merge_models import ModelCandidate
+from recon_cli.sfm.verdict import check_weak_link, examine
+from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace import atomic
+from recon_cli.workspace.summaries import AttemptSummary
 
 # Exhaustive matching grows with the square: 4950 pairs of 100 images are about a minute on two
 # cores at 600x340 and still the whole graph, so that a walk around a room closes.
 EXHAUSTIVE_MAX = 100
-# Share of the frames that can be placed at all which a model must hold to end the search. Two rooms
-# and 50 photos held all of them; a slow walk that fell into four to seven models 76 to 82%.
+# Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
+# held all of them; a slow walk that fell into four to seven models 76 to 82%.
 ENOUGH = 0.9
-# How much longer than the longest rung so far a mapping may take. Relaxed thresholds took 0.8 and
-# 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
+# How much longer than the longest attempt so far a mapping may take. Relaxed thresholds took 0.8
+# and 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
 
 
 @dataclass(frozen=True)
-class Rung:
-    """One way to a model.
+class Fallback:
+    """One way to find a model.
 
     Attributes:
         name: for the user.
         reason: why a capture begins with it.
-        wanted: gives the pairs of images that are matched first, by file name.
-        mapped: gives the models that were found.
+        choose_pairs: returns the pairs of images to match first, by file name.
+        find_models: runs the mapper.
     """
 
     name: str
     reason: str
-    wanted: Callable[[Job], set[pairs.Pair]]
-    mapped: Callable[[Job, Reporter], list[pycolmap.Reconstruction]]
+    choose_pairs: Callable[[MappingJob], set[matching.Pair]]
+    find_models: Callable[[MappingJob, Reporter], list[pycolmap.Reconstruction]]
 
 
 @dataclass(frozen=True)
-class Note:
-    """What became of a rung.
+class MapperAttempt:
+    """What became of one fallback.
 
     Attributes:
-        name: of the rung.
+        name: of the fallback.
         reason: why it was tried.
-        seconds: that it took with its matching, 0 where it was passed over.
-        skipped: why it was passed over, empty where it was tried.
+        seconds: that it took with its matching, 0 where it was skipped.
+        skipped: why it was skipped, empty where it was tried.
         registered: frames with a camera.
         shortfall: why that is not good enough, empty where it is.
         apart: frames that only other models hold, a tuple each.
         rejected: why frames were taken out of the model, by name.
         trusted: whether the verdict trusts the model.
-        weak_link: the verdict's, None where it has none.
+        weak_link: share of the matches that agree across the weakest cut, None where unknown.
         reprojection_error_px: mean, None without a model.
     """
 
@@ -102,213 +92,209 @@ class Note:
         """Frames in the model and in what is left of the others."""
         return [len(part) for part in (self.registered, *self.apart) if part]
 
-    def shown(self, *, kept: bool) -> dict[str, Any]:
-        """Returns the note for the stage's summary."""
-        return {
-            "name": self.name, "reason": self.reason, "skipped": self.skipped,
-            "registered": len(self.registered), "models": self.models,
-            "weak_link": self.weak_link, "reprojection_error_px": self.reprojection_error_px,
-            "seconds": self.seconds, "kept": kept}
+    def summary(self, *, kept: bool) -> AttemptSummary:
+        """Returns the attempt for the stage's summary."""
+        return AttemptSummary(
+            name=self.name, reason=self.reason, skipped=self.skipped,
+            registered=len(self.registered), models=tuple(self.models), weak_link=self.weak_link,
+            reprojection_error_px=self.reprojection_error_px, seconds=self.seconds, kept=kept)
 
 
-def rungs(job: Job) -> tuple[Rung, ...]:
+def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     """Returns the ways to a model that a job allows, the quickest first."""
     count = len(job.names)
     if job.pairs != "auto":
-        return (Rung(job.pairs, "it was asked for", _PAIRS[job.pairs], mapper.incremental),)
-    every = Rung("exhaustive", f"{count} frames are few enough to match all pairs",
-                 _PAIRS["exhaustive"], mapper.incremental)
+        return (_incremental(job.pairs, "it was asked for"),)
+    every = _incremental("exhaustive", f"{count} frames are few enough to match all pairs")
     begin = (every,) if count <= EXHAUSTIVE_MAX else (
-        Rung("retrieval", f"{count} frames are too many to match all pairs at once",
-             _PAIRS["retrieval"], mapper.incremental),
-        every)
+        _incremental("retrieval", f"{count} frames are too many to match all pairs at once"), every)
     return (
         *begin,
-        Rung("relaxed", "", _no_more, lambda *to: mapper.incremental(*to, relaxed=True)),
-        Rung("global", "", _no_more, mapper.globally))
+        Fallback("relaxed", "", _no_pairs, lambda *to: mapper.map_incrementally(*to, relaxed=True)),
+        Fallback("global", "", _no_pairs, mapper.map_globally))
 
 
-def match_first(job: Job, report: Reporter) -> Result:
-    """Matches what the first rung wants and returns how much that is.
+def match_first(job: MappingJob, report: Reporter) -> Result:
+    """Matches the pairs of the first fallback and returns how many there are.
 
     Raises:
         SfmError: no pair matches, or none of them shows depth.
     """
-    pairs.match(job, rungs(job)[0].wanted(job), report)
-    pairs.check_motion(job)
-    return pairs.counted(job)
+    matching.match_pairs(job, list_fallbacks(job)[0].choose_pairs(job), report)
+    matching.check_motion(job)
+    return matching.count_matches(job)
 
 
-def climb(job: Job, report: Reporter, *, deadline: float) -> Result:
-    """Writes the best model of all rungs that were needed into out/model.
+def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result:
+    """Writes the best model of all attempts that were needed into out/model.
 
     Args:
-        job: whose database holds the matches of the first rung.
+        job: whose database holds the matches of the first fallback.
         report: told of phases and counts.
         deadline: monotonic time in seconds at which the process is ended.
 
     Returns:
-        What the model holds, and what became of each rung.
+        What the model holds, and what became of each attempt.
 
     Raises:
-        SfmError: too few frames have a camera, they see the points from one place, or the verdict
-            is that the model hangs together by too little.
+        SfmError: too few frames have a camera, they see the points from one place, or the parts of
+            the model are too weakly connected.
     """
-    ledger = Ledger(job.rungs)
-    notes: list[Note] = []
-    reason = rungs(job)[0].reason
-    for rung in rungs(job):
-        noted = ledger.result(rung.name)
-        note = _read(noted) if noted else _tried(job, rung, reason, notes, report, deadline)
-        if not noted:
-            ledger.finish(rung.name, dataclasses.asdict(note), _folder(job, rung.name))
-        notes.append(note)
-        if not note.skipped:
-            reason = note.shortfall
+    log = StepLog(job.attempts)
+    attempts: list[MapperAttempt] = []
+    reason = list_fallbacks(job)[0].reason
+    for fallback in list_fallbacks(job):
+        recorded = log.result(fallback.name)
+        if recorded:
+            attempt = _read(recorded)
+        else:
+            attempt = _attempt(job, fallback, reason, attempts, report, deadline)
+            log.finish(fallback.name, dataclasses.asdict(attempt), job.attempts / fallback.name)
+        attempts.append(attempt)
+        if not attempt.skipped:
+            reason = attempt.shortfall
             if not reason:
                 break
-    return _keep(job, notes)
+    return _publish_best(job, attempts)
 
 
-def reachable(job: Job, found: Candidate) -> set[str]:
-    """Returns the frames that a model could hold: those with features and, once all pairs are
-    matched, those that matches tie to it, directly or through others."""
+def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
+    """Returns the frames that a model could hold.
+
+    Those are the frames with features and, once all pairs are matched, only those that matches
+    connect to it, directly or through others.
+    """
     counts = database.keypoint_counts(job.database)
     textured = {name for name, count in counts.items() if count >= checks.MIN_KEYPOINTS}
     if database.progress(job.database, "matches") < len(counts) * (len(counts) - 1) // 2:
         return textured
-    held = set(mapper.names(found.model))
-    tied = max(found.verdict.match_parts, key=lambda part: len(held.intersection(part)))
-    return textured.intersection(tied)
+    held = set(mapper.registered_names(candidate.model))
+    connected = max(candidate.verdict.match_parts, key=lambda part: len(held.intersection(part)))
+    return textured.intersection(connected)
 
 
-def shortfall(found: Candidate, reach: Collection[str]) -> str:
-    """Returns why a model is not good enough, empty where it is.
-
-    Args:
-        found: the model.
-        reach: frames that it could hold.
-    """
-    held = found.model.num_reg_images()
+def shortfall(candidate: ModelCandidate, reach: Collection[str]) -> str:
+    """Returns why a model is not good enough, given the frames that it could hold; empty if not."""
+    held = candidate.model.num_reg_images()
     if held < ENOUGH * len(reach):
         return f"only {held} of {len(reach)} frames that can be placed got a camera"
-    parts = [part for part in found.apart if set(part).intersection(reach)]
+    parts = [part for part in candidate.apart if set(part).intersection(reach)]
     if parts:
         return f"the capture fell into {1 + len(parts)} models"
-    if not found.verdict.trusted:
-        return " ".join(found.verdict.problems)
+    if not candidate.verdict.trusted:
+        return " ".join(candidate.verdict.problems)
     return ""
 
 
-def best(notes: Sequence[Note]) -> Note | None:
-    """Returns the note on the best model: the most frames that hang together best.
+def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
+    """Returns the attempt with the best model: many frames that are strongly connected.
 
-    A frame counts as much as the weakest link of its model holds, and as in a broken model where
-    something else speaks against it; in a tie of 1% the smaller reprojection error decides, then
-    the earlier rung.
+    A frame counts by the agreement across the weakest cut of its model, and at most as in a broken
+    model where another check failed; in a tie of 1% the smaller reprojection error decides, then
+    the earlier attempt.
     """
-    def quality(note: Note) -> tuple[float, float]:
-        link = note.weak_link if note.weak_link is not None else float(note.trusted)
-        link = link if note.trusted else min(link, MIN_WEAK_LINK)
-        most = max(len(other.registered) for other in notes)
-        return (round(len(note.registered) / most * (0.5 + 0.5 * link), 2),
-                -(note.reprojection_error_px or 0.0))
+    def quality(attempt: MapperAttempt) -> tuple[float, float]:
+        link = attempt.weak_link if attempt.weak_link is not None else float(attempt.trusted)
+        link = link if attempt.trusted else min(link, MIN_AGREEING)
+        most = max(len(other.registered) for other in attempts)
+        return (round(len(attempt.registered) / most * (0.5 + 0.5 * link), 2),
+                -(attempt.reprojection_error_px or 0.0))
 
-    found = [note for note in notes if note.registered]
-    return max(found, key=quality, default=None)
+    return max((attempt for attempt in attempts if attempt.registered), key=quality, default=None)
 
 
-def _tried(
-    job: Job, rung: Rung, reason: str, before: Sequence[Note], report: Reporter, deadline: float
-) -> Note:
-    """Returns what becomes of a rung; its model and verdict lie in its folder."""
-    folder = fresh_folder(_folder(job, rung.name))
+def _attempt(
+    job: MappingJob, fallback: Fallback, reason: str, before: Sequence[MapperAttempt],
+    report: Reporter, deadline: float,
+) -> MapperAttempt:
+    """Tries a fallback and writes its model into its folder."""
+    folder = fresh_folder(job.attempts / fallback.name)
     start = time.monotonic()
-    wanted = rung.wanted(job) if before else set()  # the first ones are matched
-    expected = _expected(job, len(wanted - database.pair_names(job.database)), before)
+    wanted = fallback.choose_pairs(job) if before else set()  # those of the first are matched
+    expected = _estimate_seconds(job, len(wanted - database.pair_names(job.database)), before)
     if before and start + expected > deadline:
-        return Note(rung.name, reason, skipped=f"it would take about {expected / 60:.0f} minutes")
+        return MapperAttempt(
+            fallback.name, reason, skipped=f"it would take about {expected / 60:.0f} minutes")
     if wanted:
-        pairs.match(job, wanted, report)
-    found = model_selection.best(job, rung.mapped(job, report))
+        matching.match_pairs(job, wanted, report)
+    candidate = merge_models.best_model(job, fallback.find_models(job, report))
     seconds = round(time.monotonic() - start, 2)
-    if found is None:
-        return Note(rung.name, reason, seconds)
-    _write(found, folder)
-    return Note(
-        rung.name, reason, seconds, "", tuple(mapper.names(found.model)),
-        shortfall(found, reachable(job, found)), found.apart, dict(found.rejected),
-        found.verdict.trusted, found.verdict.weak_link.share,
-        found.model.compute_mean_reprojection_error())
+    if candidate is None:
+        return MapperAttempt(fallback.name, reason, seconds)
+    _write(candidate.model, folder / "model")
+    return MapperAttempt(
+        fallback.name, reason, seconds, "", tuple(mapper.registered_names(candidate.model)),
+        shortfall(candidate, reachable(job, candidate)), candidate.apart, dict(candidate.rejected),
+        candidate.verdict.trusted, candidate.verdict.weakest_cut.share,
+        candidate.model.compute_mean_reprojection_error())
 
 
-def _expected(job: Job, count: int, before: Sequence[Note]) -> float:
+def _write(model: pycolmap.Reconstruction, folder: Path) -> None:
+    folder.mkdir()
+    model.write(folder)
+
+
+def _estimate_seconds(job: MappingJob, count: int, before: Sequence[MapperAttempt]) -> float:
     """Returns about how many seconds matching `count` pairs and mapping will take."""
-    matched = Ledger(job.out).result("matches") or {"seconds": 0.0, "rows": 0}
-    pace = float(matched["seconds"]) / max(1, int(matched["rows"]))
-    return count * pace + SLOWER * max((note.seconds for note in before), default=0.0)
+    matched = StepLog(job.out).result("matches") or {"seconds": 0.0, "rows": 0}
+    per_pair = float(matched["seconds"]) / max(1, int(matched["rows"]))
+    return count * per_pair + SLOWER * max((attempt.seconds for attempt in before), default=0.0)
 
 
-def _keep(job: Job, notes: Sequence[Note]) -> Result:
-    """Publishes the best model, if it passes, and returns what the stage tells of it."""
-    chosen = best(notes)
+def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
+    """Publishes the best model, if it passes the checks, and returns the result of the step."""
+    chosen = best_attempt(attempts)
     registered = chosen.registered if chosen else ()
     try:
         checks.check_registered(job.names, registered, job.min_registered)
     except SfmError as error:
-        raise SfmError(f"{error.message} {_attempts(notes)}", hint=error.hint) from error
+        raise SfmError(f"{error.message} {_describe(attempts)}", hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
-    folder = _folder(job, chosen.name)
-    model = pycolmap.Reconstruction(folder / "model")
-    described = mapper.described(model)
+    folder = job.attempts / chosen.name / "model"
+    model = pycolmap.Reconstruction(folder)
+    described = mapper.describe_model(model)
     checks.check_parallax(described["median_triangulation_angle_deg"])
-    found = verdict.examine(
-        model, job.database, job.names, sharpness=job.sharpness, times=job.times)
-    verdict.check_weak_link(found, job.accept_weak)
-    atomic.write_json(job.out / VERDICT, found.to_json())
-    publish(folder / "model", job.model)
-    shutil.rmtree(job.rungs)
+    verdict = examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
+    check_weak_link(verdict, job.accept_weak)
+    atomic.write_json(job.out / VERDICT, verdict.to_json())
+    publish(folder, job.model)
+    shutil.rmtree(job.attempts)
     return {
         **described, "poses": None,
         "models": chosen.models, "apart": [list(part) for part in chosen.apart],
-        "rejected": chosen.rejected, "verdict": found.to_json(), "lines": list(found.lines()),
-        "rungs": [note.shown(kept=note is chosen) for note in notes]}
+        "rejected": chosen.rejected, "verdict": verdict.to_json(), "lines": verdict.lines(),
+        "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}
 
 
-def _attempts(notes: Sequence[Note]) -> str:
-    """Returns a sentence on how many cameras each way found."""
-    counts = (f"{note.name} found {len(note.registered)}" if not note.skipped else
-              f"{note.name} was passed over for want of time" for note in notes)
-    return f"Cameras by way of mapping: {', '.join(counts)}."
+def _describe(attempts: Sequence[MapperAttempt]) -> str:
+    counts = (
+        f"{attempt.name} was skipped for lack of time" if attempt.skipped else
+        f"{attempt.name} found {len(attempt.registered)}" for attempt in attempts)
+    return f"Cameras by mapper: {', '.join(counts)}."
 
 
-def _write(found: Candidate, folder: Path) -> None:
-    (folder / "model").mkdir()
-    found.model.write(folder / "model")
-
-
-def _folder(job: Job, name: str) -> Path:
-    return job.rungs / name
-
-
-def _read(value: Result) -> Note:
-    return Note(**{
+def _read(value: Result) -> MapperAttempt:
+    return MapperAttempt(**{
         **value, "registered": tuple(value["registered"]),
         "apart": tuple(map(tuple, value["apart"]))})
 
 
-def _no_more(_job: Job) -> set[pairs.Pair]:
+def _incremental(pairs: str, reason: str) -> Fallback:
+    return Fallback(pairs, reason, _PAIRS[pairs], mapper.map_incrementally)
+
+
+def _no_pairs(_job: MappingJob) -> set[matching.Pair]:
     return set()
 
 
-def _near_or_alike(job: Job) -> set[pairs.Pair]:
+def _near_or_similar(job: MappingJob) -> set[matching.Pair]:
     """Returns the neighbours among the frames of each camera, and frames that look alike."""
-    near = set().union(*(pairs.sequential(group.names) for group in job.groups))
-    return near | retrieval.similar(job.database, job.names, seed=job.seed, besides=near)
+    near = set().union(*(matching.sequential_pairs(group.names) for group in job.groups))
+    return near | matching.similar_pairs(job.database, job.names, seed=job.seed, besides=near)
 
 
-_PAIRS: dict[str, Callable[[Job], set[pairs.Pair]]] = {
-    "exhaustive": lambda job: pairs.exhaustive(job.names),
-    "sequential": lambda job: pairs.sequential(job.names),
-    "retrieval": _near_or_alike,
+_PAIRS: dict[str, Callable[[MappingJob], set[matching.Pair]]] = {
+    "exhaustive": lambda job: matching.exhaustive_pairs(job.names),
+    "sequential": lambda job: matching.sequential_pairs(job.names),
+    "retrieval": _near_or_similar,
 }

@@ -1,26 +1,32 @@
-"""What the mapping process says to its parent: one JSON object a line.
+"""What the mapping process and its parent share: the job, the log of finished steps, the events.
 
-A line is one of three: a phase begins, so many of its units are done, or an error that the parent
-shall raise in its own name.
+The parent writes a job, the process works on it step by step and records each finished step. On its
+standard output it reports one JSON object a line: a phase begins, so many of its units are done, or
+an error that the parent raises.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+import os
+import shutil
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from recon_cli.errors import ConfigError, FormatError, ReconError, SfmError, WorkspaceError
 from recon_cli.scene.camera import Lens
-from recon_cli.sfm.step_log import STEPS
 from recon_cli.workspace import atomic
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
-RUNGS = "rungs"  # in the stage's folder: what is needed only until there is a model
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
+LOG_FILE = "steps.json"  # in the stage's folder: the finished steps
+STEPS = ("features", "matches", "model", "sparse", "undistorted")
+
+Result = dict[str, Any]  # JSON values only
+
 
 @dataclass(frozen=True)
 class CameraGroup:
@@ -42,7 +48,7 @@ class CameraGroup:
 
 
 @dataclass(frozen=True)
-class Job:
+class MappingJob:
     """One run of the mapping process.
 
     Attributes:
@@ -52,22 +58,22 @@ class Job:
         groups: the frames by camera.
         masks: folder of masks under the names of the frames (0 where a pixel is ignored), None
             where no frame has one.
-        poses: file of known poses (see `io.poses`), None where there are none.
+        poses: file of known poses (see `io.posed`), None where there are none.
         pose_use: "keep", "refine" or "ignore" them.
         given_points: the file of poses comes with points.
         pairs: "auto", "exhaustive", "retrieval" or "sequential".
         max_features: SIFT keypoints that an image keeps at most.
         min_registered: share of the frames that must get a camera.
-        accept_weak: a model with a weak link is taken too.
-        gravity: the world is turned upright where there is evidence for up.
-        scale_between: two places and their distance in metres (see `mapping.measure`), None where
-            the scale is not known.
-        max_minutes: after which the parent ends the process; further rungs of the ladder are begun
-            only where they are expected to fit in.
+        accept_weak: accept a model whose parts are weakly connected.
+        gravity: turn the world upright where there is evidence for up.
+        scale_between: two places and their distance in metres (see `sfm.measure`), None where the
+            scale is not known.
+        max_minutes: after which the parent ends the process; a further mapper is tried only where
+            it is expected to end in time.
         seed: of every random sampling.
         threads: for features, matching and undistortion.
-        sharpness: of frames by name, where it is known (see `capture.frames`).
-        times: of showing in seconds by name, where they are known.
+        sharpness: of frames by name, where known.
+        times: presentation times in seconds by name, where known.
     """
 
     frames: Path
@@ -106,26 +112,26 @@ class Job:
         return self.out / "model"
 
     @property
-    def rungs(self) -> Path:
-        """Where models are gathered until one of them is kept."""
-        return self.out / RUNGS
+    def attempts(self) -> Path:
+        """Models of the mappers that were tried, until one of them is the result."""
+        return self.out / "rungs"
 
     @property
     def undistorting(self) -> Path:
-        """Where undistorted images are gathered until all of them are there."""
+        """Undistorted images until all of them are there."""
         return self.out / "undistorted.partial"
 
     @property
     def known_poses(self) -> bool:
-        """Whether the cameras are given and not to be found."""
+        """Whether the cameras are given."""
         return self.poses is not None and self.pose_use != "ignore"
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """The steps of `ledger.STEPS` that this job takes."""
-        kept = self.known_poses and self.pose_use == "keep"
-        if kept and self.given_points and all(group.lens for group in self.groups):
-            return ("model", "sparse", "undistorted")  # nothing is left to be found in the pixels
+        """Those of `STEPS` that this job takes; known cameras and points need no features."""
+        keep = self.known_poses and self.pose_use == "keep"
+        if keep and self.given_points and all(group.lens for group in self.groups):
+            return ("model", "sparse", "undistorted")
         return STEPS
 
     def write(self, path: Path) -> None:
@@ -136,15 +142,15 @@ class Job:
         })
 
     @classmethod
-    def read(cls, path: Path) -> Job:
+    def read(cls, path: Path) -> MappingJob:
         """Returns the job that `write` wrote."""
         value: dict[str, Any] = atomic.read_json(path)
         for name in ("frames", "denoised", "out", "masks", "poses"):
             value[name] = None if value[name] is None else Path(value[name])
-        measured = value["scale_between"]
+        scale = value["scale_between"]
         return cls(**{
             **value, "groups": tuple(map(_group, value["groups"])),
-            "scale_between": None if measured is None else tuple(measured)})
+            "scale_between": None if scale is None else tuple(scale)})
 
 
 def _group(value: dict[str, Any]) -> CameraGroup:
@@ -155,6 +161,72 @@ def _group(value: dict[str, Any]) -> CameraGroup:
 
 def _lens(value: dict[str, Any]) -> Lens:
     return Lens(**{**value, "params": tuple(value["params"])})
+
+
+class StepLog:
+    """The finished steps in a folder; every change reaches the disk at once.
+
+    Args:
+        out: the stage's folder, or one in it.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self._out = out
+        self._steps: dict[str, dict[str, Any]] = {}
+        try:
+            self._steps = dict(atomic.read_json(out / LOG_FILE))
+        except FormatError:
+            return  # the first run, or a lost file: every step is done again
+
+    def result(self, step: str) -> Result | None:
+        """Returns the recorded result of a step whose files are all there, else None."""
+        entry = self._steps.get(step)
+        if entry is None or any(
+            not (self._out / name).is_file() or (self._out / name).stat().st_size != size
+            for name, size in entry["files"].items()
+        ):
+            return None
+        result: Result = entry["result"]
+        return result
+
+    def finish(self, step: str, result: Result, folder: Path | None = None) -> None:
+        """Records a step as finished, with its result and the files in the `folder` it wrote."""
+        files = {
+            path.relative_to(self._out).as_posix(): path.stat().st_size
+            for path in (() if folder is None else _files(folder))
+        }
+        self._steps[step] = {"result": result, "files": files}
+        atomic.write_json(self._out / LOG_FILE, self._steps)
+
+    def forget_from(self, step: str) -> None:
+        """Removes a step and all that build on it."""
+        for name in STEPS[STEPS.index(step):]:
+            self._steps.pop(name, None)
+        atomic.write_json(self._out / LOG_FILE, self._steps)
+
+
+def publish(folder: Path, target: Path) -> None:
+    """Moves a finished folder to its place, replacing what an interrupted run left there."""
+    for path in _files(folder):
+        with path.open("rb+") as file:
+            os.fsync(file.fileno())
+    if target.exists():
+        shutil.rmtree(target)
+    folder.rename(target)
+    atomic.sync_folder(target.parent)
+
+
+def fresh_folder(folder: Path) -> Path:
+    """Returns `folder`, made anew and empty."""
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Yields the files below a folder in a fixed order."""
+    return (path for path in sorted(folder.rglob("*")) if path.is_file())
 
 
 _ERRORS: dict[str, type[ReconError]] = {
@@ -179,22 +251,14 @@ class Phase:
 
 @dataclass(frozen=True)
 class Done:
-    """So many units of the current phase are done.
-
-    Attributes:
-        count: units, counted from the beginning of the phase.
-    """
+    """So many units of the current phase are done, counted from its beginning."""
 
     count: int
 
 
 @dataclass(frozen=True)
 class Failed:
-    """The process gives up.
-
-    Attributes:
-        error: what the parent shall raise.
-    """
+    """The process gives up with an error that the parent raises."""
 
     error: ReconError | OSError
 
@@ -203,25 +267,21 @@ Event = Phase | Done | Failed
 
 
 class Reporter:
-    """The mapping process' end of the line.
-
-    Args:
-        stream: binary, read by the parent.
-    """
+    """Writes events on a binary stream that the parent reads."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
 
     def phase(self, name: str, total: int, *, done: int = 0) -> None:
-        """Says that a phase begins; see `Phase`."""
+        """Reports that a phase begins; see `Phase`."""
         self._send({"phase": name, "total": total, "done": done})
 
     def done(self, count: int) -> None:
-        """Says how many units of the phase are done."""
+        """Reports how many units of the phase are done."""
         self._send({"count": count})
 
-    def failed(self, error: ReconError | OSError) -> None:
-        """Hands an error over."""
+    def fail(self, error: ReconError | OSError) -> None:
+        """Passes an error to the parent."""
         if isinstance(error, OSError):
             self._send({"errno": error.errno, "text": error.strerror, "file": error.filename})
         else:

@@ -11,8 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.sfm import checks, database
-from recon_cli.sfm.job import Job, Reporter
-from recon_cli.sfm.step_log import Result, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
 
 # Threads add floating-point sums in any order: two runs then differ from the third digit of the
 # principal point on. One thread gives the same bytes every time, at 5% more time on two cores.
@@ -25,11 +24,11 @@ GLOBAL_RATIO = 1.2
 MIN_IMAGES_PRINCIPAL = 10
 # COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
 MAX_ERROR, MIN_ANGLE = 4.0, 1.5
-# Where COLMAP writes models that are read from memory, and finds one that it shall go on with.
+# Where COLMAP writes models that are read from memory, and finds the one that it continues.
 FOUND, BEGUN = "found.partial", "begun.partial"
 
 
-def incremental(job: Job, report: Reporter, *, relaxed: bool = False
+def map_incrementally(job: MappingJob, report: Reporter, *, relaxed: bool = False
                 ) -> list[pycolmap.Reconstruction]:
     """Returns every model that the incremental mapper finds; they may share images.
 
@@ -44,33 +43,33 @@ def incremental(job: Job, report: Reporter, *, relaxed: bool = False
     images = itertools.count(3)  # the first call comes with the third image of a model
     report.phase("mapping", len(job.names))
     models = pycolmap.incremental_mapping(
-        job.database, job.frames, fresh_folder(job.rungs / FOUND), options,
+        job.database, job.frames, fresh_folder(job.attempts / FOUND), options,
         next_image_callback=lambda: report.done(min(next(images), len(job.names))))
-    shutil.rmtree(job.rungs / FOUND)
+    shutil.rmtree(job.attempts / FOUND)
     return list(models.values())
 
 
-def extended(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def extend_model(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Returns a model with the images that the mapper can add to it, adjusted as a whole."""
-    begun, options = fresh_folder(job.rungs / BEGUN), _options(job)
+    begun, options = fresh_folder(job.attempts / BEGUN), _options(job)
     model.write(begun)
     options.multiple_models = False
-    found = pycolmap.incremental_mapping(
-        job.database, job.frames, fresh_folder(job.rungs / FOUND), options, input_path=begun)
+    models = pycolmap.incremental_mapping(
+        job.database, job.frames, fresh_folder(job.attempts / FOUND), options, input_path=begun)
     shutil.rmtree(begun)
-    shutil.rmtree(job.rungs / FOUND)
-    return max(found.values(), key=_size, default=model)
+    shutil.rmtree(job.attempts / FOUND)
+    return max(models.values(), key=_size, default=model)
 
 
-def globally(job: Job, report: Reporter) -> list[pycolmap.Reconstruction]:
+def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the models of the global mapper, which places all images at once.
 
-    Where a focal length is unknown, those of all cameras are estimated from the matches first. That
-    is done in a copy of the database: it changes the cameras and what a pair is taken for.
+    Where a focal length is unknown, those of all cameras are estimated from the matches first, in a
+    copy of the database: it changes the cameras and the geometry of the pairs.
     """
     report.phase("mapping", len(job.names))
-    copy = job.rungs / "global.db"
-    job.rungs.mkdir(exist_ok=True)
+    copy = job.attempts / "global.db"
+    job.attempts.mkdir(exist_ok=True)
     database.remove(copy)
     shutil.copyfile(job.database, copy)
     if any(group.lens is None and group.focal_px is None for group in job.groups):
@@ -78,17 +77,17 @@ def globally(job: Job, report: Reporter) -> list[pycolmap.Reconstruction]:
         calibration.random_seed = job.seed
         pycolmap.calibrate_view_graph(copy, calibration)
     models = pycolmap.global_mapping(
-        copy, job.frames, fresh_folder(job.rungs / FOUND), _global_options(job))
-    shutil.rmtree(job.rungs / FOUND)
+        copy, job.frames, fresh_folder(job.attempts / FOUND), _global_options(job))
+    shutil.rmtree(job.attempts / FOUND)
     database.remove(copy)
     return list(models.values())
 
 
 def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) -> None:
-    """Adjusts cameras and points together, the principal point free; drops points that got lost.
+    """Runs bundle adjustment with the principal point free; drops points that got lost.
 
     The mapper keeps it in the middle, because a few images cannot tell it from a shift. All of them
-    can: on the fox photos it comes out 2 px from the value that others found, 16 px off the middle.
+    can: on the fox photos it comes out 2 px from the published value, 16 px off the middle.
 
     Args:
         model: changed in place.
@@ -108,22 +107,22 @@ def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) ->
     model.update_point_3d_errors()
 
 
-def triangulated(
-    job: Job, model: pycolmap.Reconstruction, *, refine_intrinsics: bool = False
+def triangulate(
+    job: MappingJob, model: pycolmap.Reconstruction, *, refine_intrinsics: bool = False
 ) -> pycolmap.Reconstruction:
     """Returns a model of the same poses with the points that the matches give."""
-    found = pycolmap.triangulate_points(
-        model, job.database, job.frames, fresh_folder(job.rungs / FOUND), True, _options(job),
+    triangulated = pycolmap.triangulate_points(
+        model, job.database, job.frames, fresh_folder(job.attempts / FOUND), True, _options(job),
         refine_intrinsics)
-    shutil.rmtree(job.rungs / FOUND)
-    return found
+    shutil.rmtree(job.attempts / FOUND)
+    return triangulated
 
 
-def described(model: pycolmap.Reconstruction) -> Result:
-    """Returns what a model holds, for the stage's summary; figures of tracks where it has any."""
+def describe_model(model: pycolmap.Reconstruction) -> Result:
+    """Returns what a model holds, for the stage's summary; None for figures without tracks."""
     tracks = model.compute_num_observations() > 0
     return {
-        "registered": names(model),
+        "registered": registered_names(model),
         "points": model.num_points3D(),
         "mean_track_length": model.compute_mean_track_length() if tracks else None,
         "reprojection_error_px": model.compute_mean_reprojection_error() if tracks else None,
@@ -132,7 +131,7 @@ def described(model: pycolmap.Reconstruction) -> Result:
     }
 
 
-def names(model: pycolmap.Reconstruction) -> list[str]:
+def registered_names(model: pycolmap.Reconstruction) -> list[str]:
     """Returns the names of the images that have a camera, sorted."""
     return sorted(model.image(i).name for i in model.reg_image_ids())
 
@@ -157,7 +156,7 @@ def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
-def _options(job: Job) -> pycolmap.IncrementalPipelineOptions:
+def _options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = THREADS
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job.seed
@@ -167,10 +166,10 @@ def _options(job: Job) -> pycolmap.IncrementalPipelineOptions:
 
 
 def _relax(options: pycolmap.IncrementalPipelineOptions) -> None:
-    """Halves what COLMAP asks of the first pair and of each further image, and tries oftener.
+    """Halves COLMAP's thresholds for the first pair and each further image, and tries more often.
 
-    The angle falls to a quarter: 4 degrees is what COLMAP tries last by itself for the first pair
-    of a capture with short steps, when all other thresholds have been lowered too.
+    The angle falls to a quarter: COLMAP itself tries 4 degrees last for the first pair of a capture
+    with short steps, when all other thresholds have been lowered too.
     """
     mapper = options.mapper
     mapper.init_min_num_inliers = 50  # of 100
@@ -181,7 +180,7 @@ def _relax(options: pycolmap.IncrementalPipelineOptions) -> None:
     options.init_num_trials = 400  # of 200
 
 
-def _global_options(job: Job) -> pycolmap.GlobalPipelineOptions:
+def _global_options(job: MappingJob) -> pycolmap.GlobalPipelineOptions:
     options = pycolmap.GlobalPipelineOptions()
     mapper = options.mapper
     options.min_model_size = checks.MIN_FRAMES

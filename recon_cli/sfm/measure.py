@@ -1,4 +1,4 @@
-"""A distance that the user knows, between two places that the scene knows: --scale-between."""
+"""--scale-between: the scale of a scene from a known distance between two of its places."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ Place = CameraPlace | PointPlace | PixelPlace
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What came of a `ScaleBetween`.
+    """The scale that follows from a `ScaleBetween`.
 
     Attributes:
         request: what was asked for.
@@ -107,11 +107,11 @@ def parse_place(text: str, names: Collection[str]) -> Place:
     front, colon, back = text.rpartition(":")
     if colon and (pixel := _numbers(back, 2)):
         if (name := _frame(front, names)) is None:
-            raise _unknown(front, names)
+            raise _unknown_place(front, names)
         return PixelPlace(name, *pixel)
     if xyz := _numbers(text, 3):
         return PointPlace((xyz[0], xyz[1], xyz[2]))
-    raise _unknown(text, names)
+    raise _unknown_place(text, names)
 
 
 def measure(
@@ -129,19 +129,19 @@ def measure(
         pinholes: its undistorted camera; asked only for frames that are named with a pixel.
 
     Raises:
-        ConfigError: a place cannot be made out, or both are the same.
+        ConfigError: a place is unknown, or both are the same.
     """
     a, b = (
-        _located(parse_place(text.strip(), viewmats.keys()), points, viewmats, pinholes)
+        _locate(parse_place(text.strip(), viewmats.keys()), points, viewmats, pinholes)
         for text in (request.a, request.b))
     distance = float(np.linalg.norm(a - b))
     if distance <= _EQUAL * max(float(np.abs([a, b]).max()), 1e-12):
         raise ConfigError(
-            f"{request.a} and {request.b} are the same point, {listed_point(a)}.", hint=_HINT)
+            f"{request.a} and {request.b} are the same point, {format_point(a)}.", hint=_HINT)
     return Measurement(request, a, b, request.metres / distance)
 
 
-def listed_point(point: NDArray[np.float64]) -> str:
+def format_point(point: NDArray[np.float64]) -> str:
     """Returns a point as --scale-between takes it."""
     return ",".join(f"{value:.4g}" for value in point)
 
@@ -162,14 +162,14 @@ def _numbers(text: str, count: int) -> tuple[float, ...] | None:
     return values if len(values) == count and all(map(math.isfinite, values)) else None
 
 
-def _unknown(text: str, names: Collection[str]) -> ConfigError:
+def _unknown_place(text: str, names: Collection[str]) -> ConfigError:
     close = difflib.get_close_matches(text, names, n=3, cutoff=0.5) or sorted(names)[:3]
     return ConfigError(
-        f"--scale-between names {text!r}, but that is no point and no frame that has a camera; "
-        f"near it: {', '.join(close)}.", hint=_HINT)
+        f"--scale-between names {text!r}, which is neither a point nor a frame with a camera; "
+        f"similar names: {', '.join(close)}.", hint=_HINT)
 
 
-def _located(
+def _locate(
     place: Place,
     points: NDArray[np.float64],
     viewmats: Mapping[str, NDArray[np.float64]],
@@ -187,19 +187,19 @@ def _located(
     return np.asarray(viewmat[:3, :3].T @ (depth * ray - viewmat[:3, 3]))
 
 
-def _depth_at(place: PixelPlace, seen: NDArray[np.float64], pinhole: Pinhole) -> float:
-    """Returns the depth of the one of `seen` [P, 3], in camera axes, that is nearest to a pixel."""
+def _depth_at(place: PixelPlace, points: NDArray[np.float64], pinhole: Pinhole) -> float:
+    """Returns the depth of that of the points [P, 3], in camera axes, nearest to a pixel."""
     if not (0 <= place.u <= pinhole.width and 0 <= place.v <= pinhole.height):
         raise ConfigError(
-            f"The pixel {place.u:g},{place.v:g} lies outside of {place.name}, which is "
-            f"{pinhole.width}x{pinhole.height} pixels without its distortion.", hint=_HINT)
-    seen = seen[seen[:, 2] > 0]
-    pixels = seen[:, :2] / seen[:, 2:] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+            f"The pixel {place.u:g},{place.v:g} lies outside {place.name}, which has "
+            f"{pinhole.width}x{pinhole.height} pixels once undistorted.", hint=_HINT)
+    points = points[points[:, 2] > 0]
+    pixels = points[:, :2] / points[:, 2:] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
     off = np.hypot(*(pixels - (place.u, place.v)).T)
     reach = max(_LEAST_REACH, _REACH * pinhole.width)
     if not (off <= reach).any():
         raise _nothing_near(place, pixels, off, reach)
-    return float(seen[off.argmin(), 2])
+    return float(points[off.argmin(), 2])
 
 
 def _nothing_near(
@@ -210,5 +210,5 @@ def _nothing_near(
         u, v = pixels[off.argmin()]
         hint = f"The nearest is at {place.name}:{u:.0f},{v:.0f}."
     return ConfigError(
-        f"No sparse point within {reach:.0f} pixels of {place.name}:{place.u:g},{place.v:g}, so "
-        "that its depth is not known.", hint=hint)
+        f"The depth at {place.name}:{place.u:g},{place.v:g} is unknown: no sparse point lies "
+        f"within {reach:.0f} pixels.", hint=hint)

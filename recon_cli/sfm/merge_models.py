@@ -1,13 +1,13 @@
-"""Models that fell apart, put together where the points that both hold say how they lie.
+"""One model from all that a mapper found: parts merged, wrong images taken out.
 
-Two models of one capture hold the same keypoints: in images that are in both, and in pairs of
-images, one of each, that were verified as showing the same. Where both have a point for such a
-keypoint, the two points are one, and the similarity follows from many of them.
+Two models of one capture hold the same keypoints: in images that are in both, and in verified pairs
+of images, one of each. Where both have a point for such a keypoint, the two points are one, and the
+similarity between the models follows from many of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +15,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from recon_cli.sfm import mapper
+from recon_cli.sfm import mapper, verdict
 from recon_cli.sfm.checks import MIN_FRAMES
-from recon_cli.sfm.job import Job
+from recon_cli.sfm.job import MappingJob
+from recon_cli.sfm.verdict import Verdict
 
-# COLMAP's own demands on the pose of an image (abs_pose_min_num_inliers, _min_inlier_ratio): a
+# COLMAP's thresholds for the pose of an image (abs_pose_min_num_inliers, _min_inlier_ratio): a
 # model is placed by its points just as an image is.
 MIN_INLIERS = 30
 MIN_INLIER_SHARE = 0.25
@@ -28,10 +29,30 @@ MIN_INLIER_SHARE = 0.25
 # angle between two rays (7 to 23 degrees in real captures): 1 to 3%.
 MAX_ERROR = 0.03
 MAX_TRIALS = 10_000
+# Share of the images that may be taken out of a model as wrong. Where the verdict suspects more,
+# the model is wrong, and taking out the smaller part would hide it.
+MAX_REJECTED = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class ModelCandidate:
+    """A model that may become the result.
+
+    Attributes:
+        model: adjusted.
+        verdict: on it.
+        apart: frames that only other models hold, a tuple each.
+        rejected: why frames were taken out, by name.
+    """
+
+    model: pycolmap.Reconstruction
+    verdict: Verdict
+    apart: tuple[tuple[str, ...], ...]
+    rejected: Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class Shared:
+class SharedPoints:
     """Points that two models have in common.
 
     Attributes:
@@ -43,51 +64,111 @@ class Shared:
     target: NDArray[np.float64]
 
 
-def added(job: Job, base: pycolmap.Reconstruction, other: pycolmap.Reconstruction
-          ) -> pycolmap.Reconstruction | None:
+def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> ModelCandidate | None:
+    """Returns the largest model, merged with others and without wrong images; None without models.
+
+    A part is merged only where the model is trusted no less with it than without it.
+    """
+    if not models:
+        return None
+    largest, *others = mapper.largest_first(models)
+    mapper.adjust(largest)
+    best = _drop_outliers(job, largest)
+    for other in others:
+        joined = merge(job, best.model, other)
+        if joined is None:
+            continue
+        together = _drop_outliers(job, joined)
+        if _no_worse(together, best):
+            best = together
+    return ModelCandidate(best.model, best.verdict, _apart(best, others), best.rejected)
+
+
+def _drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandidate:
+    """Takes the images that the verdict suspects out of a model and adjusts the rest."""
+    first = _examine(job, model)
+    wrong = {
+        item.name: f"{item.share:.0%} of its {item.matches} matches agree with where it was placed"
+        for item in first.outliers}
+    if not wrong or len(wrong) > MAX_REJECTED * model.num_reg_images():
+        return ModelCandidate(model, first, (), {})
+    for name in wrong:
+        model.deregister_frame(model.find_image_with_name(name).frame_id)
+    mapper.adjust(model)
+    return ModelCandidate(model, _examine(job, model), (), wrong)
+
+
+def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> Verdict:
+    return verdict.examine(
+        model, job.database, job.names, sharpness=job.sharpness, times=job.times)
+
+
+def _no_worse(together: ModelCandidate, alone: ModelCandidate) -> bool:
+    """Returns whether a merged model holds more images and is trusted as much."""
+    if together.model.num_reg_images() <= alone.model.num_reg_images():
+        return False
+    return together.verdict.trusted or not alone.verdict.trusted
+
+
+def _apart(
+    chosen: ModelCandidate, others: Sequence[pycolmap.Reconstruction]
+) -> tuple[tuple[str, ...], ...]:
+    """Returns the frames of other models that no model before them holds, three or more."""
+    held, parts = {*mapper.registered_names(chosen.model), *chosen.rejected}, []
+    for other in others:
+        new = sorted(set(mapper.registered_names(other)) - held)
+        held.update(new)
+        if len(new) >= MIN_FRAMES:
+            parts.append(tuple(new))
+    return tuple(parts)
+
+
+def merge(
+    job: MappingJob, base: pycolmap.Reconstruction, other: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction | None:
     """Returns `base` with the images of `other`, adjusted together, or None.
 
-    That is None where `other` brings fewer than three further images, or where too few points say
-    how the two lie. Whether the result can be trusted is for the caller to judge.
+    None if `other` brings fewer than three further images or shares too few points with `base`.
+    Whether the result can be trusted is for the caller to judge.
     """
-    new = set(mapper.names(other)) - set(mapper.names(base))
+    new = set(mapper.registered_names(other)) - set(mapper.registered_names(base))
     if len(new) < MIN_FRAMES:
         return None
-    motion = similarity(shared_points(job.database, other, base), base, seed=job.seed)
+    motion = similarity(find_shared_points(job.database, other, base), base, seed=job.seed)
     if motion is None:
         return None
     poses = {image.name: image.cam_from_world() for image in _images(base)}
     for image in _images(other):
         if image.name in new:
             poses[image.name] = motion.transform_camera_world(image.cam_from_world())
-    joined = mapper.triangulated(job, posed(job.database, base, poses))
+    joined = mapper.triangulate(job, posed_model(job.database, base, poses))
     mapper.adjust(joined)
-    return mapper.extended(job, joined)
+    return mapper.extend_model(job, joined)
 
 
 def similarity(
-    shared: Shared, base: pycolmap.Reconstruction, *, seed: int
+    shared: SharedPoints, base: pycolmap.Reconstruction, *, seed: int
 ) -> pycolmap.Sim3d | None:
-    """Returns the similarity that takes one model into the other, None where too little says so."""
+    """Returns the similarity from one model to the other, None where too few points agree."""
     if len(shared.source) < MIN_INLIERS:
         return None
     options = pycolmap.RANSACOptions()
     options.max_error = MAX_ERROR * _depth(base)
     options.max_num_trials = MAX_TRIALS
     options.random_seed = seed
-    found = pycolmap.estimate_sim3d_robust(shared.source, shared.target, options)
+    estimate = pycolmap.estimate_sim3d_robust(shared.source, shared.target, options)
     enough = max(MIN_INLIERS, MIN_INLIER_SHARE * len(shared.source))
-    if found is None or found["num_inliers"] < enough:
+    if estimate is None or estimate["num_inliers"] < enough:
         return None
-    motion: pycolmap.Sim3d = found["tgt_from_src"]
+    motion: pycolmap.Sim3d = estimate["tgt_from_src"]
     return motion
 
 
-def shared_points(
+def find_shared_points(
     database: Path, source: pycolmap.Reconstruction, target: pycolmap.Reconstruction
-) -> Shared:
+) -> SharedPoints:
     """Returns the points of two models that the same or matching keypoints show."""
-    ours, theirs = _seen(source), _seen(target)
+    ours, theirs = _points_of_keypoints(source), _points_of_keypoints(target)
     same = {
         (ours[name][row], theirs[name][row])
         for name in ours.keys() & theirs.keys() for row in ours[name].keys() & theirs[name].keys()}
@@ -97,15 +178,15 @@ def shared_points(
         for pair, geometry in geometries:
             first, second = (names[image] for image in pycolmap.pair_id_to_image_pair(pair))
             rows = geometry.inlier_matches
-            same |= _paired(ours.get(first), theirs.get(second), rows)
-            same |= _paired(ours.get(second), theirs.get(first), rows[:, ::-1])
+            same |= _pair_points(ours.get(first), theirs.get(second), rows)
+            same |= _pair_points(ours.get(second), theirs.get(first), rows[:, ::-1])
     ordered = sorted(same)
-    return Shared(
-        np.array([source.point3D(one).xyz for one, _ in ordered]).reshape(-1, 3),
-        np.array([target.point3D(two).xyz for _, two in ordered]).reshape(-1, 3))
+    return SharedPoints(
+        np.array([source.point3D(point).xyz for point, _ in ordered]).reshape(-1, 3),
+        np.array([target.point3D(point).xyz for _, point in ordered]).reshape(-1, 3))
 
 
-def posed(
+def posed_model(
     database: Path, cameras: pycolmap.Reconstruction | None, poses: Mapping[str, pycolmap.Rigid3d]
 ) -> pycolmap.Reconstruction:
     """Returns a model without points: the images of a database with these poses.
@@ -136,7 +217,7 @@ def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [model.image(i) for i in sorted(model.reg_image_ids())]
 
 
-def _seen(model: pycolmap.Reconstruction) -> dict[str, dict[int, int]]:
+def _points_of_keypoints(model: pycolmap.Reconstruction) -> dict[str, dict[int, int]]:
     """Returns the point that each keypoint shows, by name of image and index of the keypoint."""
     return {
         image.name: {
@@ -145,14 +226,15 @@ def _seen(model: pycolmap.Reconstruction) -> dict[str, dict[int, int]]:
         for image in _images(model)}
 
 
-def _paired(
+def _pair_points(
     ours: Mapping[int, int] | None, theirs: Mapping[int, int] | None, rows: NDArray[np.uint32]
 ) -> set[tuple[int, int]]:
     """Returns the points that matches [M, 2] between two images make one."""
     if ours is None or theirs is None:
         return set()
     return {
-        (ours[one], theirs[two]) for one, two in rows.tolist() if one in ours and two in theirs}
+        (ours[row], theirs[other]) for row, other in rows.tolist()
+        if row in ours and other in theirs}
 
 
 def _depth(model: pycolmap.Reconstruction) -> float:

@@ -1,6 +1,6 @@
-"""Starts the mapping process, shows how far it is, and makes errors of its ways to fail.
+"""Starts the mapping process, shows its progress, and turns its failures into errors.
 
-Native code can abort, hang or fill the memory; in a process of its own it takes nothing with it.
+Native code can abort, hang or fill the memory; in a process of its own it does no harm to others.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from pathlib import Path
 from recon_cli.errors import SfmError
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
-from recon_cli.sfm import job as protocol
-from recon_cli.sfm.job import LOCK, Job
+from recon_cli.sfm.job import LOCK, Done, Event, Failed, MappingJob, Phase, parse
 
 _DOING = {
     "features": ("finding features", "frame"),
@@ -42,12 +41,12 @@ class Monitor:
     """
 
     def __init__(
-        self, job: Job, progress: Progress, record: Callable[[int, int], None]
+        self, job: MappingJob, progress: Progress, record: Callable[[int, int], None]
     ) -> None:
         self._job = job
         self._progress = progress
         self._record = record
-        self._phase: protocol.Phase | None = None
+        self._phase: Phase | None = None
         self._count = 0
         self._durable = 0
         self._bar: Bar | None = None
@@ -61,37 +60,37 @@ class Monitor:
 
     @property
     def doing(self) -> str:
-        """What the process is at, in words."""
+        """What the process is doing, in words."""
         if self._phase is None:
             return "starting"
         text, unit = _DOING[self._phase.name]
         return f"{text} ({self._count} of {self._phase.total} {unit}s done)"
 
-    def show(self, event: protocol.Event | None) -> None:
-        """Takes notice of an event, or of what lies on the disk when there is none."""
-        if isinstance(event, protocol.Phase):
+    def show(self, event: Event | None) -> None:
+        """Shows an event, or the progress on the disk when there is none."""
+        if isinstance(event, Phase):
             self._begin(event)
-        elif isinstance(event, protocol.Done):
+        elif isinstance(event, Done):
             self._reach(event.count)
         else:
-            self._reach(self._counted())
+            self._reach(self._count_on_disk())
 
-    def _begin(self, phase: protocol.Phase) -> None:
+    def _begin(self, phase: Phase) -> None:
         self._open.close()
         text, unit = _DOING[phase.name]
         self._phase, self._count = phase, phase.done
         self._bar = self._open.enter_context(
             self._progress.bar(text, phase.total, unit=unit, done=phase.done))
-        self._note_durable()
+        self._record_durable()
 
     def _reach(self, count: int) -> None:
         if self._bar is not None and count > self._count:
             self._bar.advance(count - self._count)
             self._count = count
-            self._note_durable()
+            self._record_durable()
 
-    def _counted(self) -> int:
-        """Returns how many results of the current phase lie on the disk."""
+    def _count_on_disk(self) -> int:
+        """Returns how many results of the current phase are on the disk."""
         phase = self._phase
         if phase is None:
             return 0
@@ -105,14 +104,14 @@ class Monitor:
             return min(files, phase.total)  # masks lie there twice for a moment
         return 0
 
-    def _note_durable(self) -> None:
-        """Records finished steps, and images or pairs that the database keeps."""
+    def _record_durable(self) -> None:
+        """Records finished steps, and images or pairs in the database."""
         assert self._phase is not None
         frames, steps = len(self._job.names), self._job.steps
         step = steps.index(_STEP.get(self._phase.name, self._phase.name))
-        kept = self._phase.name in ("features", "matches")
-        share = min(1.0, self._count / max(1, self._phase.total)) if kept else 0.0
-        # A further rung of the ladder matches again: what was reached before stays reached.
+        durable = self._phase.name in ("features", "matches")
+        share = min(1.0, self._count / max(1, self._phase.total)) if durable else 0.0
+        # A further attempt matches again, which does not undo earlier progress.
         self._durable = max(self._durable, round((step + share) * frames))
         self._record(self._durable, len(steps) * frames)
 
@@ -124,12 +123,12 @@ _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, threa
 
 
 def run_job(
-    job: Job,
+    job: MappingJob,
     *,
     progress: Progress,
     record: Callable[[int, int], None],
 ) -> None:
-    """Runs a job in a process of its own; its results stand in the ledger.
+    """Runs a job in a process of its own; its results are in the step log.
 
     Args:
         job: what to do, and after how many minutes the process is killed.
@@ -147,29 +146,29 @@ def run_job(
     file = job.out / "job.json"
     job.write(file)
     try:
-        with _started(job, file) as child, Monitor(job, progress, record) as monitor:
+        with _start(job, file) as child, Monitor(job, progress, record) as monitor:
             for event in _events(child):
-                if isinstance(event, protocol.Failed):
+                if isinstance(event, Failed):
                     raise event.error
                 if time.monotonic() > deadline:
-                    raise _too_late(max_minutes, monitor)
+                    raise _timeout_error(max_minutes, monitor)
                 monitor.show(event)
             try:
                 code = child.wait(timeout=max(1.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired as error:  # native code may hang on its way out
-                raise _too_late(max_minutes, monitor) from error
+                raise _timeout_error(max_minutes, monitor) from error
             if code != 0:
-                raise _crashed(job.out / LOG, code, monitor)
+                raise _crash_error(job.out / LOG, code, monitor)
     finally:
         for leftover in (file, job.out / LOCK):
             leftover.unlink(missing_ok=True)
 
 
 @contextmanager
-def _started(job: Job, file: Path) -> Iterator[subprocess.Popen[bytes]]:
+def _start(job: MappingJob, file: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Yields the running process and kills it on leaving, however that happens."""
     threads = str(job.threads)
-    # In the stage's folder, for `python -m` looks for modules in the current one first.
+    # In the stage's folder: `python -m` looks for modules in the current folder first.
     with (job.out / LOG).open("ab") as log, subprocess.Popen(
         [sys.executable, "-m", "recon_cli.sfm.worker", str(file)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, cwd=job.out,
@@ -181,8 +180,8 @@ def _started(job: Job, file: Path) -> Iterator[subprocess.Popen[bytes]]:
             child.kill()
 
 
-def _events(child: subprocess.Popen[bytes]) -> Iterator[protocol.Event | None]:
-    """Yields what the process says until it falls silent, and None whenever a while has passed."""
+def _events(child: subprocess.Popen[bytes]) -> Iterator[Event | None]:
+    """Yields the events of the process until its output ends, and None every POLL_SECONDS."""
     lines: queue.Queue[bytes | None] = queue.Queue()
     assert child.stdout is not None
     stream = child.stdout
@@ -201,22 +200,23 @@ def _events(child: subprocess.Popen[bytes]) -> Iterator[protocol.Event | None]:
             continue
         if line is None:
             return
-        yield protocol.parse(line)
+        yield parse(line)
 
 
-def _too_late(max_minutes: float, monitor: Monitor) -> SfmError:
+def _timeout_error(max_minutes: float, monitor: Monitor) -> SfmError:
     return SfmError(
-        f"The cameras were not found within {max_minutes:g} minutes: it was {monitor.doing}.",
+        f"The cameras were not found within {max_minutes:g} minutes; the last step was "
+        f"{monitor.doing}.",
         hint="Allow more time with --max-minutes (features and matches found so far are kept), or "
-        "make it quicker with fewer frames (recon ingest --frames N) or --max-features 1024.")
+        "use fewer frames (recon ingest --frames N) or --max-features 1024.")
 
 
-def _crashed(log: Path, code: int, monitor: Monitor) -> SfmError:
+def _crash_error(log: Path, code: int, monitor: Monitor) -> SfmError:
     how = f"was ended by {_signal_name(-code)}" if code < 0 else f"stopped with exit code {code}"
     hint = "Run it again: features and matches found so far are kept."
     if code == -signal.SIGKILL:
         hint = (
-            "The system may have been short of memory; try --max-features 1024 or fewer frames "
+            "The system may have run out of memory; try --max-features 1024 or fewer frames "
             "(recon ingest --frames N).")
     return SfmError(
         f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
@@ -231,7 +231,7 @@ def _signal_name(number: int) -> str:
 
 
 def gist(log: Path) -> str:
-    """Returns the last line of a log that tells of an error, else its last line."""
+    """Returns the last line of a log that reports an error, else its last line."""
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _LOG_TAIL))
         text = file.read().decode(errors="replace")

@@ -16,20 +16,19 @@ import cv2
 import numpy as np
 import pycolmap
 
-from recon_cli.sfm.job import Job, Reporter
-from recon_cli.sfm.step_log import Result, fresh_folder, publish
+from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder, publish
 
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 
 
-def undistort(job: Job, report: Reporter) -> Result:
+def undistort(job: MappingJob, report: Reporter) -> Result:
     """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
     model = pycolmap.Reconstruction(job.out / "sparse")
     names = sorted(model.image(i).name for i in model.reg_image_ids())
     masked = [name for name in names if job.masks and (job.masks / name).exists()]
     report.phase("undistorted", 2 * len(names) + len(masked))
     work = fresh_folder(job.undistorting)
-    _undistorted(job, job.frames, names, work)
+    _undistort(job, job.frames, names, work)
     _write_twins(job, names, work)
     _write_masks(job, masked, work)
     cameras = _cameras(pycolmap.Reconstruction(work / SPARSE))
@@ -46,8 +45,8 @@ def _cameras(model: pycolmap.Reconstruction) -> list[dict[str, float]]:
         for index, camera in sorted(model.cameras.items())]
 
 
-def _write_twins(job: Job, names: Sequence[str], work: Path) -> None:
-    """Writes the twins; those of frames that were left as they are become copies, byte by byte."""
+def _write_twins(job: MappingJob, names: Sequence[str], work: Path) -> None:
+    """Writes the denoised twins; those of unchanged frames are copies, byte by byte."""
     changed = [
         name for name in names
         if not filecmp.cmp(job.frames / name, job.denoised / name, shallow=False)
@@ -55,7 +54,7 @@ def _write_twins(job: Job, names: Sequence[str], work: Path) -> None:
     twins = work / TWINS
     twins.mkdir()
     if changed:  # an empty list would mean all
-        _undistorted(job, job.denoised, changed, work / "twins")
+        _undistort(job, job.denoised, changed, work / "twins")
         for name in changed:
             (work / "twins" / IMAGES / name).rename(twins / name)
         shutil.rmtree(work / "twins")
@@ -63,15 +62,15 @@ def _write_twins(job: Job, names: Sequence[str], work: Path) -> None:
         shutil.copyfile(work / IMAGES / name, twins / name)
 
 
-def _write_masks(job: Job, masked: Sequence[str], work: Path) -> None:
+def _write_masks(job: MappingJob, masked: Sequence[str], work: Path) -> None:
     """Writes the masks of masked frames through the same cameras: 255 where a pixel counts.
 
-    A pixel that is made of one that counts and one that does not takes the side of the larger part.
+    A pixel that mixes one that counts and one that does not takes the value of the larger part.
     """
     if job.masks is None or not masked:  # an empty list would mean all
         return
     (work / MASKS).mkdir()
-    _undistorted(job, job.masks, masked, work / "between")
+    _undistort(job, job.masks, masked, work / "between")
     for name in masked:
         data = np.frombuffer((work / "between" / IMAGES / name).read_bytes(), np.uint8)
         gray = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))
@@ -80,7 +79,7 @@ def _write_masks(job: Job, masked: Sequence[str], work: Path) -> None:
     shutil.rmtree(work / "between")
 
 
-def _undistorted(job: Job, source: Path, names: Sequence[str], target: Path) -> None:
+def _undistort(job: MappingJob, source: Path, names: Sequence[str], target: Path) -> None:
     """Writes images/ and sparse/ into `target`, without COLMAP's stereo folder and scripts."""
     pycolmap.undistort_images(
         target, job.out / "sparse", source, list(names), num_threads=job.threads)

@@ -1,16 +1,14 @@
-"""What two images should both show if the model is right, and whether they were found to.
+"""Visual aliasing: two places that look alike and were laid over each other (doppelgangers).
 
-Two places that look alike can be laid over each other without a single match that disagrees: two
-equal doors, seen by images that nothing else ties together. What gives such a model away is what
-was *not* matched: the two groups of cameras now seem to stand in one place and look the same way,
-but all that they have in common is the door. (Zach, Irschara and Bischof 2008 call these missing
-correspondences.)
+Two equal doors, seen by images that nothing else connects, can be merged without a single match
+that disagrees. What gives such a model away is what was *not* matched: the two groups of cameras
+now seem to stand in one place and look the same way, but all they have in common is the door.
+(Zach, Irschara and Bischof 2008 call these missing correspondences.) Halves that are off by a
+degree or by a fiftieth of the extent show as well: COLMAP has dropped the points that fit one of
+them only.
 
-Halves that are off by a degree or by a fiftieth of the extent show as well: COLMAP has dropped the
-points that fit one of them only.
-
-The images are compared by the cells of a grid, not by points, because most points stand on whatever
-is rich in texture, and that may be the very thing that looks alike.
+The images are compared by the cells of a grid, not by points, because most points lie on whatever
+is rich in texture, which may be the very thing that looks alike.
 """
 
 from __future__ import annotations
@@ -23,16 +21,48 @@ import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.sfm import view_graph
-from recon_cli.sfm.evidence import Evidence
+from recon_cli.sfm.evidence import MatchEvidence
 from recon_cli.sfm.view_graph import Cut, Weights
 
+# A point is expected in an image that sees it from nearly the same direction and distance as
+# another: SIFT finds it again there, while at 20 degrees one in six is lost (Lowe 2004, fig. 9).
+# With 15 degrees and 1.5 a good model of a video of low resolution fell from .78 to .66.
+MAX_ANGLE_DEG = 10.0
+MAX_RATIO = 1.3
+# Cells along each side of an image, and points that a cell must expect to count. Of such points 55
+# to 65% were found in good models, so that all six are missed by chance one time in two hundred.
+GRID, MIN_POINTS = 6, 6
+# Points sampled per image, evenly; 1000 are 28 a cell.
+MAX_POINTS = 1000
+# A pair counts where each of the two expects this share of its cells in the other. One of them
+# alone may look through a wall, on which the other one's points then lie.
+MIN_SHARE = 0.25
+MIN_CELLS = 100  # between two groups of images: a handful of pairs
+# Share of the expected cells that must be found between two groups. The least of each model was .93
+# to .98 in photos and walks, .78 in a video of low resolution and .76 where screens changed between
+# the photos of a desk; .11 to .53 where two places with the same poster lay over each other.
+MIN_OVERLAP = 0.65
+MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
 # A group of less than this share of the cameras is not half of a doubled place; a few images that
 # are blurred or show people match badly too.
 MIN_SIDE = 0.1
 
 
 @dataclass(frozen=True)
-class Fold:
+class Overlap:
+    """Cells in which two images should show the same points; symmetric, [N, N] over all images.
+
+    Attributes:
+        expected: cells that should show the same.
+        confirmed: those of them with at least one point that both images see.
+    """
+
+    expected: Weights
+    confirmed: Weights
+
+
+@dataclass(frozen=True)
+class VisualAliasing:
     """The two groups of images that show least of what they should show in common.
 
     Attributes:
@@ -48,30 +78,73 @@ class Fold:
     cells: int
 
 
-def find(evidence: Evidence, overlap: Overlap) -> Fold:
+@dataclass(frozen=True)
+class _Samples:
+    """A sample of S observations: image i sees point p."""
+
+    image: NDArray[np.int64]  # [S]
+    point: NDArray[np.int64]  # [S]
+    cell: NDArray[np.int64]  # [S], counted through all images
+    rays: NDArray[np.float64]  # [S, 3] from the camera to the point, not normalised
+
+
+def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> Overlap:
+    """Returns where the images of a model should show the same, and whether they do.
+
+    Pairs that were never matched are zero.
+    """
+    count = len(evidence.names)
+    row = {name: index for index, name in enumerate(evidence.names)}
+    images = {row[model.image(i).name]: model.image(i) for i in model.reg_image_ids()}
+    positions = np.array([point.xyz for _, point in sorted(model.points3D.items())]).reshape(-1, 3)
+    frames = {index: _in_frame(image, positions) for index, image in sorted(images.items())}
+    samples = _sample(evidence, positions, frames)
+    cells = _cells(samples, np.ones_like(samples.image, np.bool_), count)
+    expected, confirmed = np.zeros((count, count)), np.zeros((count, count))
+    for other, frame in frames.items():
+        likely = _likely(samples, positions, frame, evidence.centers[other], other)
+        should = _cells(samples, likely, count)
+        does = should & _cells(samples, likely & evidence.seen[other][samples.point], count, 1)
+        expected[:, other], confirmed[:, other] = should.sum(axis=1), does.sum(axis=1)
+    share = expected / np.maximum(cells.sum(axis=1), 1)[:, None]
+    mutual = (np.minimum(share, share.T) >= MIN_SHARE) & evidence.tried
+    return Overlap(
+        np.where(mutual, expected + expected.T, 0.0),
+        np.where(mutual, confirmed + confirmed.T, 0.0))
+
+
+def is_confirmed(
+    expected: NDArray[np.float64],  # [C]
+    confirmed: NDArray[np.float64],  # [C]
+) -> NDArray[np.bool_]:  # [C]
+    """Returns across which of C cuts enough cells should look the same, and do."""
+    return np.asarray((expected >= MIN_CELLS) & (confirmed >= MIN_OVERLAP * expected))
+
+
+def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
     """Returns the cut of the cameras across which the least share of the cells is found."""
     rows = np.flatnonzero(evidence.registered)
     inner = np.ix_(rows, rows)
-    expected, found = overlap.expected[inner], overlap.found[inner]
+    expected, confirmed = overlap.expected[inner], overlap.confirmed[inner]
     cut, share = None, np.inf
     for order in (
-        *view_graph.disputed_orders(found, expected), *view_graph.loose_orders(expected),
+        *view_graph.disputed_orders(confirmed, expected), *view_graph.loose_orders(expected),
         *view_graph.loose_orders(evidence.shared[inner].astype(np.float64)),
     ):
         cells = view_graph.sweep(expected, order)
         shares = np.where(
             (cells >= MIN_CELLS) & _even(len(rows)),
-            view_graph.sweep(found, order) / np.maximum(cells, 1), np.inf)
+            view_graph.sweep(confirmed, order) / np.maximum(cells, 1), np.inf)
         if shares.min() < share:
             cut, share = order[:int(shares.argmin()) + 1], float(shares.min())
     if cut is None:
         reason = f"no two groups of cameras should show the same in {MIN_CELLS} places"
-        return Fold(None, reason, ((), ()), 0)
+        return VisualAliasing(None, reason, ((), ()), 0)
     side = np.zeros(len(rows), np.bool_)
     side[cut] = True
     first, second = sorted(
         (tuple(evidence.names[row] for row in rows[part]) for part in (side, ~side)), key=len)
-    return Fold(share, "", (first, second), int(view_graph.across(expected, side)))
+    return VisualAliasing(share, "", (first, second), int(view_graph.across(expected, side)))
 
 
 def _even(count: int) -> Cut:
@@ -80,89 +153,13 @@ def _even(count: int) -> Cut:
     return np.asarray(np.minimum(head, count - head) > MIN_SIDE * count)
 
 
-# A point is expected in another image when seen there from nearly the same direction and distance,
-# where SIFT finds it again: at 20 degrees one in six is lost (Lowe 2004, fig. 9). With 15 degrees
-# and 1.5 a good model of a video of low resolution fell from .78 to .66 (see MIN_OVERLAP).
-MAX_ANGLE_DEG = 10.0
-MAX_RATIO = 1.3
-# Cells along each side of an image, and points that one must expect to count. Of such points 55 to
-# 65% were found in good models, so that all six are missed by chance one time in two hundred.
-GRID, MIN_POINTS = 6, 6
-# Points an image stands for, evenly taken; 1000 are 28 a cell.
-MAX_POINTS = 1000
-# A pair counts where each of the two expects this share of its cells in the other. One of them
-# alone may look through a wall, on which the other one's points then lie.
-MIN_SHARE = 0.25
-MIN_CELLS = 100  # between two groups of images: a handful of pairs
-# Share of the expected cells that must be found between two groups. The least of each model was .93
-# to .98 in photos and walks, .78 in a video of low resolution and .76 where screens changed between
-# the photos of a desk; .11 to .53 where two places with the same poster lay over each other.
-MIN_OVERLAP = 0.65
-MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
-
-
-@dataclass(frozen=True)
-class Overlap:
-    """Cells in which two images should show the same points; symmetric, [N, N] over all images.
-
-    Attributes:
-        expected: cells that should show the same.
-        found: those of them with at least one point that both images do see.
-    """
-
-    expected: Weights
-    found: Weights
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """Observations that stand for all: image i sees point p, S of them."""
-
-    image: NDArray[np.int64]  # [S]
-    point: NDArray[np.int64]  # [S]
-    cell: NDArray[np.int64]  # [S], counted through all images
-    rays: NDArray[np.float64]  # [S, 3] from the camera to the point, not normalised
-
-
-def measure(model: pycolmap.Reconstruction, evidence: Evidence) -> Overlap:
-    """Returns where the images of a model should show the same, and whether they do.
-
-    Pairs that were never matched with each other say nothing and are zero.
-    """
-    count = len(evidence.names)
-    row = {name: index for index, name in enumerate(evidence.names)}
-    images = {row[model.image(i).name]: model.image(i) for i in model.reg_image_ids()}
-    positions = np.array([point.xyz for _, point in sorted(model.points3D.items())]).reshape(-1, 3)
-    frames = {index: _in_frame(image, positions) for index, image in sorted(images.items())}
-    samples = _sampled(evidence, positions, frames)
-    cells = _cells(samples, np.ones_like(samples.image, np.bool_), count)
-    expected, found = np.zeros((count, count)), np.zeros((count, count))
-    for other, frame in frames.items():
-        likely = _likely(samples, positions, frame, evidence.centers[other], other)
-        should = _cells(samples, likely, count)
-        does = should & _cells(samples, likely & evidence.seen[other][samples.point], count, 1)
-        expected[:, other], found[:, other] = should.sum(axis=1), does.sum(axis=1)
-    share = expected / np.maximum(cells.sum(axis=1), 1)[:, None]
-    mutual = (np.minimum(share, share.T) >= MIN_SHARE) & evidence.tried
-    return Overlap(
-        np.where(mutual, expected + expected.T, 0.0), np.where(mutual, found + found.T, 0.0))
-
-
-def borne_out(
-    expected: NDArray[np.float64],  # [C]
-    found: NDArray[np.float64],  # [C]
-) -> NDArray[np.bool_]:  # [C]
-    """Returns across which of C cuts enough should look the same, and does."""
-    return np.asarray((expected >= MIN_CELLS) & (found >= MIN_OVERLAP * expected))
-
-
 def _in_frame(
     image: pycolmap.Image,
     positions: NDArray[np.float64],  # [M, 3]
 ) -> NDArray[np.float64]:  # [M, 2]
     """Returns where points lie in an image, 0 to 1 across it and down it; NaN outside.
 
-    Distortion is left out, because its polynomial brings far points back into the frame: the frame
+    Distortion is ignored, because its polynomial brings far points back into the image: its frame
     is the rectangle that the undistorted middles of its edges span.
     """
     camera = image.camera
@@ -170,15 +167,15 @@ def _in_frame(
     left, right, top, bottom = np.asarray(camera.cam_from_img(np.array([
         [0, height / 2], [width, height / 2], [width / 2, 0], [width / 2, height]], np.float64)))
     low, high = np.array([left[0], top[1]]), np.array([right[0], bottom[1]])
-    seen = np.asarray(image.cam_from_world() * positions)
-    front = np.where(seen[:, 2] > 0, seen[:, 2], np.nan)
-    place = (seen[:, :2] / front[:, None] - low) / (high - low)
+    local = np.asarray(image.cam_from_world() * positions)
+    front = np.where(local[:, 2] > 0, local[:, 2], np.nan)
+    place = (local[:, :2] / front[:, None] - low) / (high - low)
     inside = ((place > MARGIN) & (place < 1 - MARGIN)).all(axis=1)
     return np.where(inside[:, None], place, np.nan)
 
 
-def _sampled(
-    evidence: Evidence,
+def _sample(
+    evidence: MatchEvidence,
     positions: NDArray[np.float64],  # [M, 3]
     frames: dict[int, NDArray[np.float64]],
 ) -> _Samples:
@@ -190,8 +187,9 @@ def _sampled(
         image.append(np.full(len(some), index))
         point.append(some)
         cell.append((index * GRID + line) * GRID + column)
-    images, points = _joined(image), _joined(point)
-    return _Samples(images, points, _joined(cell), positions[points] - evidence.centers[images])
+    images, points = _concatenate(image), _concatenate(point)
+    rays = positions[points] - evidence.centers[images]
+    return _Samples(images, points, _concatenate(cell), rays)
 
 
 def _likely(
@@ -225,5 +223,5 @@ def _cells(
     return np.asarray(held.reshape(count, -1) >= least)
 
 
-def _joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+def _concatenate(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.concatenate([np.zeros(0, np.int64), *parts])

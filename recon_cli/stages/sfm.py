@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from recon_cli.capture.pace import paced
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError
@@ -18,10 +17,9 @@ from recon_cli.io import frames as store
 from recon_cli.io.frames import FrameList
 from recon_cli.io.posed import POSES, read_poses
 from recon_cli.sfm import process
-from recon_cli.sfm.checks import listed
-from recon_cli.sfm.job import CameraGroup, Job
+from recon_cli.sfm.checks import list_names
+from recon_cli.sfm.job import CameraGroup, MappingJob, StepLog
 from recon_cli.sfm.measure import parse_place
-from recon_cli.sfm.step_log import Ledger
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
 
 APART = 1e6  # seconds from clip to clip: the camera may have gone anywhere meanwhile
@@ -44,7 +42,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     ingest, denoise = inputs.folders["ingest"].resolve(), inputs.folders["denoise"].resolve()
     frames = store.read_frame_list(ingest)
     poses = ingest / POSES
-    job = Job(
+    job = MappingJob(
         frames=ingest / store.FOLDER,
         denoised=denoise / store.FOLDER,
         out=out.resolve(),
@@ -69,7 +67,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
-    process.run_job(job, progress=ctx.progress, record=paced(ctx.record))
+    process.run_job(job, progress=ctx.progress, record=ctx.record)
     summary = _summary(frames, job)
     _report(summary, ctx)
     return summary
@@ -89,19 +87,19 @@ def _times(frames: FrameList) -> dict[str, float]:
             if frame.time_seconds is not None}
 
 
-def _check_frames(job: Job) -> None:
+def _check_frames(job: MappingJob) -> None:
     for verb, folder in (("ingest", job.frames), ("denoise", job.denoised)):
         missing = [name for name in job.names if not (folder / name).is_file()]
         if missing:
             raise FormatError(
-                f"{folder} lacks {len(missing)} of {len(job.names)} frames: {listed(missing)}.",
+                f"{folder} lacks {len(missing)} of {len(job.names)} frames: {list_names(missing)}.",
                 hint=f"Run `recon {verb} --again`.")
 
 
-def _summary(frames: FrameList, job: Job) -> SfmSummary:
+def _summary(frames: FrameList, job: MappingJob) -> SfmSummary:
     results: dict[str, dict[str, Any]] = {}
     for step in job.steps:
-        result = Ledger(job.out).result(step)
+        result = StepLog(job.out).result(step)
         assert result is not None, f"the mapping process ended without {step}"
         results[step] = result
     model = results["model"]
@@ -153,11 +151,11 @@ def _left_out(summary: SfmSummary) -> Iterator[str]:
         yield f"{name} was taken out of the model: {reason}."
     if missing and not summary.lines:  # the verdict names them, and why
         yield (f"{len(missing)} of {summary.frames} frames have no camera and are left out: "
-               f"{listed(missing)}.")
+               f"{list_names(missing)}.")
     if held_out:
         yield (f"{len(held_out)} frames without a camera were held out and so cannot be scored: "
-               f"{listed(held_out)}.")
+               f"{list_names(held_out)}.")
     if summary.apart:
-        parts = "; ".join(f"{len(part)} frames ({listed(part, 3)})" for part in summary.apart)
+        parts = "; ".join(f"{len(part)} frames ({list_names(part, 3)})" for part in summary.apart)
         yield (f"The capture fell apart: the largest model, of {summary.models[0]} frames, is "
                f"kept; left aside are {parts}.")

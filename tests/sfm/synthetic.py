@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 
-from recon_cli.sfm.job import CameraGroup, Job
+from recon_cli.sfm.job import CameraGroup, MappingJob
 
 
 def make_capture(folder, *, frames=20, cameras=1, points=300, seed=0):
@@ -22,7 +22,7 @@ def make_capture(folder, *, frames=20, cameras=1, points=300, seed=0):
     with pycolmap.Database.open(folder / "database.db") as database:
         truth = pycolmap.synthesize_dataset(options, database)
     names = tuple(sorted(truth.image(i).name for i in truth.reg_image_ids()))
-    job = Job(
+    job = MappingJob(
         frames=folder / "frames", denoised=folder / "frames", out=folder,
         groups=(CameraGroup(names, 1024, 768),), masks=None, poses=None, pose_use="keep",
         given_points=False, pairs="auto", max_features=2000, min_registered=0.5, accept_weak=False,

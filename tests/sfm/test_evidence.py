@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from made_model import MadeModel, along, moved, wall
 
-from recon_cli.sfm.evidence import MAX_ERROR, gather
+from recon_cli.sfm.evidence import MAX_ERROR, gather_evidence
 
 
 def made(**changes) -> MadeModel:
@@ -11,7 +11,7 @@ def made(**changes) -> MadeModel:
 
 def test_exact_matches_all_agree_and_points_are_counted_once_per_image(tmp_path):
     world = made()
-    found = gather(world.model(), world.write_database(tmp_path / "db"), world.names)
+    found = gather_evidence(world.model(), world.write_database(tmp_path / "db"), world.names)
     assert found.pairs.tolist() == [[0, 1], [0, 2], [1, 2]]
     assert (found.agreeing == found.matches).all()
     assert (found.matches == found.shared[found.pairs[:, 0], found.pairs[:, 1]]).all()
@@ -33,13 +33,13 @@ def test_a_match_agrees_up_to_the_error_at_which_it_was_accepted(pixels, agree, 
     turned = moved(0, 0, 0)
     turned.rotation = type(turned.rotation)(np.array([np.sin(angle / 2), 0, 0, np.cos(angle / 2)]))
     image.frame.rig_from_world = turned * image.cam_from_world()
-    found = gather(model, world.write_database(tmp_path / "db"), world.names)
+    found = gather_evidence(model, world.write_database(tmp_path / "db"), world.names)
     assert found.agreeing[0] == (found.matches[0] if agree else 0)
 
 
 def test_images_without_a_camera_keep_their_matches_and_agree_with_nothing(tmp_path):
     world = made(unregistered=frozenset({1}))
-    found = gather(world.model(), world.write_database(tmp_path / "db"), world.names)
+    found = gather_evidence(world.model(), world.write_database(tmp_path / "db"), world.names)
     assert found.placed.tolist() == [False, True, False]
     assert (found.matches > 0).all()
     assert found.agreeing[[0, 2]].tolist() == [0, 0]
@@ -50,7 +50,8 @@ def test_images_without_a_camera_keep_their_matches_and_agree_with_nothing(tmp_p
 def test_the_order_of_the_names_decides_not_that_of_the_database(tmp_path):
     world = made()
     model, database = world.model(), world.write_database(tmp_path / "db")
-    forward, back = (gather(model, database, names) for names in (world.names, world.names[::-1]))
+    forward, back = (
+        gather_evidence(model, database, names) for names in (world.names, world.names[::-1]))
     assert back.pairs.tolist() == forward.pairs.tolist()
     assert back.agreeing.tolist() == forward.agreeing[::-1].tolist()
     assert back.keypoints.tolist() == forward.keypoints[::-1].tolist()
@@ -59,13 +60,13 @@ def test_the_order_of_the_names_decides_not_that_of_the_database(tmp_path):
 def test_a_pair_that_was_matched_in_vain_counts_as_tried(tmp_path):
     world = MadeModel(
         np.concatenate([wall(-3, 4, count=400), wall(97, 103, count=400)]), along([0.0, 0.5, 100]))
-    found = gather(world.model(), world.write_database(tmp_path / "db"), world.names)
+    found = gather_evidence(world.model(), world.write_database(tmp_path / "db"), world.names)
     assert found.pairs.tolist() == [[0, 1]]
     assert found.tried.sum() == 6
 
 
 def test_only_pairs_that_were_matched_count_as_tried(tmp_path):
     world = made(reach=1)
-    found = gather(world.model(), world.write_database(tmp_path / "db"), world.names)
+    found = gather_evidence(world.model(), world.write_database(tmp_path / "db"), world.names)
     assert found.tried.tolist() == [
         [False, True, False], [True, False, True], [False, True, False]]

@@ -1,13 +1,32 @@
+"""The job, the log of finished steps and the events survive their way through files."""
+
+import errno
+import io
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
+from recon_cli.errors import FormatError, SfmError, WorkspaceError
 from recon_cli.scene.camera import Lens
-from recon_cli.sfm.job import CameraGroup, Job
-from recon_cli.sfm.step_log import STEPS
+from recon_cli.sfm.job import (
+    LOG_FILE,
+    STEPS,
+    CameraGroup,
+    Done,
+    Failed,
+    MappingJob,
+    Phase,
+    Reporter,
+    StepLog,
+    fresh_folder,
+    parse,
+    publish,
+)
 
 
 def job(count, pairs="auto"):
-    return Job(
+    return MappingJob(
         frames=Path("/in/frames"), denoised=Path("/in/denoised"), out=Path("/out"),
         groups=(CameraGroup(tuple(f"{index:06d}.png" for index in range(count)), 600, 340),),
         masks=None, poses=None, pose_use="keep", given_points=False, pairs=pairs,
@@ -24,7 +43,7 @@ def test_what_is_written_is_read_back(tmp_path):
         CameraGroup(("b.png",), 80, 60, lens=lens)))
     assert told.names == ("a.png", "b.png", "c.png")
     told.write(tmp_path / "job.json")
-    assert Job.read(tmp_path / "job.json") == told
+    assert MappingJob.read(tmp_path / "job.json") == told
 
 
 def test_poses_and_points_that_are_kept_leave_nothing_to_be_found():
@@ -43,3 +62,100 @@ def test_poses_that_are_ignored_are_not_known():
     assert given.known_poses
     assert not replace(given, pose_use="ignore").known_poses
     assert replace(given, pose_use="ignore").steps == STEPS
+
+
+@pytest.fixture
+def finished(tmp_path):
+    """A folder in which all steps are finished."""
+    ledger = StepLog(tmp_path)
+    for step in ("features", "matches"):
+        ledger.finish(step, {"rows": 3})
+    for step in ("model", "sparse", "undistorted"):
+        (tmp_path / step / "images").mkdir(parents=True)
+        (tmp_path / step / "images" / "a.bin").write_bytes(b"12345")
+        ledger.finish(step, {"points": 7}, tmp_path / step)
+    return tmp_path
+
+
+def done(folder):
+    ledger = StepLog(folder)
+    return [step for step in STEPS if ledger.result(step) is not None]
+
+
+def test_results_are_read_back_by_the_next_process(finished):
+    assert StepLog(finished).result("features") == {"rows": 3}
+    assert StepLog(finished).result("undistorted") == {"points": 7}
+
+
+def test_an_empty_folder_has_nothing_finished(tmp_path):
+    assert done(tmp_path) == []
+
+
+def test_a_missing_file_takes_its_step_back(finished):
+    (finished / "sparse" / "images" / "a.bin").unlink()
+    assert done(finished) == ["features", "matches", "model", "undistorted"]
+
+
+def test_a_file_cut_short_takes_its_step_back(finished):
+    (finished / "undistorted" / "images" / "a.bin").write_bytes(b"123")
+    assert done(finished) == ["features", "matches", "model", "sparse"]
+
+
+def test_files_without_a_note_prove_nothing(finished):
+    (finished / LOG_FILE).unlink()
+    assert done(finished) == []
+
+
+def test_a_note_that_cannot_be_read_proves_nothing(finished):
+    (finished / LOG_FILE).write_text('{"features": ')
+    assert done(finished) == []
+
+
+def test_what_builds_on_a_forgotten_step_is_forgotten_too(finished):
+    StepLog(finished).forget_from("matches")
+    assert done(finished) == ["features"]
+
+
+def test_publishing_replaces_what_an_interrupted_run_left(tmp_path):
+    target = tmp_path / "sparse"
+    (target / "old").mkdir(parents=True)
+    work = fresh_folder(tmp_path / "sparse.partial")
+    (work / "new.bin").write_bytes(b"1")
+    publish(work, target)
+    assert [path.name for path in target.iterdir()] == ["new.bin"]
+    assert not work.exists()
+
+
+def test_a_fresh_folder_is_empty(tmp_path):
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "left.png").write_bytes(b"1")
+    assert list(fresh_folder(tmp_path / "work").iterdir()) == []
+
+
+def sent(say):
+    """What the parent understands of what `say` told a reporter."""
+    stream = io.BytesIO()
+    say(Reporter(stream))
+    line, = stream.getvalue().splitlines()
+    return parse(line)
+
+
+def test_phases_and_counts_arrive():
+    assert sent(lambda report: report.phase("matches", 78, done=3)) == Phase("matches", 78, 3)
+    assert sent(lambda report: report.done(5)) == Done(5)
+
+
+@pytest.mark.parametrize("kind", [SfmError, FormatError, WorkspaceError])
+def test_an_error_arrives_as_what_it_was(kind):
+    event = sent(lambda report: report.fail(kind("No features.\nReally.", hint="Try again.")))
+    assert isinstance(event, Failed)
+    assert type(event.error) is kind
+    assert (event.error.message, event.error.hint) == ("No features.\nReally.", "Try again.")
+
+
+def test_a_full_disk_arrives_as_a_full_disk():
+    full = OSError(errno.ENOSPC, "No space left on device", "/out/sparse")
+    event = sent(lambda report: report.fail(full))
+    assert isinstance(event.error, OSError)
+    assert event.error.errno == errno.ENOSPC
+    assert event.error.filename == "/out/sparse"

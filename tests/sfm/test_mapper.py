@@ -63,17 +63,17 @@ def test_known_intrinsics_stay_as_they_are(tmp_path):
 def test_the_global_mapper_finds_the_cameras_and_leaves_the_database_alone(tmp_path):
     job, truth = make_capture(tmp_path)
     before = job.database.read_bytes()
-    model, = mapper.globally(job, Reporter(io.BytesIO()))
+    model, = mapper.map_globally(job, Reporter(io.BytesIO()))
     assert model.num_reg_images() == 20
     assert center_error(model, truth) < 1e-2
     assert job.database.read_bytes() == before
-    assert list(job.rungs.iterdir()) == []
+    assert list(job.attempts.iterdir()) == []
 
 
 def test_a_model_is_extended_by_the_images_that_fit(tmp_path):
     job, truth = make_capture(tmp_path)
-    whole = mapper.extended(job, part(truth, job.names[:15]))
-    assert mapper.names(whole) == list(job.names)
+    whole = mapper.extend_model(job, part(truth, job.names[:15]))
+    assert mapper.registered_names(whole) == list(job.names)
     assert center_error(whole, truth) < 1e-3
 
 

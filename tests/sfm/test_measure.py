@@ -96,7 +96,7 @@ def test_a_pixel_outside_of_the_image_is_refused():
 def test_a_point_behind_the_camera_is_not_seen():
     points, viewmats = scene()
     request = ScaleBetween("a.png:300,200", "1,1,1", 1.0)
-    with pytest.raises(ConfigError, match="No sparse point"):
+    with pytest.raises(ConfigError, match="no sparse point"):
         measure(request, points[3:], viewmats, dict.fromkeys(viewmats, PINHOLE))
 
 

@@ -1,12 +1,23 @@
+"""What is found about good and broken models."""
+
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from made_model import MadeModel, along, moved, wall
+from made_model import WIDTH, MadeModel, along, moved, wall
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm.evidence import gather
-from recon_cli.sfm.verdict import Verdict, check_weak_link, examine
+from recon_cli.sfm.checks import MAX_SHIFT, describe_shifted_centres
+from recon_cli.sfm.evidence import gather_evidence
+from recon_cli.sfm.verdict import (
+    Histogram,
+    Verdict,
+    check_weak_link,
+    examine,
+    find_jumps,
+    unregistered_reasons,
+)
 
 
 def verdict_on(made: MadeModel, folder, **known) -> Verdict:
@@ -44,13 +55,13 @@ def doubled_place() -> MadeModel:
         landmark=lambda _, point: int(looks[point]))
 
 
-def test_a_model_that_all_matches_bear_out_is_trusted(tmp_path):
+def test_a_model_that_all_matches_confirm_is_trusted(tmp_path):
     verdict = verdict_on(walk(), tmp_path)
     assert verdict.trusted
     assert verdict.problems == ()
-    assert verdict.weak_link.share == 1
-    assert verdict.fold.share == 1
-    assert (verdict.astray, verdict.jumps, verdict.unregistered) == ((), (), {})
+    assert verdict.weakest_cut.share == 1
+    assert verdict.aliasing.share == 1
+    assert (verdict.outliers, verdict.jumps, verdict.unregistered) == ((), (), {})
     assert [len(part) for part in verdict.model_parts] == [16]
     check_weak_link(verdict, accept=False)
 
@@ -59,9 +70,9 @@ def test_two_good_halves_set_wrongly_to_each_other_are_found(tmp_path):
     made = broken_walk()
     verdict = verdict_on(made, tmp_path)
     assert not verdict.trusted
-    assert verdict.weak_link.share is not None
-    assert verdict.weak_link.share < 0.1
-    assert sorted(verdict.weak_link.sides) == [tuple(made.names[:8]), tuple(made.names[8:])]
+    assert verdict.weakest_cut.share is not None
+    assert verdict.weakest_cut.share < 0.1
+    assert sorted(verdict.weakest_cut.sides) == [tuple(made.names[:8]), tuple(made.names[8:])]
     assert len(verdict.model_parts) == 1, "a few points still tie the halves"
 
 
@@ -77,10 +88,10 @@ def test_a_broken_model_is_refused_with_the_way_out_unless_it_is_accepted(tmp_pa
 def test_two_places_laid_over_each_other_are_found_though_every_match_agrees(tmp_path):
     made = doubled_place()
     verdict = verdict_on(made, tmp_path)
-    assert verdict.weak_link.share == 1
-    assert verdict.fold.share is not None
-    assert verdict.fold.share < 0.5
-    assert sorted(verdict.fold.sides) == [tuple(made.names[:6]), tuple(made.names[6:])]
+    assert verdict.weakest_cut.share == 1
+    assert verdict.aliasing.share is not None
+    assert verdict.aliasing.share < 0.5
+    assert sorted(verdict.aliasing.sides) == [tuple(made.names[:6]), tuple(made.names[6:])]
     with pytest.raises(SfmError, match="look alike"):
         check_weak_link(verdict, accept=False)
 
@@ -94,7 +105,7 @@ def test_places_that_look_alike_do_not_speak_against_a_right_model(tmp_path):
     looks[3200:] = looks[1600:3200]
     made = MadeModel(points, along(np.arange(51) * 0.4), looks=looks)
     model, database = made.model(), made.write_database(tmp_path / "database.db")
-    evidence = gather(model, database, made.names)
+    evidence = gather_evidence(model, database, made.names)
     middle = (evidence.pairs < 25).sum(axis=1) == 1
     assert evidence.agreeing[middle].sum() < 0.5 * evidence.matches[middle].sum()
     verdict = examine(model, database, made.names)
@@ -106,9 +117,9 @@ def test_one_wrong_camera_is_named_and_its_neighbours_are_not(tmp_path):
         motions={5: moved(3, 3, 0)},
         landmark=lambda image, point: point if point < 60 else (image == 5, point))
     verdict = verdict_on(made, tmp_path)
-    assert [item.name for item in verdict.astray] == [made.names[5]]
-    assert verdict.astray[0].share < 0.1
-    assert verdict.weak_link.share == 1
+    assert [item.name for item in verdict.outliers] == [made.names[5]]
+    assert verdict.outliers[0].share < 0.1
+    assert verdict.weakest_cut.share == 1
     assert not verdict.trusted
     assert made.names[5] in verdict.problems[0]
 
@@ -135,7 +146,7 @@ def test_parts_that_share_no_point_are_a_problem(tmp_path):
     verdict = verdict_on(made, tmp_path)
     assert verdict.model_parts == (tuple(made.names[:10]), tuple(made.names[10:]))
     assert [len(part) for part in verdict.match_parts] == [16]
-    assert any("2 parts of 10, 6 cameras" in problem for problem in verdict.problems)
+    assert any("2 parts, of 10, 6 cameras" in problem for problem in verdict.problems)
 
 
 def test_images_without_a_camera_have_a_reason(tmp_path):
@@ -155,17 +166,18 @@ def test_images_without_a_camera_have_a_reason(tmp_path):
 def test_two_cameras_are_too_few_to_tell(tmp_path):
     made = MadeModel(wall(-4, 4, count=20), along([0.0, 0.5]))
     verdict = verdict_on(made, tmp_path)
-    assert verdict.weak_link.share is None
-    assert "30 verified matches" in verdict.weak_link.reason
-    assert verdict.fold.share is None
+    assert verdict.weakest_cut.share is None
+    assert "30 verified matches" in verdict.weakest_cut.reason
+    assert verdict.aliasing.share is None
     check_weak_link(verdict, accept=False)
 
 
-def test_a_verdict_comes_back_from_a_file_as_it_was(tmp_path):
-    verdict = verdict_on(broken_walk(), tmp_path)
-    text = json.dumps(verdict.to_json(), allow_nan=False)
-    assert json.loads(text)["trusted"] is False
-    assert Verdict.from_json(json.loads(text)) == verdict
+def test_the_keys_of_a_verdict_on_disk_stay(tmp_path):
+    value = json.loads(json.dumps(verdict_on(broken_walk(), tmp_path).to_json(), allow_nan=False))
+    assert list(value) == [
+        "images", "registered", "model_parts", "match_parts", "weak_link", "fold", "astray",
+        "unregistered", "jumps", "keypoints", "points", "neighbours", "problems", "trusted"]
+    assert value["trusted"] is False
 
 
 def test_the_same_model_gets_the_same_verdict_twice(tmp_path):
@@ -198,5 +210,122 @@ def test_a_model_without_cameras_cannot_be_told(tmp_path):
     verdict = verdict_on(made, tmp_path)
     assert (verdict.registered, verdict.model_parts) == (0, ())
     assert len(verdict.unregistered) == 16
-    assert verdict.weak_link.share is None
+    assert verdict.weakest_cut.share is None
     assert len(verdict.lines()) == 7, "five of the sixteen are listed"
+
+
+def capture(keypoints, pairs=(), matches=()):
+    """Images of which the first two have a camera."""
+    count = len(keypoints)
+    return SimpleNamespace(
+        names=tuple("abcd"[:count]), registered=np.arange(count) < 2,
+        keypoints=np.array(keypoints), pairs=np.array(pairs, np.int64).reshape(-1, 2),
+        matches=np.array(matches, np.int64))
+
+
+def test_the_sharpness_of_the_others_decides_what_is_blurred():
+    evidence = capture([900, 900, 900])
+    assert unregistered_reasons(evidence, {"a": 50.0, "b": 60.0, "c": 20.0}) == {
+        "c": "blurred: sharpness 20, 50 is usual"}
+    assert "no overlap" in unregistered_reasons(evidence, {"a": 50.0, "b": 60.0, "c": 40.0})["c"]
+
+
+def test_an_image_that_matches_another_room_is_not_called_blurred_alone():
+    evidence = capture([900] * 4, [[0, 1], [2, 3]], [300, 300])
+    assert unregistered_reasons(evidence, {"a": 50.0, "b": 60.0, "c": 20.0, "d": 61.0})["c"] == (
+        "no overlap: no verified match with an image that has a camera, only with 1 that have "
+        "none; sharpness 20, 55 is usual")
+
+
+def test_an_image_of_a_bare_wall_has_too_few_features():
+    assert unregistered_reasons(capture([900, 900, 40]), {}) == {
+        "c": "too few features: 40 keypoints"}
+
+
+def test_an_image_that_matches_nothing_has_no_overlap():
+    assert unregistered_reasons(capture([900] * 3, [[0, 1]], [300]), {"c": None}) == {
+        "c": "no overlap: no verified match with an image that has a camera"}
+
+
+def test_an_image_that_matches_is_said_to_match():
+    reasons = unregistered_reasons(capture([900] * 3, [[0, 1], [0, 2], [1, 2]], [300, 20, 30]), {})
+    assert reasons == {"c": "matched but not placed: 50 matches to 2 images that have a camera"}
+
+
+def path(centers, names=None):
+    count = len(centers)
+    return SimpleNamespace(
+        names=tuple(names or [f"{index:06d}.png" for index in range(count)]),
+        registered=np.ones(count, bool),
+        centers=np.column_stack([centers, np.zeros((count, 2))]))
+
+
+def test_a_step_far_longer_than_those_around_it_is_a_jump():
+    jump, = find_jumps(path([*range(10), *range(29, 40)]), {})
+    assert (jump.before, jump.after) == ("000009.png", "000010.png")
+    assert jump.ratio == pytest.approx(20)
+
+
+def test_a_walk_that_speeds_up_slowly_has_no_jump():
+    assert find_jumps(path(1.15 ** np.arange(40)), {}) == ()
+
+
+def test_a_long_step_over_a_long_time_is_no_jump():
+    names = [f"{index:06d}.png" for index in [*range(10), *range(29, 40)]]
+    assert find_jumps(path([*range(10), *range(29, 40)], names), {}) == ()
+
+
+def test_photos_without_times_or_numbers_say_nothing_of_steps():
+    names = [f"photo_{index:02d}.png" for index in range(21)]
+    centers = [*range(10), *range(29, 40)]
+    assert find_jumps(path(centers, names), {}) == ()
+    assert find_jumps(path(centers, names), dict.fromkeys(names)) == ()
+    times = {name: float(index) for index, name in enumerate(names)}
+    assert len(find_jumps(path(centers, names), times)) == 1
+
+
+def test_the_times_set_the_order():
+    names = [f"{index:06d}.png" for index in range(20)]
+    times = {name: 19.0 - index for index, name in enumerate(names)}
+    assert find_jumps(path(range(20), names), times) == ()
+
+
+def test_a_few_cameras_have_no_usual_step():
+    assert find_jumps(path([0, 1, 2, 90]), {}) == ()
+
+
+def test_every_count_falls_into_one_of_ten_bins():
+    histogram = Histogram.of(np.array([0, 9, 10, 99, 99]))
+    assert histogram.edges == (0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100)
+    assert histogram.counts == (2, 1, 0, 0, 0, 0, 0, 0, 0, 2)
+    assert histogram.median == 10
+
+
+def test_no_counts_are_an_empty_histogram():
+    histogram = Histogram.of(np.zeros(0, np.int64))
+    assert sum(histogram.counts) == 0
+    assert histogram.median == 0
+
+
+def shifted(made, share):
+    """The model with its principal point moved sideways by a share of the image's width."""
+    model = made.model()
+    camera = model.camera(1)
+    camera.principal_point_x += share * WIDTH
+    return model
+
+
+def test_a_lens_that_stays_near_where_it_began_is_not_bent(tmp_path):
+    made = walk()
+    database = made.write_database(tmp_path / "database.db")
+    assert describe_shifted_centres(made.model(), database) == []
+    assert describe_shifted_centres(shifted(made, 0.9 * MAX_SHIFT), database) == []
+
+
+def test_a_model_whose_lens_went_far_is_not_trusted_but_not_refused(tmp_path):
+    made = walk()
+    database = made.write_database(tmp_path / "database.db")
+    verdict = examine(shifted(made, -0.11), database, made.names)
+    assert not verdict.trusted
+    assert "The principal point of camera 1 moved by 11%" in verdict.problems[-1]
+    check_weak_link(verdict, accept=False)

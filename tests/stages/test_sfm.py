@@ -15,7 +15,7 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images, read_scene
 from recon_cli.io.frames import read_png
 from recon_cli.sfm import database
-from recon_cli.sfm.step_log import STEPS
+from recon_cli.sfm.job import STEPS
 from recon_cli.workspace.atomic import clear_leftovers
 from recon_cli.workspace.summaries import SfmSummary
 

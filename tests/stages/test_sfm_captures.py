@@ -9,7 +9,7 @@ from sfm_inputs import run, texture, write_inputs
 
 from recon_cli.errors import SfmError
 from recon_cli.io.frames import Frame, FrameList, Group
-from recon_cli.sfm.outlier_cameras import jumps
+from recon_cli.sfm.verdict import find_jumps
 from recon_cli.stages import sfm
 
 
@@ -108,5 +108,5 @@ def test_from_clip_to_clip_the_camera_may_be_anywhere():
     centers[:, 0] = [*clips[0], *clips[1]]
     evidence = SimpleNamespace(
         names=names, registered=np.ones(len(names), bool), centers=centers)
-    assert jumps(evidence, sfm._times(listed)) == ()
-    assert jumps(evidence, {frame.name: frame.time_seconds for frame in listed.frames})
+    assert find_jumps(evidence, sfm._times(listed)) == ()
+    assert find_jumps(evidence, {frame.name: frame.time_seconds for frame in listed.frames})

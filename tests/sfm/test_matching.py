@@ -1,3 +1,5 @@
+"""Features, the choice of pairs, and their matching."""
+
 import io
 import sqlite3
 from dataclasses import replace
@@ -13,8 +15,14 @@ from recon_cli.errors import FormatError
 from recon_cli.io.frames import write_png
 from recon_cli.scene.camera import Lens
 from recon_cli.sfm import database
-from recon_cli.sfm.features import create_database, extract
-from recon_cli.sfm.job import CameraGroup, Job, Reporter
+from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.matching import (
+    create_database,
+    exhaustive_pairs,
+    extract_features,
+    sequential_pairs,
+    similar_pairs,
+)
 
 NAMES = ("a.png", "b.png", "c.png")
 
@@ -26,7 +34,7 @@ def job(tmp_path):
     (tmp_path / "out").mkdir()
     for name in NAMES:
         Image.new("RGB", (64, 48)).save(tmp_path / "frames" / name)
-    return Job(
+    return MappingJob(
         frames=tmp_path / "frames", denoised=tmp_path / "frames", out=tmp_path / "out",
         groups=(CameraGroup(NAMES, 64, 48),), masks=None, poses=None,
         pose_use="keep", given_points=False, pairs="auto", max_features=500,
@@ -141,12 +149,12 @@ def keypoints(job):
 
 def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
     job = textured(job, max_features=100)
-    extract(job, Reporter(io.BytesIO()))
+    extract_features(job, Reporter(io.BytesIO()))
     few = keypoints(job)
     assert [len(found) for found in few.values()] == [100, 100, 100]
     database.remove(job.database)
     create_database(job)
-    extract(replace(job, max_features=5000), Reporter(io.BytesIO()))
+    extract_features(replace(job, max_features=5000), Reporter(io.BytesIO()))
     for name, every in keypoints(job).items():
         coarsest = np.sort(database.scales(every))[-100:]
         np.testing.assert_array_equal(np.sort(database.scales(few[name])), coarsest)
@@ -154,7 +162,7 @@ def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
 
 def test_descriptors_stay_with_their_keypoints(job):
     job = textured(job, max_features=5000)
-    extract(job, Reporter(io.BytesIO()))
+    extract_features(job, Reporter(io.BytesIO()))
     before, every = keypoints(job), descriptors(job)
     database.keep_coarsest(job.database, 60)
     for name, rows in descriptors(job).items():
@@ -175,7 +183,7 @@ def test_nothing_is_found_where_the_mask_is_black(job, tmp_path):
     mask[:, 120:] = 255
     Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
     job = textured(job, masks=tmp_path / "masks")
-    extract(job, Reporter(io.BytesIO()))
+    extract_features(job, Reporter(io.BytesIO()))
     found = keypoints(job)
     assert len(found["b.png"]) > 20
     assert found["b.png"][:, 0].min() >= 120
@@ -187,15 +195,96 @@ def test_an_extraction_that_goes_on_keeps_the_cameras(job):
     one, two = replace(job.groups[0], names=NAMES[:1]), replace(job.groups[0], names=NAMES[1:])
     job = replace(job, groups=(one, two))
     create_database(job)
-    extract(job, Reporter(io.BytesIO()))
+    extract_features(job, Reporter(io.BytesIO()))
     whole = keypoints(job)
     with sqlite3.connect(job.database) as connection:  # as a kill before the last image leaves it
         for table in ("keypoints", "descriptors"):
             connection.execute(f"DELETE FROM {table} WHERE image_id = 3")
     connection.close()
-    extract(job, Reporter(io.BytesIO()))
+    extract_features(job, Reporter(io.BytesIO()))
     assert database.is_sound(job.database, NAMES, 2)
     with pycolmap.Database.open(job.database) as opened:
         assert [image.camera_id for image in opened.read_all_images()] == [1, 2, 2]
     for name, found in keypoints(job).items():
         np.testing.assert_array_equal(found, whole[name])
+
+
+def names(count):
+    return [f"{index:06d}.png" for index in range(count)]
+
+
+def test_all_pairs_of_a_hundred_images_are_4950():
+    assert len(exhaustive_pairs(names(100))) == 4950
+
+
+def test_a_pair_is_named_in_order():
+    assert exhaustive_pairs(["b", "c", "a"]) == {("a", "b"), ("a", "c"), ("b", "c")}
+
+
+def test_sequential_pairs_are_neighbours_and_powers_of_two():
+    # 20 images: 19 + 18 + ... + 10 neighbours at 1 to 10, and 4 pairs that are 16 apart.
+    found = sequential_pairs(names(20))
+    assert len(found) == sum(range(10, 20)) + 4
+    assert ("000000.png", "000016.png") in found
+    assert ("000000.png", "000011.png") not in found
+
+
+def test_two_images_are_one_pair():
+    assert sequential_pairs(["b", "a"]) == exhaustive_pairs(["a", "b"]) == {("a", "b")}
+
+
+GROUPS, EACH = 4, 5
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """Twenty images of four places: each place has its own kinds of descriptors."""
+    noise = np.random.default_rng(0)
+    path = tmp_path_factory.mktemp("retrieval") / "database.db"
+    kinds = noise.integers(0, 256, (GROUPS, 30, 128))
+    with pycolmap.Database.open(path) as opened:
+        camera = opened.write_camera(pycolmap.Camera(
+            model="PINHOLE", width=8, height=6, params=[5, 5, 4, 3]))
+        for index in range(GROUPS * EACH):
+            image = opened.write_image(pycolmap.Image(name=f"{index:02d}.png", camera_id=camera))
+            rows = kinds[index % GROUPS][noise.integers(0, 30, 200)]
+            rows = np.clip(rows + noise.normal(scale=10, size=rows.shape), 0, 255)
+            opened.write_keypoints(image, noise.random((200, 6)).astype(np.float32))
+            opened.write_descriptors(image, pycolmap.FeatureDescriptors(
+                type=pycolmap.FeatureExtractorType.SIFT, data=rows.astype(np.uint8)))
+        bare = opened.write_image(pycolmap.Image(name="bare.png", camera_id=camera))
+        opened.write_keypoints(bare, np.zeros((0, 6), np.float32))
+        opened.write_descriptors(bare, pycolmap.FeatureDescriptors(
+            type=pycolmap.FeatureExtractorType.SIFT, data=np.zeros((0, 128), np.uint8)))
+    return path
+
+
+PLACES = [f"{index:02d}.png" for index in range(GROUPS * EACH)]
+
+
+def test_images_of_one_place_are_paired(places):
+    pairs = similar_pairs(places, PLACES, seed=0, nearest=EACH - 1)
+    assert pairs == {
+        (name, other) for name in PLACES for other in PLACES
+        if name < other and int(name[:2]) % GROUPS == int(other[:2]) % GROUPS}
+
+
+def test_pairs_that_are_known_make_room_for_others(places):
+    known = {("00.png", "04.png"), ("00.png", "08.png")}
+    pairs = similar_pairs(places, PLACES, seed=0, nearest=2, besides=known)
+    assert not pairs & known
+    assert {("00.png", "12.png"), ("00.png", "16.png")} <= pairs
+
+
+def test_where_all_pairs_are_known_nothing_is_left(places):
+    assert similar_pairs(places, PLACES, seed=0, besides=exhaustive_pairs(PLACES)) == set()
+
+
+def test_the_same_pairs_come_out_every_time(places):
+    assert similar_pairs(places, PLACES, seed=3) == similar_pairs(places, PLACES[::-1], seed=3)
+
+
+def test_an_image_without_features_does_no_harm(places):
+    pairs = similar_pairs(places, [*PLACES, "bare.png"], seed=0, nearest=EACH - 1)
+    assert pairs >= similar_pairs(places, PLACES, seed=0, nearest=EACH - 1) - {
+        pair for pair in pairs if "bare.png" in pair}

@@ -11,18 +11,23 @@ from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
 from recon_cli.sfm import fallbacks, mapper
-from recon_cli.sfm.fallbacks import Note, best, reachable, rungs, shortfall
-from recon_cli.sfm.job import Reporter
-from recon_cli.sfm.model_selection import Candidate
-from recon_cli.sfm.step_log import Ledger
+from recon_cli.sfm.fallbacks import (
+    MapperAttempt,
+    best_attempt,
+    list_fallbacks,
+    reachable,
+    shortfall,
+)
+from recon_cli.sfm.job import Reporter, StepLog
+from recon_cli.sfm.merge_models import ModelCandidate
 
 NAMES = tuple(f"{index:06d}.png" for index in range(60))
-GOOD = Note("exhaustive", "", registered=NAMES, trusted=True, weak_link=0.95,
-            reprojection_error_px=0.5)
+GOOD = MapperAttempt(
+    "exhaustive", "", registered=NAMES, trusted=True, weak_link=0.95, reprojection_error_px=0.5)
 
 
-def climb(job, deadline=math.inf):
-    return fallbacks.climb(job, Reporter(io.BytesIO()), deadline=deadline)
+def build(job, deadline=math.inf):
+    return fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=deadline)
 
 
 @pytest.fixture
@@ -38,15 +43,16 @@ def sized(job, count):
 
 def test_a_small_capture_begins_with_all_pairs_and_a_large_one_with_some(capture):
     job, _ = capture
-    assert [rung.name for rung in rungs(sized(job, 100))] == ["exhaustive", "relaxed", "global"]
-    assert [rung.name for rung in rungs(sized(job, 101))] == [
+    assert [fallback.name for fallback in list_fallbacks(sized(job, 100))] == [
+        "exhaustive", "relaxed", "global"]
+    assert [fallback.name for fallback in list_fallbacks(sized(job, 101))] == [
         "retrieval", "exhaustive", "relaxed", "global"]
 
 
 @pytest.mark.parametrize("pairs", ["exhaustive", "retrieval", "sequential"])
 def test_a_named_way_is_the_only_one(capture, pairs):
     job, _ = capture
-    assert [rung.name for rung in rungs(replace(job, pairs=pairs))] == [pairs]
+    assert [fallback.name for fallback in list_fallbacks(replace(job, pairs=pairs))] == [pairs]
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ class Opinion:
 
 def candidate(capture, count=20, *, apart=(), opinion=None):
     job, truth = capture
-    return Candidate(part(truth, job.names[:count]), opinion or Opinion(), apart, {})
+    return ModelCandidate(part(truth, job.names[:count]), opinion or Opinion(), apart, {})
 
 
 def test_a_good_model_falls_short_of_nothing(capture):
@@ -71,7 +77,7 @@ def test_a_good_model_falls_short_of_nothing(capture):
 
 def test_each_shortfall_is_said(capture):
     names = capture[0].names
-    assert Note("exhaustive", "").shortfall == "no model was found"
+    assert MapperAttempt("exhaustive", "").shortfall == "no model was found"
     assert shortfall(candidate(capture, 17), names) == (
         "only 17 of 20 frames that can be placed got a camera")
     assert shortfall(candidate(capture, 18, apart=(("a", "b", names[19]),)), names) == (
@@ -105,43 +111,43 @@ def test_before_all_pairs_are_matched_every_frame_with_features_counts(capture):
 
 def test_more_frames_that_hang_together_are_the_better_model():
     fewer = replace(GOOD, name="relaxed", registered=NAMES[:40])
-    assert best([fewer, GOOD]) is GOOD
+    assert best_attempt([fewer, GOOD]) is GOOD
 
 
 def test_a_broken_model_of_all_frames_is_worse_than_a_sound_one_of_most():
     sound = replace(GOOD, name="relaxed", registered=NAMES[:50])
     broken = replace(GOOD, name="global", trusted=False, weak_link=0.1)
-    assert best([broken, sound]) is sound
+    assert best_attempt([broken, sound]) is sound
 
 
 def test_a_model_that_is_not_trusted_is_worse_though_its_matches_agree():
     bent = replace(GOOD, name="relaxed", trusted=False, reprojection_error_px=0.1)
     sound = replace(GOOD, name="global", registered=NAMES[:55])
-    assert best([bent, sound]) is sound
-    assert best([bent, replace(sound, registered=NAMES[:20])]) is bent
+    assert best_attempt([bent, sound]) is sound
+    assert best_attempt([bent, replace(sound, registered=NAMES[:20])]) is bent
 
 
 def test_of_two_alike_the_smaller_error_decides_and_then_the_order():
     sharper = replace(GOOD, name="global", reprojection_error_px=0.3)
-    assert best([GOOD, sharper]) is sharper
-    assert best([GOOD, replace(GOOD, name="relaxed")]) is GOOD
+    assert best_attempt([GOOD, sharper]) is sharper
+    assert best_attempt([GOOD, replace(GOOD, name="relaxed")]) is GOOD
 
 
-def test_where_no_rung_found_a_model_none_is_best():
-    assert best([Note("exhaustive", ""), Note("relaxed", "")]) is None
+def test_where_no_mapper_found_a_model_none_is_best():
+    assert best_attempt([MapperAttempt("exhaustive", ""), MapperAttempt("relaxed", "")]) is None
 
 
-def test_a_good_capture_stops_at_the_first_rung(capture):
+def test_a_good_capture_stops_at_the_first_attempt(capture):
     job, truth = capture
-    result = climb(job)
-    rung, = result["rungs"]
-    assert rung["name"] == "exhaustive"
-    assert rung["reason"] == "20 frames are few enough to match all pairs"
-    assert rung["registered"] == 20
-    assert rung["kept"]
+    result = build(job)
+    attempt, = result["rungs"]
+    assert attempt["name"] == "exhaustive"
+    assert attempt["reason"] == "20 frames are few enough to match all pairs"
+    assert attempt["registered"] == 20
+    assert attempt["kept"]
     assert result["registered"] == list(job.names)
     assert result["models"] == [20]
-    assert not job.rungs.exists()
+    assert not job.attempts.exists()
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
     assert json.loads((job.out / "verdict.json").read_text()) == json.loads(
         json.dumps(result["verdict"]))
@@ -152,11 +158,11 @@ def nothing(*_, **__):
     return []
 
 
-def test_every_rung_is_tried_until_one_finds_a_model(capture, monkeypatch):
+def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     job, _ = capture
-    monkeypatch.setattr(mapper, "incremental", nothing)
-    result = climb(job)
-    assert [(rung["name"], rung["reason"], rung["kept"]) for rung in result["rungs"]] == [
+    monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    result = build(job)
+    assert [(item["name"], item["reason"], item["kept"]) for item in result["rungs"]] == [
         ("exhaustive", "20 frames are few enough to match all pairs", False),
         ("relaxed", "no model was found", False),
         ("global", "no model was found", True)]
@@ -164,33 +170,33 @@ def test_every_rung_is_tried_until_one_finds_a_model(capture, monkeypatch):
 
 def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     job, _ = capture
-    monkeypatch.setattr(mapper, "incremental", nothing)
-    monkeypatch.setattr(mapper, "globally", nothing)
+    monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    monkeypatch.setattr(mapper, "map_globally", nothing)
     with pytest.raises(SfmError, match="Only 0 of 20 frames have a camera") as caught:
-        climb(job)
+        build(job)
     assert "exhaustive found 0, relaxed found 0, global found 0" in caught.value.message
     assert not (job.model).exists()
 
 
-def test_a_rung_that_would_take_longer_than_there_is_time_is_passed_over(capture, monkeypatch):
+def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "the model cannot be trusted")
-    result = climb(job, deadline=0.0)
-    assert [bool(rung["skipped"]) for rung in result["rungs"]] == [False, True, True]
+    result = build(job, deadline=0.0)
+    assert [bool(attempt["skipped"]) for attempt in result["rungs"]] == [False, True, True]
     assert result["registered"] == list(job.names)
 
 
-def test_an_interrupted_climb_goes_on_behind_the_last_finished_rung(capture, monkeypatch):
+def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, monkeypatch):
     job, _ = capture
-    monkeypatch.setattr(mapper, "incremental", nothing)
-    monkeypatch.setattr(mapper, "globally", interrupt)
+    monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    monkeypatch.setattr(mapper, "map_globally", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        climb(job)
-    assert Ledger(job.rungs).result("relaxed") is not None
+        build(job)
+    assert StepLog(job.attempts).result("relaxed") is not None
     monkeypatch.undo()
-    monkeypatch.setattr(mapper, "incremental", interrupt)
-    result = climb(job)
-    assert [rung["name"] for rung in result["rungs"]] == ["exhaustive", "relaxed", "global"]
+    monkeypatch.setattr(mapper, "map_incrementally", interrupt)
+    result = build(job)
+    assert [attempt["name"] for attempt in result["rungs"]] == ["exhaustive", "relaxed", "global"]
     assert result["rungs"][2]["kept"]
 
 
@@ -198,8 +204,8 @@ def test_an_interrupted_climb_goes_on_behind_the_last_finished_rung(capture, mon
 def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monkeypatch, place):
     job, truth = capture
     owner, name = {
-        "match": (fallbacks.database, "pair_names"), "models": (mapper, "incremental"),
-        "model": (fallbacks, "_write"), "note": (Ledger, "finish"),
+        "match": (fallbacks.database, "pair_names"), "models": (mapper, "map_incrementally"),
+        "model": (fallbacks, "_write"), "note": (StepLog, "finish"),
         "verdict": (fallbacks.atomic, "write_json"), "publish": (fallbacks, "publish")}[place]
 
     def full(*_, **__):
@@ -207,10 +213,10 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
 
     monkeypatch.setattr(owner, name, full)
     with pytest.raises(OSError, match="No space left"):
-        climb(job)
+        build(job)
     assert not (job.model).exists()
     monkeypatch.undo()
-    assert climb(job)["registered"] == list(job.names)
+    assert build(job)["registered"] == list(job.names)
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
 
 

@@ -3,19 +3,19 @@ import pytest
 from made_model import MadeModel, along, moved, wall
 
 from recon_cli.sfm import visual_aliasing
-from recon_cli.sfm.evidence import gather
+from recon_cli.sfm.evidence import gather_evidence
 
 
 def measured(made: MadeModel, folder) -> visual_aliasing.Overlap:
     model = made.model()
-    evidence = gather(model, made.write_database(folder / "db"), made.names)
-    return visual_aliasing.measure(model, evidence)
+    evidence = gather_evidence(model, made.write_database(folder / "db"), made.names)
+    return visual_aliasing.measure_overlap(model, evidence)
 
 
 def test_two_cameras_side_by_side_should_show_the_same_and_do(tmp_path):
     result = measured(MadeModel(wall(-4, 5, count=1500), along([0.0, 0.2])), tmp_path)
     assert result.expected[0, 1] > 50  # of 72 cells in two images
-    assert result.found[0, 1] == result.expected[0, 1]
+    assert result.confirmed[0, 1] == result.expected[0, 1]
     assert (result.expected == result.expected.T).all()
 
 
@@ -26,7 +26,7 @@ def test_cells_without_a_common_point_are_expected_and_not_found(tmp_path):
         points, along([0.0, 0.2]),
         landmark=lambda image, point: point if points[point, 0] < 0 else (image, point))
     result = measured(made, tmp_path)
-    assert result.found[0, 1] / result.expected[0, 1] == pytest.approx(0.5, abs=0.15)
+    assert result.confirmed[0, 1] / result.expected[0, 1] == pytest.approx(0.5, abs=0.15)
 
 
 @pytest.mark.parametrize("other", [
@@ -61,4 +61,4 @@ def test_a_camera_behind_a_wall_of_its_own_expects_nothing_back(tmp_path):
 def test_enough_cells_and_a_high_share_bear_a_cut_out():
     expected = np.array([1000.0, 1000.0, 50.0])
     found = np.array([900.0, 400.0, 50.0])
-    assert visual_aliasing.borne_out(expected, found).tolist() == [True, False, False]
+    assert visual_aliasing.is_confirmed(expected, found).tolist() == [True, False, False]

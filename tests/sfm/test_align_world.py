@@ -1,4 +1,4 @@
-"""From the mapper's frame to the world, with what speaks for it."""
+"""The world frame of a model: up, floor, walls and scale."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from rooms import degrees_between, make_room
+from test_similarity import random_similarity
 
 from recon_cli.errors import ConfigError
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.align_world import World, world_transform
+from recon_cli.sfm.align_world import WorldFrame, move_model, world_transform
 from recon_cli.sfm.measure import ScaleBetween
 
 
-def world_of(room, *, gravity=True, between=None, metric=False) -> World:
+def world_of(room, *, gravity=True, between=None, metric=False) -> WorldFrame:
     return world_transform(
         room.points, room.named(), gravity=gravity, scale_between=between, metric=metric)
 
@@ -49,7 +51,7 @@ def test_a_room_with_a_known_distance_comes_out_upright_in_metres_with_the_floor
 def test_everything_goes_into_json_and_the_similarity_comes_back():
     room = make_room()
     world = world_of(room, between=ScaleBetween(A, "0,0,0", 2.0))
-    value = json.loads(json.dumps(world.to_json(), allow_nan=False))
+    value = json.loads(json.dumps(world.summary().to_json(), allow_nan=False))
     back = Similarity.from_json(value["similarity"])
     assert np.array_equal(back.matrix, world.similarity.matrix)
     assert value["evidence"]["floor_share"] == world.evidence.floor_share
@@ -147,3 +149,38 @@ def _rendered(folder: Path, truth: Similarity):
         points.append(seen @ poses[frame, :3, :3].T + poses[frame, :3, 3])
         viewmats[path.name] = back.viewmat(np.linalg.inv(poses[frame]))
     return back.points(np.concatenate(points)), viewmats, truth
+
+
+def residuals(model: pycolmap.Reconstruction) -> np.ndarray:
+    """The offset of each observation from its projected point, in pixels."""
+    found = []
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        for seen in image.points2D:
+            if seen.has_point3D():
+                xyz = model.point3D(seen.point3D_id).xyz
+                found.append(image.project_point(xyz) - seen.xy)
+    return np.array(found)
+
+
+def test_every_observation_keeps_its_error_and_the_model_can_be_saved(tmp_path):
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 5, 40
+    model = pycolmap.synthesize_dataset(options)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.8
+    pycolmap.synthesize_noise(noise, model)
+    similarity = random_similarity(1)
+    before = residuals(model)
+    centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
+    points = {i: point.xyz.copy() for i, point in model.points3D.items()}
+    move_model(model, similarity)
+    assert np.abs(before).max() > 0.1
+    assert np.allclose(residuals(model), before, rtol=0, atol=1e-8)
+    for i, center in centers.items():
+        moved = model.image(i).projection_center()
+        assert np.allclose(moved, similarity.points(center), atol=1e-9)
+    for i, xyz in points.items():
+        assert np.allclose(model.point3D(i).xyz, similarity.points(xyz), atol=1e-9)
+    model.write(tmp_path)
+    assert np.allclose(residuals(pycolmap.Reconstruction(tmp_path)), before, atol=1e-8)

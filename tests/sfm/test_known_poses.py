@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm.known_poses import back, movement, near
+from recon_cli.sfm.known_poses import align_to_given, measure_movement, near_pairs
 
 
 def cameras(centers, turn=0.0):
@@ -19,7 +19,7 @@ def line(count):
 
 def test_each_camera_is_paired_with_the_nearest():
     viewmats = dict(zip([f"{i:02d}" for i in range(40)], cameras(line(40)), strict=True))
-    found = near(viewmats)
+    found = near_pairs(viewmats)
     assert ("00", "20") in found  # twenty neighbours on the one side that there is
     assert ("00", "21") not in found
     assert ("15", "25") in found  # ten on either side
@@ -30,7 +30,7 @@ def test_cameras_that_look_apart_are_not_paired():
     viewmats = {
         "a": cameras([(0, 0, 0)])[0], "b": cameras([(0.1, 0, 0)], turn=90)[0],
         "c": cameras([(5, 0, 0)], turn=60)[0]}
-    assert near(viewmats) == {("a", "c"), ("b", "c")}
+    assert near_pairs(viewmats) == {("a", "c"), ("b", "c")}
 
 
 def test_what_was_moved_as_a_whole_is_brought_back_even_from_a_line():
@@ -41,7 +41,7 @@ def test_what_was_moved_as_a_whole_is_brought_back_even_from_a_line():
     whole[:3, 3] = (3, -2, 1)
     found = given @ np.linalg.inv(whole)
     found[:, :3, 3] *= 0.5  # a unit twice as long
-    motion = back(found, given)
+    motion = align_to_given(found, given)
     assert motion.scale == pytest.approx(2)
     centers = -np.einsum("fji,fj->fi", found[:, :3, :3], found[:, :3, 3])
     matrix = motion.matrix()
@@ -51,7 +51,7 @@ def test_what_was_moved_as_a_whole_is_brought_back_even_from_a_line():
 def test_movement_is_a_share_of_the_path_and_degrees():
     given, found = cameras(line(5)), cameras(line(5))
     found[2] = cameras([(2, 0.4, 0)], turn=3)[0]
-    moved = movement(found, given)
+    moved = measure_movement(found, given)
     assert moved["moved_median"] == 0
     assert moved["moved_max"] == pytest.approx(0.1)  # 0.4 of a path 4 long
     assert moved["turned_max_deg"] == pytest.approx(3)

@@ -1,0 +1,153 @@
+"""Models that are merged, and wrong images that are taken out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic import center_error, make_capture, moved, part
+
+from recon_cli.sfm import mapper, merge_models
+from recon_cli.sfm.weakest_cut import OutlierCamera
+
+# Features are exact to float32 (1e-4 px of 1000), the path is 9 units wide.
+EXACT = 1e-4
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return make_capture(tmp_path_factory.mktemp("capture"))
+
+
+@pytest.mark.parametrize("first", [10, 12], ids=["two images in both", "no image in both"])
+def test_two_parts_of_a_capture_become_one(capture, first):
+    job, truth = capture
+    base = part(truth, job.names[:12])
+    other = part(truth, job.names[first:], motion=moved())
+    joined = merge_models.merge(job, base, other)
+    assert mapper.registered_names(joined) == list(job.names)
+    assert center_error(joined, truth) < EXACT
+    assert joined.compute_mean_reprojection_error() < 0.01
+
+
+def test_the_similarity_between_two_parts_is_found_from_their_points(capture):
+    job, truth = capture
+    base = part(truth, job.names[:12])
+    shared = merge_models.find_shared_points(
+        job.database, part(truth, job.names[12:], motion=moved()), base)
+    assert len(shared.source) == 300
+    found = merge_models.similarity(shared, base, seed=0)
+    np.testing.assert_allclose(found.matrix(), moved().inverse().matrix(), atol=1e-6)
+
+
+def test_points_that_contradict_each_other_give_no_similarity(capture):
+    _, truth = capture
+    noise = np.random.default_rng(0)
+    shared = merge_models.SharedPoints(noise.normal(size=(200, 3)), noise.normal(size=(200, 3)))
+    assert merge_models.similarity(shared, truth, seed=0) is None
+
+
+def test_too_few_shared_points_give_no_similarity(capture):
+    _, truth = capture
+    few = np.random.default_rng(0).normal(size=(merge_models.MIN_INLIERS - 1, 3))
+    assert merge_models.similarity(merge_models.SharedPoints(few, few), truth, seed=0) is None
+
+
+def test_a_part_that_brings_less_than_three_images_is_left_alone(capture):
+    job, truth = capture
+    assert merge_models.merge(
+        job, part(truth, job.names[:18]), part(truth, job.names[10:])) is None
+
+
+def test_a_posed_model_holds_the_images_of_the_database_and_no_points(capture):
+    job, truth = capture
+    poses = {image.name: image.cam_from_world()
+             for image in map(truth.image, truth.reg_image_ids()) if image.name in job.names[:5]}
+    model = merge_models.posed_model(job.database, None, poses)
+    assert mapper.registered_names(model) == list(job.names[:5])
+    assert model.num_points3D() == 0
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """As much of a verdict as is looked at."""
+
+    trusted: bool = True
+    outliers: tuple[OutlierCamera, ...] = ()
+
+
+@pytest.fixture
+def fresh_capture(tmp_path):
+    return make_capture(tmp_path)
+
+
+def say(monkeypatch, opinion):
+    monkeypatch.setattr(merge_models.verdict, "examine", lambda model, *_, **__: opinion(model))
+
+
+def test_nothing_comes_of_no_model(fresh_capture):
+    job, _ = fresh_capture
+    assert merge_models.best_model(job, []) is None
+
+
+def test_parts_that_fit_become_one_model_and_nothing_is_apart(fresh_capture):
+    job, truth = fresh_capture
+    found = merge_models.best_model(job, [
+        part(truth, job.names[12:], motion=moved()), part(truth, job.names[:12])])
+    assert mapper.registered_names(found.model) == list(job.names)
+    assert found.apart == ()
+    assert center_error(found.model, truth) < 1e-3
+
+
+def test_parts_that_cannot_be_put_together_are_named(fresh_capture, monkeypatch):
+    job, truth = fresh_capture
+    monkeypatch.setattr(merge_models, "similarity", lambda *_, **__: None)
+    found = merge_models.best_model(job, [
+        part(truth, job.names[12:16]), part(truth, job.names[:12]), part(truth, job.names[10:13]),
+        part(truth, job.names[14:])])
+    assert mapper.registered_names(found.model) == list(job.names[:12])
+    assert found.apart == (job.names[14:],)  # 12 and 13 are fewer than three
+
+
+def test_a_merge_that_cannot_be_trusted_is_undone(fresh_capture, monkeypatch):
+    job, truth = fresh_capture
+    say(monkeypatch, lambda model: Opinion(trusted=model.num_reg_images() < 20))
+    found = merge_models.best_model(job, [part(truth, job.names[:12]), part(truth, job.names[12:])])
+    assert mapper.registered_names(found.model) == list(job.names[:12])
+    assert found.apart == (job.names[12:],)
+
+
+def test_a_camera_that_was_put_elsewhere_is_found_taken_out_and_named(fresh_capture):
+    job, truth = fresh_capture
+    wrong = job.names[7]
+    model = astray(truth, wrong)
+    found = merge_models.best_model(job, [model])
+    assert mapper.registered_names(found.model) == sorted(set(job.names) - {wrong})
+    assert list(found.rejected) == [wrong]
+    assert "of its" in found.rejected[wrong]
+    assert center_error(found.model, truth) < 1e-3
+    assert found.verdict.trusted
+
+
+def astray(truth, name):
+    """The true model with one camera turned and moved away; points that it saw are not its own."""
+    model = pycolmap.Reconstruction(truth)
+    image = model.find_image_with_name(name)
+    for row, point in enumerate(image.points2D):
+        if point.has_point3D():
+            model.delete_observation(image.image_id, row)
+    turn = pycolmap.Rotation3d(np.array([0, np.sin(0.2), 0, np.cos(0.2)]))
+    model.frame(image.frame_id).set_cam_from_world(
+        image.camera_id,
+        pycolmap.Rigid3d(turn, np.array([0.5, 1.0, 0.3])) * image.cam_from_world())
+    return model
+
+
+def test_where_many_cameras_are_suspected_the_model_is_left_as_it_is(fresh_capture, monkeypatch):
+    job, truth = fresh_capture
+    suspects = tuple(OutlierCamera(name, 0.1, 200) for name in job.names[:5])
+    say(monkeypatch, lambda _: Opinion(trusted=False, outliers=suspects))
+    found = merge_models.best_model(job, [pycolmap.Reconstruction(truth)])
+    assert found.model.num_reg_images() == 20
+    assert found.rejected == {}
+    assert not found.verdict.trusted
