@@ -1,8 +1,8 @@
-"""The contact sheet: one picture of what was kept of a capture, what was dropped, and why.
+"""The contact sheet: one picture of the kept and dropped frames of a capture, with the reasons.
 
-Its size is bounded whatever the length of the capture: of what does not fit, an even sample of each
-kind is shown. It is stored with 256 colours, a quarter of a byte a pixel (measured on four
-captures), or with fewer where that takes too much.
+Its size is bounded: where not all frames fit, an even sample of each kind is shown. It has 256
+colours, a quarter of a byte a pixel (measured on four captures), or fewer where the file would be
+too large.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from recon_cli.capture.selection_record import MEANINGS, Candidate, Reason, counts
+from recon_cli.capture.selection_record import MEANINGS, FrameCandidate, Reason, count_reasons
 from recon_cli.workspace import atomic
 
 SHEET = "contact.png"
-MAX_PIXELS = 4_500_000  # 2000x2250; 1.1 MB as a rule
+MAX_PIXELS = 4_500_000  # 2000x2250; usually 1.1 MB
 MAX_BYTES = 3_000_000
-# Tried until the file is small enough; the last takes half a byte a pixel whatever is in it.
+# Tried until the file is small enough; the last takes at most half a byte a pixel.
 PALETTES = (256, 64, 16)
-MAX_WIDTH = 2000  # pixels; two sheets beside each other on a large screen
+MAX_WIDTH = 2000  # pixels; two sheets side by side on a large screen
 THUMB_PIXELS = 14_000  # 158x89 at 16:9
-# Kept frames get at most this share of the cells, so that dropped ones can be seen.
+# Kept frames get at most this share of the cells, to leave room for dropped ones.
 KEPT_SHARE = 0.65
 BORDER, GAP, LINE, TEXT = 4, 6, 15, 12  # pixels
 CELL_WIDTH = 118  # at least, for the caption
@@ -42,12 +42,12 @@ COLOURS: dict[str, Colour] = {
     Reason.CLIPPED: (20, 20, 20), Reason.DUPLICATE: (204, 121, 167), Reason.CLOSE: (190, 190, 190),
     Reason.DAMAGED: (240, 228, 66)}
 
-MOST_OBLONG = 4  # width to height of a cell; a longer picture, a panorama say, leaves paper free
+MOST_OBLONG = 4  # width to height of a cell; a longer picture, such as a panorama, has margins
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Sizes in pixels of a thumbnail and of the cell that it stands in, and how many fit."""
+    """Sizes in pixels of a thumbnail and of its cell, and the number of cells."""
 
     thumb: tuple[int, int]
     cell: tuple[int, int]
@@ -66,10 +66,10 @@ class ContactSheet:
     """
 
     def __init__(
-        self, title: str, candidates: Sequence[Candidate], width: int, height: int
+        self, title: str, candidates: Sequence[FrameCandidate], width: int, height: int
     ) -> None:
         self._title, self._candidates = title, candidates
-        self._several = len({one.source for one in candidates}) > 1
+        self._several = len({candidate.source for candidate in candidates}) > 1
         self._layout = _layout(width, height)
         self._shown = _sample(candidates, self._layout.most)
         self._thumbs: dict[int, Image.Image] = {}
@@ -80,7 +80,7 @@ class ContactSheet:
         return frozenset(candidate.index for candidate in self._shown)
 
     def add(self, index: int, rgb: NDArray[np.uint8]) -> None:
-        """Takes the pixels [H, W, 3] of a candidate; those that are not shown are ignored."""
+        """Adds the pixels [H, W, 3] of a candidate; those that are not shown are ignored."""
         if index in self.wanted:
             self._thumbs[index] = _thumbnail(rgb, self._layout.thumb)
 
@@ -93,7 +93,7 @@ class ContactSheet:
         """
         width, height = self._layout.cell
         columns = min(self._layout.columns, max(1, len(self._shown)))
-        head = _wrapped(self._heading(held_out), max(columns * width, 4 * width))
+        head = _wrap(self._heading(held_out), max(columns * width, 4 * width))
         top = GAP + sum(LINE for _ in head) + GAP
         rows = math.ceil(len(self._shown) / columns)
         canvas = Image.new(
@@ -105,10 +105,10 @@ class ContactSheet:
             row, column = divmod(place, columns)
             kind = _kind(candidate, held_out)
             self._draw_cell(canvas, draw, candidate, kind, GAP + column * width, top + row * height)
-        atomic.write_bytes(path, _encoded(canvas))
+        atomic.write_bytes(path, _encode(canvas))
 
     def _draw_cell(
-        self, canvas: Image.Image, draw: ImageDraw.ImageDraw, candidate: Candidate, kind: str,
+        self, canvas: Image.Image, draw: ImageDraw.ImageDraw, candidate: FrameCandidate, kind: str,
         x: int, y: int,
     ) -> None:
         thumb_width, thumb_height = self._layout.thumb
@@ -122,40 +122,40 @@ class ContactSheet:
             canvas.paste(thumb, (x + BORDER, y + BORDER))
         font, width = ImageFont.load_default(TEXT), self._layout.cell[0] - GAP
         like = "" if candidate.like is None else f" #{candidate.like}"
-        draw.text((x, bottom), _cut(f"#{candidate.index} {kind}{like}", font, width), INK, font)
-        draw.text((x, bottom + LINE), _cut(self._detail(candidate), font, width), FAINT, font)
+        draw.text((x, bottom), _shorten(f"#{candidate.index} {kind}{like}", font, width), INK, font)
+        draw.text((x, bottom + LINE), _shorten(self._detail(candidate), font, width), FAINT, font)
 
-    def _detail(self, candidate: Candidate) -> str:
-        """Returns the second line of a caption: how sharp a frame is, and the file of a photo."""
+    def _detail(self, candidate: FrameCandidate) -> str:
+        """Returns the second line of a caption: sharpness, and of several files the name."""
         sharp = "" if candidate.sharpness is None else f"{candidate.sharpness:.0f}"
         return f"{sharp} {candidate.source}".strip() if self._several else f"sharp {sharp}"
 
     def _heading(self, held_out: Collection[str]) -> list[tuple[str, Colour | None]]:
-        """Returns the counts and the legend: texts, some with a swatch before them."""
-        found = counts(self._candidates)
-        kept = found.pop(Reason.KEPT, 0)
+        """Returns the counts and the legend: texts, some with a colour swatch."""
+        counts = count_reasons(self._candidates)
+        chosen = counts.pop(Reason.KEPT, 0)
         held = sum(_kind(candidate, held_out) == HELD_OUT for candidate in self._candidates)
-        dropped = sum(found.values())
-        shown = sum(candidate.reason is not Reason.KEPT for candidate in self._shown)
+        dropped = sum(counts.values())
+        drawn = sum(candidate.reason is not Reason.KEPT for candidate in self._shown)
         words: list[tuple[str, Colour | None]] = [
-            (f"{self._title}: {kept} of {kept + dropped} frames kept, {held} of them held out "
+            (f"{self._title}: {chosen} of {chosen + dropped} frames kept, {held} of them held out "
              f"for the score; {dropped} dropped.", None),
-            (f"Shown in order: {len(self._shown) - shown} kept, {shown} dropped; below each: "
+            (f"Shown in order: {len(self._shown) - drawn} kept, {drawn} dropped; below each: "
              f"sharpness{', file' if self._several else ''}.", None),
-            (f"{kept - held} kept for training", COLOURS[Reason.KEPT]),
+            (f"{chosen - held} kept for training", COLOURS[Reason.KEPT]),
             (f"{held} held out", COLOURS[HELD_OUT])]
         return words + [
             (f"{count} {reason}: {MEANINGS[Reason(reason)]}", COLOURS[reason])
-            for reason, count in found.items()]
+            for reason, count in counts.items()]
 
 
-def _kind(candidate: Candidate, held_out: Collection[str]) -> str:
-    """Returns what a border stands for: a reason, or that a kept frame is held out."""
+def _kind(candidate: FrameCandidate, held_out: Collection[str]) -> str:
+    """Returns the meaning of a border: a reason, or that a kept frame is held out."""
     held = candidate.reason is Reason.KEPT and candidate.name in held_out
     return HELD_OUT if held else candidate.reason.value
 
 
-def _encoded(canvas: Image.Image) -> bytes:
+def _encode(canvas: Image.Image) -> bytes:
     """Returns a PNG of at most `MAX_BYTES`."""
     data = b""
     for colours in PALETTES:
@@ -173,7 +173,7 @@ def _thumbnail(
     rgb: NDArray[np.uint8],  # [H, W, 3]
     size: tuple[int, int],
 ) -> Image.Image:
-    """Returns a picture reduced into `size`, in its own shape: photos may lie and stand."""
+    """Returns a picture reduced to fit into `size`, whatever its orientation."""
     height, width = rgb.shape[:2]
     scale = min(size[0] / width, size[1] / height)
     fitted = max(1, round(width * scale)), max(1, round(height * scale))
@@ -196,29 +196,29 @@ def _layout(width: int, height: int) -> _Layout:
     return _Layout(thumb, cell, columns * rows, columns)
 
 
-def _sample(candidates: Sequence[Candidate], most: int) -> list[Candidate]:
+def _sample(candidates: Sequence[FrameCandidate], most: int) -> list[FrameCandidate]:
     """Returns at most `most` candidates in order, every reason among them."""
     by_reason = {
-        reason: [one for one in candidates if one.reason is reason] for reason in Reason}
-    kept = by_reason.pop(Reason.KEPT)
+        reason: [frame for frame in candidates if frame.reason is reason] for reason in Reason}
+    chosen = by_reason.pop(Reason.KEPT)
     dropped = sum(map(len, by_reason.values()))
-    room = {Reason.KEPT: min(len(kept), max(int(KEPT_SHARE * most), most - dropped))}
+    room = {Reason.KEPT: min(len(chosen), max(int(KEPT_SHARE * most), most - dropped))}
     left = most - room[Reason.KEPT]
     # The rarest reason first: what it does not need goes to the others.
-    for place, reason in enumerate(sorted(by_reason, key=lambda one: len(by_reason[one]))):
+    for place, reason in enumerate(sorted(by_reason, key=lambda name: len(by_reason[name]))):
         room[reason] = min(len(by_reason[reason]), left // (len(by_reason) - place))
         left -= room[reason]
-    shown: list[Candidate] = []
-    for reason, members in {Reason.KEPT: kept, **by_reason}.items():
+    sample: list[FrameCandidate] = []
+    for reason, members in {Reason.KEPT: chosen, **by_reason}.items():
         count = room[reason]
-        shown += [members[(2 * i + 1) * len(members) // (2 * count)] for i in range(count)]
-    return sorted(shown, key=lambda one: one.index)
+        sample += [members[(2 * i + 1) * len(members) // (2 * count)] for i in range(count)]
+    return sorted(sample, key=lambda frame: frame.index)
 
 
-def _wrapped(
+def _wrap(
     words: Sequence[tuple[str, Colour | None]], width: int
 ) -> list[list[tuple[str, Colour | None]]]:
-    """Returns texts in lines that are no wider than `width` where that can be."""
+    """Returns texts in lines that are no wider than `width` where possible."""
     font = ImageFont.load_default(TEXT)
     lines: list[list[tuple[str, Colour | None]]] = [[]]
     used = 0.0
@@ -244,7 +244,7 @@ def _write_words(
         x += font.getlength(text) + LINE
 
 
-def _cut(
+def _shorten(
     text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float
 ) -> str:
     """Returns a text shortened to fit a width."""

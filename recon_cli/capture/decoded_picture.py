@@ -1,17 +1,20 @@
-"""A decoded frame and how it is shown: its colours, square pixels, upright.
+"""A decoded frame as it is displayed: deinterlaced, in sRGB, with square pixels, upright.
 
-Pixels that are not square are stretched along the width and the height is kept, as players do:
-rows are never mixed. A mirrored display matrix is read as its rotation.
+Pixels that are not square are stretched along the width, as players do, so that rows are never
+mixed. A mirrored display matrix is read as its rotation.
 """
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
 import av
 import cv2
 import numpy as np
+from av.filter import Graph
 from av.video.reformatter import Colorspace, Interpolation
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
@@ -28,6 +31,8 @@ ROUNDED = (
     Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT)
 # H.273, table 3: the transfer characteristics of HDR.
 TRANSFERS = {16: Transfer.PQ, 18: Transfer.HLG}
+# One frame per frame, not per field: the rows of the first field stay as recorded.
+BWDIF = "mode=send_frame:parity=auto:deint=interlaced"
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Tags:
-    """What a file says about the looks of all its frames.
+    """How the frames of a file are to be displayed.
 
     Attributes:
         aspect: width of a pixel over its height.
@@ -53,22 +58,22 @@ class Tags:
 
 
 def tags_of(stream: VideoStream) -> Tags:
-    """Returns what a video stream says about the looks of its frames."""
+    """Returns how the frames of a video stream are to be displayed."""
     context = stream.codec_context
     return Tags(
-        # The container's word, else the codec's; 0 where neither has one.
+        # The container's value, else the codec's; 0 where neither has one.
         stream.sample_aspect_ratio or Fraction(1),
         TRANSFERS.get(int(context.color_trc)),
         int(context.color_primaries))
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class DecodedPicture:
     """A decoded frame.
 
     Attributes:
         frame: as it was decoded, or deinterlaced.
-        tags: what the file says about its looks.
+        tags: how it is displayed.
         interlaced: whether its two fields were taken at different times.
     """
 
@@ -78,17 +83,17 @@ class Picture:
 
     @property
     def square_size(self) -> tuple[int, int]:
-        """Width and height with square pixels, as it lies in the file."""
+        """Width and height with square pixels, before rotation."""
         return max(1, round(self.frame.width * self.tags.aspect)), self.frame.height
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height as shown."""
+        """Width and height as displayed."""
         width, height = self.square_size
         return (height, width) if self._quarter_turns() % 2 else (width, height)
 
     def rgb(self) -> NDArray[np.uint8]:
-        """Returns the frame as it is shown: upright, full-range RGB, [H, W, 3].
+        """Returns the frame as it is displayed: upright, full-range RGB, [H, W, 3].
 
         Colour matrix and range come from the frame's tags. Ten-bit frames are reduced to eight
         bits, and HDR to SDR by the one curve of `capture.tone`.
@@ -102,7 +107,7 @@ class Picture:
         return self._upright(to_sdr(signal, transfer, primaries=self.tags.primaries))
 
     def gray(self) -> NDArray[np.uint8]:
-        """Returns the frame's brightness, upright, [H, W]; of HDR as its neutral colours show."""
+        """Returns the frame's gray values, upright, [H, W]; of HDR those of neutral colours."""
         gray = self.frame.reformat(width=self.square_size[0], format="gray").to_ndarray()
         if self.tags.transfer is not None:
             gray = cv2.LUT(gray, gray_table(self.tags.transfer))
@@ -125,3 +130,62 @@ class Picture:
         # Both count counterclockwise.
         turned = np.rot90(pixels, self._quarter_turns())
         return np.ascontiguousarray(turned, np.uint8)
+
+
+def progressive(
+    items: Iterable[av.VideoFrame | Gap],
+) -> Iterator[tuple[av.VideoFrame, bool] | Gap]:
+    """Yields each frame deinterlaced and whether it was interlaced; gaps keep their place.
+
+    Args:
+        items: frames of one size in presentation order, and gaps.
+    """
+    filter_: _Deinterlacer | None = None
+    for item in items:
+        if filter_ is None and isinstance(item, av.VideoFrame) and item.interlaced_frame:
+            filter_ = _Deinterlacer(item)
+        if filter_ is not None:
+            yield from filter_.put(item)
+        else:
+            yield item if isinstance(item, Gap) else (item, False)
+    if filter_ is not None:
+        yield from filter_.finish()
+
+
+class _Deinterlacer:
+    """A filter graph, which is one frame late, and the items that wait for it."""
+
+    def __init__(self, first: av.VideoFrame) -> None:
+        self._waiting: deque[av.VideoFrame | Gap] = deque()
+        self._graph = Graph()
+        source = self._graph.add("buffer", ":".join((
+            f"video_size={first.width}x{first.height}", f"pix_fmt={first.format.name}",
+            f"time_base={first.time_base}", "pixel_aspect=1/1",
+            f"colorspace={first.colorspace}", f"range={first.color_range}")))
+        bwdif = self._graph.add("bwdif", BWDIF)
+        self._graph.link_nodes(source, bwdif, self._graph.add("buffersink")).configure()
+
+    def put(self, item: av.VideoFrame | Gap) -> Iterator[tuple[av.VideoFrame, bool] | Gap]:
+        self._waiting.append(item)
+        if isinstance(item, av.VideoFrame):
+            self._graph.vpush(item)
+        yield from self._ready()
+
+    def finish(self) -> Iterator[tuple[av.VideoFrame, bool] | Gap]:
+        self._graph.vpush(None)
+        yield from self._ready()
+
+    def _ready(self) -> Iterator[tuple[av.VideoFrame, bool] | Gap]:
+        while self._waiting:
+            oldest = self._waiting[0]
+            if isinstance(oldest, Gap):
+                yield oldest
+            else:
+                try:
+                    frame = self._graph.vpull()
+                except (av.error.BlockingIOError, av.error.EOFError):
+                    return
+                # The filter counts in half frames.
+                frame.pts, frame.time_base = oldest.pts, oldest.time_base
+                yield frame, oldest.interlaced_frame
+            self._waiting.popleft()

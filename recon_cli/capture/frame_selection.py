@@ -1,7 +1,7 @@
-"""Which frames of a video are kept: sharp for their place, and spread evenly over the motion.
+"""Which frames of a video are chosen: locally sharp ones, spread evenly over the camera's path.
 
-Frames that are mostly black or blown out count like blurred ones: they are passed over, but where a
-whole stretch is like that, the best of it bridge the gap.
+Frames that are mostly black or blown out count as blurred: they are avoided, but where a whole
+stretch is like that, its best frames bridge the gap.
 """
 
 from __future__ import annotations
@@ -13,36 +13,36 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import percentile_filter
 
-from recon_cli.capture.scan import telling, well_exposed
+from recon_cli.capture.frame_measures import has_content, well_exposed
 from recon_cli.capture.selection_record import Reason
 from recon_cli.errors import InputError
 
-# A frame is judged against the 75th percentile of the 31 frames around it: a few sharp ones set
-# the mark, and a dark or bare stretch of the room is judged by its own frames.
+# A frame is compared with the 75th percentile of the 31 frames around it: a few sharp ones set the
+# level, and a dark or bare stretch of the room is measured by its own frames.
 GATE_WINDOW, GATE_PERCENTILE = 31, 75
-# Way between chosen frames in widths of the image: 94% overlap, so that a point is seen from many
-# of them. A 10 s walk through a room (4.5 widths) gives 75 frames.
+# Path between chosen frames in widths of the image: 94% overlap, so that many of them see a
+# point. A 10 s walk through a room (4.5 widths) gives 75 frames.
 FRAME_SPACING = 0.06
 # Sharp frames further apart than this, 88% overlap, get the least blurred ones between them: a
 # fast turn is blurred throughout, and without it the reconstruction falls into two pieces.
 MAX_GAP = 0.12
-# Beside textured views a plain one fails the gate though it is sharp. It is this much sharper than
-# blurred frames of the same gap: 5 to 10 times in a rendered room.
+# Beside textured views a plain one fails the test although it is sharp. It is this much sharper
+# than blurred frames of the same gap: 5 to 10 times in a rendered room.
 MUCH_SHARPER = 2.0
-# A camera that hardly moves still gets this many, to average out noise.
+# Frames of a camera that hardly moves, to average out noise.
 MIN_AUTOMATIC = 24
-# One step counts at most this much: where tracking jumped, a larger one would eat the budget.
+# One step counts at most this much: where tracking jumped, a larger one would use up the budget.
 MAX_STEP = 0.1
-# A way of less than this (a third of a pixel in 320) is tracking noise of a camera on a tripod.
+# A shorter path (a third of a pixel in 320) is tracking noise of a camera on a tripod.
 NO_MOTION = 0.001
-# A way of less than this, two steps of the usual spacing, is noticed: three frames further apart
-# are the least that structure from motion starts from.
+# A shorter path, two steps of the usual spacing, causes a notice: structure from motion starts from
+# three frames further apart.
 LITTLE_MOTION = 2 * FRAME_SPACING
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Which of F frames may be taken, and why the others may not.
+    """Which of F frames may be chosen, and why the others may not.
 
     Attributes:
         usable: [F] bool.
@@ -55,30 +55,30 @@ class Judgement:
     refused: tuple[Reason | None, ...]
 
 
-def judged(
-    way: NDArray[np.float64],  # [F]
+def judge_frames(
+    lengths: NDArray[np.float64],  # [F]
     sharpness: NDArray[np.float64],  # [F]
     exposures: NDArray[np.float64],  # [F, 3]
     whole: NDArray[np.bool_],  # [F]
     share: float,
 ) -> Judgement:
-    """Returns which frames may be taken.
+    """Returns which frames may be chosen.
 
     Args:
-        way: `travelled`.
+        lengths: `path_length` up to each frame.
         sharpness: of each frame.
-        exposures: rows of `exposure.exposure`.
+        exposures: rows of `measure_exposure`.
         whole: which frames are undamaged.
         share: of the sharpness around it that a frame must reach.
     """
     sharp, exposed = sharp_frames(sharpness, share), well_exposed(exposures)
-    shown = telling(exposures)
-    good, possible = sharp & exposed & shown, whole & shown
-    usable = bridged(way, sharpness, good, possible)
-    why = np.select(
-        [usable, ~whole, ~(exposed & shown)],
+    filled = has_content(exposures)
+    good, possible = sharp & exposed & filled, whole & filled
+    usable = bridge_gaps(lengths, sharpness, good, possible)
+    reasons = np.select(
+        [usable, ~whole, ~(exposed & filled)],
         ["", Reason.DAMAGED, Reason.CLIPPED], Reason.BLURRED)
-    refused = tuple(Reason(one) if one else None for one in why.tolist())
+    refused = tuple(Reason(reason) if reason else None for reason in reasons.tolist())
     return Judgement(usable, usable & ~good, refused)
 
 
@@ -90,25 +90,24 @@ def check_motion(
 
     Args:
         name: of the video, for the message.
-        motion: way gained with each frame, in widths.
+        motion: displacement gained with each frame, in widths.
 
     Raises:
-        InputError: the camera does not move at all; where its motion cannot be told, nothing is
-            said.
+        InputError: the camera does not move at all, as far as its motion is known.
     """
     steps = motion[1:]
     known = steps[~np.isnan(steps)]
     if 2 * len(known) <= len(steps):
         return ""
-    way = float(known.sum())
-    if way <= NO_MOTION:
+    length = float(known.sum())
+    if length <= NO_MOTION:
         raise InputError(
-            f"The camera of {name} does not move: its {len(motion)} frames all show one view, but "
+            f"The camera of {name} does not move: all {len(motion)} frames show one view, but "
             "depth needs several.",
             hint="Record again while you walk sideways through the room.")
-    if way < LITTLE_MOTION:
+    if length < LITTLE_MOTION:
         return (
-            f"The camera of {name} hardly moves: its view shifts by {way:.1%} of its width in all. "
+            f"The camera of {name} hardly moves: its view shifts by {length:.1%} of its width. "
             "Depth will be poor; record a longer walk.")
     return ""
 
@@ -117,14 +116,14 @@ def sharp_frames(
     sharpness: NDArray[np.float64],  # [F]
     share: float,
 ) -> NDArray[np.bool_]:  # [F]
-    """Returns which frames reach `share` of the sharpness that is usual around them."""
+    """Returns which frames reach `share` of the usual sharpness around them."""
     usual = percentile_filter(
         sharpness, GATE_PERCENTILE, size=min(GATE_WINDOW, len(sharpness)), mode="nearest")
     return np.asarray(sharpness >= share * usual)
 
 
-def bridged(
-    way: NDArray[np.float64],  # [F]
+def bridge_gaps(
+    lengths: NDArray[np.float64],  # [F]
     sharpness: NDArray[np.float64],  # [F]
     sharp: NDArray[np.bool_],  # [F]
     whole: NDArray[np.bool_],  # [F]
@@ -132,18 +131,17 @@ def bridged(
     """Returns the sharp whole frames and those that are needed to close gaps between them.
 
     A gap of more than `MAX_GAP` is halved by the sharpest whole frame of its middle half, or by one
-    elsewhere that is much sharper, until the gaps are closed or hold no more frames.
+    elsewhere in it that is much sharper, until the gaps are closed or hold no more frames.
     """
     usable = sharp & whole
-    kept = np.flatnonzero(usable)
-    gaps = list(pairwise(kept.tolist()))
+    gaps = list(pairwise(np.flatnonzero(usable).tolist()))
     while gaps:
         first, last = gaps.pop()
         inside = first + 1 + np.flatnonzero(whole[first + 1:last])
-        if way[last] - way[first] <= MAX_GAP or not len(inside):
+        if lengths[last] - lengths[first] <= MAX_GAP or not len(inside):
             continue
-        off_centre = np.abs(way[inside] - (way[first] + way[last]) / 2)
-        reach = max(off_centre.min(), (way[last] - way[first]) / 4)
+        off_centre = np.abs(lengths[inside] - (lengths[first] + lengths[last]) / 2)
+        reach = max(off_centre.min(), (lengths[last] - lengths[first]) / 4)
         middle = inside[off_centre <= reach]
         bridge = _sharpest(middle, inside, sharpness)
         usable[bridge] = True
@@ -151,13 +149,13 @@ def bridged(
     return usable
 
 
-def travelled(
+def path_length(
     motion: NDArray[np.float64],  # [F], NaN where unknown
 ) -> NDArray[np.float64]:  # [F]
-    """Returns the way up to each frame in widths; unknown steps count as the median known one.
+    """Returns the path length up to each frame in widths; unknown steps count as the median one.
 
-    Where no step is known (a blank wall throughout) or nothing moves, each frame is one equal
-    step of no account, so that a choice over the way becomes a choice over time.
+    Where no step is known (a blank wall throughout) or nothing moves, all steps are equal and tiny,
+    so that a choice over the path becomes a choice over time.
     """
     known = motion[~np.isnan(motion)]
     typical = float(np.median(known[1:])) if len(known) > 1 else 0.0
@@ -167,13 +165,13 @@ def travelled(
     return np.cumsum(steps)
 
 
-def automatic_count(way: NDArray[np.float64], *, most: int) -> int:
-    """Returns how many frames a way is worth: one each `FRAME_SPACING`, within bounds."""
-    return int(min(most, max(MIN_AUTOMATIC, np.ceil(way[-1] / FRAME_SPACING))))
+def automatic_count(lengths: NDArray[np.float64], *, most: int) -> int:
+    """Returns how many frames to choose from a path: one each `FRAME_SPACING`, within bounds."""
+    return int(min(most, max(MIN_AUTOMATIC, np.ceil(lengths[-1] / FRAME_SPACING))))
 
 
 def choose_frames(
-    way: NDArray[np.float64],  # [F]
+    lengths: NDArray[np.float64],  # [F]
     sharpness: NDArray[np.float64],  # [F]
     usable: NDArray[np.bool_],  # [F]
     count: int,
@@ -182,18 +180,18 @@ def choose_frames(
 ) -> NDArray[np.int64]:
     """Returns the ascending indices of min(count, usable frames) frames.
 
-    The usable frames are cut into `count` runs of equal way, none of them empty. Each run gives
-    the sharpest frame of its middle two thirds, so that sharpness cannot push neighbours together.
-    A run gives one of the `bridges`, usable frames that are blurred or badly exposed, only where it
-    holds nothing else, for few frames lie so far apart that most gaps need no bridge; then one that
-    is much sharper may lie off the middle.
+    The usable frames are cut into `count` runs of equal path length, none of them empty. Each run
+    gives the sharpest frame of its middle two thirds, so that sharpness cannot push neighbours
+    together. A run gives one of the `bridges`, usable frames that are blurred or badly exposed,
+    only where it holds nothing else: few frames lie so far apart that most gaps need no bridge.
+    Then one that is much sharper may lie off the middle.
     """
     candidates = np.flatnonzero(usable)
     if len(candidates) <= count:
         return candidates
-    place = way[candidates]
+    place = lengths[candidates]
     start, step = place[0], (place[-1] - place[0]) / count
-    cuts = _filled(np.searchsorted(place, start + step * np.arange(count)), len(candidates))
+    cuts = _fill_runs(np.searchsorted(place, start + step * np.arange(count)), len(candidates))
     better = ~bridges[candidates] if bridges is not None else np.ones(len(candidates), np.bool_)
     chosen = []
     for run, (first, end) in enumerate(zip(cuts, [*cuts[1:], len(candidates)], strict=True)):
@@ -208,15 +206,15 @@ def choose_frames(
 
 
 def _sharpest(
-    near: NDArray[np.int64], all_of_them: NDArray[np.int64], sharpness: NDArray[np.float64]
+    near: NDArray[np.int64], others: NDArray[np.int64], sharpness: NDArray[np.float64]
 ) -> int:
-    """Returns the sharpest frame that is near, or one of all that is much sharper."""
-    close, best = near[np.argmax(sharpness[near])], all_of_them[np.argmax(sharpness[all_of_them])]
+    """Returns the sharpest near frame, or another one that is much sharper."""
+    close, best = near[np.argmax(sharpness[near])], others[np.argmax(sharpness[others])]
     return int(best if sharpness[best] > MUCH_SHARPER * sharpness[close] else close)
 
 
-def _filled(cuts: NDArray[np.int64], total: int) -> NDArray[np.int64]:
-    """Returns the starts of runs moved as little as needed for each to hold an element."""
+def _fill_runs(cuts: NDArray[np.int64], total: int) -> NDArray[np.int64]:
+    """Returns the starts of runs, moved as little as needed for each to hold an element."""
     order = np.arange(len(cuts))
     forward = np.maximum.accumulate(cuts - order) + order
     return np.minimum(forward, total - len(cuts) + order)

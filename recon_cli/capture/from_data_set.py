@@ -1,4 +1,4 @@
-"""Frames of a data set that comes with poses; recognised by its layout, see `io.layouts`."""
+"""Frames of a data set with poses; `io.layouts` recognises it by its layout."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.images import read_as_stored
-from recon_cli.capture.ingested_source import Context, Taken
+from recon_cli.capture.ingested_source import IngestContext, IngestedSource
 from recon_cli.capture.masks import opaque, read_mask, write_mask
-from recon_cli.capture.pace import paced
 from recon_cli.capture.photos import MIN_FRAMES, names_in_order
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
@@ -24,12 +23,12 @@ from recon_cli.io.posed import KnownPoses, PosedImage, PosedSet
 from recon_cli.scene.camera import Lens
 
 
-def take(config: IngestConfig, path: Path, out: Path, ctx: Context) -> Taken:
+def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> IngestedSource:
     """Writes the images, masks, poses and points of a data set into ingest's folder `out`.
 
     Args:
-        config: see `IngestConfig`. Of a sequence an even choice is taken, of other sets all images
-            unless a number is asked for. Views that the set itself holds out are all taken.
+        config: see `IngestConfig`. From a sequence, frames are chosen evenly; of other sets all
+            images are used unless a number is given. Views that the set holds out are all used.
         path: the data set.
         out: frames already in it are kept.
         ctx: for notices and progress.
@@ -39,52 +38,52 @@ def take(config: IngestConfig, path: Path, out: Path, ctx: Context) -> Taken:
         FormatError: a file of the data set is damaged or contradicts itself.
     """
     posed = read_posed(path)
-    ctx.notice(f"{path.name} is taken for {describe(posed)}.")
+    ctx.notice(f"{path.name} is read as {describe(posed)}.")
     for notice in posed.notices:
         ctx.notice(f"{notice[0].upper()}{notice[1:]}.")
-    images = _chosen(config, posed, ctx)
+    images = _choose_images(config, posed, ctx)
     names = names_in_order([Path(image.name).stem for image in images])
     broken = _write(images, names, posed.lenses, config.max_size, out, ctx)
     for reason in broken.values():
         ctx.notice(f"An image is left out: {reason}")
-    kept = [(name, image) for name, image in zip(names, images, strict=True) if name not in broken]
-    if len(kept) < MIN_FRAMES:
+    readable = [
+        (name, image) for name, image in zip(names, images, strict=True) if name not in broken]
+    if len(readable) < MIN_FRAMES:
         raise InputError(
-            f"{path}: {len(kept)} images can be read, but at least {MIN_FRAMES} are needed.",
-            hint="Check that the images of the data set lie where it says.")
-    poses = _known(posed, kept)
+            f"{path}: {len(readable)} images can be read, but at least {MIN_FRAMES} are needed.",
+            hint="Check that the images are where the data set says.")
+    poses = _known_poses(posed, readable)
     poses.write(out)
     masks = out / store.MASKS
-    return Taken(
+    return IngestedSource(
         posed.layout,
         tuple(_group(path.name, lens, config.max_size) for lens in posed.lenses),
         tuple(Frame(name, None, image.path.name, None, image.held_out, image.lens,
-                    (masks / name).exists()) for name, image in kept),
-        declared=len(posed.images) + len(posed.missing), decoded=len(kept),
+                    (masks / name).exists()) for name, image in readable),
+        declared=len(posed.images) + len(posed.missing), decoded=len(readable),
         lost=len(broken) + len(posed.missing),
         skipped=(*posed.missing, *(image.name for image, name in zip(images, names, strict=True)
                                    if name in broken)),
         splits=posed.splits, poses=poses)
 
 
-def _chosen(config: IngestConfig, posed: PosedSet, ctx: Context) -> list[PosedImage]:
-    """Returns the images to take, in order: an even choice where there are too many."""
-    kept = [image for image in posed.images if image.held_out]
+def _choose_images(config: IngestConfig, posed: PosedSet, ctx: IngestContext) -> list[PosedImage]:
+    """Returns the images to use, in order: evenly chosen ones where there are too many."""
+    held_out = [image for image in posed.images if image.held_out]
     rest = [image for image in posed.images if not image.held_out]
     most = config.frames or (config.max_frames if posed.sequence else len(rest))
     if len(rest) > most:
-        ctx.notice(f"{most} of {len(rest)} frames are taken, evenly spread; --frames changes that.")
+        ctx.notice(f"{most} of {len(rest)} frames are used, evenly spread; --frames changes that.")
         rest = [rest[int((i + 0.5) * len(rest) / most)] for i in range(most)]
-    return rest + kept
+    return rest + held_out
 
 
 def _write(
     images: Sequence[PosedImage], names: Sequence[str], lenses: Sequence[Lens], max_size: int,
-    out: Path, ctx: Context,
+    out: Path, ctx: IngestContext,
 ) -> dict[str, str]:
     """Writes frames and masks; returns why some images could not be read, by frame name."""
     broken: dict[str, str] = {}
-    record = paced(ctx.record)
     with ctx.progress.bar("images", len(images), unit="image") as bar:
         for done, (image, name) in enumerate(zip(images, names, strict=True), start=1):
             target = out / store.FOLDER / name
@@ -98,17 +97,14 @@ def _write(
                         write_mask(out / store.MASKS / name, mask)
                     store.write_png(target, rgb)
             bar.advance()
-            record(done, len(images))
+            ctx.record(done, len(images))
     return broken
 
 
 def _pixels(
     image: PosedImage, lens: Lens, max_size: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Returns RGB and mask at the stored size.
-
-    They are turned as they lie in the file: poses are those of the pixels, not of EXIF.
-    """
+    """Returns RGB and mask at the stored size, ignoring EXIF orientation as the poses do."""
     rgb, opacity = read_as_stored(image.path)
     height, width = rgb.shape[:2]
     if (width, height) != (lens.width, lens.height):
@@ -122,11 +118,11 @@ def _pixels(
     return rgb, opaque(opacity, image.name, width, height)
 
 
-def _known(posed: PosedSet, kept: Sequence[tuple[str, PosedImage]]) -> KnownPoses:
-    viewmats = {name: image.viewmat for name, image in kept}
+def _known_poses(posed: PosedSet, readable: Sequence[tuple[str, PosedImage]]) -> KnownPoses:
+    viewmats = {name: image.viewmat for name, image in readable}
     points, colors = posed.points, posed.colors
     if points is None and any(image.depth for image in posed.images):
-        # The views that the set holds out lend no depth: it would show what they are scored on.
+        # Views that the set holds out give no depth: it would reveal what they are scored on.
         rest = tuple(image for image in posed.images if not image.held_out)
         points, colors = points_from_depth(replace(posed, images=rest))
     return KnownPoses(viewmats, posed.metric, points, colors)

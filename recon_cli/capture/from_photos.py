@@ -1,4 +1,4 @@
-"""Frames of photos: all that can be read and show something of their own."""
+"""Frames of photos: all that can be read and show a view of their own."""
 
 from __future__ import annotations
 
@@ -10,36 +10,43 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.camera_groups import PhotoGroup, group_notices, group_photos
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.images import Photo, read_photo
-from recon_cli.capture.ingested_source import Choice, Context, Taken
+from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.masks import FoundMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.near_duplicates import (
     NAMED,
-    PhotoLook,
+    PhotoMeasures,
     choose_photos,
-    dropped_photos,
-    look_at_photo,
-    named,
+    describe_dropped,
+    list_names,
+    measure_photo,
 )
-from recon_cli.capture.pace import paced
-from recon_cli.capture.photos import Folder, check_count, frame_names, list_photos, photo_folder
+from recon_cli.capture.photos import (
+    PhotoFolder,
+    PhotoGroup,
+    check_count,
+    frame_names,
+    group_notices,
+    group_photos,
+    list_photos,
+    photo_folder,
+)
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
-from recon_cli.capture.selection_record import Candidate, Reason
+from recon_cli.capture.selection_record import FrameCandidate, Reason
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import frames as store
 from recon_cli.io.frames import Frame, Group
 from recon_cli.workspace import atomic
 
-PLAN = "raw.json"  # how camera RAW was developed, for the next try and for the curious
+PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
 
 
 @dataclass(frozen=True)
 class _Writer:
-    """What every photo of a folder is written with.
+    """Writes the photos of a folder.
 
     Attributes:
         out: ingest's folder.
@@ -54,11 +61,7 @@ class _Writer:
     plan: RawPlan
 
     def write(self, photo: Photo, name: str) -> NDArray[np.uint8]:
-        """Writes a frame, and before it its mask, so that a frame that is there is complete.
-
-        Returns:
-            the pixels as they are stored, RGB, [H, W, 3].
-        """
+        """Writes a mask and then its frame, and returns the stored pixels, RGB, [H, W, 3]."""
         target = self.out / store.FOLDER / name
         if target.exists():
             return store.read_png(target)
@@ -79,67 +82,67 @@ class _Writer:
         return develop(photo, self.plan) if photo.is_raw else read_photo(photo)
 
 
-def take(
-    config: IngestConfig, paths: Sequence[Path], out: Path, ctx: Context, *, prefix: str = ""
-) -> Taken:
+def ingest(
+    config: IngestConfig, paths: Sequence[Path], out: Path, ctx: IngestContext, *, prefix: str = ""
+) -> IngestedSource:
     """Writes photos into ingest's folder `out` and returns them.
 
     Args:
         config: see `IngestConfig`.
-        paths: a folder, which holds photos itself or in a folder of its own; or photos.
+        paths: a folder with photos in it or in a subfolder; or photos.
         out: frames already in it are kept.
         ctx: for notices and progress.
         prefix: of the names of the frames.
 
     Raises:
-        InputError: too few photos can be read, have a mask that can be, or show something of their
-            own.
+        InputError: too few photos can be read, or show a view of their own; a mask is broken.
     """
-    path, folder = _listed(paths, ctx)
+    path, folder = _list_photos(paths, ctx)
     check_count(path, len(folder.photos), folder.broken)
-    plan = _planned(folder.photos, out / f"{prefix}{PLAN}", ctx)
+    plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _without_twins(folder.photos, plan, ctx)
     masks = _masks(paths, photos, ctx)
     names = [f"{prefix}{name}" for name in frame_names(photos)]
     writer = _Writer(out, config.max_size, masks.by_photo, plan)
-    looks, unreadable = _write(photos, names, writer, ctx)
+    measures, unreadable = _write(photos, names, writer, ctx)
     broken = folder.broken | unreadable
-    readable = sum(look is not None for look in looks)
+    readable = sum(photo is not None for photo in measures)
     check_count(path, readable, broken)
-    _tell_broken(tuple(broken.values()), ctx)
-    record = choose_photos(path.name, [photo.path.name for photo in photos], names, looks)
-    for text in dropped_photos(record):
+    _report_broken(tuple(broken.values()), ctx)
+    record = choose_photos(path.name, [photo.path.name for photo in photos], names, measures)
+    for text in describe_dropped(record):
         ctx.notice(text)
     sheet = _sheet(path.name, record, names, writer)
-    taken = {photos[one.index]: one.name for one in record if one.name is not None}
-    dropped = {one.source for one in record if one.name is None}
-    groups = _grouped(list(taken), config.max_size, ctx)
-    return Taken(
+    frame_of = {photos[candidate.index]: candidate.name for candidate in record
+                if candidate.name is not None}
+    dropped = {candidate.source for candidate in record if candidate.name is None}
+    groups = _group_photos(list(frame_of), config.max_size, ctx)
+    return IngestedSource(
         "photos",
-        _stored(groups, path, config.max_size),
-        _frames(groups, taken, out),
+        _frame_groups(groups, path, config.max_size),
+        _frames(groups, frame_of, out),
         declared=readable + len(broken), decoded=readable, lost=len(broken),
-        skipped=tuple(sorted(dropped | broken.keys())), choice=Choice(record, sheet, prefix))
+        skipped=tuple(sorted(dropped | broken.keys())), selection=Selection(record, sheet, prefix))
 
 
-def _listed(paths: Sequence[Path], ctx: Context) -> tuple[Path, Folder]:
-    """Returns the path that stands for the photos in messages, and what they are."""
+def _list_photos(paths: Sequence[Path], ctx: IngestContext) -> tuple[Path, PhotoFolder]:
+    """Returns the path that represents the photos in messages, and the photos."""
     path = paths[0]
     if not path.is_dir():
         _refuse_namesakes(paths)
         return (path if len(paths) == 1 else path.absolute().parent), list_photos(paths)
     home = photo_folder(path)
     if home != path:
-        ctx.notice(f"{path} holds no photos itself: those in {home.name}/ are taken.")
+        ctx.notice(f"{path} holds no photos itself: those in {home.name}/ are used.")
     return path, list_photos(home.iterdir())
 
 
-def _tell_broken(reasons: Sequence[str], ctx: Context) -> None:
-    """Says why photos are left out; of many, the record of the choice names the rest."""
+def _report_broken(reasons: Sequence[str], ctx: IngestContext) -> None:
+    """Says why photos are left out; the record of the selection names all of them."""
     for reason in reasons[:NAMED]:
         ctx.notice(f"A photo is left out: {reason}")
     if len(reasons) > NAMED:
-        ctx.notice(f"{len(reasons) - NAMED} more photos are left out for such reasons.")
+        ctx.notice(f"{len(reasons) - NAMED} more photos are left out for similar reasons.")
 
 
 def _refuse_namesakes(paths: Sequence[Path]) -> None:
@@ -148,18 +151,18 @@ def _refuse_namesakes(paths: Sequence[Path]) -> None:
     if count > 1:
         raise InputError(
             f"{count} photos are called {name}.",
-            hint="Give the folders that they lie in instead of the files.")
+            hint="Give their folders instead of the files.")
 
 
-def _masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: Context) -> FoundMasks:
-    """Returns the masks in a folder that was given; files that were given bring none."""
+def _masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestContext) -> FoundMasks:
+    """Returns the masks in a given folder; given files have none."""
     if not paths[0].is_dir():
         return FoundMasks({}, ())
     masks = find_masks(paths[0], photo_folder(paths[0]), photos)
     if masks.outside:
         ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
     if masks.unused:
-        ctx.notice(f"Masks without a photo are left out: {named(masks.unused)}.")
+        ctx.notice(f"Masks without a photo are left out: {list_names(masks.unused)}.")
     if masks.unused and not masks.by_photo:
         ctx.notice(
             f"No mask is used: that of {photos[0].path.name} must be called "
@@ -168,23 +171,23 @@ def _masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: Context) -> Foun
 
 
 def _sheet(
-    title: str, record: Sequence[Candidate], names: Sequence[str], writer: _Writer
+    title: str, record: Sequence[FrameCandidate], names: Sequence[str], writer: _Writer
 ) -> ContactSheet:
-    """Returns the contact sheet, and removes the files of photos that are not kept."""
-    files = {one.index: writer.out / store.FOLDER / names[one.index] for one in record
-             if one.reason is not Reason.DAMAGED}
+    """Returns the contact sheet, and removes the files of photos that are not selected."""
+    files = {candidate.index: writer.out / store.FOLDER / names[candidate.index]
+             for candidate in record if candidate.reason is not Reason.DAMAGED}
     height, width = store.read_png(next(iter(files.values()))).shape[:2]
     sheet = ContactSheet(title, record, width, height)
     for index in sorted(sheet.wanted & files.keys()):
         sheet.add(index, store.read_png(files[index]))
-    for one in record:
-        if one.index in files and one.name is None:
-            writer.remove(names[one.index])
+    for candidate in record:
+        if candidate.index in files and candidate.name is None:
+            writer.remove(names[candidate.index])
     return sheet
 
 
-def _planned(photos: Sequence[Photo], record: Path, ctx: Context) -> RawPlan:
-    """Returns how to develop the RAW photos among all, from an earlier try where there was one."""
+def _plan_raw(photos: Sequence[Photo], record: Path, ctx: IngestContext) -> RawPlan:
+    """Returns how to develop the RAW photos; an interrupted run may have left its plan."""
     paths = [photo.path for photo in photos if photo.is_raw]
     if not paths:
         return RawPlan({}, {})
@@ -198,42 +201,41 @@ def _planned(photos: Sequence[Photo], record: Path, ctx: Context) -> RawPlan:
     return plan
 
 
-def _without_twins(photos: Sequence[Photo], plan: RawPlan, ctx: Context) -> list[Photo]:
-    """Returns the photos without what the camera wrote beside a RAW photo of the same name.
+def _without_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) -> list[Photo]:
+    """Returns the photos without those beside a RAW photo of the same name.
 
-    A view taken twice would be trained on while it is held out.
+    Such a view could be trained on and held out at once.
     """
     stems = {Path(name).stem for name in plan.shots}
     twins = [photo.path.name for photo in photos
              if not photo.is_raw and photo.path.stem in stems]
     if twins:
         ctx.notice(
-            f"{len(twins)} photos are left out because they lie beside camera RAW of the same "
-            f"name, such as {twins[0]}.")
+            f"{len(twins)} photos are left out because there is camera RAW of the same name, "
+            f"such as {twins[0]}.")
     return [photo for photo in photos if photo.path.name not in twins]
 
 
 def _write(
-    photos: Sequence[Photo], names: Sequence[str], writer: _Writer, ctx: Context
-) -> tuple[list[PhotoLook | None], dict[str, str]]:
-    """Writes the photos; returns a look at each, and why some could not be read, by file name."""
-    looks: list[PhotoLook | None] = []
+    photos: Sequence[Photo], names: Sequence[str], writer: _Writer, ctx: IngestContext
+) -> tuple[list[PhotoMeasures | None], dict[str, str]]:
+    """Writes the photos; returns their measures, and why some cannot be read by file name."""
+    measures: list[PhotoMeasures | None] = []
     broken: dict[str, str] = {}
-    record = paced(ctx.record)
     with ctx.progress.bar("photos", len(photos), unit="photo") as bar:
         for photo, name in zip(photos, names, strict=True):
             try:
-                looks.append(look_at_photo(writer.write(photo, name)))
+                measures.append(measure_photo(writer.write(photo, name)))
             except InputError as error:
                 broken[photo.path.name] = f"{error.message} {error.hint}".rstrip()
-                looks.append(None)
+                measures.append(None)
             bar.advance()
-            record(len(looks), len(photos))
-    return looks, broken
+            ctx.record(len(measures), len(photos))
+    return measures, broken
 
 
-def _grouped(photos: Sequence[Photo], max_size: int, ctx: Context) -> list[PhotoGroup]:
-    """Returns the photos by intrinsics and tells what is to be known of that."""
+def _group_photos(photos: Sequence[Photo], max_size: int, ctx: IngestContext) -> list[PhotoGroup]:
+    """Returns the photos by intrinsics and gives notices about the groups."""
     groups = group_photos(photos)
     for notice in group_notices(groups):
         ctx.notice(notice)
@@ -242,16 +244,16 @@ def _grouped(photos: Sequence[Photo], max_size: int, ctx: Context) -> list[Photo
     return groups
 
 
-def _stored(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> tuple[Group, ...]:
+def _frame_groups(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> tuple[Group, ...]:
     """Returns the groups at the size at which their photos are stored."""
-    stored = []
+    frame_groups = []
     for group in groups:
         name = source.name if len(groups) == 1 else f"{source.name}: {group.name}"
         width, height = store.fitted_size(group.width, group.height, max_size)
         scale = min(1.0, max_size / max(group.width, group.height))
         focal = None if group.focal_px is None else group.focal_px * scale
-        stored.append(Group(name, width, height, focal_px=focal))
-    return tuple(stored)
+        frame_groups.append(Group(name, width, height, focal_px=focal))
+    return tuple(frame_groups)
 
 
 def _frames(

@@ -1,4 +1,4 @@
-"""Frames of a video: scanned once, chosen, and written at a second pass."""
+"""Frames of a video: one pass scans it, a second one writes the chosen frames."""
 
 from __future__ import annotations
 
@@ -11,50 +11,50 @@ from numpy.typing import NDArray
 
 from recon_cli.capture import selection_record
 from recon_cli.capture.contact_sheet import ContactSheet
+from recon_cli.capture.frame_measures import check_exposure, well_exposed
 from recon_cli.capture.frame_selection import (
     NO_MOTION,
     Judgement,
     automatic_count,
     check_motion,
     choose_frames,
-    judged,
-    travelled,
+    judge_frames,
+    path_length,
 )
-from recon_cli.capture.ingested_source import Choice, Context, Taken
-from recon_cli.capture.pace import paced
+from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.photos import MIN_FRAMES
-from recon_cli.capture.scan import Scan, check_exposure, decode_threads, scan_video, well_exposed
-from recon_cli.capture.video import claimed_length, frames_at
+from recon_cli.capture.scan import Scan, decode_threads, scan_video
+from recon_cli.capture.video import declared_length, frames_at
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import frames as store
 from recon_cli.io.frames import Frame, Group
 from recon_cli.workspace import atomic
 
-# A count that was made from the duration is off by this much, as a share or in frames (sound that
-# ends a little later), without anything being lost.
+# A count by the duration may be off by this much, as a share or in frames (sound that ends a little
+# later), without any loss.
 COUNT_SHARE, COUNT_FRAMES = 0.02, 10
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What the first pass over a video found.
+class ScannedVideo:
+    """A video after the first pass.
 
     Attributes:
         path: the video.
         scan: of its F frames.
-        way: [F] float64 way travelled up to each frame, in widths.
-        judgement: which frames may be taken, and why the others may not.
+        lengths: [F] float64 `path_length` up to each frame, in widths.
+        judgement: which frames may be chosen, and why the others may not.
     """
 
     path: Path
     scan: Scan
-    way: NDArray[np.float64]
+    lengths: NDArray[np.float64]
     judgement: Judgement
 
 
-def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> Look:
-    """Returns what a pass over all frames of a video finds; `scan_file` keeps it for a next try.
+def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
+    """Returns a video after a pass over all of its frames; `scan_file` keeps it for a next run.
 
     Raises:
         InputError: the file is no video, gives too few whole frames, shows nothing, or was taken
@@ -63,7 +63,7 @@ def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> 
     if scan_file.exists():
         scan = Scan.from_json(atomic.read_json(scan_file))
     else:
-        claim = claimed_length(path)
+        claim = declared_length(path)
         with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
             scan = scan_video(path, threads=ctx.threads, step=bar.advance)
         atomic.write_json(scan_file, scan.to_json())
@@ -75,35 +75,36 @@ def look_at(config: IngestConfig, path: Path, scan_file: Path, ctx: Context) -> 
     warning = check_motion(path.name, scan.motion)
     if warning:
         ctx.notice(warning)
-    way = travelled(scan.motion)
-    return Look(path, scan, way, judged(
-        way, scan.sharpness, scan.exposure, scan.whole, config.sharpness))
+    lengths = path_length(scan.motion)
+    return ScannedVideo(path, scan, lengths, judge_frames(
+        lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness))
 
 
-def shares(config: IngestConfig, looks: Sequence[Look]) -> list[int]:
-    """Returns how many frames to take of each video.
+def frame_counts(config: IngestConfig, sources: Sequence[ScannedVideo]) -> list[int]:
+    """Returns how many frames to choose from each video.
 
-    --frames, or what the motion asks for up to --max-frames, is divided by the ways travelled; a
-    part gets `MIN_FRAMES` at least.
+    --frames, or what the motion needs up to --max-frames, is divided by the lengths of the paths; a
+    video gets at least `MIN_FRAMES`.
     """
-    wanted = [automatic_count(look.way, most=config.max_frames) for look in looks]
+    wanted = [automatic_count(source.lengths, most=config.max_frames) for source in sources]
     total = config.frames or min(config.max_frames, sum(wanted))
-    if len(looks) <= 1:
-        return [total] * len(looks)
-    ways = np.cumsum([look.way[-1] for look in looks])
-    cuts = np.round(ways / ways[-1] * total).astype(int)
+    if len(sources) <= 1:
+        return [total] * len(sources)
+    sums = np.cumsum([source.lengths[-1] for source in sources])
+    cuts = np.round(sums / sums[-1] * total).astype(int)
     return [max(MIN_FRAMES, int(count)) for count in np.diff(cuts, prepend=0)]
 
 
-def take(
-    config: IngestConfig, look: Look, count: int, out: Path, ctx: Context, *, prefix: str = ""
-) -> Taken:
+def ingest(
+    config: IngestConfig, source: ScannedVideo, count: int, out: Path, ctx: IngestContext, *,
+    prefix: str = "",
+) -> IngestedSource:
     """Writes `count` frames of a video into ingest's folder `out` and returns them.
 
     Args:
         config: see `IngestConfig`.
-        look: what `look_at` found.
-        count: how many frames to take, if there are as many.
+        source: of `scan`.
+        count: how many frames to choose, if there are as many.
         out: frames already in it are kept.
         ctx: for notices and progress.
         prefix: of the names of the frames.
@@ -111,34 +112,33 @@ def take(
     Raises:
         InputError: too few frames are sharp, or the file has changed.
     """
-    path, scan = look.path, look.scan
-    judgement = look.judgement
+    path, scan, judgement = source.path, source.scan, source.judgement
     chosen = choose_frames(
-        look.way, scan.sharpness, judgement.usable, count, bridges=judgement.bridges)
+        source.lengths, scan.sharpness, judgement.usable, count, bridges=judgement.bridges)
     _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
-    record = selection_record.of_video(
-        path.name, scan.sharpness, judgement.refused, look.way, names, same=NO_MOTION)
+    record = selection_record.video_candidates(
+        path.name, scan.sharpness, judgement.refused, source.lengths, names, same=NO_MOTION)
     sheet = ContactSheet(path.name, record, scan.width, scan.height)
-    _write(look, names, sheet, config.max_size, out, ctx)
+    _write(source, names, sheet, config.max_size, out, ctx)
     frames = tuple(
         Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False)
         for index, name in names.items())
     width, height = store.fitted_size(scan.width, scan.height, config.max_size)
-    return Taken(
+    return IngestedSource(
         "video", (Group(path.name, width, height),), frames,
         declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
         blurred=int((scan.whole & ~judgement.usable).sum()),
-        choice=Choice(record, sheet, prefix))
+        selection=Selection(record, sheet, prefix))
 
 
-def _report_lost(path: Path, scan: Scan, ctx: Context) -> None:
+def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
     """Says how many frames are missing or damaged; refuses a video that has too few left."""
     decoded, whole = len(scan.whole), int(scan.whole.sum())
     if whole < MIN_FRAMES:
         raise InputError(
-            f"{path} gives {whole} whole frames of {scan.expected}, but at least {MIN_FRAMES} are "
+            f"{path} has {whole} whole frames of {scan.expected}, but at least {MIN_FRAMES} are "
             "needed.",
             hint="Give a longer video, or copy it from the camera again if it should be longer.")
     inexact = max(COUNT_SHARE * scan.declared, COUNT_FRAMES)
@@ -150,20 +150,17 @@ def _report_lost(path: Path, scan: Scan, ctx: Context) -> None:
         ctx.notice(f"{path.name} declares {scan.declared} frames but holds {decoded}.")
 
 
-def _report_clipped(path: Path, scan: Scan, ctx: Context) -> None:
-    """Says where most of a video is lost to its exposure: what it shows, the rest cannot stand for.
-
-    The counts of the summary and the contact sheet tell of fewer ones.
-    """
+def _report_clipped(path: Path, scan: Scan, ctx: IngestContext) -> None:
+    """Says that most of a video is clipped, since the rest cannot replace what it showed."""
     whole = int(scan.whole.sum())
     clipped = whole - int(well_exposed(scan.exposure[scan.whole]).sum())
     if 2 * clipped > whole:
         ctx.notice(
-            f"{clipped} of {whole} frames of {path.name} are mostly black or blown out and are "
-            "left out.")
+            f"{clipped} of {whole} frames of {path.name} are left out: they are mostly black or "
+            "blown out.")
 
 
-def _report_short(scan: Scan, chosen: int, asked: int | None, ctx: Context) -> None:
+def _report_short(scan: Scan, chosen: int, asked: int | None, ctx: IngestContext) -> None:
     """Says why fewer frames were chosen than asked for; refuses too few."""
     whole = int(scan.whole.sum())
     if chosen < MIN_FRAMES:
@@ -176,12 +173,12 @@ def _report_short(scan: Scan, chosen: int, asked: int | None, ctx: Context) -> N
         ctx.notice(f"{asked} frames were asked for, but the video has {whole}.")
     if chosen < whole:
         ctx.notice(
-            f"{chosen} of {whole} frames are sharp enough and all of them are taken; "
-            "--sharpness 0 takes blurred ones too.")
+            f"Only {chosen} of {whole} frames are sharp enough, and all of them are used; "
+            "--sharpness 0 uses blurred ones too.")
 
 
-def report_reduced(width: int, height: int, max_size: int, ctx: Context) -> None:
-    """Says that frames are stored smaller than they are."""
+def report_reduced(width: int, height: int, max_size: int, ctx: IngestContext) -> None:
+    """Says that frames are stored at a reduced size."""
     if max(height, width) > max_size:
         ctx.notice(
             f"Frames of {width}x{height} are reduced to {max_size} pixels on the longer side; "
@@ -189,19 +186,20 @@ def report_reduced(width: int, height: int, max_size: int, ctx: Context) -> None
 
 
 def _write(
-    look: Look, names: dict[int, str], sheet: ContactSheet, max_size: int, out: Path, ctx: Context
+    source: ScannedVideo, names: dict[int, str], sheet: ContactSheet, max_size: int, out: Path,
+    ctx: IngestContext,
 ) -> None:
-    """Writes the frames that are not there yet, and gives the sheet the pixels that it shows."""
+    """Writes the frames that are not there yet, and adds the thumbnails to the contact sheet."""
     folder = out / store.FOLDER
     missing = {index for index, name in names.items() if not (folder / name).exists()}
-    done, record = len(names) - len(missing), paced(ctx.record)
-    threads = decode_threads(look.scan, ctx.threads)
+    done = len(names) - len(missing)
+    threads = decode_threads(source.scan, ctx.threads)
     with ctx.progress.bar("frames", len(names), unit="frame", done=done) as bar:
-        for index, rgb in frames_at(look.path, missing | sheet.wanted, threads=threads):
+        for index, rgb in frames_at(source.path, missing | sheet.wanted, threads=threads):
             sheet.add(index, rgb)
             if index not in missing:
                 continue
             store.write_png(folder / names[index], store.fitted(rgb, max_size))
             done += 1
             bar.advance()
-            record(done, len(names))
+            ctx.record(done, len(names))

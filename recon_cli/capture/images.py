@@ -1,11 +1,13 @@
-"""One photo: its upright size, and its pixels as 8-bit RGB, from Pillow or, for RAW, LibRaw.
+"""One photo: its upright size, its lens by EXIF, and its pixels as 8-bit RGB.
 
-A photo is read whole or refused; half a JPEG never passes. Colour profiles are not applied, so
-that the photos of one camera stay comparable, and no metadata is carried over.
+Pillow reads photos, and LibRaw the headers of camera RAW. A photo is read whole or refused: a
+truncated JPEG never passes. Colour profiles are not applied, so that the photos of one camera stay
+comparable, and no metadata is carried over.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 import warnings
 from dataclasses import dataclass
@@ -20,7 +22,6 @@ import rawpy
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from recon_cli.capture.exif import Lens, read_lens
 from recon_cli.errors import InputError
 
 RAW_SUFFIXES = frozenset({
@@ -30,7 +31,7 @@ RAW_SUFFIXES = frozenset({
 })
 # What cameras and converters write. Pillow also opens documents (EPS by way of Ghostscript).
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM")
-# A file so named that cannot be read is a broken photo; any other that cannot is no photo.
+# A file with one of these endings that cannot be read is a broken photo; any other is no photo.
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
     ".ppm", ".tif", ".tiff", ".webp",
@@ -52,6 +53,11 @@ RAW_QUARTER_TURNS = frozenset({5, 6})  # LibRaw: flip
 # TIFF 6.0: ImageWidth, ImageLength, BitsPerSample, and PlanarConfiguration with its value for
 # planes of their own.
 WIDTH, LENGTH, BITS, PLANAR, APART = 256, 257, 258, 284, 2
+FILM_DIAGONAL = 43.267  # mm; CIPA DCG-001 defines the 35 mm equivalent by the diagonal
+# EXIF 2.32, FocalPlaneResolutionUnit, in mm; 4 and 5 are not in it but in TIFF/EP (ISO 12234-2).
+UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+# Sensors of phones are 4 mm wide, of medium format 54 mm: values far outside are wrong.
+SENSOR_MM = (2.0, 70.0)
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class Photo:
         path: its file.
         width: width in pixels once upright.
         height: height in pixels once upright.
-        focal_px: focal length in pixels by EXIF, None where it does not follow.
+        focal_px: focal length in pixels by EXIF, None where unknown.
         camera: maker and model by EXIF, empty where not given.
         focal_mm: focal length in mm by EXIF, None where not given.
     """
@@ -89,24 +95,24 @@ def inspect_photo(path: Path) -> Photo:
     if path.suffix.lower() in RAW_SUFFIXES:
         return _inspect_raw(path)
     try:
-        with opened(path) as image:
-            exif, (width, height) = image.getexif(), _stored_size(image)
+        with open_image(path) as image:
+            exif, (width, height) = image.getexif(), _size_in_file(image)
             lens = read_lens(exif, width, height)
             if exif.get(ExifTags.Base.Orientation) in QUARTER_TURNS:
                 width, height = height, width
     except BROKEN as error:
-        raise refused(path, error) from error
+        raise unreadable_error(path, error) from error
     return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm)
 
 
 def read_photo(photo: Photo) -> NDArray[np.uint8]:
-    """Returns a photo's pixels, upright RGB, [H, W, 3]; not of RAW, which `raw.develop` reads.
+    """Returns a photo's pixels, upright RGB, [H, W, 3]; `raw.develop` reads RAW instead.
 
     Raises:
-        InputError: the file is truncated, damaged, or holds pixels that are no colours.
+        InputError: the file is truncated, damaged, or of an unsupported pixel format.
     """
     if photo.is_raw:
-        raise ValueError(f"{photo.path.name} is to be developed")
+        raise ValueError(f"{photo.path.name} is camera RAW")
     rgb = read_rgb(photo.path)
     check_size(photo, rgb)
     return rgb
@@ -120,38 +126,38 @@ def read_alpha(photo: Photo) -> NDArray[np.uint8] | None:
     """
     if photo.is_raw or not _has_alpha(photo.path):
         return None
-    image = _decoded(photo.path, upright=True)
+    image = _decode(photo.path, upright=True)
     alpha = np.array(image.convert("RGBA").getchannel("A"))
     check_size(photo, alpha)
     return alpha
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
-    """Returns any picture's pixels, upright, as RGB, [H, W, 3]; what is transparent shows black.
+    """Returns any picture's pixels, upright, as RGB, [H, W, 3], on black where transparent.
 
     Raises:
-        InputError: the file is truncated, damaged, or holds pixels that are no colours.
+        InputError: the file is truncated, damaged, or of an unsupported pixel format.
     """
-    return _before_black(_decoded(path, upright=True))
+    return _on_black(_decode(path, upright=True))
 
 
 def read_as_stored(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Returns a picture's RGB, [H, W, 3], and opacity, [H, W] or None, not turned as EXIF says.
+    """Returns a picture's RGB, [H, W, 3], and opacity, [H, W] or None, ignoring EXIF orientation.
 
-    Poses that others found belong to the pixels as they lie in the file.
+    The poses of a data set belong to the pixels as they are in the file.
 
     Raises:
         InputError: see `read_rgb`.
     """
-    image = _decoded(path, upright=False)
+    image = _decode(path, upright=False)
     alpha = None
     if image.has_transparency_data:
         alpha = np.array(image.convert("RGBA").getchannel("A"))
-    return _before_black(image), alpha
+    return _on_black(image), alpha
 
 
-def _before_black(image: Image.Image) -> NDArray[np.uint8]:
-    """Returns RGB, [H, W, 3]; what is transparent shows black, as behind a splat."""
+def _on_black(image: Image.Image) -> NDArray[np.uint8]:
+    """Returns RGB, [H, W, 3], on black where transparent, as behind splats."""
     if image.has_transparency_data:
         black = Image.new("RGBA", image.size, (0, 0, 0, 255))
         image = Image.alpha_composite(black, image.convert("RGBA"))
@@ -159,7 +165,7 @@ def _before_black(image: Image.Image) -> NDArray[np.uint8]:
 
 
 def check_size(photo: Photo, pixels: NDArray[np.uint8]) -> None:
-    """Raises InputError when pixels [H, W, ...] are not as many as a photo's header says."""
+    """Raises InputError when pixels [H, W, ...] are not of the size in the photo's header."""
     height, width = pixels.shape[:2]
     if (width, height) != (photo.width, photo.height):
         raise InputError(
@@ -167,105 +173,105 @@ def check_size(photo: Photo, pixels: NDArray[np.uint8]) -> None:
             f"{photo.width}x{photo.height}.")
 
 
-def opened(path: Path) -> Image.Image:
-    """Returns a picture of which Pillow has read the header."""
+def open_image(path: Path) -> Image.Image:
+    """Returns a picture of which only the header has been read."""
     with warnings.catch_warnings():
         # Pillow warns from 89 megapixels, which phones reach, and refuses from twice that.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         return Image.open(path, formats=_formats())
 
 
-def refused(path: Path, error: Exception) -> InputError:
-    """Returns what to raise for a picture that a library does not read."""
+def unreadable_error(path: Path, error: Exception) -> InputError:
+    """Returns the error for a picture that a library does not read."""
     return InputError(f"{path.name} cannot be read: {_reason(path, error)}.")
 
 
 def _reason(path: Path, error: Exception) -> str:
-    """Returns a library's words, or plainer ones for what happens most."""
+    """Returns the message of a library, or a plainer one for common cases."""
     if path.is_file() and path.stat().st_size == 0:
         return "it is empty (0 bytes)"
     if isinstance(error, UnidentifiedImageError):
-        return "it is no picture of a known format"
+        return "it is not a picture of a known format"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     words = error.args[0] if error.args else type(error).__name__
     text = words.decode(errors="replace") if isinstance(words, bytes) else str(words)
     if isinstance(error, Image.DecompressionBombError):
-        return text.split(", could be")[0]  # Pillow goes on about an attack
+        return text.split(", could be")[0]  # the rest is about an attack
     return text.split(" (")[0] if text.startswith("image file is truncated") else text.rstrip(".")
 
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Returns those of `FORMATS` that this Pillow knows, AVIF came late, with HEIF made known."""
+    """Returns those of `FORMATS` that this Pillow knows, with HEIF registered."""
     Image.init()
     pillow_heif.register_heif_opener()
     return tuple(name for name in FORMATS if name in Image.OPEN)
 
 
 def _has_alpha(path: Path) -> bool:
-    """Returns whether a picture holds opacity, from its header: most do not, and decoding costs."""
+    """Returns from its header whether a picture holds opacity."""
     try:
-        with opened(path) as image:
+        with open_image(path) as image:
             return image.has_transparency_data
     except BROKEN as error:
-        raise refused(path, error) from error
+        raise unreadable_error(path, error) from error
 
 
-def _stored_size(image: Image.Image) -> tuple[int, int]:
-    """Returns width and height before turning; of a TIFF, Pillow tells those after it."""
+def _size_in_file(image: Image.Image) -> tuple[int, int]:
+    """Returns width and height before rotation; for a TIFF, Pillow gives those after it."""
     tags = getattr(image, "tag_v2", {})
     return tags.get(WIDTH, image.width), tags.get(LENGTH, image.height)
 
 
-def _decoded(path: Path, *, upright: bool) -> Image.Image:
-    """Returns a picture of 8 bits a channel, in whatever mode, if `upright` turned as EXIF says.
+def _decode(path: Path, *, upright: bool) -> Image.Image:
+    """Returns a picture of 8 bits a channel, in any mode, if `upright` rotated as EXIF says.
 
-    HEIC is turned by the box irot, which libheif has done; its EXIF then says no more (HEIF,
-    ISO 23008-12, holds EXIF's orientation to be without effect).
+    libheif has already rotated HEIC by its irot box and cleared the EXIF orientation, which has no
+    effect there (ISO 23008-12).
     """
     try:
-        with opened(path) as image:
-            image.verify()  # checksums, which loading passes over; uses the image up
-        with opened(path) as image:
-            eight = _eight_bits(path, image)  # first: reading the EXIF of a PNG uses up its tiles
+        with open_image(path) as image:
+            image.verify()  # checksums, which loading ignores; consumes the image
+        with open_image(path) as image:
+            eight = _eight_bits(path, image)  # first: reading the EXIF of a PNG consumes its tiles
             turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
             return eight.transpose(turn) if upright and turn is not None else eight
     except BROKEN as error:
-        raise refused(path, error) from error
+        raise unreadable_error(path, error) from error
 
 
 def _eight_bits(path: Path, image: Image.Image) -> Image.Image:
     if image.mode == "F":
         raise ValueError("its pixels are floating point, of unknown range")
     if image.mode.startswith("I"):
-        return Image.fromarray(_reduced(np.asarray(image)))
+        return Image.fromarray(_to_8bit(np.asarray(image)))
     if _is_wide(image):
-        return _decoded_wide(path, image)
+        return _decode_wide(path, image)
     image.load()
     return image
 
 
 def _is_wide(image: Image.Image) -> bool:
-    """Returns whether colours have 16 bits, of which Pillow would cut the lower half off."""
+    """Returns whether colours have 16 bits, of which Pillow would drop the lower half."""
     if max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
         return True
     return any(";16" in str(tile.args) for tile in getattr(image, "tile", ()))
 
 
-def _decoded_wide(path: Path, image: Image.Image) -> Image.Image:
+def _decode_wide(path: Path, image: Image.Image) -> Image.Image:
     if getattr(image, "tag_v2", {}).get(PLANAR) == APART:  # read wrongly by Pillow and OpenCV
-        raise ValueError("its colours have 16 bits and lie in planes of their own")
+        raise ValueError("its colours have 16 bits in separate planes, which is not supported")
     wide = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if wide is None or wide.dtype != np.uint16 or wide.ndim != 3:
         raise ValueError(f"its pixels of {image.mode} with 16 bits cannot be decoded")
     if image.format == "TIFF":  # OpenCV has turned it, whatever the flags
         image.getexif()[ExifTags.Base.Orientation] = 1
     order = cv2.COLOR_BGR2RGB if wide.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-    return Image.fromarray(_reduced(cv2.cvtColor(wide, order)))
+    return Image.fromarray(_to_8bit(cv2.cvtColor(wide, order)))
 
 
-def _reduced(wide: NDArray[Any]) -> NDArray[np.uint8]:
+def _to_8bit(wide: NDArray[Any]) -> NDArray[np.uint8]:
     """Returns 16-bit values in 8 bits: 65535 is 257 times 255."""
     if wide.size and (wide.min() < 0 or wide.max() > 65535):  # a mode of 32 bits
         raise ValueError(f"its pixels reach from {wide.min()} to {wide.max()}, not to 65535")
@@ -277,7 +283,7 @@ def _inspect_raw(path: Path) -> Photo:
         with rawpy.imread(str(path)) as raw:
             sizes, focal = raw.sizes, raw.other.focal_length
     except rawpy.LibRawError as error:
-        raise refused(path, error) from error
+        raise unreadable_error(path, error) from error
     width, height = sizes.iwidth, sizes.iheight
     lens = _raw_lens(path, width, height)
     if sizes.flip in RAW_QUARTER_TURNS:
@@ -285,10 +291,10 @@ def _inspect_raw(path: Path) -> Photo:
     return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm or focal or None)
 
 
-def _raw_lens(path: Path, width: int, height: int) -> Lens:
-    """Returns what a RAW file says that is built like a TIFF, as most are; else nothing.
+def _raw_lens(path: Path, width: int, height: int) -> ExifLens:
+    """Returns the EXIF of a RAW file that is built like a TIFF, as most are; else nothing.
 
-    LibRaw's binding tells neither the 35 mm equivalent nor the camera.
+    rawpy gives neither the 35 mm equivalent nor the camera.
     """
     exif = Image.Exif()
     try:
@@ -296,4 +302,68 @@ def _raw_lens(path: Path, width: int, height: int) -> Lens:
             exif.load_from_fp(file)
             return read_lens(exif, width, height)
     except BROKEN:
-        return Lens()
+        return ExifLens()
+
+
+@dataclass(frozen=True)
+class ExifLens:
+    """The optics by EXIF.
+
+    Attributes:
+        camera: maker and model, empty where not given.
+        focal_mm: focal length in mm, None where not given.
+        focal_px: focal length in pixels, None where unknown.
+    """
+
+    camera: str = ""
+    focal_mm: float | None = None
+    focal_px: float | None = None
+
+
+def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
+    """Returns camera and focal length of a picture of width x height pixels, as stored.
+
+    The focal length in pixels comes from the 35 mm equivalent, by the diagonal; where that is
+    missing, from the focal length and the width of the sensor, which is the width in pixels at the
+    time of the shot over the resolution of the focal plane (EXIF 2.32, section 4.6.5).
+    """
+    detail = exif.get_ifd(ExifTags.IFD.Exif)
+    focal = _positive(detail.get(ExifTags.Base.FocalLength))
+    film = _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    pixels = None
+    if film is not None:
+        pixels = math.hypot(width, height) * film / FILM_DIAGONAL
+    elif focal is not None:
+        sensor = _sensor_mm(detail)
+        pixels = None if sensor is None else max(width, height) * focal / sensor
+    return ExifLens(_camera(exif), focal, pixels)
+
+
+def _sensor_mm(detail: dict[int, Any]) -> float | None:
+    """Returns the length of the sensor's longer side."""
+    density = _positive(detail.get(ExifTags.Base.FocalPlaneXResolution))
+    across = [
+        _positive(detail.get(tag))
+        for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    unit = UNIT_MM.get(detail.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    longer = max((side for side in across if side is not None), default=None)
+    if density is None or longer is None or unit is None:
+        return None
+    size = longer / density * unit
+    return size if SENSOR_MM[0] <= size <= SENSOR_MM[1] else None
+
+
+def _camera(exif: Image.Exif) -> str:
+    """Returns maker and model, the maker once."""
+    maker, model = (
+        str(exif.get(tag) or "").strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
+    return model if model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
+
+
+def _positive(value: Any) -> float | None:
+    """Returns a positive EXIF number; None for text, zero or a fraction over zero."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None

@@ -1,4 +1,4 @@
-"""What every kind of capture comes down to, and what taking one needs."""
+"""The result of ingesting one source, whatever its kind, and the context that this needs."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Protocol
 
 from recon_cli.capture.contact_sheet import SHEET, ContactSheet
-from recon_cli.capture.selection_record import CHOICE, Candidate, write_choice
+from recon_cli.capture.selection_record import CHOICE, FrameCandidate, write_choice
 from recon_cli.io.frames import Frame, Group
 from recon_cli.io.posed import KnownPoses
 from recon_cli.progress import Progress
 
 
-class Context(Protocol):
-    """How taking a capture reports; a stage's context is one."""
+class IngestContext(Protocol):
+    """How an ingest reports; a stage's context is one."""
 
     @property
     def progress(self) -> Progress:
@@ -26,53 +26,48 @@ class Context(Protocol):
         """CPU threads to use."""
 
     def notice(self, text: str) -> None:
-        """Tells the user something that is no error but must not be missed."""
+        """Tells the user something important that is not an error."""
 
     def record(self, done: int, total: int, /) -> None:
-        """Notes how much would survive a crash."""
+        """Records how much would survive a crash."""
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
-    """What a source was chosen from.
+class Selection:
+    """What the frames of a source were selected from.
 
     Attributes:
         candidates: every frame or photo, in order.
-        sheet: with the thumbnails that it wants.
-        prefix: of the names of the frames, and of the files about the choice.
+        sheet: with its thumbnails.
+        prefix: of the names of the frames and of the two files.
     """
 
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[FrameCandidate, ...]
     sheet: ContactSheet
     prefix: str
 
     def write(self, stage: Path, held_out: Collection[str]) -> None:
-        """Writes the record and the contact sheet into ingest's folder.
-
-        Args:
-            stage: the folder.
-            held_out: names of the frames that are kept for the score.
-        """
+        """Writes the record and the contact sheet into ingest's folder `stage`."""
         write_choice(stage / f"{self.prefix}{CHOICE}", self.candidates)
         self.sheet.write(stage / f"{self.prefix}{SHEET}", held_out)
 
 
 @dataclass(frozen=True)
-class Taken:
+class IngestedSource:
     """The stored frames of one source.
 
     Attributes:
         kind: "video", "photos", or the layout of a data set.
         groups: of frames that share intrinsics.
         frames: sorted by name; their groups count within this source.
-        declared: how many images the source claims to hold, 0 where it does not say.
-        decoded: how many whole ones it gave.
-        lost: how many are broken or missing.
-        blurred: how many were passed over for blur or exposure.
+        declared: images that the source claims to hold, 0 where it does not say.
+        decoded: whole ones that it gave.
+        lost: broken or missing ones.
+        blurred: those that were too blurred or badly exposed.
         skipped: names of files that were left out.
-        splits: the source says itself which frames are held out.
+        splits: the source itself says which frames are held out.
         poses: known poses, by the names of the frames.
-        choice: what it was chosen from, None where nothing was to be chosen.
+        selection: what the frames were selected from, None without a selection.
     """
 
     kind: str
@@ -85,10 +80,10 @@ class Taken:
     skipped: tuple[str, ...] = ()
     splits: bool = False
     poses: KnownPoses | None = None
-    choice: Choice | None = None
+    selection: Selection | None = None
 
 
-def joined(parts: Sequence[Taken]) -> Taken:
+def merge_sources(parts: Sequence[IngestedSource]) -> IngestedSource:
     """Returns several sources as one; the names of their frames must differ already."""
     if len(parts) == 1:
         return parts[0]
@@ -98,7 +93,7 @@ def joined(parts: Sequence[Taken]) -> Taken:
         frames += [replace(frame, group=frame.group + len(groups)) for frame in part.frames]
         groups += part.groups
     kinds = {part.kind for part in parts}
-    return Taken(
+    return IngestedSource(
         kind=kinds.pop() if len(kinds) == 1 else "mixed",
         groups=tuple(groups),
         frames=tuple(sorted(frames, key=lambda frame: frame.name)),

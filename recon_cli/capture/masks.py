@@ -1,9 +1,9 @@
-"""What of a photo is to be ignored: from a folder of masks, or from the photo's own transparency.
+"""Masks of photos: from a folder of masks, or from the photo's own transparency.
 
-White counts, black is ignored. A mask lies in masks/ inside the folder that was given, or inside
-the one in it that holds the photos, and has its photo's name with .png or the ending of any other
-picture, or, as COLMAP wants it, behind the photo's whole name. Masks beside the folder that was
-given are not taken: they are no part of the input, and a change of theirs would go unnoticed.
+White counts, black is ignored. Masks lie in masks/ inside the given folder, or inside its subfolder
+that holds the photos. A mask is named after its photo, with .png or another picture's suffix in
+place of the photo's or, as for COLMAP, appended to it. Masks beside the given folder are not used:
+they are not part of the input, and changes to them would go unnoticed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from recon_cli.workspace import atomic
 
 FOLDER = "masks"
 SUFFIXES = PHOTO_SUFFIXES - RAW_SUFFIXES
-HALF = 128  # from here on a pixel is white, or opaque
+HALF = 128  # from this value on a pixel is white, or opaque
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class FoundMasks:
     Attributes:
         by_photo: path of the mask, by the photo's file name.
         unused: file names of masks to which no photo belongs.
-        outside: a folder of masks that lies beside the given one, None where there is none.
+        outside: a folder of masks beside the given one, None where there is none.
     """
 
     by_photo: dict[str, Path]
@@ -41,7 +41,7 @@ class FoundMasks:
 
 
 def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FoundMasks:
-    """Returns which masks belong to photos; none where there is no masks/.
+    """Returns the masks of photos; none where there is no masks/.
 
     Args:
         given: the folder that the user named.
@@ -56,13 +56,13 @@ def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FoundMasks:
         path for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and path.is_file() and path.name[0] != ".")
     by_stem = {path.stem: path for path in reversed(files)}
-    found = {}
+    by_photo = {}
     for photo in photos:
         mask = by_stem.get(photo.path.name) or by_stem.get(photo.path.stem)
         if mask is not None:
-            found[photo.path.name] = mask
-    used = set(found.values())
-    return FoundMasks(found, tuple(path.name for path in files if path not in used))
+            by_photo[photo.path.name] = mask
+    used = set(by_photo.values())
+    return FoundMasks(by_photo, tuple(path.name for path in files if path not in used))
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
@@ -79,35 +79,23 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
         raise InputError(
             f"The mask {path.name} has {gray.shape[1]}x{gray.shape[0]} pixels, but {width}x{height}"
             " or the same shape in another size is needed.",
-            hint="Make masks from the photos as they are shown, upright.")
-    mask = _fitted(gray, width, height)
+            hint="Make masks from the photos as they are displayed, upright.")
+    mask = _resample(gray, width, height)
     if not mask.any():
         raise InputError(
             f"The mask {path.name} ignores every pixel: its brightest value is {gray.max()}, but "
-            "255 is to stand for what counts.",
+            "255 marks what counts.",
             hint="Write masks with 0 and 255, or remove the photo.")
     return mask
 
 
 def _gray(path: Path) -> NDArray[np.uint8]:
-    """Returns the brightest channel of a mask, [H, W]; a mask is often called like its photo."""
+    """Returns the brightest channel of a mask, [H, W]."""
     try:
         return np.asarray(read_rgb(path).max(axis=2), np.uint8)
     except InputError as error:
         raise InputError(
             f"The mask {error.message}", hint="Write it again, or remove it.") from error
-
-
-def alpha_mask(photo: Photo) -> NDArray[np.uint8] | None:
-    """Returns what a photo's transparency ignores, [H, W], 0 below half opacity, else 255.
-
-    Returns:
-        None where nothing is ignored.
-
-    Raises:
-        InputError: the photo cannot be read or is transparent everywhere.
-    """
-    return opaque(read_alpha(photo), photo.path.name, photo.width, photo.height)
 
 
 def opaque(
@@ -128,28 +116,20 @@ def opaque(
         return None
     if alpha.max() < HALF:
         raise InputError(f"{name} is transparent everywhere.")
-    return _fitted(alpha, width, height)
+    return _resample(alpha, width, height)
 
 
 def photo_mask(
     photo: Photo, path: Path | None, width: int, height: int
 ) -> NDArray[np.uint8] | None:
-    """Returns what counts of a photo stored with width x height pixels, [H, W], 255 or 0.
+    """Returns the mask of a photo stored with width x height pixels, [H, W]; None where all counts.
 
-    Args:
-        photo: whose transparency is asked.
-        path: its mask, None where it has none.
-        width: of the stored frame.
-        height: of the stored frame.
-
-    Returns:
-        None where all of it counts.
+    It combines the mask file `path`, if there is one, with the photo's transparency.
 
     Raises:
-        InputError: see `read_mask` and `alpha_mask`; or the two leave nothing together.
+        InputError: see `read_mask` and `opaque`; or the two together leave nothing.
     """
-    alpha = alpha_mask(photo)
-    own = None if alpha is None else _fitted(alpha, width, height)
+    own = opaque(read_alpha(photo), photo.path.name, width, height)
     given = None if path is None else read_mask(path, width, height)
     if own is None or given is None:
         mask = given if own is None else own
@@ -163,18 +143,18 @@ def photo_mask(
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
-    """Writes a mask [H, W] as 8-bit gray PNG, whole or not at all, and the folder it lies in."""
+    """Writes a mask [H, W] as 8-bit gray PNG, whole or not at all, and makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(".png", mask)
     atomic.write_bytes(path, data.tobytes())
 
 
 def _same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
-    """Returns whether one size is the other times one factor, but for rounding to whole pixels."""
+    """Returns whether two sizes have the same shape, up to rounding to whole pixels."""
     small, large = sorted([(width, height), (other_width, other_height)])
     return abs(large[1] * small[0] / large[0] - small[1]) <= 1
 
 
-def _fitted(values: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+def _resample(values: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     nearest = cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
     return np.where(nearest >= HALF, 255, 0).astype(np.uint8)

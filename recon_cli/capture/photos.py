@@ -1,8 +1,9 @@
-"""A folder of photos: which files are photos, whether they suffice, and their frame names."""
+"""A folder of photos: which files are photos, their frame names, and which share intrinsics."""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,37 +14,39 @@ from recon_cli.errors import InputError
 MIN_FRAMES = 3  # two views leave nothing to check a reconstruction with
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 NO_PHOTOS = frozenset({"masks"})  # subfolders that hold pictures, but none of the scene
+# Focal lengths that agree this well are one setting of the lens: EXIF rounds to a tenth of a mm.
+SAME_FOCAL = 0.01
 
 
 @dataclass(frozen=True)
-class Folder:
-    """The photos of a folder in the order in which a person counts, and what is broken.
+class PhotoFolder:
+    """The photos of a folder in natural order (2 before 10), and what is broken.
 
     Attributes:
         photos: readable by their header.
-        broken: why each file that is named like a photo, but is none, was refused, by file name.
+        broken: why each file that is named like a photo could not be read, by file name.
     """
 
     photos: tuple[Photo, ...]
     broken: dict[str, str]
 
 
-def list_photos(paths: Iterable[Path]) -> Folder:
-    """Returns the photos among files, by content; hidden files and folders are left out."""
+def list_photos(paths: Iterable[Path]) -> PhotoFolder:
+    """Returns the photos among files, by content; hidden files and folders are ignored."""
     photos: list[Photo] = []
     broken: dict[str, str] = {}
     files = (path for path in paths if path.is_file() and path.name[0] != ".")
-    for path in sorted(files, key=lambda path: (_counting(path.stem), path.name)):
+    for path in sorted(files, key=lambda path: (_natural_key(path.stem), path.name)):
         try:
             photos.append(inspect_photo(path))
         except InputError as error:
             if path.suffix.lower() in PHOTO_SUFFIXES:
                 broken[path.name] = error.message
-    return Folder(tuple(photos), broken)
+    return PhotoFolder(tuple(photos), broken)
 
 
 def photo_folder(folder: Path) -> Path:
-    """Returns where the photos of a folder lie: in itself, in images/, or in its one subfolder.
+    """Returns the folder that holds the photos: itself, images/ in it, or its only subfolder.
 
     Raises:
         InputError: it holds none, but several of its subfolders do.
@@ -57,14 +60,14 @@ def photo_folder(folder: Path) -> Path:
     images = [path for path in inner if path.name == "images"]
     if len(inner) > 1 and not images:
         raise InputError(
-            f"{folder} holds no photos itself, but {len(inner)} of its folders do: "
+            f"{folder} holds no photos itself, but {len(inner)} of its subfolders do: "
             f"{', '.join(path.name for path in inner)}.",
             hint=f"Give one of them, such as {inner[0]}.")
     return (images or inner or [folder])[0]
 
 
 def _holds_photos(folder: Path) -> bool:
-    """Returns whether a folder holds photos, be they broken."""
+    """Returns whether a folder holds photos, even if they are broken."""
     files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
     if any(path.suffix.lower() in PHOTO_SUFFIXES for path in files):
         return True
@@ -79,20 +82,14 @@ def _is_photo(path: Path) -> bool:
     return True
 
 
-def _counting(stem: str) -> list[tuple[int, str]]:
+def _natural_key(stem: str) -> list[tuple[int, str]]:
     """Returns a sort key by which 2 comes before 10."""
     parts = re.split(r"(\d+)", stem)
     return [(int(part) if part.isdecimal() else -1, part) for part in parts]
 
 
 def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
-    """Raises InputError when too few photos can be used to reconstruct anything.
-
-    Args:
-        folder: that holds them, for the message.
-        readable: how many can be used.
-        broken: why each of the others cannot, by file name.
-    """
+    """Raises InputError for too few readable photos; `broken` says why others are not."""
     if readable >= MIN_FRAMES:
         return
     if not broken:
@@ -103,7 +100,7 @@ def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
     raise InputError(
         f"{folder} holds {_photos(readable)} that can be used and {len(broken)} that cannot, but "
         f"at least {MIN_FRAMES} are needed. The first: {next(iter(broken.values()))}",
-        hint="Mend what is named, or copy the photos from the camera again.")
+        hint="Fix the files listed above, or copy the photos from the camera again.")
 
 
 def _photos(count: int) -> str:
@@ -116,10 +113,9 @@ def frame_names(photos: Sequence[Photo]) -> list[str]:
 
 
 def names_in_order(stems: Sequence[str]) -> list[str]:
-    """Returns a PNG name for each stem, such that the names sort as the stems are ordered.
+    """Returns a PNG name for each stem, so that the names sort in the order of the stems.
 
-    They keep their own names where those are plain, differ (also where case does not count) and
-    sort in this order; else all are numbered, for a mixture would not sort.
+    The stems stay where they are plain, unique (ignoring case) and sorted; else all are numbered.
     """
     plain = all(SAFE_STEM.fullmatch(stem) for stem in stems)
     distinct = len({stem.lower() for stem in stems}) == len(stems)
@@ -127,3 +123,104 @@ def names_in_order(stems: Sequence[str]) -> list[str]:
     if plain and distinct and names == sorted(names):
         return names
     return [f"{index:06d}.png" for index in range(len(stems))]
+
+
+@dataclass(frozen=True)
+class PhotoGroup:
+    """Photos that share intrinsics.
+
+    Attributes:
+        name: camera, size and, where two groups share these, focal length; for messages.
+        photos: at least one, in their given order.
+    """
+
+    name: str
+    photos: tuple[Photo, ...]
+
+    @property
+    def width(self) -> int:
+        """Width in pixels, upright."""
+        return self.photos[0].width
+
+    @property
+    def height(self) -> int:
+        """Height in pixels, upright."""
+        return self.photos[0].height
+
+    @property
+    def focal_px(self) -> float | None:
+        """Focal length in pixels by EXIF, None where unknown."""
+        return self.photos[0].focal_px
+
+
+def group_photos(photos: Sequence[Photo]) -> list[PhotoGroup]:
+    """Returns the photos in groups of one size, camera and focal length, by their first photos.
+
+    Portrait and landscape photos differ in size. Photos without EXIF are one group for each size.
+    """
+    groups: list[list[Photo]] = []
+    for photo in photos:
+        home = next((group for group in groups if _same_camera(group[0], photo)), None)
+        if home is None:
+            groups.append([photo])
+        else:
+            home.append(photo)
+    names = _names([group[0] for group in groups])
+    return [PhotoGroup(name, tuple(group)) for name, group in zip(names, groups, strict=True)]
+
+
+def odd_photos(groups: Sequence[PhotoGroup]) -> list[Photo]:
+    """Returns photos alone in their group, without EXIF and of a unique size: perhaps mistakes."""
+    sizes = Counter((group.width, group.height) for group in groups)
+    return [
+        group.photos[0] for group in groups
+        if len(groups) > 1 and len(group.photos) == 1 and not _has_exif(group.photos[0])
+        and sizes[group.width, group.height] == 1]
+
+
+def group_notices(groups: Sequence[PhotoGroup]) -> list[str]:
+    """Returns notices about the groups; none where there is only one."""
+    if len(groups) < 2:
+        return []
+    listed = ", ".join(f"{len(group.photos)} of {group.name}" for group in groups)
+    return [
+        f"The photos form {len(groups)} groups with separate intrinsics: {listed}.",
+        *(f"{photo.path.name} matches no other photo: {photo.width}x{photo.height}, no EXIF. "
+          "Remove it if it does not belong to the scene." for photo in odd_photos(groups))]
+
+
+def _same_camera(first: Photo, other: Photo) -> bool:
+    return (
+        (first.width, first.height, first.camera) == (other.width, other.height, other.camera)
+        and _same_focal(first.focal_px, other.focal_px)
+        and _same_focal(first.focal_mm, other.focal_mm))
+
+
+def _same_focal(first: float | None, other: float | None) -> bool:
+    if first is None or other is None:
+        return first is other
+    return max(first, other) <= min(first, other) * (1 + SAME_FOCAL)
+
+
+def _has_exif(photo: Photo) -> bool:
+    return bool(photo.camera) or photo.focal_px is not None or photo.focal_mm is not None
+
+
+def _names(firsts: Sequence[Photo]) -> list[str]:
+    """Returns a name for each group, with its focal length where that is needed."""
+    plain = [f"{photo.camera} {photo.width}x{photo.height}".strip() for photo in firsts]
+    twice = {name for name, count in Counter(plain).items() if count > 1}
+    names = [
+        f"{name} {_focal(photo)}".strip() if name in twice else name
+        for name, photo in zip(plain, firsts, strict=True)]
+    counts: Counter[str] = Counter()
+    for place, name in enumerate(names):
+        counts[name] += 1
+        names[place] = name if counts[name] == 1 else f"{name} ({counts[name]})"
+    return names
+
+
+def _focal(photo: Photo) -> str:
+    if photo.focal_mm is not None:
+        return f"{photo.focal_mm:g} mm"
+    return "" if photo.focal_px is None else f"f = {photo.focal_px:.0f} px"

@@ -1,8 +1,8 @@
 """Camera RAW: a set of photos is developed alike, so that a point has one colour in all of them.
 
-One white balance and one saturation for each camera, one brightness for the whole set, and what a
-photo was exposed longer or shorter than the others taken back. LibRaw does the developing; what it
-would choose for each photo by itself (brightness, maximum) is switched off.
+There is one white balance and one saturation per camera, one brightness for the whole set, and
+differences of exposure are undone. LibRaw develops; what it would choose per photo (brightness,
+maximum) is switched off.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
-from recon_cli.capture.images import Photo, check_size, refused
-from recon_cli.capture.raw_exposure import Look, exposures, look_at, nominal_ev
+from recon_cli.capture.images import Photo, check_size, unreadable_error
+from recon_cli.capture.raw_exposure import RawMeasures, exposures, measure_view, nominal_ev
 from recon_cli.errors import InputError
 
 SRGB = (2.4, 12.92)  # IEC 61966-2-1: power and slope of the straight part
 LOOK_PIXELS = 800  # longer side of the small views that exposures are measured on
 SATURATED = 0.99  # of the maximum; interpolation and rounding take the rest
-# LibRaw's own thresholds: white is what 1 % of the pixels exceed (auto_bright_thr), and a maximum
-# of the data above .75 of the nominal one is where the sensor saturates (adjust_maximum_thr).
+# LibRaw's own thresholds: 1 % of the pixels exceed white (auto_bright_thr), and a maximum of the
+# data above .75 of the nominal one is where the sensor saturates (adjust_maximum_thr).
 BLOWN_SHARE, SATURATES_ABOVE = 0.01, 0.75
-# A photo counts as clipped from this share of its pixels on: below, lamps and glints.
+# A photo counts as clipped from this share of its pixels on; fewer are lamps and glints.
 CLIPPED_SHARE = 0.001
-# White comes down so far that all photos clip at one radiance, but blows no more of the set than
+# White is lowered so far that all photos clip at one radiance, but clips no more of the set than
 # this: a long exposure of a dark corner must not erase a bright room.
 SACRIFICED_SHARE = 0.1
 MOST_BRIGHTENED = 8.0  # LibRaw's limit for exp_shift
 
 
 T = TypeVar("T")
-Shared = tuple[tuple[float, ...], int]  # multipliers and saturation of one camera
+CameraSettings = tuple[tuple[float, ...], int]  # multipliers and saturation of one camera
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class RawPlan:
     broken: dict[str, str]
 
     def to_json(self) -> dict[str, Any]:
-        """Returns plain dictionaries, lists and numbers."""
+        """Returns JSON values."""
         return dataclasses.asdict(self)
 
     @staticmethod
     def from_json(value: dict[str, Any]) -> RawPlan:
-        """Returns the plan of which `to_json` made `value`."""
+        """Returns the plan that `to_json` wrote."""
         shots = {
             name: RawShot(tuple(shot["multipliers"]), shot["saturation"], shot["gain_ev"])
             for name, shot in value["shots"].items()}
@@ -84,7 +84,7 @@ class RawPlan:
 
 @dataclass(frozen=True)
 class _Header:
-    """What planning needs to know of a photo before it looks at it."""
+    """What planning needs from the header of a photo."""
 
     path: Path
     camera: tuple[object, ...]
@@ -96,30 +96,30 @@ class _Header:
 
 
 def plan_raw(paths: Sequence[Path], *, step: Callable[[], None] = lambda: None) -> RawPlan:
-    """Returns how to develop RAW photos of one scene so that they match, or why one cannot be.
+    """Returns how to develop RAW photos of one scene so that they match.
 
     Args:
         paths: the photos of one folder in the order of taking.
         step: is called after each photo.
     """
     broken: dict[str, str] = {}
-    headers = [header for path in paths if (header := _tried(_read_header, path, broken))]
+    headers = [header for path in paths if (header := _try_read(_read_header, path, broken))]
     common = _by_camera(headers)
-    looks: list[Look] = []
-    seen: list[_Header] = []
+    measures: list[RawMeasures] = []
+    readable: list[_Header] = []
     for header in headers:
-        look = _tried(partial(_look, shared=common[header.camera]), header.path, broken)
-        if look is not None:
-            looks.append(look)
-            seen.append(header)
+        view = _try_read(partial(_measure, shared=common[header.camera]), header.path, broken)
+        if view is not None:
+            measures.append(view)
+            readable.append(header)
         step()
-    if not seen:
+    if not readable:
         return RawPlan({}, broken)
-    ev = exposures(looks, _nominal(seen))
-    gains = -ev - math.log2(_white(looks, ev))
+    ev = exposures(measures, _nominal(readable))
+    gains = -ev - math.log2(_white(measures, ev))
     return RawPlan({
         header.path.name: RawShot(*common[header.camera], float(gain))
-        for header, gain in zip(seen, gains, strict=True)}, broken)
+        for header, gain in zip(readable, gains, strict=True)}, broken)
 
 
 def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
@@ -134,29 +134,29 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     try:
         with rawpy.imread(str(photo.path)) as raw:
             rgb = np.asarray(raw.postprocess(
-                **_fixed(shot.multipliers, shot.saturation), bright=2.0 ** shot.gain_ev,
+                **_fixed_options(shot.multipliers, shot.saturation), bright=2.0 ** shot.gain_ev,
                 gamma=SRGB, output_color=rawpy.ColorSpace.sRGB, output_bps=8), np.uint8)
     except rawpy.LibRawError as error:
-        raise refused(photo.path, error) from error
+        raise unreadable_error(photo.path, error) from error
     check_size(photo, rgb)
     return rgb
 
 
-def _fixed(multipliers: Sequence[float], saturation: int) -> dict[str, Any]:
-    """Returns what LibRaw would otherwise choose for each photo by itself."""
+def _fixed_options(multipliers: Sequence[float], saturation: int) -> dict[str, Any]:
+    """Returns the options that LibRaw would otherwise choose per photo."""
     return {
         "user_wb": list(multipliers), "user_sat": saturation, "no_auto_bright": True,
         "adjust_maximum_thr": 0.0, "highlight_mode": rawpy.HighlightMode.Clip}
 
 
-def _tried(read: Callable[[Path], T], path: Path, broken: dict[str, str]) -> T | None:
-    """Returns what `read` does, or None with the reason noted in `broken`."""
+def _try_read(read: Callable[[Path], T], path: Path, broken: dict[str, str]) -> T | None:
+    """Returns what `read` does, or None with the reason in `broken`."""
     try:
         return read(path)
     except InputError as error:
         broken[path.name] = error.message
     except rawpy.LibRawError as error:
-        broken[path.name] = refused(path, error).message
+        broken[path.name] = unreadable_error(path, error).message
     return None
 
 
@@ -167,7 +167,7 @@ def _read_header(path: Path) -> _Header:
         if highest == 0:  # how LibRaw answers a compression that it does not know
             raise InputError(f"{path.name} holds only black pixels.")
         f_number = shot.aperture if shot.aperture > 0 else None
-        # Of one camera, and one depth of bits: a maximum of 4095 says nothing of 16383.
+        # Per camera and bit depth: a maximum of 4095 says nothing about 16383.
         camera = (raw.rgb_xyz_matrix.tobytes(), raw.color_desc, round(math.log2(max(white, 1))))
         return _Header(
             path, camera, _multipliers(raw), white, highest,
@@ -176,14 +176,14 @@ def _read_header(path: Path) -> _Header:
 
 def _multipliers(raw: rawpy.RawPy) -> tuple[float, ...]:
     """Returns the white balance as shot, else that of daylight, with green as 1."""
-    for found in (raw.camera_whitebalance, raw.daylight_whitebalance):
-        red, green, blue, second = (float(value) for value in found)
+    for balance in (raw.camera_whitebalance, raw.daylight_whitebalance):
+        red, green, blue, second = (float(value) for value in balance)
         if all(math.isfinite(value) and value > 0 for value in (red, green, blue)):
             return (red / green, 1.0, blue / green, (second or green) / green)
     return (1.0, 1.0, 1.0, 1.0)
 
 
-def _by_camera(headers: Sequence[_Header]) -> dict[tuple[object, ...], Shared]:
+def _by_camera(headers: Sequence[_Header]) -> dict[tuple[object, ...], CameraSettings]:
     """Returns for each camera the white balance of its median photo, and where it saturates."""
     common = {}
     for camera in {header.camera for header in headers}:
@@ -197,10 +197,10 @@ def _by_camera(headers: Sequence[_Header]) -> dict[tuple[object, ...], Shared]:
     return common
 
 
-def _look(path: Path, shared: Shared) -> Look:
+def _measure(path: Path, shared: CameraSettings) -> RawMeasures:
     with rawpy.imread(str(path)) as raw:
         wide = raw.postprocess(
-            **_fixed(*shared), half_size=True, gamma=(1, 1),
+            **_fixed_options(*shared), half_size=True, gamma=(1, 1),
             output_color=rawpy.ColorSpace.raw, output_bps=16)
     linear = wide.astype(np.float32) / 65535
     clipped = (linear.max(axis=2) >= SATURATED).astype(np.float32)
@@ -208,11 +208,11 @@ def _look(path: Path, shared: Shared) -> Look:
     small, touched = (
         cv2.resize(plane, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         for plane in (linear, clipped))
-    return look_at(small, touched > 0)
+    return measure_view(small, touched > 0)
 
 
 def _nominal(headers: Sequence[_Header]) -> list[float | None]:
-    """Returns exposures by EXIF; a lens that never tells its f-number is held to keep it."""
+    """Returns exposures by EXIF; a lens that never gives its f-number is assumed to keep it."""
     if all(header.f_number is None for header in headers):
         return [header.ev for header in headers]
     return [
@@ -221,14 +221,14 @@ def _nominal(headers: Sequence[_Header]) -> list[float | None]:
         for header in headers]
 
 
-def _white(looks: Sequence[Look], ev: NDArray[np.float64]) -> float:
+def _white(measures: Sequence[RawMeasures], ev: NDArray[np.float64]) -> float:
     """Returns the radiance that becomes white, where saturation of the median photo has 1."""
     radiance = np.concatenate([
-        look.brightest * 2.0 ** -own for look, own in zip(looks, ev, strict=True)])
+        view.brightest * 2.0 ** -own for view, own in zip(measures, ev, strict=True)])
     bright, floor = np.quantile(
         radiance, [1 - BLOWN_SHARE, 1 - SACRIFICED_SHARE], method="lower")
     white = min(1.0, max(float(bright), 1 / MOST_BRIGHTENED))
     clips = [
-        2.0 ** -own for look, own in zip(looks, ev, strict=True)
-        if look.clipped_share > CLIPPED_SHARE]
+        2.0 ** -own for view, own in zip(measures, ev, strict=True)
+        if view.clipped_share > CLIPPED_SHARE]
     return float(min([white, *(max(at, float(floor)) for at in clips)]))

@@ -1,4 +1,4 @@
-"""The record of a choice: every frame that could have been taken, and why it was or was not."""
+"""The record of the selection: every candidate frame, and why it was chosen or not."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHOICE = "choice.json"
 
 
 class Reason(StrEnum):
-    """What became of a frame, in the words that a person reads."""
+    """What became of a frame."""
 
     KEPT = "kept"
     DAMAGED = "damaged"
@@ -39,7 +39,7 @@ MEANINGS = {
 
 
 @dataclass(frozen=True)
-class Candidate:
+class FrameCandidate:
     """One frame of a capture.
 
     Attributes:
@@ -48,7 +48,7 @@ class Candidate:
         reason: what became of it.
         sharpness: variance of its Laplacian; None where it could not be read.
         name: of the stored frame, None where it was not kept.
-        like: index of the kept frame that stands for a duplicate or lies nearest to one too close.
+        like: index of the kept frame that a duplicate equals, or that is nearest to one too close.
     """
 
     source: str
@@ -59,52 +59,52 @@ class Candidate:
     like: int | None = None
 
 
-def of_video(
+def video_candidates(
     source: str,
     sharpness: NDArray[np.float64],  # [F]
     refused: Sequence[Reason | None],  # [F]
-    way: NDArray[np.float64],  # [F]
+    lengths: NDArray[np.float64],  # [F]
     names: dict[int, str],
     *,
     same: float,
-) -> tuple[Candidate, ...]:
-    """Returns the record of a choice among the frames of a video.
+) -> tuple[FrameCandidate, ...]:
+    """Returns the record of a selection among the frames of a video.
 
     Args:
         source: name of the video.
         sharpness: of each frame.
-        refused: why a frame could not be taken, None where it could.
-        way: travelled up to each frame, in widths of the image.
+        refused: why a frame could not be chosen, None where it could.
+        lengths: of the path up to each frame, in widths of the image.
         names: of the stored frames by index; at least one.
-        same: ways that differ by no more than this are the same view.
+        same: path lengths that differ by no more than this are the same view.
     """
-    kept = np.array(sorted(names))
-    found = []
+    chosen = np.array(sorted(names))
+    candidates = []
     for index, reason in enumerate(refused):
-        nearest, like = int(kept[np.argmin(np.abs(way[kept] - way[index]))]), None
+        nearest, like = int(chosen[np.argmin(np.abs(lengths[chosen] - lengths[index]))]), None
         if index in names:
             became = Reason.KEPT
         elif reason is not None:
             became = reason
         else:
             like = nearest
-            still = abs(way[nearest] - way[index]) <= same
+            still = abs(lengths[nearest] - lengths[index]) <= same
             became = Reason.DUPLICATE if still else Reason.CLOSE
-        found.append(Candidate(
+        candidates.append(FrameCandidate(
             source, index, became, round(float(sharpness[index]), 2), names.get(index), like))
-    return tuple(found)
+    return tuple(candidates)
 
 
-def counts(candidates: Sequence[Candidate]) -> dict[str, int]:
+def count_reasons(candidates: Sequence[FrameCandidate]) -> dict[str, int]:
     """Returns how many candidates each reason has, in the order of `Reason`, without zeros."""
-    found = Counter(candidate.reason for candidate in candidates)
-    return {reason.value: found[reason] for reason in Reason if found[reason]}
+    numbers = Counter(candidate.reason for candidate in candidates)
+    return {reason.value: numbers[reason] for reason in Reason if numbers[reason]}
 
 
-def write_choice(path: Path, candidates: Sequence[Candidate]) -> None:
-    """Writes the record of a choice as JSON."""
+def write_choice(path: Path, candidates: Sequence[FrameCandidate]) -> None:
+    """Writes the record of a selection as JSON."""
     atomic.write_json(path, {
-        "counts": counts(candidates),
+        "counts": count_reasons(candidates),
         "meanings": {reason.value: text for reason, text in MEANINGS.items()},
         "candidates": [dataclasses.asdict(candidate) for candidate in candidates],
     })

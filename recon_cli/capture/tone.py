@@ -1,10 +1,10 @@
-"""HDR light to SDR bytes: HLG or PQ to BT.709 primaries in the code of sRGB.
+"""HDR to SDR: HLG or PQ to sRGB bytes with BT.709 primaries.
 
 Display light comes from ITU-R BT.2100: the EOTF of PQ, or of HLG with its OOTF for a display of
 1000 cd/m2. The curve that fits it below the white of SDR is the EETF of Report BT.2408, Annex 5
-(in BT.2390 up to revision 7). It is applied to the largest of R, G and B, so that hue stays and
-nothing clips. One curve serves every frame of every video: a curve that follows the scene would
-give one wall another colour in each frame. What a file says about its own peak is not read.
+(in BT.2390 up to revision 7). It is applied to the largest of R, G and B, which keeps the hue and
+avoids clipping. One curve is used for every frame of every video: a curve that adapts to the scene
+would give one wall another colour in each frame. The peak in a file's metadata is ignored.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ GAIN_REACH = 2.0  # of the peak: pure red of BT.2020 is 1.66 of it as red of BT.
 # What swscale makes of white in limited range when it goes to 16 bits: 255 * 256. In full range it
 # is up to 0.4 % more, which clips.
 WHITE = 65280
-# Pixels at a time, so that what lies in between stays in the cache: 14 ms a megapixel of HLG on one
+# Pixels at a time, so that intermediate values stay in the cache: 14 ms a megapixel of HLG on one
 # core of a server CPU (AMD EPYC), 37 in one piece.
 STRIP = 1 << 15
 
 
 class Transfer(Enum):
-    """The two ways in which HDR video codes light."""
+    """The transfer functions of HDR video."""
 
     HLG = "HLG"
     PQ = "PQ"
@@ -71,7 +71,7 @@ def hlg_scene(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - HLG_C) / HLG_A) + HLG_B) / 12)
 
 
-def compressed(light: NDArray[np.float64]) -> NDArray[np.float64]:
+def tone_map(light: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns light of up to `PEAK` cd/m2 fitted below `SDR_WHITE`; BT.2408, Annex 5.
 
     Up to 88 cd/m2 nothing changes. Above, a Hermite spline in PQ bends to the white of SDR: 203
@@ -90,10 +90,7 @@ def compressed(light: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def srgb_code(light: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Returns light in [0, 1] as sRGB bytes (IEC 61966-2-1), the code that viewers take a PNG in.
-
-    BT.1886 would be right for a television set in a dark room.
-    """
+    """Returns light in [0, 1] as sRGB bytes (IEC 61966-2-1), which viewers expect in a PNG."""
     code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.asarray(np.round(255 * code), np.uint8)
 
@@ -106,7 +103,7 @@ def gray_table(transfer: Transfer) -> NDArray[np.uint8]:
     """
     signal = np.arange(256) / 255
     light = hlg_scene(signal) ** HLG_GAMMA * PEAK if transfer is Transfer.HLG else pq_light(signal)
-    return srgb_code(compressed(light) / SDR_WHITE)
+    return srgb_code(tone_map(light) / SDR_WHITE)
 
 
 def to_sdr(
@@ -138,16 +135,16 @@ def _strip_to_sdr(
     linear = cv2.transform(light, to_bt709)
     if transfer is Transfer.HLG:
         # The OOTF scales all three by a power of the luminance, so it may come after the matrix.
-        linear = _scaled(linear, cv2.pow(cv2.transform(light, luminance), HLG_GAMMA - 1))
+        linear = _scale(linear, cv2.pow(cv2.transform(light, luminance), HLG_GAMMA - 1))
     # Below 0 are colours that BT.709 cannot show. Not linear.max(axis=2): 28 ms a megapixel.
     largest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
     root = cv2.sqrt(np.maximum(largest, 0) / GAIN_REACH)
     gain = _gain_table().take((root * (GAIN_STEPS - 1) + 0.5).astype(np.uint16))
-    linear = np.clip(_scaled(linear, gain), 0, 1)
+    linear = np.clip(_scale(linear, gain), 0, 1)
     return _code_table().take((linear * 65535 + 0.5).astype(np.uint16))
 
 
-def _scaled(rgb: NDArray[np.float32], factor: NDArray[np.float32]) -> NDArray[np.float32]:
+def _scale(rgb: NDArray[np.float32], factor: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns pixels [N, 1, 3] times a factor each [N, 1]."""
     # Ten times as fast as broadcasting over an axis of three.
     return np.asarray(cv2.multiply(rgb, cv2.merge([factor] * 3)))
@@ -167,7 +164,7 @@ def _gain_table() -> NDArray[np.float32]:  # [GAIN_STEPS]
     """Returns the gain that takes light in units of the peak to light in units of SDR's white."""
     light = np.linspace(0, 1, GAIN_STEPS) ** 2 * GAIN_REACH
     light[0] = light[1]  # below the knee the gain is constant
-    return (compressed(light * PEAK) / (light * SDR_WHITE)).astype(np.float32)
+    return (tone_map(light * PEAK) / (light * SDR_WHITE)).astype(np.float32)
 
 
 @cache

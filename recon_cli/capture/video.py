@@ -1,11 +1,15 @@
-"""Video files through PyAV: what is a video, and its frames in order.
+"""Video files through PyAV: whether a file is a video, its declared length, its frames in order.
 
-A packet that cannot be decoded is passed over and reported as a `Gap`. Of several videos in one
-file the first is taken; sound and covers are passed over.
+A packet that cannot be decoded is skipped and reported as a `Gap`. Of several videos in one file
+the first is used; sound and covers are ignored. `codec_name` and `lacks_index` read the container
+themselves, for the messages about files that FFmpeg cannot open.
 """
 
 from __future__ import annotations
 
+import mmap
+import re
+import struct
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,27 +22,39 @@ from av.stream import Disposition
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from recon_cli.capture.container_probe import codec_name, lacks_index
-from recon_cli.capture.decoded_picture import Gap, Picture, Tags, tags_of
-from recon_cli.capture.deinterlace import progressive
+from recon_cli.capture.decoded_picture import DecodedPicture, Gap, Tags, progressive, tags_of
 from recon_cli.errors import InputError
 
-# FFmpeg renders text and text art as video; nobody means that by a capture.
+# FFmpeg renders text and text art as video; no capture is that.
 TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
-# A demuxer that fails this often in one file makes no progress any more.
+# A demuxer that fails this often in one file no longer makes progress.
 MAX_DEMUX_ERRORS = 100
+# How containers mark their video: MP4 and MOV in the first sample entry of a video track, Matroska
+# as V_ and capitals, AVI in the header of a video stream.
+MARKS = (
+    re.compile(rb"hdlr.{8}vide.*?stsd.{12}([\x20-\x7e]{4})", re.DOTALL),
+    re.compile(rb"(V_[A-Z0-9_/]{3,30})"),
+    re.compile(rb"strh.{4}vids([\x20-\x7e]{4})", re.DOTALL),
+)
+SIGNATURES = (rb"....ftyp|....moov|....mdat|....wide", rb"\x1aE\xdf\xa3", rb"RIFF....AVI ")
+# Codecs that a build may lack: HEVC for patents, AV1 and VVC for age.
+NAMES = {
+    "av01": "AV1", "V_AV1": "AV1", "AV01": "AV1",
+    "hvc1": "HEVC", "hev1": "HEVC", "dvh1": "HEVC", "dvhe": "HEVC", "V_MPEGH/ISO/HEVC": "HEVC",
+    "vvc1": "VVC", "vvi1": "VVC", "evc1": "EVC",
+}
 
 
 @contextmanager
 def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Yields the container and the video stream of a file, whatever its name ends in.
+    """Yields the container and the video stream of a file, whatever its suffix.
 
     Raises:
         InputError: the file is missing, not readable, no video, or a single picture.
     """
     try:
-        # "file:" keeps a colon in the name from being read as a protocol, and the whitelist keeps
-        # a playlist from fetching anything.
+        # "file:" prevents a colon in the name from being read as a protocol, and the whitelist
+        # prevents a playlist from fetching anything.
         container = av.open(
             f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
     except av.error.FFmpegError as error:
@@ -65,12 +81,12 @@ def _unreadable(path: Path, reason: str) -> InputError:
 
 def _cut_off(path: Path) -> InputError:
     return InputError(
-        f"{path} is cut off: its index (the moov box) is not there in full.",
-        hint="Copy it from the camera again; if it is no longer there, record once more.")
+        f"{path} is truncated: its index (the moov box) is incomplete.",
+        hint="Copy it from the camera again, or record once more.")
 
 
 def _video_stream(path: Path, container: InputContainer) -> VideoStream:
-    """Returns the first moving picture; the cover of a song is none."""
+    """Returns the first video stream that is no cover."""
     moving = moving_pictures(container)
     for stream in moving:
         if stream.codec_context is not None:
@@ -83,8 +99,8 @@ def _video_stream(path: Path, container: InputContainer) -> VideoStream:
     if lacks_index(path):
         raise _cut_off(path)
     kinds = {"video": "a still picture or text"}
-    found = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
-    only = f", only {', '.join(found)}" if found else ": it is empty"
+    types = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
+    only = f", only {', '.join(types)}" if types else ": it is empty"
     raise InputError(
         f"{path} holds no video that can be decoded{only}.",
         hint="Give a video or a folder of photos.")
@@ -100,20 +116,20 @@ def moving_pictures(container: InputContainer) -> list[VideoStream]:
 
 
 def convert_hint(path: Path) -> str:
-    """Returns what to type to make a file of a codec that every build decodes."""
+    """Returns the command that converts a file to a codec that every build decodes."""
     return (
-        "Convert it where a player shows it, such as by "
+        "Convert it where a player can play it, for example with "
         f'ffmpeg -i "{path}" -c:v libx264 -crf 16 "{path.stem}-h264.mp4"')
 
 
 @dataclass(frozen=True)
-class Claim:
-    """What a file says about its length, before anything is decoded.
+class DeclaredLength:
+    """The length of a video by its container.
 
     Attributes:
         frames: the container's count, 0 where it keeps none.
         seconds: duration, 0 where it is not known.
-        rate: frames per second; little more than a guess where the rate varies.
+        rate: frames per second; a rough guess where the rate varies.
     """
 
     frames: int
@@ -121,11 +137,11 @@ class Claim:
     rate: float
 
     def count(self, rate: float) -> int:
-        """Returns how many frames there should be, by the duration where none are counted."""
+        """Returns the number of frames there should be, by the duration where there is no count."""
         return self.frames or round(self.seconds * rate)
 
 
-def claimed_length(path: Path) -> Claim:
+def declared_length(path: Path) -> DeclaredLength:
     """Returns what a video's container says about its length.
 
     Raises:
@@ -136,14 +152,14 @@ def claimed_length(path: Path) -> Claim:
             seconds = float(stream.duration * stream.time_base)
         else:
             seconds = (container.duration or 0) / av.time_base
-        return Claim(stream.frames, seconds, float(stream.average_rate or 0))
+        return DeclaredLength(stream.frames, seconds, float(stream.average_rate or 0))
 
 
-def decode(path: Path, *, threads: int) -> Iterator[Picture | Gap]:
-    """Yields every frame of a video in the order of showing, and a `Gap` for each lost packet.
+def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
+    """Yields every frame of a video in presentation order, and a `Gap` for each lost packet.
 
     The frames of an undamaged video do not depend on `threads`; around damage they do. A frame of
-    another size than the first counts as lost. Interlaced frames come out deinterlaced.
+    another size than the first counts as lost. Interlaced frames are deinterlaced.
 
     Raises:
         InputError: as `open_video`.
@@ -156,9 +172,9 @@ def decode(path: Path, *, threads: int) -> Iterator[Picture | Gap]:
             if isinstance(item, Gap):
                 yield item
                 continue
-            # Not before the first frame: some cameras say that it is HLG within the stream alone.
+            # Not before the first frame: some cameras signal HLG only within the stream.
             tags = tags or tags_of(stream)
-            yield Picture(item[0], tags, item[1])
+            yield DecodedPicture(item[0], tags, item[1])
 
 
 def frames_at(
@@ -172,7 +188,7 @@ def frames_at(
     missing = set(indices)
     if not missing:
         return
-    pictures = (item for item in decode(path, threads=threads) if isinstance(item, Picture))
+    pictures = (item for item in decode(path, threads=threads) if isinstance(item, DecodedPicture))
     for index, picture in enumerate(pictures):
         if index in missing:
             yield index, picture.rgb()
@@ -180,8 +196,8 @@ def frames_at(
         if not missing:
             return
     raise InputError(
-        f"{path} ended before frame {min(missing)}, which was there on the first reading.",
-        hint="Leave the file alone while it is read, then run the same command again.")
+        f"{path} ended before frame {min(missing)}, which the first pass had read.",
+        hint="Do not change the file while it is read, then run the same command again.")
 
 
 def _of_one_size(items: Iterable[av.VideoFrame | Gap]) -> Iterator[av.VideoFrame | Gap]:
@@ -209,10 +225,39 @@ def _frames(container: InputContainer, stream: VideoStream) -> Iterator[av.Video
 def _packets(
     container: InputContainer, stream: VideoStream
 ) -> Iterator[av.Packet[VideoStream] | Gap]:
-    """Yields the packets of a stream; goes on behind what the demuxer stumbles over."""
+    """Yields the packets of a stream; continues after errors of the demuxer."""
     for _ in range(MAX_DEMUX_ERRORS):
         try:
             yield from container.demux(stream)
             return
         except av.error.FFmpegError:
             yield Gap(None)
+
+
+def codec_name(path: Path) -> str:
+    """Returns the name of the codec of a file's first video, "" where it is not found."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for signature, mark in zip(SIGNATURES, MARKS, strict=True):
+            if re.match(signature, data, re.DOTALL) and (match := mark.search(data)):
+                name = match[1].decode("ascii").strip()
+                return NAMES.get(name, name)
+    return ""
+
+
+def lacks_index(path: Path) -> bool:
+    """Returns whether a file is an MP4 or MOV whose index, the moov box, is incomplete."""
+    size, at, boxes = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while len(head := file.read(16)) >= 8:
+            length, name = struct.unpack_from(">I4s", head)
+            if length == 1 and len(head) == 16:  # a length of 64 bits follows
+                length = struct.unpack_from(">Q", head, 8)[0]
+            end = at + length if length else size  # 0: to the end of the file
+            if at == 0 and name not in {b"ftyp", b"mdat", b"wide", b"moov"}:
+                return False
+            if length and length < 8:
+                break
+            boxes.add(name if end <= size else b"")
+            at = end
+            file.seek(at)
+    return bool(boxes) and b"moov" not in boxes

@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.filters import FILTERS
-from recon_cli.capture.noise import estimate_noise
+from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.evaluation.tables import Table
 from recon_cli.experiments.variants import run_grid

@@ -1,7 +1,7 @@
-"""denoise: measures the noise of each frame and filters those that have some.
+"""denoise: measures the noise of each frame and filters the noisy ones.
 
-Each frame is judged by itself: a phone raises its gain when it turns to a dark corner, so that one
-capture holds clean and noisy frames. Frames that pass stay byte-identical.
+Frames are measured one by one: a phone raises its gain when it turns to a dark corner, so that one
+capture holds clean and noisy frames. Clean frames stay byte-identical.
 """
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon_cli.capture.filters import FILTERS
-from recon_cli.capture.noise import estimate_noise
-from recon_cli.capture.pace import paced
+from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io import frames as store
@@ -63,16 +61,15 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
 def _process(
     config: DenoiseConfig, names: list[str], source: Path, target: Path, ctx: StageContext
 ) -> list[_Outcome]:
-    """Returns what became of each frame, in the order of `names`."""
+    """Returns the outcome of each frame, in the order of `names`."""
     outcomes = []
-    record = paced(ctx.record)
     pool = ThreadPoolExecutor(ctx.threads)
     try:
         with ctx.progress.bar("denoise", len(names), unit="frame") as bar:
             for outcome in pool.map(lambda n: _frame(config, source / n, target / n), names):
                 outcomes.append(outcome)
                 bar.advance()
-                record(len(outcomes), len(names))
+                ctx.record(len(outcomes), len(names))
     finally:
         pool.shutdown(cancel_futures=True)  # an error or Ctrl-C does not wait for the rest
     return outcomes
@@ -85,7 +82,7 @@ def _frame(config: DenoiseConfig, source: Path, target: Path) -> _Outcome:
     filtered = config.mode == "force" or (config.mode == "auto" and sigma >= config.threshold)
     if not target.exists():
         if filtered:
-            # Whoever forces the filter says that the estimate is too low.
+            # With --force the estimate is taken to be too low.
             noise = max(sigma, config.threshold)
             store.write_png(target, FILTERS[config.filter](rgb, noise, config.strength))
         else:

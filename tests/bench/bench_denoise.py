@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.filters import FILTERS
-from recon_cli.capture.noise import estimate_noise
+from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.capture.video import frames_at
 from recon_cli.experiments import filter_comparison
 

@@ -18,7 +18,7 @@ from recon_cli.io.frames import FOLDER, read_frame_list
 from recon_cli.io.posed import POSES, read_poses
 from recon_cli.sfm import known_poses
 from recon_cli.sfm import known_poses as spot_check
-from recon_cli.sfm.job import CameraGroup, Job
+from recon_cli.sfm.job import CameraGroup, MappingJob
 
 Poses = dict[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 
@@ -51,13 +51,13 @@ def main(workspace: Path) -> None:
                     group.width, group.height, group.focal_px, group.lens)
         for index, group in enumerate(frames.groups))
     with tempfile.TemporaryDirectory() as out:
-        job = Job(
+        job = MappingJob(
             frames=ingest / FOLDER, denoised=ingest / FOLDER, out=Path(out), groups=groups,
             masks=None, poses=ingest / POSES, pose_use="keep", given_points=True, pairs="auto",
             max_features=3000, min_registered=0.5, accept_weak=False, gravity=True,
             scale_between=None, max_minutes=5.0, seed=0, threads=2, sharpness={}, times={})
         for label, viewmats in spoilt(dict(read_poses(ingest / POSES).viewmats)).items():
-            found = spot_check.check(job, known_poses.neighbours(viewmats), viewmats)
+            found = spot_check.spot_check(job, known_poses.neighbours(viewmats), viewmats)
             share = "too few to tell" if found.share is None else f"{found.share:.3f}"
             click.echo(f"{label:<24} {found.matches:>6} matches, share {share}")
 

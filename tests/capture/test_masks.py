@@ -3,10 +3,14 @@ import pytest
 from PIL import Image
 
 from recon_cli.capture.images import Photo, inspect_photo
-from recon_cli.capture.masks import alpha_mask, find_masks, photo_mask, read_mask, write_mask
+from recon_cli.capture.masks import find_masks, photo_mask, read_mask, write_mask
 from recon_cli.errors import InputError
 
 ORIENTATION = 0x0112
+
+
+def own_mask(photo):
+    return photo_mask(photo, None, photo.width, photo.height)
 
 
 def photos(folder, *names):
@@ -120,19 +124,19 @@ def test_transparency_below_half_is_ignored_and_turned_with_the_photo(tmp_path):
     alpha = np.where(half() > 0, 128, 127).astype(np.uint8)
     exif = Image.Exif()
     exif[ORIENTATION] = 6
-    np.testing.assert_array_equal(alpha_mask(see_through(tmp_path / "a.png", alpha)), half())
-    turned = alpha_mask(see_through(tmp_path / "b.png", alpha, exif=exif))
+    np.testing.assert_array_equal(own_mask(see_through(tmp_path / "a.png", alpha)), half())
+    turned = own_mask(see_through(tmp_path / "b.png", alpha, exif=exif))
     np.testing.assert_array_equal(turned, np.rot90(half(), -1))
 
 
 def test_an_opaque_photo_has_no_mask(tmp_path):
-    assert alpha_mask(see_through(tmp_path / "a.png", np.full((6, 8), 255, np.uint8))) is None
-    assert alpha_mask(inspect_photo(saved(tmp_path / "b.png", half()))) is None
+    assert own_mask(see_through(tmp_path / "a.png", np.full((6, 8), 255, np.uint8))) is None
+    assert own_mask(inspect_photo(saved(tmp_path / "b.png", half()))) is None
 
 
 def test_a_photo_that_is_transparent_everywhere_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"a\.png is transparent everywhere"):
-        alpha_mask(see_through(tmp_path / "a.png", np.zeros((6, 8), np.uint8)))
+        own_mask(see_through(tmp_path / "a.png", np.zeros((6, 8), np.uint8)))
 
 
 def test_mask_and_transparency_both_take_away(tmp_path):

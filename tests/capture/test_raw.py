@@ -172,7 +172,7 @@ def test_a_photo_that_breaks_after_the_plan_is_refused(tmp_path):
 
 def test_a_raw_photo_is_not_read_like_a_picture(tmp_path):
     found = inspect_photo(write_shot(tmp_path / "a.dng", scene(), Shot()))
-    with pytest.raises(ValueError, match="developed"):
+    with pytest.raises(ValueError, match="camera RAW"):
         read_photo(found)
 
 

@@ -1,3 +1,5 @@
+"""One pass over a video: measures, damage and notices."""
+
 import dataclasses
 import json
 from fractions import Fraction
@@ -6,10 +8,11 @@ import av
 import cv2
 import numpy as np
 import pytest
-from media import set_display_matrix, spoil_packets, texture, write_video
+from media import set_display_matrix, spoil_packets, texture, write_luma, write_video
 
-from recon_cli.capture.decoded_picture import Picture
-from recon_cli.capture.scan import Scan, decode_threads, scan_video, sharpness
+from recon_cli.capture.decoded_picture import DecodedPicture
+from recon_cli.capture.frame_measures import measure_sharpness
+from recon_cli.capture.scan import Scan, decode_threads, scan_video
 from recon_cli.capture.video import decode, frames_at
 from recon_cli.errors import InputError
 
@@ -31,15 +34,15 @@ def video(tmp_path):
 
 def test_blur_lowers_sharpness():
     gray = texture(96, 160)[:, :, 0]
-    blurred = [sharpness(cv2.GaussianBlur(gray, (0, 0), sigma)) for sigma in (0.5, 1, 2, 4)]
+    blurred = [measure_sharpness(cv2.GaussianBlur(gray, (0, 0), sigma)) for sigma in (0.5, 1, 2, 4)]
     assert blurred == sorted(blurred, reverse=True)
-    assert sharpness(np.full((96, 160), 128, np.uint8)) == 0
+    assert measure_sharpness(np.full((96, 160), 128, np.uint8)) == 0
 
 
 def test_sharpness_is_measured_at_one_size():
     gray = texture(540, 960, coarseness=12)[:, :, 0]
     larger = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-    assert sharpness(larger) == pytest.approx(sharpness(gray), rel=1e-6)
+    assert measure_sharpness(larger) == pytest.approx(measure_sharpness(gray), rel=1e-6)
 
 
 def test_an_undamaged_video_is_whole(video):
@@ -74,7 +77,7 @@ def test_a_scan_survives_json(video):
 @pytest.mark.parametrize("packet", [1, 4, 13, 22, 35])
 def test_whole_frames_are_exactly_those_of_the_undamaged_video(video, packet, erase):
     def pixels():
-        found = (item for item in decode(video, threads=1) if isinstance(item, Picture))
+        found = (item for item in decode(video, threads=1) if isinstance(item, DecodedPicture))
         return {picture.frame.pts: picture.rgb() for picture in found}
 
     truth = pixels()
@@ -134,3 +137,46 @@ def test_a_scan_is_of_the_upright_square_frame(tmp_path):
     assert (scan.width, scan.height) == (96, 213)
     shapes = {rgb.shape for _, rgb in frames_at(path, range(5), threads=1)}
     assert shapes == {(213, 96, 3)}
+
+
+HLG, PQ, BT2020 = 18, 16, 9
+
+
+def notices(path):
+    return scan_video(path, threads=1, step=lambda: None).notices
+
+
+def test_plain_video_gives_no_notice(tmp_path):
+    assert notices(write_video(tmp_path / "plain.mp4", [texture(64, 96)] * 5)) == ()
+
+
+def test_hdr_is_named_with_its_kind(tmp_path):
+    luma = np.full((64, 96), 500)
+    for name, trc in (("HLG", HLG), ("PQ", PQ)):
+        path = write_luma(
+            tmp_path / f"{name}.mp4", [luma] * 3, trc=trc, primaries=BT2020, colorspace=BT2020)
+        assert notices(path) == (
+            f"{name}.mp4 is {name} video: tone-mapped to SDR by one curve.",)
+
+
+def test_ten_bits_of_sdr_give_no_notice(tmp_path):
+    assert notices(write_luma(tmp_path / "ten.mp4", [np.full((64, 96), 500)] * 3)) == ()
+
+
+def test_stretched_pixels_are_named_with_both_sizes(tmp_path):
+    path = write_video(tmp_path / "dv.mp4", [texture(64, 90)] * 3, aspect=Fraction(16, 15))
+    assert notices(path) == (
+        "dv.mp4 has pixels of aspect 16/15: its frames of 90x64 are stretched to 96x64.",)
+
+
+def test_a_second_video_in_the_file_is_named(tmp_path):
+    path = tmp_path / "two.mkv"
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("libx264", rate=10) for _ in range(2)]
+        for stream, width in zip(streams, (96, 64), strict=True):
+            stream.width, stream.height, stream.pix_fmt = width, 64, "yuv420p"
+        for stream in streams:
+            frame = av.VideoFrame.from_ndarray(texture(64, stream.width))
+            container.mux([*stream.encode(frame), *stream.encode()])
+    assert notices(path) == ("two.mkv holds 2 videos: the first that can be decoded is used.",)
+    assert scan_video(path, threads=1, step=lambda: None).width == 96

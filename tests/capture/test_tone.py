@@ -7,13 +7,13 @@ from recon_cli.capture.tone import (
     SDR_WHITE,
     WHITE,
     Transfer,
-    compressed,
     gray_table,
     hlg_scene,
     pq_light,
     pq_signal,
     srgb_code,
     to_sdr,
+    tone_map,
 )
 
 # ITU-R BT.2087-0: linear BT.709 to linear BT.2020.
@@ -58,7 +58,7 @@ def test_both_curves_end_where_the_standard_says():
 
 def test_the_curve_keeps_dark_light_and_bends_the_peak_to_the_white_of_sdr():
     light = np.linspace(0, 2 * PEAK, 20001)
-    out = compressed(light)
+    out = tone_map(light)
     np.testing.assert_allclose(out[light < KNEE], light[light < KNEE], rtol=1e-9)
     assert out[light >= PEAK] == pytest.approx(SDR_WHITE)
     assert (np.diff(out[light <= PEAK]) > 0).all()
@@ -76,7 +76,7 @@ def test_srgb_codes_are_those_of_the_standard():
 def test_a_gray_ramp_follows_the_documented_curve(transfer):
     signal = np.linspace(0, 1, 1024)
     light = pq_light(signal) if transfer is Transfer.PQ else PEAK * hlg_scene(signal) ** 1.2
-    expected = srgb_code(compressed(light) / SDR_WHITE).astype(int)
+    expected = srgb_code(tone_map(light) / SDR_WHITE).astype(int)
     found = to_sdr(gray(signal), transfer)[0].astype(int)
     assert np.abs(found - expected[:, None]).max() <= 1  # tables in between
     assert np.ptp(found, axis=1).max() <= 1  # gray stays gray
@@ -104,7 +104,7 @@ def test_a_brighter_colour_keeps_its_hue(transfer):
     code = to_sdr(sixteen_bits(signal)[None, None], transfer)[0, 0] / 255
     linear = ((code + 0.055) / 1.055) ** 2.4
     np.testing.assert_allclose(linear / linear[0], colour / colour[0], rtol=0.03)
-    assert linear[0] * SDR_WHITE == pytest.approx(compressed(colour[:1])[0], rel=0.02)
+    assert linear[0] * SDR_WHITE == pytest.approx(tone_map(colour[:1])[0], rel=0.02)
 
 
 def test_colours_beyond_bt709_stay_in_range():

@@ -1,3 +1,5 @@
+"""Video files: which can be read, their length, their frames, and what the container says."""
+
 import av
 import numpy as np
 import pytest
@@ -5,8 +7,15 @@ from av.stream import Disposition
 from media import set_display_matrix, texture, write_sound, write_video
 from PIL import Image
 
-from recon_cli.capture.decoded_picture import Gap, Picture
-from recon_cli.capture.video import claimed_length, decode, frames_at, open_video
+from recon_cli.capture.decoded_picture import DecodedPicture, Gap
+from recon_cli.capture.video import (
+    codec_name,
+    declared_length,
+    decode,
+    frames_at,
+    lacks_index,
+    open_video,
+)
 from recon_cli.errors import InputError
 
 # Two roundings (to YUV and back) of 8-bit values, and a little loss of the codec.
@@ -32,7 +41,7 @@ def centres(picture):
 
 
 def first_frame(path):
-    return next(f for f in decode(path, threads=1) if isinstance(f, Picture))
+    return next(f for f in decode(path, threads=1) if isinstance(f, DecodedPicture))
 
 
 # The matrices that cameras write: the picture has to be turned clockwise by so much to be upright.
@@ -92,7 +101,7 @@ def test_text_is_no_video_whatever_its_name(tmp_path, name):
     path = tmp_path / name
     path.write_text("no frames in here\n" * 100)
     with pytest.raises(InputError, match=r"cannot be read as a video|holds no video"):
-        claimed_length(path)
+        declared_length(path)
 
 
 def test_a_video_without_frames_is_refused(tmp_path):
@@ -101,43 +110,43 @@ def test_a_video_without_frames_is_refused(tmp_path):
         stream.height, stream.width, stream.pix_fmt = 64, 64, "yuv420p"
         container.start_encoding()
     with pytest.raises(InputError, match=r"holds no video that can be decoded: it is empty\."):
-        claimed_length(tmp_path / "empty.mp4")
+        declared_length(tmp_path / "empty.mp4")
 
 
 def test_sound_is_no_video(tmp_path):
     with pytest.raises(InputError, match="holds no video that can be decoded, only audio"):
-        claimed_length(write_sound(tmp_path / "sound.mp4"))
+        declared_length(write_sound(tmp_path / "sound.mp4"))
 
 
 def test_an_empty_file_is_named_as_such(tmp_path):
     (tmp_path / "empty.mp4").touch()
     with pytest.raises(InputError, match="is empty"):
-        claimed_length(tmp_path / "empty.mp4")
+        declared_length(tmp_path / "empty.mp4")
 
 
 def test_a_missing_file_is_named_as_such(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
-        claimed_length(tmp_path / "none.mp4")
+        declared_length(tmp_path / "none.mp4")
 
 
 def test_a_single_picture_is_refused_even_if_named_like_a_video(tmp_path):
     Image.fromarray(quadrants()).save(tmp_path / "a.jpg")
     (tmp_path / "a.jpg").rename(tmp_path / "a.mp4")
     with pytest.raises(InputError, match="single picture"):
-        claimed_length(tmp_path / "a.mp4")
+        declared_length(tmp_path / "a.mp4")
 
 
 def test_a_video_is_known_by_its_content_not_by_its_name(tmp_path):
     path = write_video(tmp_path / "video.mp4", [quadrants()] * 5)
     path = path.rename(tmp_path / "room: take 1.txt")
-    assert claimed_length(path).frames == 5
+    assert declared_length(path).frames == 5
     with open_video(path) as (_, stream):
         assert stream.width == 96
 
 
 def test_the_count_is_taken_from_the_duration_where_the_container_names_none(tmp_path):
     path = write_video(tmp_path / "video.mkv", [quadrants()] * 12)
-    claim = claimed_length(path)
+    claim = declared_length(path)
     assert claim.frames == 0
     assert claim.count(claim.rate) == 12
 
@@ -173,7 +182,7 @@ def test_frames_that_change_their_size_midway_count_as_lost(tmp_path):
     path = tmp_path / "both.h264"
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
     items = list(decode(path, threads=1))
-    assert {item.size[0] for item in items if isinstance(item, Picture)} == {96}
+    assert {item.size[0] for item in items if isinstance(item, DecodedPicture)} == {96}
     assert any(isinstance(item, Gap) for item in items)
 
 
@@ -223,7 +232,7 @@ def test_noise_is_no_video(tmp_path):
     path = tmp_path / "noise.mp4"
     path.write_bytes(np.random.default_rng(0).bytes(20000))
     with pytest.raises(InputError, match="cannot be read as a video"):
-        claimed_length(path)
+        declared_length(path)
 
 
 @pytest.mark.parametrize("faststart", [False, True])
@@ -236,6 +245,50 @@ def test_an_mp4_whose_index_is_cut_off_is_named_as_such(tmp_path, faststart):
         data = data[:head] + data[at:] + data[head:at]
     for kept in (data.index(b"moov") + 10, data.index(b"moov") + 300):
         path.write_bytes(data[:kept])
-        with pytest.raises(InputError, match="is cut off: its index") as told:
-            claimed_length(path)
+        with pytest.raises(InputError, match="is truncated: its index") as told:
+            declared_length(path)
         assert "Copy it from the camera again" in told.value.hint
+
+
+@pytest.fixture(scope="module")
+def mp4(tmp_path_factory):
+    return write_video(tmp_path_factory.mktemp("mp4") / "a.mp4", [texture(64, 96)] * 5).read_bytes()
+
+
+@pytest.mark.parametrize(("fourcc", "name"), [
+    (b"avc1", "avc1"), (b"av01", "AV1"), (b"hvc1", "HEVC"), (b"dvh1", "HEVC"), (b"xy z", "xy z")])
+def test_an_mp4_names_its_codec_by_four_letters(tmp_path, mp4, fourcc, name):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(mp4.replace(b"avc1", fourcc))
+    assert codec_name(path) == name
+
+
+@pytest.mark.parametrize(("suffix", "codec", "name"), [
+    (".mkv", "libx264", "V_MPEG4/ISO/AVC"), (".avi", "mpeg4", "FMP4"), (".ts", "libx264", "")])
+def test_other_containers_name_it_in_their_own_way_or_not_at_all(tmp_path, suffix, codec, name):
+    path = write_video(tmp_path / f"a{suffix}", [texture(64, 96)] * 5, codec=codec)
+    assert codec_name(path) == name
+
+
+def test_an_mp4_has_its_index_until_a_byte_of_it_is_missing(tmp_path, mp4):
+    path = tmp_path / "a.mp4"
+    end = mp4.index(b"moov") - 4 + int.from_bytes(mp4[mp4.index(b"moov") - 4:][:4])
+    for length, lacking in ((end, False), (end - 1, True), (len(mp4) // 2, True), (9, True)):
+        path.write_bytes(mp4[:length])
+        assert lacks_index(path) is lacking, length
+
+
+@pytest.mark.parametrize("content", [b"", b"text\n" * 50, bytes(5000), b"RIFF\0\0\0\0AVI LIST"])
+def test_what_is_no_mp4_lacks_no_index(tmp_path, content):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(content)
+    assert lacks_index(path) is False
+
+
+def test_a_length_of_64_bits_and_one_to_the_end_are_understood(tmp_path):
+    path = tmp_path / "a.mp4"
+    long = (1).to_bytes(4) + b"mdat" + (100).to_bytes(8) + bytes(84)
+    path.write_bytes(long + bytes(4) + b"moov" + bytes(20))
+    assert lacks_index(path) is False
+    path.write_bytes(long + (200).to_bytes(4) + b"moov" + bytes(20))
+    assert lacks_index(path) is True

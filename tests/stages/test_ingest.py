@@ -103,7 +103,7 @@ def test_photos_of_the_same_view_are_left_out_and_named(tmp_path, notices):
     assert (summary.frames, summary.skipped) == (6, ("IMG_0007.jpg",))
     assert not (tmp_path / "out" / "frames" / "IMG_0007.png").exists()
     assert notices() == [
-        "1 photos are left out, for others show the same: IMG_0007.jpg (like IMG_0002.jpg)."]
+        "1 photos are left out because others show the same: IMG_0007.jpg (like IMG_0002.jpg)."]
     before = files(tmp_path / "out")
     take(folder, tmp_path / "out")
     assert files(tmp_path / "out") == before

@@ -67,7 +67,7 @@ def test_a_long_sequence_is_thinned_evenly_and_its_test_views_are_not(tmp_path, 
     poses = known(tmp_path / "out").viewmats
     places = [np.linalg.inv(poses[name])[:3, 3] for name in sorted(poses)][:4]
     np.testing.assert_allclose(places, [pose(index)[:3, 3] for index in (1, 4, 7, 10)], atol=1e-8)
-    assert any("4 of 12 frames are taken" in text for text in notices())
+    assert any("4 of 12 frames are used" in text for text in notices())
 
 
 def test_missing_images_of_a_transforms_file_are_counted_and_told(tmp_path, notices):

@@ -67,7 +67,7 @@ def test_a_video_that_lost_nearly_all_is_refused(tmp_path):
 def test_a_video_cut_off_before_its_index_is_refused(tmp_path, sample_video):
     data = sample_video.read_bytes()
     (tmp_path / "head.mp4").write_bytes(data[:1000])
-    with pytest.raises(InputError, match="is cut off: its index"):
+    with pytest.raises(InputError, match="is truncated: its index"):
         take(tmp_path / "head.mp4", tmp_path / "out")
 
 
@@ -95,7 +95,7 @@ def test_a_video_that_is_dark_for_the_most_part_is_told(tmp_path, notices):
     lit = walk(30)
     take(write_video(tmp_path / "room.mp4", [*lit[:10], *(frame // 64 for frame in lit[10:])]),
          tmp_path / "out")
-    assert "20 of 30 frames of room.mp4 are mostly black or blown out" in notices()[0]
+    assert "20 of 30 frames of room.mp4 are left out: they are mostly black" in notices()[0]
 
 
 def test_adjacent_frames_are_warned_of(tmp_path, notices):

@@ -35,7 +35,7 @@ def test_mixed_sizes_become_groups_and_are_told(tmp_path, notices):
         ("room: 128x96", 64, 48), ("room: 96x128", 48, 64)]
     assert [frame["group"] for frame in written["frames"]] == [0, 1, 0, 0, 1]
     assert notices()[0] == (
-        "The photos are of 2 kinds, each with a lens of its own: 3 of 128x96, 2 of 96x128.")
+        "The photos form 2 groups with separate intrinsics: 3 of 128x96, 2 of 96x128.")
     assert len(notices()) == 3  # each size is reduced
 
 
@@ -112,8 +112,8 @@ def test_options_without_effect_on_photos_are_told(tmp_path, notices):
     folder = write_photos(tmp_path / "room", 4)
     take(folder, tmp_path / "out", config=IngestConfig(holdout="segment:0:0.01", frames=3))
     assert notices() == [
-        "--holdout segment:0:0.01 holds out none of 4 frames: no score.",
-        "--frames has no effect on photos: all are taken."]
+        "--holdout segment:0:0.01 holds out none of 4 frames, so that nothing can be scored.",
+        "--frames has no effect on photos: all are used."]
 
 
 def test_a_photo_that_is_given_twice_is_taken_once(tmp_path):
@@ -137,7 +137,7 @@ def test_photos_in_an_inner_folder_are_taken_and_their_masks_beside_it(tmp_path,
     mask_of(tmp_path / "room" / "masks", "IMG_0000.png", mask)
     assert take(tmp_path / "room", tmp_path / "out").frames == 3
     assert listed(tmp_path / "out")["frames"][0]["masked"]
-    assert "those in images/ are taken" in notices()[0]
+    assert "those in images/ are used" in notices()[0]
 
 
 def write_raw(folder, stops):

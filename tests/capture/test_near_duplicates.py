@@ -6,9 +6,9 @@ from noisy_room import noisy
 
 from recon_cli.capture.near_duplicates import (
     choose_photos,
-    dropped_photos,
-    duplicates,
-    look_at_photo,
+    describe_dropped,
+    find_duplicates,
+    measure_photo,
     signature,
 )
 from recon_cli.capture.selection_record import Reason
@@ -31,7 +31,7 @@ def moved(rgb, share):
 
 def choose(pictures):
     """`pictures` by file name, None for one that cannot be read."""
-    looks = [None if one is None else look_at_photo(one) for one in pictures.values()]
+    looks = [None if one is None else measure_photo(one) for one in pictures.values()]
     return choose_photos("room", list(pictures), [f"{one}.png" for one in pictures], looks)
 
 
@@ -73,7 +73,7 @@ def test_the_sharpest_of_a_group_stays_and_the_first_of_equals():
 def test_a_chain_of_small_steps_is_not_one_group():
     chain = np.stack([
         signature(moved(photo(1), 0.001 * step)[:, :, 0]) for step in range(60)])
-    goes = duplicates(chain, np.zeros(60))
+    goes = find_duplicates(chain, np.zeros(60))
     stays = [index for index in range(60) if index not in goes]
     assert len(stays) > 2
     for index, stands in goes.items():
@@ -82,7 +82,7 @@ def test_a_chain_of_small_steps_is_not_one_group():
 
 def test_flat_pictures_are_like_no_other():
     flat = np.zeros((3, 64 * 64), np.float32)
-    assert duplicates(flat, np.zeros(3)) == {}
+    assert find_duplicates(flat, np.zeros(3)) == {}
 
 
 def test_what_is_left_out_is_named():
@@ -92,15 +92,15 @@ def test_what_is_left_out_is_named():
     found = choose(pictures)
     assert reasons(found)["broken"] is Reason.DAMAGED
     assert reasons(found)["cap"] is Reason.CLIPPED
-    assert dropped_photos(found) == [
-        "1 photos are left out, for others show the same: copy (like b).",
-        "1 photos are left out, all black, blown out or flat: cap."]
+    assert describe_dropped(found) == [
+        "1 photos are left out because others show the same: copy (like b).",
+        "1 photos are left out because they are black, blown out or flat: cap."]
 
 
 def test_many_names_are_cut_short():
     pictures = {"a": photo(1), "b": photo(2), "c": photo(3)} | {
         f"copy{index}": photo(1) for index in range(12)}
-    assert dropped_photos(choose(pictures))[0].endswith("and 4 more.")
+    assert describe_dropped(choose(pictures))[0].endswith("and 4 more.")
 
 
 @pytest.mark.parametrize("count", [3, 12])
@@ -111,7 +111,7 @@ def test_copies_of_one_photo_are_refused(count):
 
 
 def test_photos_that_are_all_black_are_refused():
-    with pytest.raises(InputError, match="too dark: so are 4 of its 4 photos"):
+    with pytest.raises(InputError, match="too dark: 4 of its 4 photos"):
         choose({str(index): photo(index) // 50 for index in range(4)})
 
 

@@ -7,12 +7,12 @@ from PIL import Image
 
 from recon_cli.capture import contact_sheet
 from recon_cli.capture.contact_sheet import COLOURS, HELD_OUT, MAX_BYTES, ContactSheet
-from recon_cli.capture.selection_record import Candidate, Reason
+from recon_cli.capture.selection_record import FrameCandidate, Reason
 
 
 def capture(reasons):
     return [
-        Candidate("room.mp4", index, reason, 10.0,
+        FrameCandidate("room.mp4", index, reason, 10.0,
                   f"{index:06d}.png" if reason is Reason.KEPT else None)
         for index, reason in enumerate(reasons)]
 
@@ -86,7 +86,7 @@ def test_a_picture_that_takes_too_much_gets_fewer_colours(monkeypatch):
     sizes = []
     for most in (3_000_000, 50_000, 31_000):
         monkeypatch.setattr(contact_sheet, "MAX_BYTES", most)
-        data = contact_sheet._encoded(Image.fromarray(noise))
+        data = contact_sheet._encode(Image.fromarray(noise))
         assert len(data) <= most
         sizes.append(len(data))
         assert Image.open(io.BytesIO(data)).size == (300, 200)

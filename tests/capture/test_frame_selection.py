@@ -6,12 +6,12 @@ from recon_cli.capture.frame_selection import (
     MAX_GAP,
     MIN_AUTOMATIC,
     automatic_count,
-    bridged,
+    bridge_gaps,
     check_motion,
     choose_frames,
-    judged,
+    judge_frames,
+    path_length,
     sharp_frames,
-    travelled,
 )
 from recon_cli.capture.selection_record import Reason
 from recon_cli.errors import InputError
@@ -43,13 +43,13 @@ def test_a_flat_video_passes_the_gate(count):
 
 
 def test_unknown_steps_count_as_the_usual_one():
-    way = travelled(np.array([0.0, 0.02, np.nan, 0.02, 0.04]))
+    way = path_length(np.array([0.0, 0.02, np.nan, 0.02, 0.04]))
     np.testing.assert_allclose(way, [0, 0.02, 0.04, 0.06, 0.1])
 
 
 @pytest.mark.parametrize("motion", [np.zeros(50), np.r_[0.0, np.full(49, np.nan)]])
 def test_where_nothing_moves_the_choice_spreads_over_time(motion):
-    way = travelled(motion)
+    way = path_length(motion)
     chosen = choose_frames(way, np.ones(50), everything(50), 10)
     assert len(chosen) == 10
     np.testing.assert_allclose(np.diff(chosen), 5, atol=2)
@@ -58,7 +58,7 @@ def test_where_nothing_moves_the_choice_spreads_over_time(motion):
 def test_one_wild_step_does_not_eat_the_budget():
     motion = np.full(100, 0.01)
     motion[50] = 30.0
-    assert travelled(motion)[-1] < 1.2
+    assert path_length(motion)[-1] < 1.2
 
 
 def test_the_number_of_frames_follows_the_way_within_bounds():
@@ -70,7 +70,7 @@ def test_the_number_of_frames_follows_the_way_within_bounds():
 
 def test_frames_are_spread_over_the_way_not_over_time():
     # The camera rests for half of the video, then moves evenly.
-    way = travelled(np.r_[np.zeros(100), np.full(100, 0.01)])
+    way = path_length(np.r_[np.zeros(100), np.full(100, 0.01)])
     chosen = choose_frames(way, np.ones(200), everything(200), 20)
     assert len(chosen) == 20
     assert (chosen < 100).sum() <= 1
@@ -94,7 +94,7 @@ def test_frames_that_are_not_usable_are_never_taken():
 @pytest.mark.parametrize("count", [3, 17, 60, 99, 100, 101])
 def test_as_many_frames_as_asked_for_come_out_whatever_the_motion(count):
     motion = np.random.default_rng(count).exponential(0.02, 100) ** 2
-    chosen = choose_frames(travelled(motion), motion, everything(100), count)
+    chosen = choose_frames(path_length(motion), motion, everything(100), count)
     assert len(chosen) == min(count, 100)
     assert (np.diff(chosen) > 0).all()
 
@@ -104,7 +104,7 @@ def test_a_blurred_turn_is_bridged_by_its_least_blurred_frames():
     sharp, sharpness = everything(201), np.full(201, 100.0)
     sharp[80:120], sharpness[80:120] = False, 10.0  # 0.4 widths of blur
     sharpness[100] = 20.0
-    usable = bridged(way, sharpness, sharp, everything(201))
+    usable = bridge_gaps(way, sharpness, sharp, everything(201))
     kept = np.flatnonzero(usable)
     assert usable[100]
     assert np.diff(way[kept]).max() <= MAX_GAP
@@ -116,9 +116,9 @@ def test_a_gap_is_bridged_off_its_middle_where_frames_are_much_sharper():
     sharp, sharpness = everything(201), np.full(201, 100.0)
     sharp[80:120], sharpness[80:120] = False, 10.0
     sharpness[82] = 40.0  # a plain view: sharp, but under the mark of the others
-    assert bridged(way, sharpness, sharp, everything(201))[82]
+    assert bridge_gaps(way, sharpness, sharp, everything(201))[82]
     sharpness[82] = 15.0
-    assert not bridged(way, sharpness, sharp, everything(201))[82]
+    assert not bridge_gaps(way, sharpness, sharp, everything(201))[82]
 
 
 def test_short_gaps_and_damaged_frames_are_not_bridged():
@@ -126,14 +126,14 @@ def test_short_gaps_and_damaged_frames_are_not_bridged():
     sharp, whole = everything(201), everything(201)
     sharp[10:15] = False
     whole[80:120] = False
-    assert (bridged(way, np.ones(201), sharp, whole) == (sharp & whole)).all()
+    assert (bridge_gaps(way, np.ones(201), sharp, whole) == (sharp & whole)).all()
 
 
 def test_a_bridge_is_taken_only_where_there_is_nothing_better():
     # 0.2 widths of blur: among 4 frames, 0.5 apart, it needs no bridge; among 40 it does.
     way, sharpness = np.linspace(0, 2, 201), np.full(201, 100.0)
     sharpness[80:100] = 10.0
-    found = judged(way, sharpness, np.array([FINE] * 201), everything(201), 0.5)
+    found = judge_frames(way, sharpness, np.array([FINE] * 201), everything(201), 0.5)
     assert found.bridges[80:100].any()
     for count, bridges in ((4, False), (40, True)):
         chosen = choose_frames(way, sharpness, found.usable, count, bridges=found.bridges)
@@ -154,7 +154,7 @@ def test_frames_that_are_refused_have_a_reason():
     sharpness[5], whole[20:22] = 10.0, False
     exposures = np.array([FINE] * 40)
     exposures[30], exposures[5] = HALF_DARK, HALF_DARK
-    found = judged(np.linspace(0, 0.4, 40), sharpness, exposures, whole, 0.5)
+    found = judge_frames(np.linspace(0, 0.4, 40), sharpness, exposures, whole, 0.5)
     refused = {index: one for index, one in enumerate(found.refused) if one}
     assert refused == {
         5: Reason.CLIPPED, 20: Reason.DAMAGED, 21: Reason.DAMAGED, 30: Reason.CLIPPED}
@@ -166,13 +166,13 @@ def test_a_dim_stretch_is_bridged_but_a_black_one_is_not():
     for row, bridges in ((HALF_DARK, True), (DARK, False)):
         exposures = np.array([FINE] * 201)
         exposures[80:120] = row
-        found = judged(way, np.full(201, 100.0), exposures, everything(201), 0.5)
+        found = judge_frames(way, np.full(201, 100.0), exposures, everything(201), 0.5)
         assert found.usable[80:120].any() == bridges
         assert found.usable[80:120].sum() <= 8
 
 
 def test_a_camera_that_does_not_move_is_refused():
-    with pytest.raises(InputError, match=r"room\.mp4 does not move: its 50 frames") as caught:
+    with pytest.raises(InputError, match=r"room\.mp4 does not move: all 50 frames") as caught:
         check_motion("room.mp4", np.zeros(50))
     assert "walk sideways" in caught.value.hint
 

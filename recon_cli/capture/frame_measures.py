@@ -1,0 +1,167 @@
+"""What is measured of every frame: sharpness, exposure, and how far the view moved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.errors import InputError
+
+TRACK_WIDTH = 320  # pixels; wide enough for corners, small enough for 5 ms a frame
+ANCHOR_REACH = 0.03  # of the width, about 10 px: still well inside the tracker's basin
+MIN_TRACKS = 8  # fewer agree by chance
+# Corners as in Shi and Tomasi; their spacing spreads 300 of them over the frame.
+MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING = 300, 0.005, 6
+# 15 px windows on 4 pyramid levels follow about 40 px at this width.
+WINDOW, LEVELS = (15, 15), 3
+RETURN_ERROR = 1.0  # pixels between a corner and where following it there and back ends
+# Gray values of 8 bits; a codec moves true black and white by a few.
+BLACK, BLOWN_OUT = 16, 250
+# More than this and the frame is clipped: it is avoided where neighbours are better.
+MOST_CLIPPED = 0.5
+# More than this and nothing in the frame can be matched: it is never chosen.
+ALL_CLIPPED = 0.95
+# A frame whose areas differ by less than this many gray values (standard deviation) is flat: a
+# lens cap, a wall that fills the view. Noise is averaged out before.
+FLAT = 4.0
+AREAS = 32  # along each side
+EVERY = 4  # pixels; a share is known well enough from every 16th
+# Pixels on the longest side: makes sharpness comparable and keeps sensor noise of large frames
+# from passing for detail.
+SHARPNESS_SIZE = 960
+
+
+class MotionMeter:
+    """Follows corners through a video, one gray frame at a time."""
+
+    def __init__(self) -> None:
+        self._anchor: NDArray[np.uint8] | None = None
+        self._corners: NDArray[np.float32] | None = None
+        self._reached = 0.0  # furthest displacement from the anchor so far
+
+    def advance(self, gray: NDArray[np.uint8]) -> float:
+        """Returns how much further from the anchor this frame is than any frame since the anchor.
+
+        Args:
+            gray: the next frame, [H, W] uint8, of any constant size.
+
+        Returns:
+            The median displacement gained, as a fraction of the width; 0 for the first frame and
+            for one that moves back; NaN where too few corners can be followed.
+        """
+        small = _shrink(gray)
+        if self._anchor is None:
+            self._drop_anchor(small)
+            return 0.0
+        displacement = self._displacement(small)
+        if math.isnan(displacement):
+            self._drop_anchor(small)
+            return displacement
+        gained = max(0.0, displacement - self._reached)
+        self._reached += gained
+        if self._reached >= ANCHOR_REACH:
+            self._drop_anchor(small)
+        return gained
+
+    def _drop_anchor(self, small: NDArray[np.uint8]) -> None:
+        self._anchor = small
+        self._corners = cv2.goodFeaturesToTrack(
+            small, MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING)
+        self._reached = 0.0
+
+    def _displacement(self, small: NDArray[np.uint8]) -> float:
+        """Returns the median displacement of the anchor's corners, NaN where most are lost."""
+        if self._corners is None or len(self._corners) < MIN_TRACKS:
+            return float("nan")
+        tracked, forward, _ = cv2.calcOpticalFlowPyrLK(
+            self._anchor, small, self._corners, None, winSize=WINDOW, maxLevel=LEVELS)
+        returned, backward, _ = cv2.calcOpticalFlowPyrLK(
+            small, self._anchor, tracked, None, winSize=WINDOW, maxLevel=LEVELS)
+        # A corner counts when tracking it back ends where it began; onto a blank wall the tracker
+        # slides without an error.
+        error = np.linalg.norm((returned - self._corners).reshape(-1, 2), axis=1)
+        good = (forward & backward)[:, 0].astype(bool) & (error <= RETURN_ERROR)
+        if good.sum() < MIN_TRACKS:
+            return float("nan")
+        steps = np.linalg.norm((tracked - self._corners)[good].reshape(-1, 2), axis=1)
+        return float(np.median(steps) / small.shape[1])
+
+
+def _shrink(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = gray.shape
+    if width <= TRACK_WIDTH:
+        return gray
+    size = (TRACK_WIDTH, max(1, round(height * TRACK_WIDTH / width)))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+
+
+def measure_exposure(
+    gray: NDArray[np.uint8],  # [H, W]
+) -> tuple[float, float, float]:
+    """Returns the share of black pixels, that of blown-out ones, and the spread of the rest.
+
+    The spread is the standard deviation over 32x32 areas, in gray values of 8 bits.
+    """
+    few = gray[::EVERY, ::EVERY]
+    areas = cv2.resize(gray, (AREAS, AREAS), interpolation=cv2.INTER_AREA)
+    return float(np.mean(few <= BLACK)), float(np.mean(few >= BLOWN_OUT)), float(areas.std())
+
+
+def well_exposed(
+    exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
+) -> NDArray[np.bool_]:  # [F]
+    """Returns which frames are neither black nor blown out for the most part."""
+    return np.asarray(exposures[:, :2].sum(axis=1) <= MOST_CLIPPED)
+
+
+def has_content(
+    exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
+) -> NDArray[np.bool_]:  # [F]
+    """Returns which frames show anything at all: neither all clipped nor flat."""
+    visible = exposures[:, :2].sum(axis=1) <= ALL_CLIPPED
+    return np.asarray(visible & (exposures[:, 2] >= FLAT))
+
+
+def check_exposure(
+    name: str,
+    exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
+    *,
+    least: int,
+    unit: str = "frames",
+) -> None:
+    """Raises InputError when too few frames show anything, and says what is wrong with most.
+
+    Args:
+        name: of the capture, for the message.
+        exposures: of all frames that could be read.
+        least: how many must show something.
+        unit: what the capture consists of, for the message.
+    """
+    usable = int(has_content(exposures).sum())
+    if usable >= least:
+        return
+    black, blown, _ = exposures.T
+    kinds: Sequence[tuple[str, NDArray[np.bool_], str]] = (
+        ("too dark", black > MOST_CLIPPED, "Turn on the light, remove the lens cap, and record "
+         "again; a dark but clean recording can be brightened in an editor first."),
+        ("over-exposed", blown > MOST_CLIPPED, "Record again with less exposure: tap on a bright "
+         "part of the room before you start."),
+        ("flat", ~has_content(exposures), "Record again with furniture, edges and texture in view; "
+         "bare walls cannot be reconstructed."),
+    )
+    kind, hit, hint = next((row for row in kinds if row[1].sum() * 2 > len(black)), kinds[-1])
+    raise InputError(
+        f"{name} is {kind}: {int(hit.sum())} of its {len(black)} {unit} are. Only {usable} show "
+        f"anything that can be matched, but at least {least} are needed.", hint=hint)
+
+
+def measure_sharpness(gray: NDArray[np.uint8]) -> float:
+    """Returns the variance of the Laplacian of a gray frame [H, W] at a common size."""
+    scale = SHARPNESS_SIZE / max(gray.shape)
+    if scale < 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
