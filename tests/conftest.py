@@ -55,7 +55,7 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
 @pytest.fixture(scope="session")
 def build_once(
     tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[str, Callable[[Path], None]], Path]:
+) -> Callable[[str, Callable[[Path], object]], Path]:
     """Returns a folder by name, which one function fills once for all workers; copy, never write.
 
     The function gets the empty folder. A failure is the failure of every test that asks.
@@ -64,7 +64,7 @@ def build_once(
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent  # of all workers
 
-    def build(name: str, fill: Callable[[Path], None]) -> Path:
+    def build(name: str, fill: Callable[[Path], object]) -> Path:
         folder, filled = base / f"shared-{name}", base / f"shared-{name}.filled"
         with FileLock(f"{folder}.lock"):
             if not filled.exists():

@@ -12,6 +12,8 @@ from numba_runs import Run, compile_for_avx2, damage_and_repair, read_run
 
 from recon_cli.render.numba.simd import LANES
 
+BuildOnce = Callable[[str, Callable[[Path], object]], Path]
+
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
@@ -23,19 +25,19 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def damaged_run(build_once: Callable[[str, Callable[[Path], None]], Path]) -> Run:
+def damaged_run(build_once: BuildOnce) -> Run:
     """The process that found every file of the cache cut in half."""
     return read_run(build_once("numba-damaged", damage_and_repair) / "damaged")
 
 
 @pytest.fixture(scope="session")
-def repaired_run(build_once: Callable[[str, Callable[[Path], None]], Path]) -> Run:
+def repaired_run(build_once: BuildOnce) -> Run:
     """The process after that one, in the same cache folder."""
     return read_run(build_once("numba-damaged", damage_and_repair) / "repaired")
 
 
 @pytest.fixture(scope="session")
-def avx2_run(build_once: Callable[[str, Callable[[Path], None]], Path]) -> Run:
+def avx2_run(build_once: BuildOnce) -> Run:
     """The process that compiled for a CPU with AVX2."""
     if platform.machine() not in ("x86_64", "AMD64"):
         pytest.skip("AVX2 is of x86 CPUs; this machine has another")

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tiny_scene import VIEWS
-from tiny_stages import holding_out, mean_colour_psnr, pruned, run, without
+from tiny_stages import holding_out, mean_colour_psnr, run, without
 
 from recon_cli.config.stages import EvaluateConfig
 from recon_cli.context import StageInputs
@@ -21,10 +21,10 @@ from recon_cli.stages import evaluate
 from recon_cli.train.runner import read_config, write_config
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
+@pytest.fixture
+def inputs(tiny_pruned):
     """ingest, sfm, and a finished train and prune."""
-    return pruned(tmp_path_factory.mktemp("tiny"))
+    return tiny_pruned
 
 
 def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):

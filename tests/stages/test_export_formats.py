@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from tiny_stages import CONTEXT, LEARNT, trained
+from tiny_stages import CONTEXT
 
 from recon_cli.config.stages import EXPORT_FORMATS, ExportConfig
 from recon_cli.context import StageInputs
@@ -22,17 +22,17 @@ from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
 from recon_cli.stages import export
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
+@pytest.fixture
+def inputs(tiny_learnt):
     """A short training of the tiny scene."""
-    return trained(tmp_path_factory.mktemp("tiny"), LEARNT)
+    return tiny_learnt
 
 
 @pytest.fixture(scope="module")
-def exported(inputs, tmp_path_factory):
+def exported(tiny_learnt, tmp_path_factory):
     """All formats at once: the folder and the summary."""
     out = tmp_path_factory.mktemp("export")
-    return out, export.run(ExportConfig(format=",".join(EXPORT_FORMATS)), inputs, out, CONTEXT)
+    return out, export.run(ExportConfig(format=",".join(EXPORT_FORMATS)), tiny_learnt, out, CONTEXT)
 
 
 def test_every_format_of_gaussians_can_be_asked_for():

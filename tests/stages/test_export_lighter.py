@@ -6,7 +6,7 @@ import logging
 
 import pytest
 import torch
-from tiny_stages import CONTEXT, LEARNT, trained
+from tiny_stages import CONTEXT
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
@@ -16,10 +16,10 @@ from recon_cli.io.splats.registry import FORMATS
 from recon_cli.stages import export
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
+@pytest.fixture
+def inputs(tiny_learnt):
     """A short training of the tiny scene, with harmonics."""
-    return trained(tmp_path_factory.mktemp("tiny"), LEARNT)
+    return tiny_learnt
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, pruned, run, without
+from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, run, without
 
 from recon_cli.config.stages import ExportConfig, PruneConfig, RunConfig
 from recon_cli.errors import FormatError, StageError, TrainingError
@@ -21,10 +21,10 @@ from recon_cli.train.state import save_state
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
+@pytest.fixture
+def inputs(tiny_pruned):
     """ingest, sfm, and a finished train and prune."""
-    return pruned(tmp_path_factory.mktemp("tiny"))
+    return tiny_pruned
 
 
 class Killed(Exception):  # noqa: N818 - an event, not an error

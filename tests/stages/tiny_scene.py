@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from recon_cli.context import StageInputs
 from recon_cli.io.images import write_png
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 from recon_cli.workspace.atomic import write_json
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
@@ -41,14 +43,35 @@ ONE = (Shape(WIDTH, HEIGHT, FOCAL),)
 TWO = (Shape(48, 36, 40.0), Shape(30, 44, 34.0, 2.5, -3.0))  # landscape, portrait
 
 
+@cache
+def truth() -> Splats:
+    """The 60 Gaussians that the views show."""
+    splats = random_splats(60, seed=0, dtype=torch.float32)
+    splats.means[:, 2] = 3 + 0.3 * splats.means[:, 2]  # none near a camera, no needles
+    splats.log_scales.clamp_(min=-2.0, max=-1.5)
+    return splats
+
+
+def viewmat(i: int) -> np.ndarray:
+    """World to camera of view `i`."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = [0.4 * np.cos(i), 0.4 * np.sin(i), 0.1 * i]
+    return matrix
+
+
+@cache
+def pixels_of(i: int, shape: Shape) -> np.ndarray:
+    """View `i` of the truth, [H, W, 3] uint8."""
+    with torch.no_grad():
+        rgb = render(truth(), shape.at(viewmat(i)), torch.zeros(3), 0).rgb.clamp(0, 1)
+    return (rgb.numpy() * 255 + 0.5).astype(np.uint8)
+
+
 def make_inputs(folder: Path, shapes: tuple[Shape, ...] = ONE) -> StageInputs:
-    """Renders 12 views of 60 Gaussians and writes what ingest and sfm would have left.
+    """Writes what ingest and sfm would have left of 12 views of the truth.
 
     Each shape takes four views in a row, the first of which is held out.
     """
-    truth = random_splats(60, seed=0, dtype=torch.float32)
-    truth.means[:, 2] = 3 + 0.3 * truth.means[:, 2]  # none near a camera, no needles
-    truth.log_scales.clamp_(min=-2.0, max=-1.5)
     model = pycolmap.Reconstruction()
     for i, shape in enumerate(shapes):
         inner = shape.at(np.eye(4))
@@ -63,22 +86,18 @@ def make_inputs(folder: Path, shapes: tuple[Shape, ...] = ONE) -> StageInputs:
     frames = []
     for i in range(VIEWS):
         name = f"{i:06d}.png"
-        viewmat = np.eye(4)
-        viewmat[:3, 3] = [0.4 * np.cos(i), 0.4 * np.sin(i), 0.1 * i]
         group = i // 4 % len(shapes)
-        camera = shapes[group].at(viewmat)
-        with torch.no_grad():
-            rgb = render(truth, camera, torch.zeros(3), 0).rgb.clamp(0, 1)
-        pixels = (rgb.numpy() * 255 + 0.5).astype(np.uint8)
+        pose = viewmat(i)
+        pixels = pixels_of(i, shapes[group])
         write_png(images / name, pixels)
         write_png(denoised / name, pixels)
         model.add_image_with_trivial_frame(
             pycolmap.Image(name=name, camera_id=group + 1, image_id=i + 1,
                            keypoints=np.zeros((0, 2))),
-            pycolmap.Rigid3d(pycolmap.Rotation3d(viewmat[:3, :3]), viewmat[:3, 3]))
+            pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3]))
         frames.append({"name": name, "time_seconds": i / 10, "source": "tiny.mp4",
                        "sharpness": 1.0, "held_out": i % 4 == 0, "group": group})
-    for mean, color in zip(truth.means.numpy(), truth.sh_dc.numpy(), strict=True):
+    for mean, color in zip(truth().means.numpy(), truth().sh_dc.numpy(), strict=True):
         value = ((0.282 * color + 0.5).clip(0, 1) * 255).astype(np.uint8)
         model.add_point3D(mean.astype(np.float64), pycolmap.Track(), value)
     model.write(sparse)

@@ -169,6 +169,7 @@ def test_launches_that_cannot_be_recorded_are_started_one_by_one(reference, monk
     assert_same(held(state), reference)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_goes_on_to_the_same_bits(reference, folder):
     state = load_state(
         folder / "state.safetensors", CONFIG, 1.0, device_of("triton"), backend="triton")
@@ -176,6 +177,7 @@ def test_a_checkpoint_goes_on_to_the_same_bits(reference, folder):
     assert_same(held(state), reference)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["torch", "numba"])
 def test_another_backend_goes_on_where_this_one_stopped(reference, folder, backend):
     state = load_state(
@@ -189,6 +191,7 @@ def test_another_backend_goes_on_where_this_one_stopped(reference, folder, backe
         assert (ours - theirs).abs().max() <= 1e-5, name
 
 
+@pytest.mark.slow
 def test_this_backend_goes_on_where_another_one_stopped(reference, folder):
     state = first("numba")
     run(state, task_of("numba"), CHECKPOINT, looks=lambda _: True)

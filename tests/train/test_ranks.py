@@ -192,6 +192,7 @@ def test_processes_that_part_are_stopped(others, densify_every):
     others.fit(first_state(config), tiny_task(config), 3)
 
 
+@pytest.mark.integration
 @three
 def test_a_process_may_have_no_view_of_a_step(others):
     config = batched(2)
