@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import FormatError
+from recon_cli.evaluation.intervals import Interval
 from recon_cli.workspace.atomic import read_json
 
 BASE, PRUNED = MODELS = ("base", "pruned")
@@ -45,15 +46,6 @@ class ModelRow:
     gain_psnr_db: float | None
     seen_psnr_db: Mapping[str, float]
     views: tuple[ViewRow, ...]
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A mean difference over the views and its 95% interval; no bounds if there is one view."""
-
-    mean: float
-    low: float | None
-    high: float | None
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from recon_cli.evaluation.intervals import Interval
 from recon_cli.evaluation.tables import Table
 from recon_cli.progress import format_megabytes
-from recon_cli.report.records import BASE, MODELS, PRUNED, Interval, Metrics, ModelRow
+from recon_cli.report.records import BASE, MODELS, PRUNED, Metrics, ModelRow
 
 LABELS = {BASE: "base", PRUNED: "pruned"}
 _TITLES = {"psnr": "PSNR", "psnr_8bit": "8-bit", "ssim": "SSIM", "ssim_padded": "SSIM 0-pad",
