@@ -14,7 +14,6 @@ from recon_cli.commands import console
 from recon_cli.commands.options import Call
 from recon_cli.errors import ReconError
 from recon_cli.lazy import load
-from recon_cli.progress import bars_aside
 from recon_cli.train.distributed import launch
 
 INTERRUPTED = 130
@@ -26,7 +25,7 @@ VERBS = {
     "denoise": ("stages.denoise", "Filter noisy frames and pass the others through."),
     "sfm": ("stages.sfm", "Estimate cameras and a sparse point cloud."),
     "train": ("stages.train", "Fit Gaussians; denoise and sfm run first where needed."),
-    "import": ("import_scene.import_scene", "Import a splat file instead of training."),
+    "import": ("stages.import_scene", "Import a splat file instead of training."),
     "prune": ("stages.prune", "Remove the least important Gaussians and fine-tune the rest."),
     "eval": ("stages.evaluate", "Score every model on the held-out views."),
     "export": ("stages.export", "Write a .ply and other formats that viewers open; verify each."),
@@ -77,7 +76,7 @@ def cli() -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit code."""
     call = Call()
-    handler = console.show_log(detailed=lambda: call.verbose, aside=bars_aside)
+    handler = console.show_log(detailed=lambda: call.verbose)
     try:
         if launch.follows():
             return launch.follow()

@@ -1,7 +1,6 @@
-"""Everything that a user can do wrong, each with its exit code.
+"""The errors that a user can act on, each with its exit code.
 
-A message says what was found and what was needed; a hint says what to type next. Programming
-mistakes stay ValueError or AssertionError and leave the CLI with exit code 1.
+Programming mistakes stay ValueError or AssertionError and leave the CLI with exit code 1.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ class InputError(ReconError):
 
 
 class StageError(ReconError):
-    """A stage was asked for before what it reads is there and fresh."""
+    """A stage needs the result of another one that is missing or stale."""
 
     exit_code = 4
 
 
 class ReconstructionError(ReconError):
-    """The input was read, but no trustworthy reconstruction came out of it."""
+    """The input was read, but gave no reconstruction that can be trusted."""
 
     exit_code = 5
 
@@ -52,11 +51,11 @@ class SfmError(ReconstructionError):
 
 
 class TrainingError(ReconstructionError):
-    """Training diverged or has nothing to fit."""
+    """Training diverged or has nothing to fit, or not enough memory."""
 
 
 class LostError(TrainingError):
-    """Another of the processes that train together is gone."""
+    """Another process of a distributed training ended."""
 
 
 class BackendError(ReconError):

@@ -1,4 +1,7 @@
-"""How long work reports on itself: a protocol, tqdm for terminals, a null for all else."""
+"""How long work reports its progress: a protocol, tqdm for terminals, a null for all else.
+
+Also how times and sizes are written for people.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ class _NullBar:
 
 
 class NullProgress:
-    """Says nothing: for tests and for use as a library."""
+    """Shows nothing: for tests and for use as a library."""
 
     @contextmanager
     def bar(
@@ -60,8 +63,8 @@ class _TqdmBar:
 
 
 @contextmanager
-def bars_aside() -> Iterator[None]:
-    """Takes the bars from a terminal's last line, and draws them again below what was written."""
+def hide_bars() -> Iterator[None]:
+    """Hides the bars of a terminal while something is written, and draws them again below it."""
     if not sys.stderr.isatty():
         yield
         return
@@ -70,7 +73,7 @@ def bars_aside() -> Iterator[None]:
 
 
 class TqdmProgress:
-    """Bars on stderr. Where stderr is no terminal, one line every 20 seconds is enough."""
+    """Bars on stderr; one line every 20 seconds where stderr is no terminal."""
 
     @contextmanager
     def bar(self, label: str, total: int, *, unit: str = "it", done: int = 0) -> Iterator[Bar]:

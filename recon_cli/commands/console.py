@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from typing import TextIO
 
 import click
+
+from recon_cli.progress import hide_bars
 
 logger = logging.getLogger("recon")
 
@@ -22,30 +23,22 @@ class _NoticeFormatter(logging.Formatter):
 
 
 class _BarAwareHandler(logging.StreamHandler[TextIO]):
-    """Writes on stderr, where progress bars may be drawn: they make way meanwhile."""
-
-    def __init__(self, aside: Callable[[], AbstractContextManager[None]]) -> None:
-        super().__init__()
-        self._aside = aside
+    """Writes on stderr, where progress bars are hidden meanwhile."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Writes a record on a line of its own."""
-        with self._aside():
+        with hide_bars():
             super().emit(record)
 
 
-def show_log(
-    *, detailed: Callable[[], bool],
-    aside: Callable[[], AbstractContextManager[None]] = nullcontext,
-) -> logging.Handler:
+def show_log(*, detailed: Callable[[], bool]) -> logging.Handler:
     """Shows the log on stderr and returns the handler, to be removed at the end.
 
     Args:
-        detailed: whether debug messages are shown too; asked anew for each of them, because the
-            log is there before the command line has been read.
-        aside: lets progress bars make way while a message is written.
+        detailed: whether debug messages are shown too; asked for each of them, because the log
+            starts before the command line is parsed.
     """
-    handler = _BarAwareHandler(aside)
+    handler = _BarAwareHandler()
     handler.setFormatter(_NoticeFormatter())
     handler.addFilter(lambda record: record.levelno >= logging.INFO or detailed())
     logger.addHandler(handler)

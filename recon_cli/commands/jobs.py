@@ -16,7 +16,7 @@ from recon_cli.context import Nobody, Watcher
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress, format_duration
-from recon_cli.stages import STAGES
+from recon_cli.stages import STAGES, Stage
 from recon_cli.workspace.layout import Workspace
 
 
@@ -29,6 +29,7 @@ def run_stages(
     base: Settings | None = None,
     forced: Settings | None = None,
     watcher: Watcher | None = None,
+    table: Sequence[Stage] = (),
 ) -> None:
     """Runs stages one after the other, or prints their options.
 
@@ -40,21 +41,24 @@ def run_stages(
         base: defaults of the verb; recon.toml, --config and options win over them.
         forced: settings that the verb implies; they win over everything.
         watcher: observes the training.
+        table: of all stages; STAGES if empty.
     """
+    table = table or STAGES
     file_settings = explicit_settings(call)
     values = layers.merge(
         [base or {}, file_settings, _of_all_processes(call, file_settings), forced or {}])
-    rows = [row for row in STAGES if row.name in stages]
-    configs = {row.name: layers.build(row.config, values) for row in rows}
+    rows = [row for row in table if row.name in stages]
+    configs = {layers.section_of(row.config): layers.build(row.config, values) for row in rows}
     compute = layers.build(ComputeConfig, values)
     if call.print_config:
         click.echo(layers.to_toml({**configs, "compute": compute}), nl=False)
         return
     job = Job(
-        Workspace(call.workspace), file_settings, compute, TqdmProgress(), report_outcome, STAGES,
+        Workspace(call.workspace), file_settings, compute, TqdmProgress(), report_outcome, table,
         watcher or Nobody(), call.ranks)
     targets = [
-        Target(row.name, configs[row.name], () if row.needs else sources) for row in rows]
+        Target(row.name, config, () if row.needs else sources)
+        for row, config in zip(rows, configs.values(), strict=True)]
     plan.run(job, verb, targets, again=call.again)
     if "evaluate" in stages:
         click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
@@ -73,8 +77,13 @@ def _of_all_processes(call: Call, file_settings: Settings) -> Settings:
     return layers.merge([call.settings, {"train": total}])
 
 
-def open_job(call: Call, kind: type[C]) -> tuple[Job, C]:
-    """Returns a job on the workspace that runs no stage, and the options of one config class."""
+def open_job(call: Call) -> Job:
+    """Returns a job on the workspace for a verb that runs no stage."""
+    return open_job_with(call, ComputeConfig)[0]
+
+
+def open_job_with(call: Call, kind: type[C]) -> tuple[Job, C]:
+    """Returns a job as `open_job` does, and the options of one config class."""
     file_settings = explicit_settings(call)
     values = layers.merge([file_settings, call.settings])
     compute = layers.build(ComputeConfig, values)

@@ -87,5 +87,5 @@ def render(call: Call, /, path: str | None, views: tuple[str, ...], **request: A
         raise click.UsageError("--path and --views exclude each other.")
     # the other options are fields of the request
     checked = RenderRequest(path=path or TRAINING, views=views, **request)
-    job, _ = open_job(call, ComputeConfig)
+    job = open_job(call)
     click.echo(load("recon_cli.flythrough.run.render_frames")(checked, job))

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.jobs import open_job, run_stages
+from recon_cli.commands.jobs import open_job_with, run_stages
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.view import show_training
 from recon_cli.config.settings import Settings
@@ -18,13 +18,14 @@ from recon_cli.config.stages import (
     DenoiseConfig,
     EvaluateConfig,
     ExportConfig,
+    ImportConfig,
     IngestConfig,
     PruneConfig,
     SfmConfig,
     TrainConfig,
 )
 from recon_cli.lazy import load
-from recon_cli.stages import STAGES
+from recon_cli.stages import IMPORT, STAGES
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune while training goes on
@@ -59,7 +60,7 @@ def denoise(call: Call, compare: bool) -> None:
     """Filter noisy frames and pass the others through."""
     if compare:
         compare_filters = load("recon_cli.experiments.filter_comparison.compare_filters")
-        click.echo(compare_filters(*open_job(call, DenoiseConfig)))
+        click.echo(compare_filters(*open_job_with(call, DenoiseConfig)))
         return
     run_stages(call, "denoise", ["denoise"])
 
@@ -95,6 +96,23 @@ def train(call: Call, with_prune: bool, with_view: bool) -> None:
             run_stages(call, "train", ["train"], watcher=watcher)
 
 
+@verb("import")
+@click.argument("file", required=False, type=click.Path(path_type=Path))
+@options.stage(ImportConfig, renders=True)
+@pass_call
+def import_scene(call: Call, file: Path | None) -> None:
+    """Import a splat file instead of training.
+
+    FILE is a .ply, .compressed.ply, .splat, .spz, .sog or .glb of any program. In a workspace with
+    views (`recon ingest`, `recon sfm`) it is checked against some of them, and can be pruned and
+    scored; without, it can be viewed, rendered and exported. Without FILE, the previous file is
+    used.
+    """
+    table = tuple(IMPORT if row.name == IMPORT.name else row for row in STAGES)
+    run_stages(
+        call, IMPORT.verb, [IMPORT.name], sources=() if file is None else (file,), table=table)
+
+
 @verb("prune")
 @options.sweep()
 @options.stage(PruneConfig, renders=True)
@@ -103,7 +121,7 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
     """Remove the least important Gaussians and fine-tune the rest."""
     if sweep:
         run_sweep = load("recon_cli.experiments.sweep.run_sweep")
-        click.echo(run_sweep(*open_job(call, PruneConfig), ratios))
+        click.echo(run_sweep(*open_job_with(call, PruneConfig), ratios))
         return
     run_stages(call, "prune", ["prune"])
 
@@ -129,12 +147,12 @@ def evaluate(call: Call, items: tuple[Path, ...], seeds: int | None, form: str) 
         raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
     if seeds:
         score_seeds = load("recon_cli.experiments.seeds.score_seeds")
-        click.echo(score_seeds(*open_job(call, EvaluateConfig), seeds).text(form))
+        click.echo(score_seeds(*open_job_with(call, EvaluateConfig), seeds).text(form))
         return
     if items:
         compare = load("recon_cli.commands.compare_scores.compare")
         click.echo(compare(
-            lambda path: open_job(dataclasses.replace(call, workspace=path), EvaluateConfig),
+            lambda path: open_job_with(dataclasses.replace(call, workspace=path), EvaluateConfig),
             call.workspace, items, form))
         return
     run_stages(call, "eval", ["evaluate"])

@@ -54,7 +54,7 @@ def view(
         content, photos = load("recon_cli.viewer.content.load_file")(item), None
     else:
         call.workspace = workspace
-        job, _ = open_job(call, ComputeConfig)
+        job = open_job(call)
         content = load("recon_cli.viewer.content.load_workspace")(job, model)
         photos = load("recon_cli.viewer.photo_pairs.PhotoPairs")(job, content.max_size)
     serve_scene = load("recon_cli.viewer.server.serve_scene")
@@ -95,8 +95,8 @@ def _workspace(call: Call, item: Path | None) -> Path | None:
     """
     if item is None:
         return call.workspace
-    given = click.get_current_context().get_parameter_source("workspace")
-    if given == click.core.ParameterSource.COMMANDLINE:
+    source = click.get_current_context().get_parameter_source("workspace")
+    if source == click.core.ParameterSource.COMMANDLINE:
         raise click.UsageError("ITEM and -w exclude each other.")
     if not item.exists():
         raise InputError(f"{item} does not exist.", hint="Check the path.")

@@ -13,7 +13,6 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job, summary_text
 from recon_cli.commands.options import Call, pass_call, verb
-from recon_cli.config.stages import ComputeConfig
 from recon_cli.lazy import load
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.clean import free_space
@@ -35,7 +34,7 @@ logger = logging.getLogger("recon")
 @pass_call
 def status(call: Call, as_json: bool) -> None:
     """Show which stages are fresh, stale and why, or missing."""
-    job, _ = open_job(call, ComputeConfig)
+    job = open_job(call)
     stages = plan.status(job)
     if as_json:
         click.echo(json.dumps({
@@ -98,5 +97,5 @@ def report(call: Call, out: Path | None) -> None:
     It is one file that any browser opens without a network. No stage is run; the report names what
     is missing or stale, with the command to type.
     """
-    job, _ = open_job(call, ComputeConfig)
+    job = open_job(call)
     click.echo(load("recon_cli.report.build.write_report")(job, out))

@@ -274,10 +274,10 @@ class PruneConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         limits = ("ratio", "max_gaussians", "max_mb", "max_psnr_drop")
-        given = [name for name in limits if getattr(self, name) is not None]
-        if len(given) > 1:
+        limited = [name for name in limits if getattr(self, name) is not None]
+        if len(limited) > 1:
             raise ConfigError(
-                f"{' and '.join(given)} are given, but only one can limit the pruning.",
+                f"{' and '.join(limited)} are given, but only one can limit the pruning.",
                 hint=f"Leave out all but one of {', '.join(limits)}.")
         if self.max_psnr_drop is not None and self.at == "mid":
             raise ConfigError(

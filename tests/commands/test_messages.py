@@ -9,8 +9,8 @@ import termios
 SAYS = """
 import logging
 from recon_cli.commands import console
-from recon_cli.progress import TqdmProgress, bars_aside
-console.show_log(detailed=lambda: False, aside=bars_aside)
+from recon_cli.progress import TqdmProgress
+console.show_log(detailed=lambda: False)
 with TqdmProgress().bar("train", 10) as bar:
     bar.advance(3)
     logging.getLogger("recon").warning("a frame is dark")
