@@ -12,6 +12,7 @@ from pathlib import Path
 
 import fake_stages
 import pytest
+from facts import assert_facts
 from fake_stages import STEPS, bring, job_at, stale
 
 from recon_cli.commands.workspace import status_table
@@ -112,8 +113,7 @@ def test_a_stale_optional_stage_is_left_out_with_a_notice(
     other: Settings = {"prune": {"ratio": 0.25}}
     assert bring(job_at(job.workspace.root, other), "evaluate") == ["evaluate"]
     assert set(fake_stages.seen["evaluate"].folders) == {"ingest", "sfm", "train"}
-    assert ("prune is left out of eval: it is stale: prune.ratio changed: automatic -> 0.25"
-            in caplog.text)
+    assert_facts(caplog.text, "prune", "eval", "stale", "prune.ratio", "automatic -> 0.25")
 
 
 def test_a_missing_optional_stage_is_left_out_in_silence(

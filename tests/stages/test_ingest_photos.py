@@ -6,6 +6,7 @@ import logging
 import numpy as np
 import pytest
 from dng import Shot, linear, write_shot
+from facts import assert_facts
 from ingest_media import blocks, listed, take, write_photos
 from PIL import Image
 
@@ -111,9 +112,9 @@ def test_a_split_that_leaves_nothing_to_train_on_is_refused(tmp_path):
 def test_options_without_effect_on_photos_are_told(tmp_path, notices):
     folder = write_photos(tmp_path / "room", 4)
     take(folder, tmp_path / "out", config=IngestConfig(holdout="segment:0:0.01", frames=3))
-    assert notices() == [
-        "--holdout segment:0:0.01 holds out none of 4 frames, so that nothing can be scored.",
-        "--frames has no effect on photos: all are used."]
+    holdout, frames = notices()
+    assert_facts(holdout, "--holdout segment:0:0.01", "none of 4 frames")
+    assert_facts(frames, "--frames", "no effect", "photos")
 
 
 def test_a_photo_that_is_given_twice_is_taken_once(tmp_path):
