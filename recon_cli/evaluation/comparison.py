@@ -13,13 +13,7 @@ from typing import Any
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
-from recon_cli.evaluation.metrics import (
-    MASK_CONVENTION,
-    PSNR_8BIT_CONVENTION,
-    PSNR_CONVENTION,
-    SSIM_CONVENTION,
-    SSIM_PADDED_CONVENTION,
-)
+from recon_cli.evaluation.metrics import CONVENTION_LINES, CONVENTIONS, MASK_CONVENTION
 from recon_cli.evaluation.reference_views import (
     LABELS,
     ReferenceView,
@@ -40,9 +34,6 @@ from recon_cli.scene.splats import Splats, transformed
 from recon_cli.workspace.atomic import read_json
 
 _TRANSFORM = "transform.json"  # that an export leaves beside its files
-CONVENTIONS = {
-    "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
-    "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION}
 
 logger = logging.getLogger("recon")
 
@@ -192,8 +183,6 @@ def _record(models: Sequence[ScoredModel]) -> dict[str, Any]:
         **CONVENTIONS, "mask_convention": MASK_CONVENTION}
 
 
-_NOTE = (
-    f"PSNR: {PSNR_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\nSSIM: {SSIM_CONVENTION}\n"
-    f"SSIM 0-pad: {SSIM_PADDED_CONVENTION}\n"
+_NOTE = CONVENTION_LINES + (
     "Differences: paired, bootstrap over the views; only between models that were scored on the "
     "same views.")

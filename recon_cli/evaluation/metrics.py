@@ -24,6 +24,12 @@ SSIM_PADDED_CONVENTION = (
 MASK_CONVENTION = (
     "ignored pixels have no part in the squared error; the map of SSIM is averaged over the others")
 LPIPS_CONVENTION = "LPIPS 0.1 with AlexNet, of the float render, lower is better"
+CONVENTIONS = {  # as JSON files hold them
+    "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
+    "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION}
+CONVENTION_LINES = (  # below tables
+    f"PSNR: {PSNR_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\nSSIM: {SSIM_CONVENTION}\n"
+    f"SSIM 0-pad: {SSIM_PADDED_CONVENTION}\n")
 MIN_SIDE = 11  # pixels; the window of SSIM
 MIN_PIXELS = MIN_SIDE**2  # that a mask must leave: one window of SSIM
 _MAX_DB = 100.0  # of equal images, which JSON cannot hold

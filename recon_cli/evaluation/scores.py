@@ -1,4 +1,4 @@
-"""Tables of scores: models side by side, views, data sets."""
+"""Scores of views and models, and tables of them: models side by side, views, data sets."""
 
 from __future__ import annotations
 
@@ -14,46 +14,27 @@ from recon_cli.evaluation.tables import Table
 
 @dataclass(frozen=True)
 class ViewScore:
-    """The scores of one view.
-
-    Attributes:
-        name: of the view.
-        psnr_db: peak signal-to-noise ratio in dB.
-        psnr_8bit_db: of the render rounded to 8 bits.
-        ssim: structural similarity by scikit-image.
-        ssim_padded: by INRIA's convention.
-        lpips: perceptual distance, lower is better; None where it was not measured.
-        pixels_scored: share of the pixels that a mask leaves; None without a mask.
-    """
+    """The scores of one view."""
 
     name: str
     psnr_db: float
-    psnr_8bit_db: float
-    ssim: float
-    ssim_padded: float
-    lpips: float | None = None
-    pixels_scored: float | None = None
+    psnr_8bit_db: float  # of the render rounded to 8 bits
+    ssim: float  # by scikit-image
+    ssim_padded: float  # by INRIA's convention
+    lpips: float | None = None  # None where it was not measured
+    pixels_scored: float | None = None  # fraction that a mask leaves; None without a mask
 
 
 @dataclass(frozen=True)
 class ModelScore:
-    """The scores of one model over all held-out views.
+    """The scores of one model over all held-out views."""
 
-    Attributes:
-        label: how tables call it.
-        views: per view, by name.
-        gaussians: count.
-        bytes: size of its file.
-        render_ms: median milliseconds a view.
-        train_seconds: seconds of training that led to it; None where nobody knows.
-    """
-
-    label: str
+    label: str  # in tables
     views: tuple[ViewScore, ...]
     gaussians: int
-    bytes: int
-    render_ms: float
-    train_seconds: float | None
+    bytes: int  # of its file
+    render_ms: float  # median milliseconds a view
+    train_seconds: float | None  # of training that led to it; None where unknown
 
     @property
     def psnr_db(self) -> float:
@@ -103,7 +84,8 @@ def model_table(scores: Sequence[ModelScore]) -> Table:
 def view_table(scores: Sequence[ModelScore]) -> Table:
     """Returns each view with the scores of all models, which have the same views."""
     labels = [score.label for score in scores]
-    headings = ("view", *(f"{what} {label}" for what in ("PSNR dB", "SSIM") for label in labels))
+    headings = ("view", *(
+        f"{metric} {label}" for metric in ("PSNR dB", "SSIM") for label in labels))
     return Table(headings, tuple((
         views[0].name, *(f"{view.psnr_db:.2f}" for view in views),
         *(f"{view.ssim:.4f}" for view in views))

@@ -12,15 +12,11 @@ _TEX = str.maketrans({
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells; the first column holds names, the others numbers.
-
-    Attributes:
-        headings: of the columns.
-        rows: each as long as the headings.
-    """
+    """Rows of cells, each as long as the headings; the first column holds names, others numbers."""
 
     headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: Sequence[tuple[str, ...]]
+    title: str = ""
 
     def text(self, *, rule: bool = False) -> str:
         """Returns aligned columns for a terminal; with a line below the headings if `rule`."""
@@ -32,12 +28,13 @@ class Table:
             for row in rows]
         if rule:
             lines.insert(1, "-" * max(map(len, lines)))
-        return "\n".join(lines)
+        return "\n".join([self.title, *lines] if self.title else lines)
 
     def markdown(self) -> str:
-        """Returns the table in Markdown."""
+        """Returns a pipe table, under a heading where it has a title."""
         lines = [self.headings, ("---", *["---:"] * (len(self.headings) - 1)), *self.rows]
-        return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+        table = "".join("| " + " | ".join(line) + " |\n" for line in lines)
+        return f"### {self.title}\n\n{table}".rstrip() if self.title else table
 
     def latex(self) -> str:
         """Returns the table in LaTeX; needs booktabs."""
@@ -47,33 +44,6 @@ class Table:
         columns = "l" + "r" * (len(self.headings) - 1)
         return (f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{line(self.headings)}\\midrule\n"
                 f"{''.join(map(line, self.rows))}\\bottomrule\n\\end{{tabular}}\n")
-
-
-@dataclass(frozen=True)
-class TitledTable:
-    """A table with a title.
-
-    Attributes:
-        title: what it is about.
-        header: of the columns.
-        rows: cells, as many in each as the header has; the first is text, the others figures.
-    """
-
-    title: str
-    header: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
-
-    def text(self) -> str:
-        """Returns aligned columns under the title."""
-        return f"{self.title}\n{self._table.text()}"
-
-    def markdown(self) -> str:
-        """Returns a pipe table under a heading."""
-        return f"### {self.title}\n\n{self._table.markdown()}".rstrip()
-
-    @property
-    def _table(self) -> Table:
-        return Table(self.header, tuple(self.rows))
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -86,5 +56,5 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def percent(value: float | None) -> str:
-    """Returns a share in percent, "-" for one that is not known."""
+    """Returns a fraction in percent, "-" for one that is not known."""
     return "-" if value is None else f"{100 * value:.3g}%"

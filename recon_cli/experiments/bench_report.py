@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recon_cli.evaluation.tables import TitledTable, number, percent
+from recon_cli.evaluation.tables import Table, number, percent
 from recon_cli.experiments.accuracy import Accuracy
 from recon_cli.experiments.bench_result import (
     BackendResult,
@@ -23,9 +23,9 @@ _REFERENCE = "torch"  # what the other backends and losses are compared with
 _RATED = {"forward: composite": "forward", "backward: decompose": "backward"}
 
 
-def tables(result: BenchResult) -> list[TitledTable]:
+def tables(result: BenchResult) -> list[Table]:
     """Returns all tables of a result, in the order in which they are read."""
-    all_tables: list[TitledTable] = []
+    all_tables: list[Table] = []
     for name, scene in result.scenes.items():
         where = (f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
                  f"SH degree {scene.sh_degree}")
@@ -54,7 +54,7 @@ def _both(speed: Speed) -> float:
     return speed.forward.ms + speed.backward.ms
 
 
-def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> TitledTable:
+def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> Table:
     """Returns the figures that are quoted, one row each, a column a backend."""
     backends = scene.backends
     rows = [(name, *(figure(backend) for backend in backends.values()))
@@ -67,7 +67,7 @@ def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> Titl
         rows.append((f"loss {name}, ms", _ms(timing), *[""] * width))
         if fused and timing is not fused:
             rows.append((f"loss {name} : fused", _ratio(timing.ms, fused.ms), *[""] * width))
-    return TitledTable(f"Figures ({where})", ("what", *backends), rows)
+    return Table(("what", *backends), rows, f"Figures ({where})")
 
 
 def _quoted(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult], str]]]:
@@ -115,7 +115,7 @@ def _millions(pairs: tuple[int, int] | None, index: int) -> str:
     return number(pairs[index] / 1e6 if pairs else None)
 
 
-def _stages(where: str, scene: BenchedScene) -> TitledTable:
+def _stages(where: str, scene: BenchedScene) -> Table:
     """Returns every stage of every backend, with one thread and with all."""
     threads = next(iter(scene.backends.values())).speed.threads
     several = threads > 1 and _has_core(scene)  # otherwise both columns would say the same
@@ -128,8 +128,8 @@ def _stages(where: str, scene: BenchedScene) -> TitledTable:
                 (f"{name} {part}", *(_ms(_time(speed, part)) for speed in speeds),
                  *_rates(_core(backend), part)) for part in (label, *parts)]
     columns = ("ms, 1 thread", f"ms, {threads} threads") if several else ("ms",)
-    return TitledTable(
-        f"Stages ({where})", ("stage", *columns, "Gpairs/s a core", "of peak"), rows)
+    return Table(
+        ("stage", *columns, "Gpairs/s a core", "of peak"), rows, f"Stages ({where})")
 
 
 def _time(speed: Speed, part: str) -> Timing | None:
@@ -148,11 +148,11 @@ def _rates(speed: Speed, part: str) -> tuple[str, str]:
 _ERRORS = ("image max", "image RMS", "pixels > 1e-5", "gradient rel.", "worst", "gradient 1 - cos")
 
 
-def _errors(where: str, scene: BenchedScene) -> TitledTable:
+def _errors(where: str, scene: BenchedScene) -> Table:
     """Returns every backend against the oracle."""
     rows = [(name, number(_both(backend.speed)), *_accuracy_cells(backend.accuracy))
             for name, backend in scene.backends.items()]
-    return TitledTable(f"Error against float64 ({where})", ("backend", "ms", *_ERRORS), rows)
+    return Table(("backend", "ms", *_ERRORS), rows, f"Error against float64 ({where})")
 
 
 def _accuracy_cells(accuracy: Accuracy) -> tuple[str, ...]:
@@ -162,7 +162,7 @@ def _accuracy_cells(accuracy: Accuracy) -> tuple[str, ...]:
             accuracy.gradient_worst, number(1 - accuracy.gradient_cosine, 2))
 
 
-def _variants(where: str, scene: BenchedScene) -> TitledTable:
+def _variants(where: str, scene: BenchedScene) -> Table:
     """Returns every approximation against the oracle, and what it saves."""
     contract = scene.variants[0].time
     rows = []
@@ -170,9 +170,8 @@ def _variants(where: str, scene: BenchedScene) -> TitledTable:
         saved = None if variant.time is None or contract is None else contract.ms - variant.time.ms
         rows.append((variant.name, _ms(variant.time), number(saved, 2),
                      *_accuracy_cells(variant.accuracy)))
-    return TitledTable(
-        f"Approximations on {scene.variants_of} ({where})",
-        ("what", "ms", "ms saved", *_ERRORS), rows)
+    return Table(("what", "ms", "ms saved", *_ERRORS), rows,
+                 f"Approximations on {scene.variants_of} ({where})")
 
 
 _FLOOR = 1e-9  # an error of zero has no place on a logarithmic axis

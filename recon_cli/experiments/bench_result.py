@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import ConfigError, FormatError
-from recon_cli.evaluation.tables import TitledTable, number
+from recon_cli.evaluation.tables import Table, number
 from recon_cli.experiments.accuracy import Accuracy
 from recon_cli.experiments.host import Host, Timing
 from recon_cli.workspace import atomic
@@ -180,7 +180,7 @@ def _settings_text(settings: Mapping[str, int], threads: int) -> str:
             f"SH degree {settings['sh_degree']}, {threads} threads")
 
 
-def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> TitledTable:
+def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> Table:
     """Returns old, new and old / new for each scene, backend and figure that both records have."""
     rows = []
     for scene, record in new["scenes"].items():
@@ -191,7 +191,7 @@ def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> TitledTa
                 rows.append((
                     f"{scene} {backend} {figure}", number(was), number(now),
                     number(ratio(was, now))))
-    return TitledTable("Old against new", ("figure", "old", "new", "old / new"), rows)
+    return Table(("figure", "old", "new", "old / new"), rows, "Old against new")
 
 
 def ratio(old: float | None, new: float | None) -> float | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import ConfigError, FormatError, InputError
-from recon_cli.evaluation.tables import TitledTable
+from recon_cli.evaluation.tables import Table
 from recon_cli.workspace import atomic
 
 BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"
@@ -44,7 +44,7 @@ class OutputFiles:
             _with_text(self.markdown, "")
 
     def write(
-        self, record: Mapping[str, Any], head: str, tables: Sequence[TitledTable],
+        self, record: Mapping[str, Any], head: str, tables: Sequence[Table],
         draw: Callable[[Path], None],
     ) -> None:
         """Writes them.

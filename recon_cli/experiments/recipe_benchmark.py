@@ -13,7 +13,7 @@ import numpy as np
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError
-from recon_cli.evaluation.tables import TitledTable, number
+from recon_cli.evaluation.tables import Table, number
 from recon_cli.experiments.host import Host, examine, timing_of
 from recon_cli.experiments.outputs import OutputFiles, add_legend, drawing
 from recon_cli.experiments.runner import STEPS, ExperimentRequest, Runner, Runs, shared_options
@@ -187,7 +187,7 @@ def head(result: CurvesResult) -> str:
             "brackets; scored on validation views, scoring not timed")
 
 
-def tables(result: CurvesResult) -> list[TitledTable]:
+def tables(result: CurvesResult) -> list[Table]:
     """Returns one table a scene."""
     return [_table(name, scene, result) for name, scene in result.scenes.items()]
 
@@ -202,13 +202,13 @@ def median_cell(values: Sequence[float | None], digits: int = 3) -> str:
     return cell if len(known) == len(values) else f"{cell}, {len(known)} of {len(values)}"
 
 
-def _table(name: str, scene: SceneCurves, result: CurvesResult) -> TitledTable:
+def _table(name: str, scene: SceneCurves, result: CurvesResult) -> Table:
     targets = result.targets_of(scene)
     header = ("recipe", *(f"{kind} to {db:g} dB" for db in targets for kind in ("s", "CPU s")),
               "PSNR dB", "SSIM", "Gaussians", "MB", "steps", "s", "CPU s")
     title = (f"{name}: {scene.views} validation views at {scene.width}x{scene.height}, "
              f"at most {result.base.max_gaussians:,} Gaussians")
-    return TitledTable(title, header, [_row(recipe, scene, targets) for recipe in scene.recipes])
+    return Table(header, [_row(recipe, scene, targets) for recipe in scene.recipes], title)
 
 
 def _row(recipe: str, scene: SceneCurves, targets: Sequence[float]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from typing import Any
 from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread
 from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
-from recon_cli.evaluation.tables import TitledTable
+from recon_cli.evaluation.tables import Table
 from recon_cli.experiments.host import examine
 from recon_cli.experiments.outputs import add_legend, draw_if_possible, drawing
 from recon_cli.experiments.runner import Records
@@ -137,7 +137,7 @@ def head(result: StudyResult) -> str:
             f"run on {' and '.join(result.machines)}")
 
 
-def scores(result: StudyResult, comparison: str) -> TitledTable:
+def scores(result: StudyResult, comparison: str) -> Table:
     """Returns the table of means and standard deviations."""
     header = ("scene, arm", *(name for label, _, _ in _COLUMNS for name in (label, "sd")),
               *(label for label, _, _ in _COSTS))
@@ -149,10 +149,10 @@ def scores(result: StudyResult, comparison: str) -> TitledTable:
             costs = [f"{result.spread(row, comparison, variant, figure).mean:,.{digits}f}"
                      for _, figure, digits in _COSTS]
             rows.append((f"{row}, {variant.label}", *cells, *costs))
-    return TitledTable(f"Scores at {comparison}", header, rows)
+    return Table(header, rows, f"Scores at {comparison}")
 
 
-def differences(result: StudyResult, comparison: str) -> TitledTable:
+def differences(result: StudyResult, comparison: str) -> Table:
     """Returns the table of paired differences with their intervals."""
     header = ("scene, arm - arm", *(
         name for label, _, _ in _COLUMNS for name in (label, "95% from", "to")))
@@ -162,7 +162,7 @@ def differences(result: StudyResult, comparison: str) -> TitledTable:
             cells = [cell for _, figure, digits in _COLUMNS for cell in _interval_cells(
                 result.difference(row, comparison, pair, figure), digits)]
             rows.append((f"{row}, {pair[0].label} - {pair[1].label}", *cells))
-    return TitledTable(f"Differences at {comparison}", header, rows)
+    return Table(header, rows, f"Differences at {comparison}")
 
 
 def _spread_cells(spread: Spread, digits: int) -> tuple[str, str]:
@@ -199,13 +199,13 @@ def _sentence(
             f"{difference.verdict}.")
 
 
-def beside_the_paper(result: StudyResult) -> TitledTable | None:
+def beside_the_paper(result: StudyResult) -> Table | None:
     """Returns the paper's figures beside ours, None where no scene has a name of theirs."""
     rows = list(_published_rows(result))
     header = ("scene", "paper: 3DGS dB", "SSIM", "theirs dB", "SSIM", "gain dB", "SSIM",
               "here: 3DGS dB", "SSIM", "paper's prune dB", "SSIM", "gain dB", "SSIM")
     title = f"The paper's Table I beside this study, {EQUAL_STEPS}"
-    return TitledTable(title, header, rows) if rows else None
+    return Table(header, rows, title) if rows else None
 
 
 def _published_rows(result: StudyResult) -> Iterator[tuple[str, ...]]:

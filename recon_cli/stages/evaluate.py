@@ -1,6 +1,6 @@
 """evaluate: scores every model on the held-out views, against the original pixels.
 
-The .ply is read back and rendered, so that what is handed out is what is measured. Writes
+The .ply is read back and rendered, so that the written file is what is measured. Writes
 metrics.json, metrics.csv, metrics.md, metrics.tex, table.txt, and pictures: renders/<model>/,
 truth/ and difference/<model>/ (absolute error times four). Pixels that a mask ignores are not
 scored: they are painted in one colour in truth/ and black in difference/.
@@ -9,29 +9,27 @@ scored: they are painted in one colour in truth/ and black in difference/.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.config.stages import EvaluateConfig
+from recon_cli.config.stages import EvaluateConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
+    CONVENTION_LINES,
+    CONVENTIONS,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
-    PSNR_8BIT_CONVENTION,
-    PSNR_CONVENTION,
-    SSIM_CONVENTION,
-    SSIM_PADDED_CONVENTION,
+    Perceptual,
     load_lpips,
 )
 from recon_cli.evaluation.reference_views import (
     LABELS,
     ReferenceView,
-    RenderScores,
     evenly_spread,
     load_held_out_views,
     load_reference_views,
@@ -51,30 +49,116 @@ from recon_cli.train.runner import LOG, read_config, seconds_at
 from recon_cli.workspace.atomic import write_bytes, write_json
 
 _GAIN = 4  # of the difference images
-_EVER = 1 << 62  # an iteration beyond any
-_SEEN_VIEWS = 20  # training and validation views that are scored beside, at most
+_ANY_ITERATION = 1 << 62  # beyond the last
+_SEEN_VIEWS = 20  # training and validation views that are also scored, at most
+_STAGES = {"base": "train", "pruned": "prune"}  # by model
 
 
 @dataclass(frozen=True)
 class _Model:
-    """One model's scores.
+    """One model's scores."""
 
-    Attributes:
-        score: on the held-out views.
-        corrected_db: its mean PSNR there after the best gain per channel of each view.
-        seen_db: mean PSNR on some training and validation views, by the name of the split, after
-            the best gain where training had gains.
-    """
-
-    score: ModelScore
-    corrected_db: float
+    score: ModelScore  # on the held-out views
+    corrected_db: float  # mean PSNR there after the best gain per channel of each view
+    # mean PSNR on some training and validation views, by the name of the split, after the best gain
+    # where training had gains
     seen_db: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class _Evaluation:
+    """What is scored and on which views."""
+
+    out: Path
+    folders: Mapping[str, Path]  # of train and prune, by model
+    config: RunConfig  # of the training
+    origin: Origin | None
+    scene: Scene
+    held_out: Sequence[ReferenceView]
+    seen: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
+    ctx: StageContext
+
+    @property
+    def gains(self) -> bool:
+        """Whether training had a gain for each view."""
+        return self.config.exposure == "on"
+
+    def score(
+        self, model: str, perceptual: Perceptual | None, on_view: Callable[[], None]
+    ) -> _Model:
+        """Renders and scores one model, and saves its pictures."""
+        path, backend = self.folders[model] / "splats.ply", self.ctx.backend
+        splats = read_ply(path).map(lambda tensor: tensor.to(self.ctx.device))
+        degree = self.config.sh_degree
+
+        def save(view: ReferenceView, image: NDArray[np.float32]) -> None:
+            _save_pictures(self.out, model, view, image)
+            on_view()
+
+        scores = score_views(
+            splats, self.held_out, degree, backend, perceptual=perceptual, on_view=save)
+        seen_db = {
+            name: mean_psnr(splats, views, degree, backend, corrected=self.gains, on_view=on_view)
+            for name, views in self.seen.items()}
+        seconds = None if self.origin else seconds_at(self.folders[model] / LOG, _ANY_ITERATION)
+        score = ModelScore(
+            LABELS[model], scores.views, len(splats), path.stat().st_size, scores.render_ms,
+            seconds)
+        return _Model(score, scores.corrected_db, seen_db)
+
+    def counts(self) -> Summary:
+        """Returns how many views are scored, and the names of those that are not."""
+        hidden = {view.name for view in self.scene.test} - {view.name for view in self.held_out}
+        return {
+            "test_views": len(self.held_out),
+            "unregistered_test": list(self.scene.unregistered_test),
+            **({"masked_out_test": sorted(hidden)} if hidden else {}),
+        }
+
+    def note(self, lacking: str) -> str:
+        """Returns what the figures of the tables mean; `lacking` is why there is no LPIPS."""
+        sizes = " and ".join(f"{width}x{height}" for width, height in sizes_of(
+            [view.camera for view in self.held_out]))
+        masked = sum(view.mask is not None for view in self.held_out)
+        note = (f"{len(self.held_out)} held-out views at {sizes}, "
+                f"{len(self.scene.unregistered_test)} more without a camera\n{CONVENTION_LINES}"
+                f"LPIPS: {f'not measured, {lacking}' if lacking else LPIPS_CONVENTION}\n")
+        if masked:
+            note += f"Masks on {masked} of {len(self.held_out)} views: {MASK_CONVENTION}\n"
+        return note + "".join(
+            f"{text}\n" for text in (self.origin.warnings() if self.origin else ()))
 
 
 def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Renders and scores the held-out views and returns the means of each model."""
+    evaluation = _load(config, inputs, out, ctx)
+    for view in evaluation.held_out:
+        _save(out / "truth" / f"{Path(view.name).stem}.png", view.image)
+    perceptual, lacking = load_lpips()
+    views = len(evaluation.held_out) + sum(map(len, evaluation.seen.values()))
+    with ctx.progress.bar("evaluate", len(evaluation.folders) * views, unit="view") as bar:
+        models = {model: evaluation.score(model, perceptual, bar.advance)
+                  for model in evaluation.folders}
+    unregistered = evaluation.scene.unregistered_test
+    if unregistered:
+        ctx.notice(f"{len(unregistered)} held-out views have no camera and are not scored: "
+                   f"{', '.join(unregistered)}")
+    for text in evaluation.origin.warnings() if evaluation.origin else ():
+        ctx.notice(text)
+    _write(evaluation, models, inputs.folders["ingest"].parent.resolve().name, lacking)
+    return {
+        **evaluation.counts(),
+        **{f"{name}_{key}": round(getattr(model.score, key), 4)
+           for name, model in models.items() for key in ("psnr_db", "ssim", "gaussians")},
+        **{f"{name}_gain_psnr_db": round(model.corrected_db, 4)
+           for name, model in models.items() if evaluation.gains},
+    }
+
+
+def _load(
+    config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext
+) -> _Evaluation:
     train_config = read_config(inputs.folders["train"])
-    origin = Origin.of(inputs.folders["train"])
     scene = load_scene(inputs, validation=train_config.validation)
     size = config.max_size or train_config.max_size
     held_out = load_held_out_views(scene, size, ctx)
@@ -83,57 +167,10 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
               "validation": scene.validation}
     seen = {name: views for name, split in splits.items() if (
         views := load_reference_views(evenly_spread(split, _SEEN_VIEWS), size))}
-    stages = {"base": "train", "pruned": "prune"}
-    folders = {model: inputs.folders[stage] for model, stage in stages.items()
+    folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
-    for view in held_out:
-        _save(out / "truth" / f"{Path(view.name).stem}.png", view.image)
-    perceptual, lacking = load_lpips()
-    lacking = lacking or "views with a mask have none"
-    gains = train_config.exposure == "on"
-    models: dict[str, _Model] = {}
-    total = len(folders) * (len(held_out) + sum(map(len, seen.values())))
-    with ctx.progress.bar("evaluate", total, unit="view") as bar:
-        for model, folder in folders.items():
-            splats = read_ply(folder / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
-
-            def save(
-                view: ReferenceView, image: NDArray[np.float32], model: str = model
-            ) -> None:
-                _save_pictures(out, model, view, image)
-                bar.advance()
-
-            degree = train_config.sh_degree
-            scores = score_views(
-                splats, held_out, degree, ctx.backend, perceptual=perceptual, on_view=save)
-            seen_db = {name: mean_psnr(
-                splats, views, degree, ctx.backend, corrected=gains, on_view=bar.advance)
-                for name, views in seen.items()}
-            seconds = None if origin else seconds_at(folder / LOG, _EVER)
-            models[model] = _Model(
-                _model_score(model, folder, scores, len(splats), seconds), scores.corrected_db,
-                seen_db)
-    if scene.unregistered_test:
-        ctx.notice(f"{len(scene.unregistered_test)} held-out views have no camera and are not "
-                   f"scored: {', '.join(scene.unregistered_test)}")
-    for text in origin.warnings() if origin else ():
-        ctx.notice(text)
-    _write(out, inputs, models, held_out, scene, gains=gains, lacking=lacking)
-    return {
-        **_counts(held_out, scene),
-        **{f"{name}_{key}": round(getattr(model.score, key), 4)
-           for name, model in models.items() for key in ("psnr_db", "ssim", "gaussians")},
-        **{f"{name}_gain_psnr_db": round(model.corrected_db, 4)
-           for name, model in models.items() if gains},
-    }
-
-
-def _model_score(
-    model: str, folder: Path, scores: RenderScores, gaussians: int, train_seconds: float | None
-) -> ModelScore:
-    return ModelScore(
-        LABELS[model], scores.views, gaussians, (folder / "splats.ply").stat().st_size,
-        scores.render_ms, train_seconds)
+    return _Evaluation(
+        out, folders, train_config, Origin.of(inputs.folders["train"]), scene, held_out, seen, ctx)
 
 
 def _save_pictures(
@@ -154,30 +191,28 @@ def _save(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 def _write(
-    out: Path, inputs: StageInputs, models: Mapping[str, _Model], held_out: Sequence[ReferenceView],
-    scene: Scene, *, gains: bool, lacking: str,
+    evaluation: _Evaluation, models: Mapping[str, _Model], workspace: str, lacking: str
 ) -> None:
-    """Writes the scores as JSON and as tables."""
+    """Writes the scores as JSON and as tables; `lacking` is why LPIPS cannot be measured."""
+    out, held_out, gains = evaluation.out, evaluation.held_out, evaluation.gains
     scores = {name: model.score for name, model in models.items()}
     measured = next(iter(scores.values())).lpips is not None
-    masked = sum(view.mask is not None for view in held_out)
-    origin = Origin.of(inputs.folders["train"])
+    lacking = "" if measured else lacking or "views with a mask have none"
     write_json(out / "metrics.json", {
         "models": {name: _record(model, gains=gains) for name, model in models.items()},
         **({"pruned_minus_base": {
             key: dataclasses.asdict(_difference(scores, key)) for key in ("psnr_db", "ssim")}}
            if len(scores) == 2 else {}),
-        "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
-        "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION,
-        "lpips_convention": LPIPS_CONVENTION if measured else f"not measured: {lacking}",
-        **({"mask_convention": MASK_CONVENTION} if masked else {}),
+        **CONVENTIONS,
+        "lpips_convention": f"not measured: {lacking}" if lacking else LPIPS_CONVENTION,
+        **({"mask_convention": MASK_CONVENTION}
+           if any(view.mask is not None for view in held_out) else {}),
         "truth_digest": reference_digest(held_out),
-        **size_summary([view.camera for view in held_out]), **_counts(held_out, scene),
-        **({"imported_from": origin.file} if origin else {}),
+        **size_summary([view.camera for view in held_out]), **evaluation.counts(),
+        **({"imported_from": evaluation.origin.file} if evaluation.origin else {}),
     })
     table = list(scores.values())
-    note = _note(held_out, scene, masked, lacking=None if measured else lacking)
-    note += "".join(f"{text}\n" for text in origin.warnings()) if origin else ""
+    note = evaluation.note(lacking)
     for name, model in models.items():
         if gains:
             note += (f"{LABELS[name]}, after the best gain per channel of each view: "
@@ -193,8 +228,7 @@ def _write(
     write_bytes(out / "metrics.csv", csv_table(scores).encode())
     tex = first.latex()
     if len(scores) == 2:
-        name = inputs.folders["ingest"].parent.resolve().name
-        tex += "\n" + paper_table({name: (scores["base"], scores["pruned"])}).latex()
+        tex += "\n" + paper_table({workspace: (scores["base"], scores["pruned"])}).latex()
     write_bytes(out / "metrics.tex", tex.encode())
 
 
@@ -228,28 +262,3 @@ def _gap(model: _Model, *, gains: bool) -> str:
     if "training" not in model.seen_db:
         return text
     return f"{text}: a gap of {model.seen_db['training'] - held_out:.2f} dB to the training views"
-
-
-def _counts(held_out: Sequence[ReferenceView], scene: Scene) -> Summary:
-    """Returns how many views are scored, and the names of those that are not."""
-    hidden = {view.name for view in scene.test} - {view.name for view in held_out}
-    return {
-        "test_views": len(held_out), "unregistered_test": list(scene.unregistered_test),
-        **({"masked_out_test": sorted(hidden)} if hidden else {}),
-    }
-
-
-def _note(
-    held_out: Sequence[ReferenceView], scene: Scene, masked: int, *, lacking: str | None
-) -> str:
-    """Returns what the figures of the tables mean."""
-    sizes = " and ".join(
-        f"{width}x{height}" for width, height in sizes_of([view.camera for view in held_out]))
-    note = (f"{len(held_out)} held-out views at {sizes}, "
-            f"{len(scene.unregistered_test)} more without a camera\n"
-            f"PSNR: {PSNR_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\n"
-            f"SSIM: {SSIM_CONVENTION}\nSSIM 0-pad: {SSIM_PADDED_CONVENTION}\n"
-            f"LPIPS: {LPIPS_CONVENTION if lacking is None else f'not measured, {lacking}'}\n")
-    if masked:
-        note += f"Masks on {masked} of {len(held_out)} views: {MASK_CONVENTION}\n"
-    return note

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
-from recon_cli.evaluation.tables import TitledTable, number, percent
+from recon_cli.evaluation.tables import Table, number, percent
 from recon_cli.experiments import bench_report, outputs
 from recon_cli.experiments.accuracy import Accuracy
 from recon_cli.experiments.bench_report import head, tables
@@ -121,7 +121,7 @@ def test_numbers_keep_their_digits() -> None:
 
 
 def test_a_table_is_aligned_as_text_and_piped_as_markdown() -> None:
-    table = TitledTable("Title", ("what", "n"), [("one", "1"), ("three", "3.5")])
+    table = Table(("what", "n"), [("one", "1"), ("three", "3.5")], "Title")
     assert table.text() == "Title\nwhat     n\none      1\nthree  3.5"
     assert table.markdown() == (
         "### Title\n\n| what | n |\n| --- | ---: |\n| one | 1 |\n| three | 3.5 |")

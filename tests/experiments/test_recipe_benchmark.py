@@ -284,4 +284,4 @@ def test_the_picture_is_drawn(tmp_path: Path) -> None:
     module.draw(found, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 5000
     assert module.tables(found)[0].rows[0][0] == "one"
-    assert "s to 20 dB" in module.tables(found)[0].header
+    assert "s to 20 dB" in module.tables(found)[0].headings
