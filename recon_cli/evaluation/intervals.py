@@ -64,11 +64,6 @@ def paired_bootstrap(ours: Sequence[float], theirs: Sequence[float], *, seed: in
     Views are drawn with replacement, both models' scores of a view together (Efron 1979). The
     interval speaks of other views of the same scene, and not of other scenes or other seeds; views
     of one walk resemble each other, so it is rather too narrow.
-
-    Args:
-        ours: a score by view.
-        theirs: of the same views.
-        seed: of the draws.
     """
     pairs = np.array(ours, np.float64) - np.array(theirs, np.float64)
     mean = float(pairs.mean())
@@ -85,10 +80,6 @@ def paired_t(ours: Sequence[float], theirs: Sequence[float]) -> Interval:
 
     The differences are paired: the same seed on both sides. (Student 1908, "The probable error of
     a mean".) The interval speaks of other seeds on the same scenes, not of other scenes.
-
-    Args:
-        ours: a figure by seed.
-        theirs: the same seeds of the other variant.
     """
     pairs = [a - b for a, b in zip(ours, theirs, strict=True)]
     mean = statistics.fmean(pairs)

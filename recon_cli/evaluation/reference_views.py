@@ -184,16 +184,7 @@ def mean_psnr(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str,
     *, corrected: bool = False, on_view: Callable[[], None] = lambda: None,
 ) -> float:
-    """Returns the mean PSNR in dB over views, at least one.
-
-    Args:
-        splats: the model.
-        views: to score.
-        sh_degree: in use.
-        backend: name of a rasterizer.
-        corrected: after the best gain per channel of each view.
-        on_view: called after each view.
-    """
+    """Returns the mean PSNR in dB over views, at least one."""
     metric = corrected_psnr if corrected else psnr
     values = []
     for view in views:

@@ -72,7 +72,7 @@ def accuracy(candidate: Answer, truth: Answer) -> Accuracy:
     relative, cosine = _compare(candidate.gradients, truth.gradients)
     worst = max(relative, key=lambda name: relative[name], default="")
     return Accuracy(
-        _known(difference.max()), _known(difference.square().mean().sqrt()),
+        _inf_if_nan(difference.max()), _inf_if_nan(difference.square().mean().sqrt()),
         float((~(difference.amax(-1) <= FLIP)).double().mean()),
         relative.get(worst, 0.0), worst, cosine)
 
@@ -88,7 +88,7 @@ def _compare(
         if length == 0:
             continue
         scaled, unit = candidate[name] / length, gradient / length
-        relative[name] = _known((scaled - unit).norm())
+        relative[name] = _inf_if_nan((scaled - unit).norm())
         product += float((scaled * unit).sum())
         square += float(scaled.square().sum())
         count += 1
@@ -97,7 +97,7 @@ def _compare(
     return relative, product / (square * count) ** 0.5 if square else 0.0
 
 
-def _known(error: Tensor) -> float:
+def _inf_if_nan(error: Tensor) -> float:
     """Returns an error as a number, infinite where it is NaN."""
     value = float(error)
     return math.inf if math.isnan(value) else value

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.experiments.accuracy import Answer, accuracy, answer, oracle
+from recon_cli.experiments.accuracy import Accuracy, accuracy, answer, oracle
 from recon_cli.experiments.bench_result import BackendResult, BenchedScene, Speed, VariantResult
 from recon_cli.experiments.host import (
     FLOPS_BACKWARD,
@@ -20,6 +21,7 @@ from recon_cli.experiments.host import (
     Host,
     Samples,
     Stopwatch,
+    Timing,
     added_memory,
     alternate,
     peak_fraction,
@@ -123,7 +125,7 @@ def noise(scene: BenchScene) -> NDArray[np.uint8]:
     return np.random.default_rng(0).integers(0, 256, size, np.uint8)
 
 
-Work = Callable[[], Mapping[str, float]]
+Work = Callable[[], Mapping[str, float]]  # returns the milliseconds of its parts
 Pairs = tuple[int, int] | None
 
 
@@ -138,77 +140,24 @@ class BenchPlan:
     threads: int  # CPU threads; the figures of one thread are taken as well
     rounds: int  # behind each median
 
-    @property
-    def thread_counts(self) -> list[int]:
-        """The numbers of threads that speeds are taken with."""
-        return [self.threads] if self.device == "cuda" else sorted({1, self.threads})
-
 
 def measure(plan: BenchPlan, host: Host, progress: Progress) -> BenchedScene:
     """Returns every figure of one scene."""
-    scene = build_scene(plan.size, plan.sh_degree, plan.device)
-    with _threads(plan.threads), progress.bar(
+    size = plan.size
+    with use_threads(plan.threads), progress.bar(
         "bench", 3 * (plan.rounds + 1) + 1, unit="round"
     ) as bar:
-        memory = {name: _memory(scene, name, plan.device) for name in plan.backends}
-        truth = oracle(scene)
-        bar.advance()
-        backends = _backends(scene, plan, host, truth, memory, bar)
-        losses = alternate(
-            {name: _second(work, plan.device)
-             for name, work in loss_passes(scene, plan.device).items()},
-            plan.rounds, bar.advance)
-        variants = _variants(scene, plan, truth, bar)
+        measurement = _Measurement(plan, bar)
+        backends = measurement.measure_backends(host)
+        losses = measurement.measure_losses()
+        variants = measurement.measure_variants()
     return BenchedScene(
-        plan.size.gaussians, plan.size.width, plan.size.height, plan.sh_degree, backends,
-        {name: timing_of(samples["whole"]) for name, samples in losses.items()},
+        size.gaussians, size.width, size.height, plan.sh_degree, backends, losses,
         plan.backends[0], variants)
 
 
-def _backends(
-    scene: BenchScene, plan: BenchPlan, host: Host, truth: Answer, memory: Mapping[str, int],
-    bar: Bar,
-) -> dict[str, BackendResult]:
-    """Returns speed and accuracy of every backend, all thread counts in turn."""
-    peak = host.peak_gflops if plan.device == "cpu" else None
-    works, pairs = _speed_works(scene, plan)
-    samples = alternate(works, plan.rounds, bar.advance)
-
-    def speed(name: str, threads: int) -> Speed:
-        return _speed(samples[_label(name, threads)], pairs[name], peak, threads)
-
-    return {
-        name: BackendResult(
-            speed(name, plan.threads), speed(name, 1) if plan.device == "cpu" else None,
-            accuracy(answer(scene, registry.renderer(name)), truth), pairs[name], memory[name])
-        for name in plan.backends}
-
-
-def _variants(
-    scene: BenchScene, plan: BenchPlan, truth: Answer, bar: Bar
-) -> list[VariantResult]:
-    """Returns time and accuracy of the contract and of every approximation, in turn."""
-    backend = plan.backends[0]
-    variants = [CONTRACT, *variants_for(backend, plan.sh_degree)]
-    renderers = {variant.name: renderer_of(variant, backend) for variant in variants}
-    with _threads(plan.threads, backend):
-        samples = alternate(
-            {name: _whole(_passes(scene, draw), plan.device) for name, draw in renderers.items()},
-            plan.rounds, bar.advance)
-    return [
-        VariantResult(
-            variant.name,
-            timing_of(samples[variant.name]["whole"]) if variant.saves_time else None,
-            accuracy(answer(scene, renderers[variant.name]), truth))
-        for variant in variants]
-
-
-def _label(backend: str, threads: int) -> str:
-    return f"{backend} {threads}"
-
-
 @contextmanager
-def _threads(count: int, backend: str = "torch") -> Iterator[None]:
+def use_threads(count: int, backend: str = "torch") -> Iterator[None]:
     """Lets a backend use `count` threads within the block, in the way that training does."""
     before, pool_before = torch.get_num_threads(), pool.threads
     registry.use_threads(backend, count)
@@ -219,64 +168,130 @@ def _threads(count: int, backend: str = "torch") -> Iterator[None]:
         pool.threads = pool_before
 
 
-def _render(scene: BenchScene, draw: Renderer) -> RenderOutput:
-    splats = scene.splats.map(lambda tensor: tensor.detach().requires_grad_())
-    return draw(splats, scene.camera, scene.background, scene.sh_degree, False)
+class _Measurement:
+    """One scene, the memory of every backend on it, and the oracle's answer."""
 
+    def __init__(self, plan: BenchPlan, bar: Bar) -> None:
+        self._plan, self._bar = plan, bar
+        self._scene = build_scene(plan.size, plan.sh_degree, plan.device)
+        self._memory = {name: self._added_memory(name) for name in plan.backends}
+        self._pairs: dict[str, Pairs] = dict.fromkeys(plan.backends)
+        self._truth = oracle(self._scene)
+        bar.advance()
 
-def _memory(scene: BenchScene, backend: str, device: str) -> int:
-    """Returns the memory of a first pass, after one on a tiny scene has compiled everything."""
-    draw = registry.renderer(backend)
-    tiny = build_scene(QUICK, scene.sh_degree, device)
+    def measure_backends(self, host: Host) -> dict[str, BackendResult]:
+        """Returns speed and accuracy of every backend, all thread counts in turn."""
+        plan, on_cpu = self._plan, self._plan.device == "cpu"
+        counts = sorted({1, plan.threads}) if on_cpu else [plan.threads]
+        samples = self._alternate({
+            f"{name} {threads}": self._timed_work(name, threads)
+            for threads in counts for name in plan.backends})
 
-    _passes(tiny, draw)()
-    return added_memory(_passes(scene, draw), device)
+        def speed(name: str, threads: int) -> Speed:
+            peak = host.peak_gflops if on_cpu else None
+            return _speed(samples[f"{name} {threads}"], self._pairs[name], peak, threads)
 
+        return {
+            name: BackendResult(
+                speed(name, plan.threads), speed(name, 1) if on_cpu else None,
+                self._accuracy(registry.renderer(name)), self._pairs[name], self._memory[name])
+            for name in plan.backends}
 
-def _speed_works(scene: BenchScene, plan: BenchPlan) -> tuple[dict[str, Work], dict[str, Pairs]]:
-    """Returns the timed work of each backend and thread count, and where their pairs end up."""
-    pairs: dict[str, Pairs] = dict.fromkeys(plan.backends)
+    def measure_losses(self) -> dict[str, Timing]:
+        """Returns the time of every photometric loss, of the second of two passes.
 
-    def work(name: str, threads: int) -> Work:
-        step = training_step(scene, name)
+        In training the images have just been written; after the pause between candidates they have
+        left the caches.
+        """
+        def second(work: Callable[[], object]) -> Work:
+            def run() -> Mapping[str, float]:
+                work()
+                return self._time(work)
+
+            return run
+
+        passes = loss_passes(self._scene, self._plan.device)
+        samples = self._alternate({name: second(work) for name, work in passes.items()})
+        return {name: timing_of(by_part["whole"]) for name, by_part in samples.items()}
+
+    def measure_variants(self) -> list[VariantResult]:
+        """Returns time and accuracy of the contract and of every approximation, in turn."""
+        backend = self._plan.backends[0]
+        variants = [CONTRACT, *variants_for(backend, self._plan.sh_degree)]
+        renderers = {variant.name: renderer_of(variant, backend) for variant in variants}
+        with use_threads(self._plan.threads, backend):
+            samples = self._alternate({
+                name: partial(self._time, partial(_render_and_back, self._scene, renderer))
+                for name, renderer in renderers.items()})
+        return [
+            VariantResult(
+                variant.name,
+                timing_of(samples[variant.name]["whole"]) if variant.saves_time else None,
+                self._accuracy(renderers[variant.name]))
+            for variant in variants]
+
+    def _alternate(self, works: Mapping[str, Work]) -> dict[str, Samples]:
+        return alternate(works, self._plan.rounds, self._bar.advance)
+
+    def _accuracy(self, renderer: Renderer) -> Accuracy:
+        return accuracy(answer(self._scene, renderer), self._truth)
+
+    def _added_memory(self, backend: str) -> int:
+        """Returns the memory of a first pass, after one on a tiny scene has compiled everything."""
+        renderer, device = registry.renderer(backend), self._plan.device
+        _render_and_back(build_scene(QUICK, self._scene.sh_degree, device), renderer)
+        return added_memory(partial(_render_and_back, self._scene, renderer), device)
+
+    def _time(self, work: Callable[[], object]) -> Mapping[str, float]:
+        watch = Stopwatch(self._plan.device)
+        work()
+        watch.mark("whole")
+        return watch.ms
+
+    def _timed_work(self, backend: str, threads: int) -> Work:
+        """Returns what takes one step of a backend, notes its pairs and returns its times."""
+        step = training_step(self._scene, backend)
 
         def run() -> Mapping[str, float]:
-            with _threads(threads, name):
-                passes, pairs[name] = _timed_passes(scene, name, plan.device)
-                return {**passes, **_timed_step(step, name, plan.device)}
+            with use_threads(threads, backend):
+                return {**self._time_passes(backend), **self._time_step(step, backend)}
 
         return run
 
-    works = {_label(name, threads): work(name, threads)
-             for threads in plan.thread_counts for name in plan.backends}
-    return works, pairs
+    def _time_passes(self, backend: str) -> dict[str, float]:
+        """Returns the milliseconds of both passes and of their parts."""
+        probe = probe_for(backend, self._plan.device)
+        with probe.watch():
+            watch = Stopwatch(self._plan.device)
+            output = _render(self._scene, registry.renderer(backend))
+            watch.mark("forward")
+            forward = probe.collect()
+            output.rgb.backward(self._scene.weights)  # type: ignore[no-untyped-call]
+            watch.mark("backward")
+            backward = probe.collect()
+        self._pairs[backend] = probe.pairs(output)
+        return {**_parts("forward", watch.ms["forward"], forward),
+                **_parts("backward", watch.ms["backward"], backward)}
+
+    def _time_step(self, step: Callable[[Mark], None], backend: str) -> dict[str, float]:
+        """Returns the milliseconds of an optimization step and of its parts."""
+        probe = probe_for(backend, self._plan.device)
+        with probe.watch():
+            watch = Stopwatch(self._plan.device)
+            step(watch.mark)
+        parts = probe.collect()
+        parts.setdefault(ADAM, watch.ms[ADAM])
+        return _parts("step", sum(watch.ms.values()), parts)
 
 
-def _timed_passes(scene: BenchScene, name: str, device: str) -> tuple[dict[str, float], Pairs]:
-    """Returns the milliseconds of both passes and of their parts, and the pairs."""
-    draw, probe = registry.renderer(name), probe_for(name, device)
-    with probe.watching():
-        watch = Stopwatch(device)
-        output = _render(scene, draw)
-        watch.mark("forward")
-        forward = probe.collect()
-        output.rgb.backward(scene.weights)  # type: ignore[no-untyped-call]
-        watch.mark("backward")
-        backward = probe.collect()
-    return {
-        **_parts("forward", watch.ms["forward"], forward),
-        **_parts("backward", watch.ms["backward"], backward)}, probe.pairs(output)
+def _render(scene: BenchScene, renderer: Renderer) -> RenderOutput:
+    splats = scene.splats.map(lambda tensor: tensor.detach().requires_grad_())
+    return renderer(splats, scene.camera, scene.background, scene.sh_degree, False)
 
 
-def _timed_step(step: Callable[[Mark], None], name: str, device: str) -> dict[str, float]:
-    """Returns the milliseconds of an optimization step and of its parts."""
-    probe = probe_for(name, device)
-    with probe.watching():
-        watch = Stopwatch(device)
-        step(watch.mark)
-    parts = probe.collect()
-    parts.setdefault(ADAM, watch.ms[ADAM])
-    return _parts("step", sum(watch.ms.values()), parts)
+def _render_and_back(scene: BenchScene, renderer: Renderer) -> None:
+    """Runs both passes of a renderer."""
+    _render(scene, renderer).rgb.backward(scene.weights)  # type: ignore[no-untyped-call]
 
 
 def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float]:
@@ -288,47 +303,15 @@ def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float
     return times
 
 
-def _whole(work: Callable[[], object], device: str) -> Work:
-    """Returns a function that does some work and returns its milliseconds."""
-    def run() -> Mapping[str, float]:
-        watch = Stopwatch(device)
-        work()
-        watch.mark("whole")
-        return watch.ms
-
-    return run
-
-
-def _second(work: Callable[[], object], device: str) -> Work:
-    """Returns a function that does short work twice and returns the milliseconds of the second.
-
-    In training the images have just been written; after the pause between candidates they have
-    left the caches.
-    """
-    timed = _whole(work, device)
-
-    def run() -> Mapping[str, float]:
-        work()
-        return timed()
-
-    return run
-
-
-def _passes(scene: BenchScene, draw: Renderer) -> Callable[[], object]:
-    """Returns a function that runs both passes of a renderer."""
-    return lambda: _render(scene, draw).rgb.backward(  # type: ignore[no-untyped-call]
-        scene.weights)
-
-
 def _speed(samples: Samples, pairs: Pairs, peak: float | None, threads: int) -> Speed:
     """Returns medians and rates; those of pairs are of the compositing stages alone."""
     timings = {name: timing_of(values) for name, values in samples.items()}
-    whole = {name: timings.pop(name) for name in ("forward", "backward", "step")}
     inner = [timings.get(f"forward: {COMPOSITE}"), timings.get(f"backward: {DECOMPOSE}")]
     forward, backward = (
         rate(pairs[i] if pairs else None, stage.ms if stage else None)
         for i, stage in enumerate(inner))
     return Speed(
-        threads, whole["forward"], whole["backward"], whole["step"], forward, backward,
+        threads, timings.pop("forward"), timings.pop("backward"), timings.pop("step"),
+        forward, backward,
         peak_fraction(forward, FLOPS_FORWARD, peak, threads),
         peak_fraction(backward, FLOPS_BACKWARD, peak, threads), timings)

@@ -58,7 +58,7 @@ def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> Tabl
     """Returns the figures that are quoted, one row each, a column a backend."""
     backends = scene.backends
     rows = [(name, *(figure(backend) for backend in backends.values()))
-            for name, figure in _quoted(scene)]
+            for name, figure in _quoted_rows(scene)]
     width = len(backends) - 1
     if warm_start is not None:
         rows.append(("kernels ready in a fresh process, ms", _ms(warm_start), *[""] * width))
@@ -70,7 +70,7 @@ def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> Tabl
     return Table(("what", *backends), rows, f"Figures ({where})")
 
 
-def _quoted(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult], str]]]:
+def _quoted_rows(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult], str]]]:
     """Returns the names of the rows of `_figures`, and how a backend's cell is made."""
     reference = scene.backends.get(_REFERENCE)
     threads = next(iter(scene.backends.values())).speed.threads

@@ -1,6 +1,6 @@
 """`recon denoise --compare`: what each noise filter would gain and lose on the frames of a capture.
 
-The truth is not known, so it is made: the capture's own frames, halved by area, which leaves half
+The truth is not known, so it is made: the capture's own frames, halve by area, which leaves half
 of their noise, and noise of known levels added to those. Compression, which follows noise in a
 video, is not imitated; on a video the figures are therefore what a filter could do at best.
 Nothing is filtered: compare.json lies beside the stages, so that no result turns stale.
@@ -92,10 +92,6 @@ VARIANTS = (
 def compare_filters(job: Job, config: DenoiseConfig) -> str:
     """Writes compare.json into the workspace and returns its table and what follows from it.
 
-    Args:
-        job: whose workspace holds the frames.
-        config: the options that `recon denoise` would run with.
-
     Raises:
         StageError: there are no fresh frames.
         WorkspaceError: the workspace is in use or cannot be written.
@@ -106,9 +102,9 @@ def compare_filters(job: Job, config: DenoiseConfig) -> str:
     with disk_errors(root, "comparing filters"), job.workspace.writing("denoise --compare"):
         names = [frame.name for frame in read_frame_list(frames.parent).frames]
         noise = float(np.median([estimate_noise(read_png(frames / name))
-                                 for name in _spread(names, _MEASURED)]))
-        samples = _spread(names, _SAMPLES)
-        truths = [halved(read_png(frames / name)) for name in samples]
+                                 for name in _pick_evenly(names, _MEASURED)]))
+        samples = _pick_evenly(names, _SAMPLES)
+        truths = [halve(read_png(frames / name)) for name in samples]
         levels = levels_with(noise)
         total = len(levels) * len(VARIANTS) * len(truths)
         with job.progress.bar("compare", total, unit="run") as bar:
@@ -126,13 +122,13 @@ def compare_filters(job: Job, config: DenoiseConfig) -> str:
     return "\n\n".join([heading, _table(scores), _advice(config, noise, scores)])
 
 
-def _spread(names: Sequence[str], count: int) -> list[str]:
+def _pick_evenly(names: Sequence[str], count: int) -> list[str]:
     """Returns up to `count` names, evenly spread."""
     count = min(count, len(names))
     return [names[(2 * place + 1) * len(names) // (2 * count)] for place in range(count)]
 
 
-def halved(frame: Pixels) -> Pixels:
+def halve(frame: Pixels) -> Pixels:
     """Returns a frame at half its size by area, which halves noise that is independent."""
     height, width = frame.shape[:2]
     return np.asarray(
@@ -149,13 +145,7 @@ def levels_with(measured: float) -> tuple[float, ...]:
 def score_filters(
     truths: Sequence[Pixels], levels: Sequence[float], *, on_run: Callable[[], None]
 ) -> tuple[FilterScore, ...]:
-    """Returns a score for each filter and level of noise, by filter, then by level.
-
-    Args:
-        truths: frames that are taken as noiseless, each [H, W, 3].
-        levels: standard deviations of the noise to add, in 1/255.
-        on_run: called after each filter, level and frame.
-    """
+    """Returns a score for each filter and level of noise in 1/255, by filter, then by level."""
     megapixels = sum(truth.shape[0] * truth.shape[1] for truth in truths) / 1e6
 
     def measure(variant: FilterVariant, noisy: tuple[float, int]) -> tuple[float, float, float]:
@@ -202,10 +192,6 @@ def edges_kept(truth: Pixels, image: Pixels) -> float:
     The mean slope of the image along the true gradient over the steepest 5% of the pixels, divided
     by that of the truth: 1 where all edges stand, less where they are washed out. Noise, whose
     slope points anywhere, cancels out.
-
-    Args:
-        truth: without noise, [H, W, 3].
-        image: filtered, of the same size.
     """
     across, down = _slopes(truth)
     steepness = np.hypot(across, down)
@@ -232,16 +218,16 @@ def best(scores: Sequence[FilterScore], level: float) -> FilterScore:
     usable = [
         score for score in scores
         if score.noise_255 == near and score.offered
-        and score.edges_kept >= _unfiltered(scores, near).edges_kept - _MAX_EDGE_LOSS]
+        and score.edges_kept >= _score_of_none(scores, near).edges_kept - _MAX_EDGE_LOSS]
     return max(usable, key=lambda score: score.psnr_db)
 
 
 def gain_db(scores: Sequence[FilterScore], score: FilterScore) -> float:
     """Returns by how many dB a filter comes closer to the truth than doing nothing."""
-    return score.psnr_db - _unfiltered(scores, score.noise_255).psnr_db
+    return score.psnr_db - _score_of_none(scores, score.noise_255).psnr_db
 
 
-def _unfiltered(scores: Sequence[FilterScore], level: float) -> FilterScore:
+def _score_of_none(scores: Sequence[FilterScore], level: float) -> FilterScore:
     return next(
         score for score in scores if score.filter == "none" and score.noise_255 == level)
 
@@ -273,9 +259,9 @@ def _advice(config: DenoiseConfig, noise: float, scores: Sequence[FilterScore]) 
             f"Best at {chosen.noise_255:g}/255: --filter {chosen.filter} --strength "
             f"{chosen.strength:g}, {gain_db(scores, chosen):+.1f} dB if that noise is white, and "
             f"{chosen.edges_kept:.0%} of the edges kept.")
-    unfiltered = noise < config.threshold and config.mode == "auto"
+    leaves_frames = noise < config.threshold and config.mode == "auto"
     lines.append(
         f"recon denoise leaves frames below --threshold {config.threshold:g} as they are."
-        if unfiltered else
+        if leaves_frames else
         f"recon denoise would use --filter {config.filter} --strength {config.strength:g}.")
     return "\n".join(lines)

@@ -77,11 +77,6 @@ def alternate(
 
     A slow minute then falls on all candidates alike. One round ahead is not counted: it compiles
     and warms the caches.
-
-    Args:
-        works: by name; each returns the milliseconds of its parts.
-        rounds: counted runs of each.
-        on_round: called after each round, that ahead included.
     """
     samples: dict[str, Samples] = {name: {} for name in works}
     for number in range(rounds + 1):
@@ -180,34 +175,24 @@ def warm_start(rounds: int) -> Timing:
     return timing_of([1e3 * value for value in seconds])
 
 
-# Operations of an evaluated pair, counted in the inner loops of the compositing kernels: a
-# multiply-add is two, a division one; comparisons, selections, integer operations, loads, and what
-# is the same for all pixels of a row are none. The first number of each line is of the forward
-# pass, the second of the backward pass.
-_COUNT = {
-    "u along the row": (2, 2),
-    "log2 alpha = log2 o - u^2 - v^2": (4, 4),
+# Operations of an evaluated pair, forward and backward, counted in the inner loops of the
+# compositing kernels: a multiply-add is two, a division one; comparisons, selections, integer
+# operations, loads, and what is the same for all pixels of a row are none. As in docs/bench.md.
+OPERATIONS_PER_PAIR = {
+    "u along the row, log2 alpha = log2 o - u^2 - v^2": (6, 6),
     "2^x: reduction 3, polynomial of degree 5 by Estrin 11": (14, 14),
-    "weight alpha T": (1, 1),
-    "T (1 - alpha), T / (1 - alpha)": (2, 2),
+    "weight alpha T; T (1 - alpha), T / (1 - alpha)": (3, 3),
     "red, green, blue, depth composited, or their gradients summed": (8, 8),
-    "g . c": (0, 7),
-    "slope g . c - R, and R moved on": (0, 3),
-    "s = alpha T slope": (0, 1),
+    "g . c, the slope g . c - R, s = alpha T slope": (0, 11),
     "moments 1, u, v, uu, uv, vv of s": (0, 11),
     "statistics: size of s along x and y, s^2, hits": (0, 8),
 }
-FLOPS_FORWARD = sum(forward for forward, _ in _COUNT.values())
-FLOPS_BACKWARD = sum(backward for _, backward in _COUNT.values())
+FLOPS_FORWARD = sum(forward for forward, _ in OPERATIONS_PER_PAIR.values())
+FLOPS_BACKWARD = sum(backward for _, backward in OPERATIONS_PER_PAIR.values())
 
 _CHAINS = 12  # independent: two units times a latency of 4 to 6 cycles
 _ITERATIONS = 2_000_000  # 3 ms on a core with AVX-512
 _ATTEMPTS = 9
-
-
-def operations_per_pair() -> list[tuple[str, int, int]]:
-    """Returns the count line by line: its name, operations forward, operations backward."""
-    return [(name, *numbers) for name, numbers in _COUNT.items()]
 
 
 @kernel

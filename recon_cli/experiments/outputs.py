@@ -47,14 +47,7 @@ class OutputFiles:
         self, record: Mapping[str, Any], head: str, tables: Sequence[Table],
         draw: Callable[[Path], None],
     ) -> None:
-        """Writes them.
-
-        Args:
-            record: for the JSON file.
-            head: line above the tables.
-            tables: for the page.
-            draw: draws the picture into a path.
-        """
+        """Writes them."""
         if self.json_file is not None:
             atomic.write_json(self.json_file, record)
         if self.plot is not None:

@@ -20,13 +20,13 @@ _STAGES = {"composite_backward": DECOMPOSE, "project_backward": "unproject"}
 
 
 class Probe:
-    """Measures a backend while `watching`."""
+    """Measures a backend while `watch`."""
 
     def __init__(self) -> None:
         self.ms: dict[str, float] = {}  # by stage, since `collect` was last called
 
     @contextmanager
-    def watching(self) -> Iterator[None]:
+    def watch(self) -> Iterator[None]:
         """Measures within the block. This one sees nothing."""
         yield
 
@@ -47,7 +47,7 @@ class NumbaProbe(Probe):
     """Observes the thread pool, which runs every parallel kernel."""
 
     @contextmanager
-    def watching(self) -> Iterator[None]:
+    def watch(self) -> Iterator[None]:
         """Measures kernels within the block."""
         pool.observer = lambda name, seconds: self._add(
             _STAGES.get(name, name), 1e3 * seconds)
@@ -72,7 +72,7 @@ class TorchProbe(Probe):
         self._backward = False
 
     @contextmanager
-    def watching(self) -> Iterator[None]:
+    def watch(self) -> Iterator[None]:
         """Measures projection, binning and compositing within the block."""
         with ExitStack() as stack:
             for place, name, label in (
@@ -80,17 +80,17 @@ class TorchProbe(Probe):
                 (tiles._Rasterize, "forward", COMPOSITE),
                 (tiles._Rasterize, "backward", DECOMPOSE),
             ):
-                stack.enter_context(_replaced(
-                    place, name, self._timed(label, getattr(place, name))))
-            stack.enter_context(_replaced(
-                tiles, "alphas", self._counted(blocks.alphas)))
+                stack.enter_context(_replace(
+                    place, name, self._time_calls(label, getattr(place, name))))
+            stack.enter_context(_replace(
+                tiles, "alphas", self._count_pairs(blocks.alphas)))
             yield
 
     def pairs(self, output: RenderOutput) -> tuple[int, int] | None:  # noqa: ARG002
         """Returns what the blocks held: every pixel of a tile for every instance."""
         return self._pairs[0], self._pairs[1]
 
-    def _timed(self, label: str, work: Callable[..., Any]) -> Callable[..., Any]:
+    def _time_calls(self, label: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def run(*args: Any) -> Any:
             if label in (COMPOSITE, DECOMPOSE):
                 self._backward = label == DECOMPOSE
@@ -103,7 +103,7 @@ class TorchProbe(Probe):
 
         return run
 
-    def _counted(self, alphas: Callable[..., Any]) -> Callable[..., Any]:
+    def _count_pairs(self, alphas: Callable[..., Any]) -> Callable[..., Any]:
         def run(table: Any, block: Any, *rest: Any) -> Any:
             self._pairs[self._backward] += block.rows.numel() * blocks.PIXELS
             return alphas(table, block, *rest)
@@ -112,7 +112,7 @@ class TorchProbe(Probe):
 
 
 @contextmanager
-def _replaced(place: Any, name: str, function: Callable[..., Any]) -> Iterator[None]:
+def _replace(place: Any, name: str, function: Callable[..., Any]) -> Iterator[None]:
     """Puts another function under a name of a module, or of a class as a static method."""
     original = vars(place)[name]
     setattr(place, name, staticmethod(function) if isinstance(place, type) else function)

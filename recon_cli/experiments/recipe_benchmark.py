@@ -154,16 +154,7 @@ def score_steps(iterations: int, count: int = _SCORES) -> tuple[int, ...]:
 
 
 def seconds_to(points: Sequence[CurvePoint], target_db: float, clock: Figure) -> float | None:
-    """Returns when a curve first reaches a PSNR, on straight lines between its points.
-
-    Args:
-        points: of one run, in order.
-        target_db: to reach.
-        clock: seconds of a point: on the wall or of the CPU.
-
-    Returns:
-        Seconds; None where no point reaches the target.
-    """
+    """Returns when a curve first reaches a PSNR, on straight lines between its points, or None."""
     before: CurvePoint | None = None
     for point in points:
         if point.psnr_db >= target_db:

@@ -69,13 +69,7 @@ class ExperimentRequest:
 def base_config(
     settings: Settings, *, max_size: int, max_gaussians: int, validation: float | None = None
 ) -> RunConfig:
-    """Returns the options that all variants share.
-
-    Args:
-        settings: what --set set.
-        max_size: longest side of the images in pixels.
-        max_gaussians: cap of the count.
-        validation: fraction of the views that is not trained on; None where --set may say so.
+    """Returns the options that all variants share; --set may say `validation` where it is None.
 
     Raises:
         ConfigError: --set reaches a stage that is not run, or what has an option of its own.
@@ -193,14 +187,7 @@ class Records:
 
 
 class Runner:
-    """Makes the runs that are missing from the records and returns all of them.
-
-    Args:
-        base: options that all variants share.
-        progress: opens bars.
-        machine: that runs are made on, in words.
-        records: of earlier runs; None where nothing is recorded.
-    """
+    """Makes the runs that are missing from the records, if there are any, and returns all."""
 
     def __init__(
         self, base: RunConfig, progress: Progress, machine: str = "",
@@ -226,22 +213,17 @@ class Runner:
         steps: Mapping[str, int], *, label: str,
         score_at: Callable[[int], Sequence[int]] = lambda _steps: (),
     ) -> Runs:
-        """Returns the runs of every variant with every seed.
+        """Returns the runs of every variant with every seed, 0 to seeds - 1.
 
-        Args:
-            loaded: the scene.
-            variants: to run.
-            seeds: how many, from 0 on.
-            steps: of each run, by variant.
-            label: of the progress bar.
-            score_at: for the steps of a run, those after which it is scored, beside its end.
+        `steps` are those of each run, by variant; `score_at` returns, for the steps of a run, those
+        after which it is scored beside its end.
         """
         with self._progress.bar(label, seeds * sum(steps.values()), unit="step") as bar:
 
             def measure(variant: Variant, seed: int) -> Record:
                 bar.note(f"{variant.label}, seed {seed}")
                 run = TrainingRun(variant, self._base, steps[variant.name], seed)
-                record = self.recorded(loaded, run)
+                record = self.find_record(loaded, run)
                 if record is None:
                     return self.make(loaded, run, score_at(run.iterations), bar.advance)
                 bar.advance(run.iterations)
@@ -249,7 +231,7 @@ class Runner:
 
             return run_grid({variant.name: variant for variant in variants}, range(seeds), measure)
 
-    def recorded(self, loaded: LoadedScene, run: TrainingRun) -> Record | None:
+    def find_record(self, loaded: LoadedScene, run: TrainingRun) -> Record | None:
         """Returns a run of earlier, None where it was not made or nothing is recorded."""
         return self._records.run(key_of(loaded, run)) if self._records else None
 

@@ -85,13 +85,7 @@ def open_scene(
 ) -> SceneFolders:
     """Returns the folders of a scene; a data set is read and mapped with the poses it has.
 
-    Args:
-        name: of the scene.
-        path: a workspace, which is only read, or a data set.
-        scratch: folder for the workspaces of data sets; what is fresh in it is not made again.
-        settings: options of ingest, denoise and sfm for data sets.
-        compute: threads.
-        progress: opens bars.
+    A workspace is only read. Those of data sets lie in `scratch`; what is fresh there is kept.
 
     Raises:
         ReconError: whatever the stages raise.

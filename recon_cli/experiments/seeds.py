@@ -95,11 +95,6 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
 
     The first seed is that of the workspace, the others follow it.
 
-    Args:
-        job: whose workspace holds a trained model.
-        config: how to score.
-        count: of seeds, at least one.
-
     Raises:
         StageError: there is no fresh model.
         WorkspaceError: the workspace is in use, full, or was changed meanwhile.

@@ -122,11 +122,11 @@ class StudyResult:
                 "digest": scene.digest, "parts": self.parts(name),
             } for name, scene in self.scenes.items()},
             "comparisons": {
-                name: {row: self._compared(row, name) for row in self.rows}
+                name: {row: self._comparison_record(row, name) for row in self.rows}
                 for name in next(iter(self.scenes.values())).runs},
         }
 
-    def _compared(self, row: str, comparison: str) -> dict[str, Any]:
+    def _comparison_record(self, row: str, comparison: str) -> dict[str, Any]:
         def interval(pair: tuple[Variant, Variant], figure: str) -> dict[str, Any]:
             difference = self.difference(row, comparison, pair, figure)
             return {**asdict(difference), "shown": difference.verdict}
@@ -146,10 +146,6 @@ def equal_seconds(iterations: int, seconds: Mapping[str, float]) -> dict[str, in
     """Returns the steps of each variant that take as long as the slowest one's `iterations`.
 
     A first guess: steps of a longer run cost as much where the count has reached its cap in both.
-
-    Args:
-        iterations: steps that every variant took.
-        seconds: that they took, by variant.
     """
     slowest = max(seconds.values())
     return {name: max(iterations, round(iterations * slowest / own)) if own > 0 else iterations
@@ -161,12 +157,7 @@ def corrected_steps(
 ) -> int:
     """Returns the steps that take `target` seconds, on the line through two measured runs.
 
-    Args:
-        iterations: of the shorter run.
-        guess: of the longer run.
-        seconds: that the shorter run took.
-        guess_seconds: that the longer run took.
-        target: seconds to fill.
+    The runs took `iterations` steps in `seconds`, and more, `guess`, in `guess_seconds`.
     """
     near = abs(guess_seconds - target) <= _NEAR * target
     if near or guess <= iterations or guess_seconds <= seconds:
@@ -208,7 +199,7 @@ class Study:
         steps = [{variant.name: self._request.iterations},
                  self._records.steps(self._steps_key(loaded))]
         return sum(
-            by_variant is None or self._runner.recorded(
+            by_variant is None or self._runner.find_record(
                 loaded, self._run(variant, by_variant[variant.name], seed)) is None
             for by_variant in steps for seed in range(self._request.seeds))
 
@@ -246,7 +237,7 @@ class Study:
         with self._progress.bar(label, sum(steps.values()), unit="step") as bar:
             for variant in VARIANTS:
                 guess = self._run(variant, steps[variant.name], 0)
-                record = self._runner.recorded(loaded, guess) or self._runner.make(
+                record = self._runner.find_record(loaded, guess) or self._runner.make(
                     loaded, guess, (), bar.advance)
                 steps[variant.name] = corrected_steps(
                     count, guess.iterations, seconds[variant.name], self._seconds(record), target)

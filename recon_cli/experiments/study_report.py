@@ -201,16 +201,16 @@ def _sentence(
 
 def beside_the_paper(result: StudyResult) -> Table | None:
     """Returns the paper's figures beside ours, None where no scene has a name of theirs."""
-    rows = list(_published_rows(result))
+    rows = list(_rows_beside_the_paper(result))
     header = ("scene", "paper: 3DGS dB", "SSIM", "theirs dB", "SSIM", "gain dB", "SSIM",
               "here: 3DGS dB", "SSIM", "paper's prune dB", "SSIM", "gain dB", "SSIM")
     title = f"The paper's Table I beside this study, {EQUAL_STEPS}"
     return Table(header, rows, title) if rows else None
 
 
-def _published_rows(result: StudyResult) -> Iterator[tuple[str, ...]]:
+def _rows_beside_the_paper(result: StudyResult) -> Iterator[tuple[str, ...]]:
     for scene in result.scenes:
-        theirs = published(scene)
+        theirs = published_scores(scene)
         if theirs is None:
             continue
         base, paper = (
@@ -228,7 +228,7 @@ def _pair(psnr_db: float, ssim: float, *, sign: str = "") -> tuple[str, str]:
     return f"{psnr_db:{sign}.2f}", f"{ssim:{sign}.3f}"
 
 
-def published(scene: str) -> PublishedScores | None:
+def published_scores(scene: str) -> PublishedScores | None:
     """Returns the paper's figures for a scene of that name, None where it has none."""
     return TABLE_I.get(scene.lower())
 
@@ -291,7 +291,7 @@ def _draw_panel(axes: Any, result: StudyResult, comparison: str, figure: str) ->
                   for interval in intervals],
             fmt="o", markersize=4, capsize=3, label=variant.label, color=f"C{number}")
     for number, row in enumerate(result.rows):
-        if (theirs := published(row)) is not None:
+        if (theirs := published_scores(row)) is not None:
             axes.plot(theirs.gains[figure], number - _OFFSET, "x", color="black")
     axes.axvline(0, color="0.6", linewidth=0.8, zorder=0)
     axes.set_yticks(range(len(result.rows)), result.rows)

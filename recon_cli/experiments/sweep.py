@@ -53,10 +53,8 @@ class SweepTrial:
 def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
     """Writes sweep.json and sweep.svg into the workspace and returns the table.
 
-    Args:
-        job: whose workspace holds a trained model.
-        config: the options that `recon prune` would run with; score, ratio and limits are swept.
-        ratios: fractions to remove, each in (0, 1).
+    The options are those of `recon prune`, but for score, ratio and limits; each ratio is the
+    fraction to remove, in (0, 1).
 
     Raises:
         StageError: there is no fresh model.
@@ -196,13 +194,7 @@ def table(trials: Sequence[SweepTrial], score: str) -> str:
 
 
 def draw(trials: Sequence[SweepTrial], before_db: float, path: Path) -> None:
-    """Draws PSNR against the fraction removed, a line a score and the controls, into a .svg.
-
-    Args:
-        trials: of a sweep, the control with equal steps first.
-        before_db: PSNR of the model before it was pruned.
-        path: of the picture.
-    """
+    """Draws PSNR against the fraction removed, a line a score and the controls, into a .svg."""
     with drawing(path, 8, 5.5) as figure:
         axes = figure.subplots()
         for name in (*PRUNE_SCORES, NONE):

@@ -63,12 +63,6 @@ def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Cam
     Flat Gaussians at a spacing that follows their number, of all opacities and with
     view-dependent colours: dense lists a tile, many layers behind each other, and needles at
     grazing angles, as in a trained indoor scene.
-
-    Args:
-        n: Gaussians; a third of them on the boxes.
-        width: of the camera's image in pixels.
-        height: of the camera's image in pixels.
-        seed: of every random number.
     """
     rng = np.random.default_rng(seed)
     wall = rng.integers(0, 6, n)
@@ -158,14 +152,14 @@ def renderer_of(variant: RendererVariant, backend: str) -> Renderer:
         mask: Tensor | None = None,
     ) -> RenderOutput:
         if variant.half_colors:
-            splats = _rounded(splats)
+            splats = _round_colors(splats)
         degree = sh_degree if variant.sh_degree is None else variant.sh_degree
         return draw(splats, camera, background, degree, scores, mask)
 
     return render
 
 
-def _rounded(splats: Splats) -> Splats:
+def _round_colors(splats: Splats) -> Splats:
     """Returns splats with colours rounded to float16; gradients pass as through the identity."""
     def through(sh: Tensor) -> Tensor:
         return sh + (sh.detach().half().to(sh.dtype) - sh.detach())

@@ -60,11 +60,7 @@ _WARM_STEPS = 10  # caches and threads; the kernels are compiled before
 
 
 class TrainingClock:
-    """Counts wall and CPU seconds from its creation on, but for its pauses.
-
-    Args:
-        device: "cpu" or "cuda", whose queue is waited for.
-    """
+    """Counts wall and CPU seconds from its creation on, but for its pauses; waits for a GPU."""
 
     def __init__(self, device: str) -> None:
         self._device = device
@@ -76,7 +72,7 @@ class TrainingClock:
         return wall - self._zero[0], cpu - self._zero[1]
 
     @contextmanager
-    def paused(self) -> Iterator[None]:
+    def pause(self) -> Iterator[None]:
         """Leaves out the time of the block."""
         began = self._now()
         try:
@@ -132,7 +128,7 @@ class LoadedScene:
     @cached_property
     def parts(self) -> dict[str, Any]:
         """The parts of the model that the scene needs, as `recon train` finds them by trials."""
-        task = self._loaded(self.base)
+        task = self._load_task(self.base)
         return model_parts(parts_needed(task, self.scene, self.ctx, harmonics=True).config)
 
     def task(self, run: TrainingRun) -> Task:
@@ -143,9 +139,9 @@ class LoadedScene:
         if undecided:  # only then, because it may take trials
             config = dataclasses.replace(config, **{name: self.parts[name] for name in undecided})
         return dataclasses.replace(
-            self._loaded(config), validation=[], schedule=Schedule(config))
+            self._load_task(config), validation=[], schedule=Schedule(config))
 
-    def _loaded(self, config: RunConfig) -> Task:
+    def _load_task(self, config: RunConfig) -> Task:
         images = "denoised" if config.images == "denoised" else "original"
         if images not in self._tasks:
             self._tasks[images] = load_task(self.scene, config, self.ctx)
@@ -159,13 +155,7 @@ class LoadedScene:
 def load_for_training(
     folders: SceneFolders, split: str, base: RunConfig, ctx: StageContext
 ) -> LoadedScene:
-    """Returns a scene with the views in memory that scores come from.
-
-    Args:
-        folders: of the scene.
-        split: "test" or "validation": which views are scored.
-        base: options that all variants share.
-        ctx: where to compute.
+    """Returns a scene with the views in memory that scores come from: "test" or "validation".
 
     Raises:
         ReconstructionError: no held-out view has a camera.
@@ -209,15 +199,7 @@ class Advance(Protocol):
 def prune_rest(
     state: TrainState, task: Task, prune: MidPrune, until: int, advance: Advance
 ) -> None:
-    """Removes the Gaussians that matter least to the training views and trains the rest.
-
-    Args:
-        state: changed in place.
-        task: views and plan of the run.
-        prune: which Gaussians go.
-        until: step at which the run ends.
-        advance: trains the state.
-    """
+    """Removes the Gaussians that matter least to the training views and trains the rest."""
     config, first = prune.config, state.iteration
     recovery = until - first
     if prune.restarts:
@@ -236,13 +218,7 @@ def prune_rest(
 def run_trial(
     loaded: LoadedScene, run: TrainingRun, score_at: Sequence[int], *, on_step: Callable[[], None]
 ) -> tuple[CurvePoint, ...]:
-    """Trains and returns the state of the run after the steps in `score_at`, and at its end.
-
-    Args:
-        loaded: the scene.
-        run: what is trained.
-        score_at: steps after which the model is scored; 0 is before the first.
-        on_step: called after each step.
+    """Trains and returns the scores after the steps in `score_at`, 0 for the start, and at the end.
 
     Raises:
         TrainingError: memory is short, or training diverged.
@@ -257,7 +233,7 @@ def run_trial(
 
     def take_score() -> None:
         wall, cpu = clock.seconds()
-        with clock.paused():
+        with clock.pause():
             splats = state.splats.map(lambda tensor: tensor.detach())
             degree = task.schedule.sh_degree(max(1, state.iteration))
             score, size = score_as_ply(splats, loaded.scored, degree, loaded.ctx)

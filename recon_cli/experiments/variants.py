@@ -30,11 +30,6 @@ def run_grid(
     """Returns what was measured of each variant, by its name, one result for each repeat.
 
     Repeats are the outer loop: a slow minute of the machine then affects all variants alike.
-
-    Args:
-        variants: by name.
-        repeats: seeds, ratios or frames.
-        measure: runs one variant once.
     """
     results: dict[str, list[_Result]] = {name: [] for name in variants}
     for repeat in repeats:

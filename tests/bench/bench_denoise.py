@@ -1,7 +1,7 @@
 """Measures what noise filters gain and what edges they cost.
 
 `python tests/bench/bench_denoise.py FOLDER...` adds noise of known levels to two images of each
-folder, those of more than 1000 pixels halved by area first, and prints means over the folders.
+folder, those of more than 1000 pixels halve by area first, and prints means over the folders.
 
 `python tests/bench/bench_denoise.py --decoded VIDEO FOLDER` compares decoded frames of a noisy
 video with its clean frames (FOLDER, frame k = k-th by name), before and after a filter; each
@@ -31,9 +31,9 @@ STRENGTH = 4.0
 
 
 def load(path: Path) -> NDArray[np.uint8]:
-    """Returns an image, [H, W, 3], halved where it is large."""
+    """Returns an image, [H, W, 3], halve where it is large."""
     rgb = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-    return filter_comparison.halved(rgb) if max(rgb.shape) > LARGE else rgb
+    return filter_comparison.halve(rgb) if max(rgb.shape) > LARGE else rgb
 
 
 def images(folder: Path) -> list[Path]:

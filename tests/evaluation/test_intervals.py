@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from recon_cli.evaluation.intervals import Spread, paired_t
+from recon_cli.evaluation.intervals import Spread, paired_bootstrap, paired_t
 
 
 def test_a_spread_is_the_mean_and_the_deviation_of_a_sample():
@@ -51,3 +51,19 @@ def test_one_seed_has_no_interval():
 def test_seeds_without_a_partner_are_refused():
     with pytest.raises(ValueError, match="zip"):
         paired_t([1.0, 2.0], [1.0])
+
+
+def test_a_constant_difference_has_an_interval_of_no_width():
+    found = paired_bootstrap([30, 32, 29.5], [29, 31, 28.5])
+    assert (found.mean, found.low, found.high) == (1.0, 1.0, 1.0)
+
+
+def test_the_interval_of_a_paired_difference_is_that_of_a_normal_mean():
+    rng = np.random.default_rng(0)
+    theirs = rng.normal(30, 3, 200)
+    ours = theirs + rng.normal(0.2, 0.5, 200)
+    found = paired_bootstrap(ours, theirs)
+    half = 1.96 * (ours - theirs).std() / np.sqrt(200)
+    assert found.low == pytest.approx(found.mean - half, abs=0.01)
+    assert found.high == pytest.approx(found.mean + half, abs=0.01)
+    assert paired_bootstrap([1.0], [0.5]).low is None

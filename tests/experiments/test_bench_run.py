@@ -95,7 +95,7 @@ def test_a_probe_changes_nothing_and_leaves_nothing_behind(backend: str) -> None
     before = tiles.alphas, tiles.project, vars(tiles._Rasterize)["forward"]
     plain = answer(scene, draw)
     probe = probe_for(backend, "cpu")
-    with probe.watching():
+    with probe.watch():
         seen = answer(scene, draw)
     assert torch.equal(plain.image, seen.image)
     assert all(torch.equal(plain.gradients[name], seen.gradients[name]) for name in seen.gradients)

@@ -41,7 +41,7 @@ def test_a_flat_picture_has_no_edges_to_lose():
 
 def test_halving_halves_independent_noise():
     flat = np.full((200, 300, 3), 128, np.uint8)
-    assert filter_comparison.halved(noisy(flat, 10)).std() == pytest.approx(5, rel=0.05)
+    assert filter_comparison.halve(noisy(flat, 10)).std() == pytest.approx(5, rel=0.05)
 
 
 def test_the_measured_level_is_compared_too_unless_it_is_one_of_the_others():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from tiny_scene import make_inputs
 from recon_cli.cli import main
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError
 from recon_cli.experiments import outputs, runner, trial
 from recon_cli.experiments import recipe_benchmark as module
 from recon_cli.experiments.host import Host
@@ -28,31 +26,19 @@ from recon_cli.experiments.recipe_benchmark import (
     seconds_to,
 )
 from recon_cli.experiments.runner import Record, Runner
-from recon_cli.experiments.scenes import SceneFolders, check_scenes
+from recon_cli.experiments.scenes import SceneFolders
 from recon_cli.experiments.trial import (
     CurvePoint,
-    LoadedScene,
-    TrainingClock,
-    TrainingRun,
     load_for_training,
-    run_trial,
 )
 from recon_cli.experiments.variants import (
-    BUDGET,
-    PAPER,
     REFERENCE,
     Variant,
-    parse_recipe,
-    parse_recipes,
 )
 from recon_cli.progress import NullProgress
 
 Said = pytest.CaptureFixture[str]
 BASE = RunConfig(iterations=1, max_size=48, max_gaussians=90, densify_every=10, validation=0.2)
-
-
-def nothing() -> None:
-    """Reports to nobody."""
 
 
 def point(seconds: float, psnr_db: float) -> CurvePoint:
@@ -62,12 +48,6 @@ def point(seconds: float, psnr_db: float) -> CurvePoint:
 
 def wall(one: CurvePoint) -> float:
     return one.seconds
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> LoadedScene:
-    place = SceneFolders("tiny", make_inputs(tmp_path))
-    return load_for_training(place, "validation", BASE, StageContext(backend="numba"))
 
 
 # ---- curves ----
@@ -97,96 +77,6 @@ def test_a_median_says_how_many_runs_it_is_of() -> None:
     assert median_cell([1.0, 2.0, 3.0]) == "2 (1)"
     assert median_cell([1.0, None, 3.0]) == "2 (1), 2 of 3"
     assert median_cell([1.0, None]) == "-"
-
-
-def test_the_clock_stands_still_in_its_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    walls, cpus = iter([1.0, 3.0, 10.0, 11.0]), iter([5.0, 9.0, 20.0, 20.5])
-    monkeypatch.setattr(trial.time, "perf_counter", lambda: next(walls))
-    monkeypatch.setattr(trial.time, "process_time", lambda: next(cpus))
-    found = TrainingClock("cpu")
-    with found.paused():  # from 3 to 10, and from 9 to 20
-        pass
-    assert found.seconds() == (3.0, 4.5)
-
-
-# ---- recipes ----
-
-def test_a_recipe_may_change_options_of_training() -> None:
-    arm = parse_recipe("budget+sh_degree=1+ssim_weight=0.5")
-    config = arm.config(BASE, iterations=7, seed=3)
-    assert (config.densify, config.sh_degree, config.ssim_weight) == ("budget", 1, 0.5)
-    assert (config.iterations, config.seed, config.max_size) == (7, 3, 48)
-    assert parse_recipe("paper") is not PAPER
-    assert parse_recipe("paper").prune == PAPER.prune
-    assert [one.name for one in parse_recipes(("reference, budget", "mcmc"))] == [
-        "reference", "budget", "mcmc"]
-
-
-@pytest.mark.parametrize("text", [
-    "none", "budget+nothing=1", "budget+sh_degree", "budget+sh_degree=9", "budget+iterations=5",
-    "budget,budget", ","])
-def test_a_recipe_that_means_nothing_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError):
-        parse_recipes((text,))
-
-
-# ---- one run ----
-
-def test_looking_changes_nothing_about_a_run(tiny: LoadedScene) -> None:
-    run = TrainingRun(REFERENCE, BASE, 40, 0)
-    often = run_trial(tiny, run, score_steps(40, 8), on_step=nothing)
-    once = run_trial(tiny, run, (), on_step=nothing)
-    assert [one.iteration for one in often] == list(range(0, 41, 5))
-    assert len(once) == 1
-    assert dataclasses.replace(once[0], seconds=0, cpu_seconds=0) == dataclasses.replace(
-        often[-1], seconds=0, cpu_seconds=0)
-    assert often[-1].psnr_db > often[0].psnr_db + 3
-    assert all(a.seconds <= b.seconds for a, b in itertools.pairwise(often))
-    assert often[-1].bytes > 248 * often[-1].gaussians  # 62 float32 each, and a header
-
-
-def test_every_step_is_reported_once(tiny: LoadedScene) -> None:
-    steps: list[int] = []
-    run_trial(tiny, TrainingRun(PAPER, BASE, 30, 0), (7,), on_step=lambda: steps.append(1))
-    assert len(steps) == 30
-
-
-def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: LoadedScene) -> None:
-    assert PAPER.prune
-    assert (PAPER.prune.config.ratio, PAPER.prune.config.score) == (0.6, "paper")
-    points = {one.iteration: one for one in run_trial(
-        tiny, TrainingRun(PAPER, BASE, 60, 0), (40, 41, 60), on_step=nothing)}
-    before, after = points[40].gaussians, points[41].gaussians
-    assert after == before - int(0.6 * before)
-    assert points[60].gaussians == after  # nothing grows back
-    other = run_trial(tiny, TrainingRun(REFERENCE, BASE, 60, 0), (40,), on_step=nothing)
-    assert other[0].psnr_db == points[40].psnr_db  # the same run up to there
-
-
-def test_a_run_trains_on_no_view_that_is_scored(tiny: LoadedScene) -> None:
-    task = tiny.task(TrainingRun(BUDGET, BASE, 5, 0))
-    assert len(task.train) == len(tiny.scene.train)
-    assert task.validation == []
-    assert {view.name for view in tiny.scene.validation}.isdisjoint(
-        view.name for view in tiny.scene.train)
-
-
-# ---- scenes ----
-
-def test_a_digest_is_of_what_a_scene_holds(tmp_path: Path) -> None:
-    one = SceneFolders("one", make_inputs(tmp_path / "a"))
-    two = SceneFolders("two", make_inputs(tmp_path / "b"))
-    assert one.digest == two.digest
-    image = tmp_path / "b" / "sfm" / "undistorted" / "denoised" / "000003.png"
-    image.write_bytes(image.read_bytes() + b"\0")
-    assert SceneFolders("two", two.inputs).digest != one.digest
-
-
-def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
-    for parent in ("a", "b"):
-        make_replica(tmp_path / parent / "room")
-    with pytest.raises(ConfigError, match="both called room"):
-        check_scenes([tmp_path / "a" / "room", tmp_path / "b" / "room"])
 
 
 # ---- the command ----
@@ -264,9 +154,11 @@ def test_options_of_the_rasterizers_mean_nothing_to_training(
 
 
 def test_seconds_become_steps_by_a_pilot(
-    tiny: LoadedScene, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "run_pilot", lambda *_: point(4.0, 20.0))
+    folders = SceneFolders("tiny", make_inputs(tmp_path))
+    tiny = load_for_training(folders, "validation", BASE, StageContext(backend="numba"))
     a_step = Runner(BASE, NullProgress()).pilot_seconds(tiny, [REFERENCE])["reference"]
     request = RecipeRequest(scenes=(), seeds=1, base=BASE, recipes=(REFERENCE,), seconds=10.0)
     assert module.steps_of(request, a_step) == round(trial.PILOT_STEPS * 10 / 4)

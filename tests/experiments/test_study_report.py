@@ -18,7 +18,7 @@ from recon_cli.experiments.study import (
     StudiedScene,
     StudyResult,
 )
-from recon_cli.experiments.study_report import TABLE_I, published
+from recon_cli.experiments.study_report import TABLE_I, published_scores
 from recon_cli.experiments.trial import CurvePoint
 
 HOST = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
@@ -101,8 +101,8 @@ def test_runs_of_two_machines_are_told():
 
 def test_the_figures_of_the_paper_stand_beside_scenes_of_their_names():
     assert len(TABLE_I) == 8
-    assert published("Office0") is TABLE_I["office0"]
-    assert published("office") is None
+    assert published_scores("Office0") is TABLE_I["office0"]
+    assert published_scores("office") is None
     table = study_report.beside_the_paper(result())
     assert rows(table) == {"office0": (
         "38.45", "0.925", "39.05", "0.934", "+0.60", "+0.009",

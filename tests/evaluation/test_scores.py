@@ -1,0 +1,72 @@
+"""Scores of models in closed form, and the tables that hold them."""
+
+import csv
+
+import pytest
+
+from recon_cli.evaluation.scores import (
+    ModelScore,
+    ViewScore,
+    csv_table,
+    model_table,
+    paper_table,
+    view_table,
+)
+from recon_cli.evaluation.tables import Table
+
+
+def view(name, psnr_db, ssim, lpips=None):
+    return ViewScore(name, psnr_db, psnr_db - 0.01, ssim, ssim + 0.01, lpips)
+
+
+def scores():
+    views = (view("a.png", 30.0, 0.9), view("b.png", 32.0, 0.8))
+    return {"base": ModelScore("3DGS", views, 1234, 5_000_000, 12.0, 60.0),
+            "pruned": ModelScore("ours", views, 600, 2_000_000, 6.0, None)}
+
+
+def test_means_are_over_views():
+    assert scores()["base"].psnr_db == 31.0
+    assert scores()["base"].psnr_8bit_db == 30.99
+    assert scores()["base"].ssim == pytest.approx(0.85)
+    assert scores()["base"].ssim_padded == pytest.approx(0.86)
+
+
+def test_lpips_has_no_mean_where_a_view_has_none():
+    half = ModelScore("x", (view("a", 30, 0.9, 0.1), view("b", 30, 0.9)), 1, 1, 1, 1)
+    whole = ModelScore("x", (view("a", 30, 0.9, 0.1), view("b", 30, 0.9, 0.3)), 1, 1, 1, 1)
+    assert half.lpips is None
+    assert whole.lpips == pytest.approx(0.2)
+    assert "LPIPS" in model_table([half, whole]).headings
+    assert "LPIPS" not in model_table([half]).headings
+
+
+def test_every_table_holds_the_same_figures():
+    table = model_table(list(scores().values()))
+    assert table.rows[0] == (
+        "3DGS", "31.00", "30.99", "0.8500", "0.8600", "1,234", "5.0", "12", "60")
+    assert table.rows[1][-1] == "-"
+    assert view_table(list(scores().values())).rows[0] == (
+        "a.png", "30.00", "30.00", "0.9000", "0.9000")
+    rows = list(csv.DictReader(csv_table(scores()).splitlines()))
+    assert [row["view"] for row in rows] == ["a.png", "b.png", "mean"] * 2
+    assert float(rows[2]["psnr_db"]) == 31.0
+    assert float(rows[2]["ssim_padded"]) == pytest.approx(0.86)
+    assert rows[0]["lpips"] == ""
+
+
+def test_the_table_of_the_paper_sets_3dgs_against_ours_by_data_set():
+    base, pruned = scores().values()
+    table = paper_table({"room0": (base, pruned)})
+    assert table.headings == ("data set", "PSNR 3DGS", "PSNR ours", "SSIM 3DGS", "SSIM ours")
+    assert table.rows == (("room0", "31.00", "31.00", "0.8500", "0.8500"),)
+
+
+def test_a_table_says_the_same_in_every_form():
+    table = Table(("a_b", "50%"), (("x", "1"), ("yy", "22")))
+    assert table.text() == "a_b  50%\nx      1\nyy    22"
+    assert table.text(rule=True).splitlines()[1] == "-" * 8
+    assert table.markdown() == "| a_b | 50% |\n| --- | ---: |\n| x | 1 |\n| yy | 22 |\n"
+    assert table.latex() == (
+        "\\begin{tabular}{lr}\n\\toprule\na\\_b & 50\\% \\\\\n\\midrule\nx & 1 \\\\\n"
+        "yy & 22 \\\\\n\\bottomrule\n\\end{tabular}\n")
