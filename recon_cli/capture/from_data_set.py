@@ -17,9 +17,10 @@ from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import frames as store
 from recon_cli.io.depth_points import points_from_depth
-from recon_cli.io.frames import Frame, Group
+from recon_cli.io.frames import Frame, Group, KnownPoses
+from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.io.layouts import describe, read_posed
-from recon_cli.io.posed import KnownPoses, PosedImage, PosedSet
+from recon_cli.io.posed import PosedImage, PosedSet
 from recon_cli.scene.camera import Lens
 
 
@@ -95,7 +96,7 @@ def _write(
                 else:
                     if mask is not None:  # first: a frame that is there is finished
                         write_mask(out / store.MASKS / name, mask)
-                    store.write_png(target, rgb)
+                    write_png(target, rgb)
             bar.advance()
             ctx.record(done, len(images))
     return broken
@@ -111,7 +112,7 @@ def _pixels(
         raise InputError(
             f"{image.name} holds {width}x{height} pixels, but its camera has "
             f"{lens.width}x{lens.height}.")
-    rgb = store.fitted(rgb, max_size)
+    rgb = fit_image(rgb, max_size)
     height, width = rgb.shape[:2]
     if image.mask is not None:
         return rgb, read_mask(image.mask, width, height)
@@ -129,5 +130,5 @@ def _known_poses(posed: PosedSet, readable: Sequence[tuple[str, PosedImage]]) ->
 
 
 def _group(name: str, lens: Lens, max_size: int) -> Group:
-    width, height = store.fitted_size(lens.width, lens.height, max_size)
+    width, height = fit_size(lens.width, lens.height, max_size)
     return Group(name, width, height, lens=lens.resized(width, height))

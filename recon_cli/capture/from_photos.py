@@ -39,6 +39,7 @@ from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import frames as store
 from recon_cli.io.frames import Frame, Group
+from recon_cli.io.images import fit_image, fit_size, read_png, write_png
 from recon_cli.workspace import atomic
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
@@ -64,13 +65,13 @@ class _Writer:
         """Writes a mask and then its frame, and returns the stored pixels, RGB, [H, W, 3]."""
         target = self.out / store.FOLDER / name
         if target.exists():
-            return store.read_png(target)
-        rgb = store.fitted(self._read(photo), self.max_size)
+            return read_png(target)
+        rgb = fit_image(self._read(photo), self.max_size)
         height, width = rgb.shape[:2]
         mask = photo_mask(photo, self.masks.get(photo.path.name), width, height)
         if mask is not None:
             write_mask(self.out / store.MASKS / name, mask)
-        store.write_png(target, rgb)
+        write_png(target, rgb)
         return rgb
 
     def remove(self, name: str) -> None:
@@ -176,10 +177,10 @@ def _sheet(
     """Returns the contact sheet, and removes the files of photos that are not selected."""
     files = {candidate.index: writer.out / store.FOLDER / names[candidate.index]
              for candidate in record if candidate.reason is not Reason.DAMAGED}
-    height, width = store.read_png(next(iter(files.values()))).shape[:2]
+    height, width = read_png(next(iter(files.values()))).shape[:2]
     sheet = ContactSheet(title, record, width, height)
     for index in sorted(sheet.wanted & files.keys()):
-        sheet.add(index, store.read_png(files[index]))
+        sheet.add(index, read_png(files[index]))
     for candidate in record:
         if candidate.index in files and candidate.name is None:
             writer.remove(names[candidate.index])
@@ -249,7 +250,7 @@ def _frame_groups(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> 
     frame_groups = []
     for group in groups:
         name = source.name if len(groups) == 1 else f"{source.name}: {group.name}"
-        width, height = store.fitted_size(group.width, group.height, max_size)
+        width, height = fit_size(group.width, group.height, max_size)
         scale = min(1.0, max_size / max(group.width, group.height))
         focal = None if group.focal_px is None else group.focal_px * scale
         frame_groups.append(Group(name, width, height, focal_px=focal))

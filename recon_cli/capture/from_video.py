@@ -29,6 +29,7 @@ from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import frames as store
 from recon_cli.io.frames import Frame, Group
+from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.workspace import atomic
 
 # A count by the duration may be off by this much, as a share or in frames (sound that ends a little
@@ -125,7 +126,7 @@ def ingest(
     frames = tuple(
         Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False)
         for index, name in names.items())
-    width, height = store.fitted_size(scan.width, scan.height, config.max_size)
+    width, height = fit_size(scan.width, scan.height, config.max_size)
     return IngestedSource(
         "video", (Group(path.name, width, height),), frames,
         declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
@@ -199,7 +200,7 @@ def _write(
             sheet.add(index, rgb)
             if index not in missing:
                 continue
-            store.write_png(folder / names[index], store.fitted(rgb, max_size))
+            write_png(folder / names[index], fit_image(rgb, max_size))
             done += 1
             bar.advance()
             ctx.record(done, len(names))

@@ -80,7 +80,8 @@ def ssim(
     """Returns the structural similarity of an image clamped to [0, 1].
 
     With a mask: the mean of the map over the pixels that count, of an image that is the truth
-    elsewhere. The truth under the mask lies in their windows; `io.images.painted` makes it neutral.
+    elsewhere. The truth under the mask lies in their windows; `io.images.fill_masked` makes it
+    neutral.
 
     Args:
         image: [H, W, 3].

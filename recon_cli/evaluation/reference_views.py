@@ -32,7 +32,7 @@ from recon_cli.evaluation.metrics import (
 from recon_cli.evaluation.scores import ViewScore
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.frames import read_frame_list
-from recon_cli.io.images import eight_bit, fitted_camera, read_masked_image
+from recon_cli.io.images import fit_camera, read_masked_image, to_uint8
 from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
@@ -103,7 +103,7 @@ def load_reference_views(
     """
     loaded, hidden = [], []
     for view in views:
-        camera = fitted_camera(view.camera, max_size)
+        camera = fit_camera(view.camera, max_size)
         if min(camera.width, camera.height) < MIN_SIDE:
             raise ConfigError(
                 f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
@@ -242,7 +242,7 @@ def _view_score(
     if perceptual is not None and mask is None:
         distance = perceptual(image, view.image)
     return ViewScore(
-        view.name, psnr(image, view.image, mask), psnr(eight_bit(image), view.image, mask),
+        view.name, psnr(image, view.image, mask), psnr(to_uint8(image), view.image, mask),
         ssim(image, view.image, mask), ssim(image, view.image, mask, padded=True), distance,
         None if mask is None else float(mask.mean()))
 

@@ -1,14 +1,25 @@
-"""Small groups of Gaussians that hang together with nothing else.
+"""Removal of floaters, by what the training views show of each Gaussian, and of islands.
 
-Two Gaussians touch where their centres are no farther apart than three of their standard deviations
-together, both along the line between them. The largest group that touches is the scene; small ones
-far from it are islands.
+There are three kinds of floaters. *Unseen*: no view blends it with more than a tiny weight
+(RadSplat, Niemeyer et al. 2024, prunes by the same maximum). *In front*: at most two views see it,
+and in each it is less than half way to what is behind it: it was fitted to these views alone.
+*Harmful*: without it the views would be rendered better. That is exact for each Gaussian alone,
+since colour is affine in its alpha: with d = alpha T (c - B) its contribution to a pixel and e the
+error there, removing it changes the squared error by sum ||d||^2 - 2 sum e d. The first sum is
+`loo`; the second is the gradient of half the squared error by the logarithm of the opacity. Two
+that cover each other share each other's error, so the worst are removed first and the rest is
+measured again.
+
+Islands are small groups far from the largest group of touching Gaussians, the scene. Two touch if
+their centres are no farther apart than three of their standard deviations together, both along the
+line between them.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,17 +32,34 @@ from torch import Tensor
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
-from recon_cli.export.floaters import floaters, sightings
+from recon_cli.render import RenderOutput, render
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 
+_TOUCH = 3.0  # standard deviations
+_NEIGHBOURS = 16  # compared with each; a surface around a Gaussian has about six
+_SMALL = 0.005  # of the Gaussians at most
+_APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
+_BULK = 0.9  # of the scene lies within its radius
+_EDGE = 0.005  # of the scene lies beyond each side of its box
+_VISIBLE = 1 / 255  # fainter ones are not rendered, and touch nothing
+# Measurements behind these constants: docs/cleanup.md.
+_WEIGHT = 0.01  # alpha T; below, a view does not show it. RadSplat's threshold for high quality
+_FEW = 2  # views
+_IN_FRONT = 0.5  # of the depth of what is behind
+_SOLID = 0.5  # coverage from which something counts as behind
+_HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
+_WORST = 0.2  # of the greatest harm: the threshold of a round
+_ROUNDS = 12
+
 logger = logging.getLogger("recon")
 
 
-def without_floaters(splats: Splats, views: Sequence[TrainView], ctx: StageContext) -> Splats:
-    """Returns a scene without what hangs in the air, and says how much of which kind goes.
+def drop_floaters(splats: Splats, views: Sequence[TrainView], ctx: StageContext) -> Splats:
+    """Returns a scene without floaters, and logs how many of each kind are removed.
 
     Args:
         splats: the scene, on the CPU.
@@ -41,17 +69,17 @@ def without_floaters(splats: Splats, views: Sequence[TrainView], ctx: StageConte
     Raises:
         ConfigError: nothing would be left.
     """
-    there = splats.map(lambda tensor: tensor.to(ctx.device))
+    on_device = splats.map(lambda tensor: tensor.to(ctx.device))
     with ctx.progress.bar("look for floaters", 3 * len(views), unit="view") as bar:
-        found = floaters(there, views, backend=ctx.backend, on_view=bar.advance)
+        floaters = find_floaters(on_device, views, backend=ctx.backend, on_view=bar.advance)
     logger.info(
         "floaters: %d Gaussians that no view shows, %d in front of the few views that show them, "
-        "%d that make the views worse", int(found.unseen.sum()), int(found.in_front.sum()),
-        int(found.harmful.sum()))
-    return _without(splats, found.all, "--drop-floaters")
+        "%d that make the views worse", int(floaters.unseen.sum()),
+        int(floaters.in_front.sum()), int(floaters.harmful.sum()))
+    return _drop(splats, floaters.all, "--drop-floaters")
 
 
-def without_islands(
+def drop_islands(
     splats: Splats, scene: Scene, similarity: Similarity, views: Sequence[TrainView] | None,
     ctx: StageContext,
 ) -> Splats:
@@ -59,108 +87,237 @@ def without_islands(
 
     Args:
         splats: the scene, on the CPU.
-        scene: says how far the room reaches, in the world of the training.
+        scene: with the extent of the room, in the world of the training.
         similarity: from there to the world of `splats`.
-        views: training views with cameras in that world; None where there are none.
+        views: training views with cameras in that world; None if there are none.
         ctx: backend and device.
     """
     center = similarity.points(scene.center).tolist()
     near = splats.within(center, similarity.scale * scene.reach)
-    seen = None
+    visible = None
     if views is not None:
-        there = splats.map(lambda tensor: tensor.to(ctx.device))
-        seen = sightings(there, views, backend=ctx.backend).cpu() > 0
-    return _without(splats, islands(splats, near, seen), "--drop-islands")
+        on_device = splats.map(lambda tensor: tensor.to(ctx.device))
+        visible = count_sightings(on_device, views, backend=ctx.backend).cpu() > 0
+    return _drop(splats, find_islands(splats, near, visible), "--drop-islands")
 
 
-def _without(splats: Splats, goes: Tensor, option: str) -> Splats:
-    stays = ~goes.cpu()
-    if not torch.any(stays):
+def _drop(splats: Splats, removed: Tensor, option: str) -> Splats:
+    remaining = ~removed.cpu()
+    if not torch.any(remaining):
         raise ConfigError(
             f"{option} would leave nothing of {len(splats):,} Gaussians.",
-            hint="Look whether the scene lies where the views look: `recon render --views train`.")
-    return splats.select(stays)
+            hint="Check that the views show the scene: `recon render --views train`.")
+    return splats.select(remaining)
 
 
-_TOUCH = 3.0  # standard deviations
-_NEIGHBOURS = 16  # looked at for each; a surface around a Gaussian has about six
-_SMALL = 0.005  # of the Gaussians at most
-_APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
-_BULK = 0.9  # of the scene lies within its radius
-_EDGE = 0.005  # of the scene lies beyond each side of its box
-_VISIBLE = 1 / 255  # fainter ones are drawn nowhere, and touch nothing
+@dataclass(frozen=True, eq=False)
+class Floaters:
+    """Masks of the Gaussians of each kind, [N] bool; they are disjoint."""
+
+    unseen: Tensor
+    in_front: Tensor
+    harmful: Tensor
+
+    @property
+    def all(self) -> Tensor:
+        """Mask of all kinds, [N] bool."""
+        return self.unseen | self.in_front | self.harmful
 
 
-def islands(splats: Splats, near: Tensor, seen: Tensor | None) -> Tensor:
-    """Returns which Gaussians belong to islands, [N] bool.
-
-    What lies outside the box of the scene and is seen by a view stays: that is what is seen through
-    a window.
+def find_floaters(
+    splats: Splats, views: Sequence[TrainView], *, backend: str,
+    on_view: Callable[[], None] = lambda: None,
+) -> Floaters:
+    """Returns which Gaussians are floaters.
 
     Args:
         splats: N Gaussians.
-        near: [N] bool, what is no view from a window for certain; the rest is left alone.
-        seen: [N] bool, what a training view shows; None where nobody knows, and then what lies
-            outside goes too.
+        views: training views, whose cameras are in the world of the Gaussians; never validation or
+            test views.
+        backend: rasterizer.
+        on_view: called after each rendered view.
+    """
+    none = torch.zeros(len(splats), dtype=torch.bool, device=splats.means.device)
+    seen_by = count_sightings(splats, views, backend=backend, on_view=on_view)
+    floaters = Floaters(
+        seen_by == 0, _find_in_front(splats, seen_by, views, backend, on_view), none)
+    rows = torch.nonzero(~floaters.all)[:, 0]
+    harmful = none.clone()
+    for number in range(1, _ROUNDS + 1):
+        harm, error = measure_harm(splats.select(rows), views, backend=backend, on_view=on_view)
+        worst = harm > max(_HARM * error, _WORST * float(harm.max()) if len(rows) else 0.0)
+        if not worst.any() or worst.all():
+            break
+        logger.info("floaters, round %d: %d Gaussians make the training views worse", number,
+                    int(worst.sum()))
+        harmful[rows[worst]] = True
+        rows = rows[~worst]
+    return Floaters(floaters.unseen, floaters.in_front, harmful)
+
+
+def measure_harm(
+    splats: Splats, views: Sequence[TrainView], *, backend: str,
+    on_view: Callable[[], None] = lambda: None,
+) -> tuple[Tensor, float]:
+    """Returns the decrease of the squared error without each one [N] float64, and the error.
+
+    Args:
+        splats: N Gaussians.
+        views: with their images; pixels that a mask ignores have no error.
+        backend: rasterizer.
+        on_view: called after each view.
+    """
+    leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(True))
+    device = splats.means.device
+    loo = torch.zeros(len(splats), dtype=torch.float64, device=device)
+    total = 0.0
+    for view in views:
+        output = _render_scores(leaves, view.camera, backend, view.counting(device))
+        difference = output.rgb - view.pixels(device)
+        mask = view.counting(device)
+        if mask is not None:
+            difference = difference * mask[..., None]
+        error = 0.5 * difference.square().sum()
+        total += 2 * float(error.detach())
+        if error.requires_grad:
+            error.backward()  # type: ignore[no-untyped-call]
+        loo += output.statistics.loo
+        on_view()
+    gradient = leaves.logit_opacities.grad
+    if gradient is None:
+        return torch.zeros_like(loo), total
+    # d/d log o = (d/d logit) / (1 - o), for o' = o (1 - o)
+    by_log = gradient.double() * (1 + torch.exp(splats.logit_opacities.detach().double()))
+    return 2 * by_log - loo, total
+
+
+def count_sightings(
+    splats: Splats, views: Sequence[TrainView], *, backend: str,
+    on_view: Callable[[], None] = lambda: None,
+) -> Tensor:
+    """Returns how many views blend each Gaussian with a weight of 0.01 or more, [N] int64.
+
+    The arguments are those of `floaters`.
+    """
+    seen_by = torch.zeros(len(splats), dtype=torch.int64, device=splats.means.device)
+    with torch.no_grad():
+        for view in views:
+            seen_by += _render_scores(splats, view.camera, backend).statistics.blend_max >= _WEIGHT
+            on_view()
+    return seen_by
+
+
+def _render_scores(
+    splats: Splats, camera: Camera, backend: str, mask: Tensor | None = None
+) -> RenderOutput:
+    background = torch.zeros(3, dtype=splats.means.dtype, device=splats.means.device)
+    return render(
+        splats, camera, background, splats.sh_degree, backend=backend, scores=True, mask=mask)
+
+
+def _find_in_front(
+    splats: Splats, seen_by: Tensor, views: Sequence[TrainView], backend: str,
+    on_view: Callable[[], None],
+) -> Tensor:
+    """Returns which Gaussians are in front of the few views that see them, [N] bool."""
+    few = (seen_by > 0) & (seen_by <= _FEW)
+    in_front = few.clone()
+    rest = splats.select(~few)
+    if not few.any() or not len(rest):
+        return torch.zeros_like(few)
+    with torch.no_grad():
+        for view in views:
+            statistics = _render_scores(splats, view.camera, backend).statistics
+            visible = few & (statistics.blend_max >= _WEIGHT)
+            if visible.any():
+                behind = _render_scores(rest, view.camera, backend)
+                in_front[visible] &= _is_before(splats.means[visible], view.camera, behind)
+            on_view()
+    return in_front
+
+
+def _is_before(means: Tensor, camera: Camera, behind: RenderOutput) -> Tensor:
+    """Returns which centres [K, 3] are far in front of what a render shows, [K] bool."""
+    viewmat = torch.from_numpy(camera.viewmat).to(means)
+    x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(dim=1)
+    ahead = z.clamp_min(1e-6)
+    column = (camera.fx * x / ahead + camera.cx).long().clamp(0, camera.width - 1)
+    line = (camera.fy * y / ahead + camera.cy).long().clamp(0, camera.height - 1)
+    cover = behind.alpha[line, column]
+    return (cover >= _SOLID) & (z * cover < _IN_FRONT * behind.depth[line, column])
+
+
+def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor:
+    """Returns which Gaussians belong to islands, [N] bool.
+
+    Groups outside the box of the scene that a view shows are no islands: they are seen through a
+    window.
+
+    Args:
+        splats: N Gaussians.
+        near: [N] bool, Gaussians near enough to be islands.
+        visible: [N] bool, what a training view shows; None if unknown, and then groups outside
+            are islands too.
     """
     drawn = (near & (splats.opacities >= _VISIBLE)).cpu()
     rows = torch.nonzero(drawn)[:, 0]
-    found = torch.zeros(len(splats), dtype=torch.bool)
+    is_island = torch.zeros(len(splats), dtype=torch.bool)
     if len(rows) <= _NEIGHBOURS:
-        return found.to(near.device)
+        return is_island.to(near.device)
     means = splats.means[rows.to(near.device)].detach().double().cpu().numpy()
-    group = _groups(means, splats.select(rows.to(near.device)))
+    group = _find_groups(means, splats.select(rows.to(near.device)))
     counts = np.bincount(group)
     main = int(counts.argmax())
-    away = _apart(means, group, main)
+    far = _find_far_groups(means, group, main)
     small = counts <= max(1, int(_SMALL * len(rows)))
     small[main] = False
-    goes = small[group] & away[group]
-    if seen is not None:
+    removed = small[group] & far[group]
+    if visible is not None:
         low, high = np.quantile(means[group == main], (_EDGE, 1 - _EDGE), axis=0)
         outside = ((means < low) | (means > high)).any(axis=1)
-        window = outside & seen.cpu().numpy()[rows.numpy()]
-        goes &= ~np.isin(group, np.unique(group[window]))
-    found[rows[torch.from_numpy(goes)]] = True
-    return found.to(near.device)
+        window = outside & visible.cpu().numpy()[rows.numpy()]
+        removed &= ~np.isin(group, np.unique(group[window]))
+    is_island[rows[torch.from_numpy(removed)]] = True
+    return is_island.to(near.device)
 
 
-def _groups(means: NDArray[np.float64], splats: Splats) -> NDArray[np.int64]:
-    """Returns the number of the group that each Gaussian is in, [K]."""
+def _find_groups(means: NDArray[np.float64], splats: Splats) -> NDArray[np.int64]:
+    """Returns the index of the group of each Gaussian, [K]."""
     distance, other = cKDTree(means).query(means, k=_NEIGHBOURS + 1)
     scales = splats.scales.detach().double().cpu().numpy()
-    turn = Rotation.from_quat(_wxyz(splats), scalar_first=True).as_matrix()
-    ones, twos = [], []
-    for near in range(1, _NEIGHBOURS + 1):  # one at a time: all at once would take gigabytes
-        two, apart = other[:, near], distance[:, near]
-        way = (means[two] - means) / np.maximum(apart, 1e-12)[:, None]
+    rotation = Rotation.from_quat(_valid_quats(splats), scalar_first=True).as_matrix()
+    sources, targets = [], []
+    for rank in range(1, _NEIGHBOURS + 1):  # one at a time: all at once would take gigabytes
+        neighbour, apart = other[:, rank], distance[:, rank]
+        way = (means[neighbour] - means) / np.maximum(apart, 1e-12)[:, None]
         touch = np.flatnonzero(apart <= _TOUCH * (
-            _along(scales, turn, way) + _along(scales[two], turn[two], way)))
-        ones.append(touch)
-        twos.append(two[touch])
-    one, two = np.concatenate(ones), np.concatenate(twos)
-    edges = coo_matrix((np.ones(len(one), bool), (one, two)), shape=(len(means),) * 2)
+            _deviations_along(scales, rotation, way)
+            + _deviations_along(scales[neighbour], rotation[neighbour], way)))
+        sources.append(touch)
+        targets.append(neighbour[touch])
+    source, target = np.concatenate(sources), np.concatenate(targets)
+    edges = coo_matrix((np.ones(len(source), bool), (source, target)), shape=(len(means),) * 2)
     return np.asarray(connected_components(edges, directed=False)[1], np.int64)
 
 
-def _along(
-    scales: NDArray[np.float64], turn: NDArray[np.float64], way: NDArray[np.float64]
+def _deviations_along(
+    scales: NDArray[np.float64], rotation: NDArray[np.float64], way: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Returns the standard deviations [K] along unit vectors: sqrt(d^T Sigma d) = |S R^T d|."""
-    return np.asarray(np.linalg.norm(scales * np.einsum("kij,ki->kj", turn, way), axis=1))
+    return np.asarray(np.linalg.norm(scales * np.einsum("kij,ki->kj", rotation, way), axis=1))
 
 
-def _wxyz(splats: Splats) -> NDArray[np.float64]:
-    """Returns quaternions [K, 4], those of zeros as no rotation."""
+def _valid_quats(splats: Splats) -> NDArray[np.float64]:
+    """Returns quaternions [K, 4] wxyz, zeros replaced by no rotation."""
     quats = splats.quats.detach().double().cpu().numpy()
     quats[~quats.any(axis=1)] = [1, 0, 0, 0]
     return np.asarray(quats)
 
 
-def _apart(
+def _find_far_groups(
     means: NDArray[np.float64], group: NDArray[np.int64], main: int
 ) -> NDArray[np.bool_]:
-    """Returns for each group whether all of it lies far from the main one."""
+    """Returns for each group whether all of it is far from the main one."""
     scene = means[group == main]
     middle = np.median(scene, axis=0)
     radius = np.quantile(np.linalg.norm(scene - middle, axis=1), _BULK)

@@ -1,8 +1,7 @@
-"""Whether an imported scene lies where the cameras of the workspace look.
+"""Alignment of an imported scene with the cameras of the workspace.
 
-A scene in another frame renders without complaint, and every figure behind it is wrong. So some
-training views are rendered and held against their pictures, and against what a flat picture in
-their mean colour gets.
+A scene in another frame renders without complaint, and every score of it is wrong. So some training
+views are rendered and compared with their images, and with flat images in their mean colours.
 """
 
 from __future__ import annotations
@@ -36,15 +35,15 @@ _DOUBTFUL, _EVIDENT = 8.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
-    """What the views say of a scene in one frame or several.
+class Alignment:
+    """How well a scene fits the training views, in one or several candidate frames.
 
     Attributes:
-        frame: that is taken.
+        frame: that was chosen.
         similarity: from the file to the workspace.
         psnr_db: on the views, by frame that was tried.
-        flat_db: of flat pictures in the mean colours of the views.
-        views: how many.
+        flat_db: of flat images in the mean colours of the views.
+        views: count.
     """
 
     frame: str
@@ -55,10 +54,10 @@ class Match:
 
     @property
     def doubt(self) -> str:
-        """What speaks against the frame, as a sentence; empty where nothing does."""
+        """Why the frame may be wrong, as a sentence; empty if it fits."""
         above = self.psnr_db[self.frame] - self.flat_db
         if not above >= _EVIDENT:  # a NaN too
-            return (f"the imported scene does not show what the views show: {self}. It lies in "
+            return (f"the imported scene does not show what the views show: {self}. It is in "
                     "another frame than the cameras, and no score of it means anything")
         if above < _DOUBTFUL:
             return (f"the imported scene hardly shows what the views show: {self}. It is a poor "
@@ -68,11 +67,11 @@ class Match:
     def __str__(self) -> str:
         tried = ", ".join(f"{value:.1f} dB in the frame of the {name}"
                           for name, value in self.psnr_db.items())
-        return (f"{tried} on {self.views} training views; flat pictures in their mean colours get "
+        return (f"{tried} on {self.views} training views; flat images in their mean colours get "
                 f"{self.flat_db:.1f} dB")
 
 
-def world_of(sfm: Path) -> Similarity:
+def read_world(sfm: Path) -> Similarity:
     """Returns the similarity from the world of the capture's cameras to that of the workspace.
 
     Args:
@@ -90,22 +89,22 @@ def world_of(sfm: Path) -> Similarity:
             hint="Run `recon sfm --again`.") from error
 
 
-def match(
+def align_to_views(
     splats: Splats, scene: Scene, world: Similarity, frame: str, max_size: int, ctx: StageContext
-) -> Match:
-    """Returns in which frame a scene fits the training views, and how well.
+) -> Alignment:
+    """Returns the frame in which a scene fits the training views best, and how well.
 
     Args:
-        splats: as they lie in the file.
+        splats: as they are in the file.
         scene: the views of the workspace.
         world: from the frame of the source to that of the workspace.
-        frame: source, workspace, or auto for the one that shows the views better.
-        max_size: longest side of the pictures in pixels.
+        frame: source, workspace, or auto for the better one.
+        max_size: longest side of the images in pixels.
         ctx: backend and device.
 
     Raises:
         ConfigError: the views are too small to score.
-        ReconstructionError: no training view is left to look at.
+        ReconstructionError: no training view can be compared.
     """
     frames = {WORKSPACE: Similarity(), SOURCE: world}
     if frame != "auto":
@@ -115,21 +114,21 @@ def match(
     views = load_reference_views(evenly_spread(scene.train, _VIEWS), max_size)
     if not views:
         raise ReconstructionError(
-            "There is no training view to hold the imported scene against: none has a camera, or "
+            "There is no training view to compare the imported scene with: none has a camera, or "
             "masks leave nothing of them.",
             hint="Run `recon ingest` with other images or masks, then `recon sfm`.")
-    found = {}
+    psnr_db = {}
     for name, similarity in frames.items():
-        there = transformed(splats, similarity).map(lambda tensor: tensor.to(ctx.device))
-        found[name] = mean_psnr(there, views, there.sh_degree, ctx.backend)
-    best = max(found, key=lambda name: found[name])
-    return Match(
-        best, frames[best], found, statistics.fmean(map(_flat_psnr, views)), len(views))
+        moved = transformed(splats, similarity).map(lambda tensor: tensor.to(ctx.device))
+        psnr_db[name] = mean_psnr(moved, views, moved.sh_degree, ctx.backend)
+    best = max(psnr_db, key=lambda name: psnr_db[name])
+    return Alignment(
+        best, frames[best], psnr_db, statistics.fmean(map(_flat_psnr, views)), len(views))
 
 
 def _flat_psnr(view: ReferenceView) -> float:
-    """Returns the PSNR of a picture in the view's mean colour."""
-    counted = view.image.reshape(-1, 3) if view.mask is None else view.image[view.mask]
+    """Returns the PSNR of an image in the view's mean colour."""
+    pixels = view.image.reshape(-1, 3) if view.mask is None else view.image[view.mask]
     flat = np.broadcast_to(
-        (counted.mean(axis=0) / 255).astype(np.float32), view.image.shape)
+        (pixels.mean(axis=0) / 255).astype(np.float32), view.image.shape)
     return psnr(flat, view.image, view.mask)

@@ -1,13 +1,16 @@
-"""What a file of Gaussians loses against the scene that it was made of, on views of that scene."""
+"""Checks of written files: the .ply bit for bit, every other format by its PSNR on known views."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+import torch
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ReconstructionError
+from recon_cli.errors import ReconstructionError, WorkspaceError
 from recon_cli.evaluation.reference_views import (
     MASK_HINT,
     ReferenceView,
@@ -15,16 +18,30 @@ from recon_cli.evaluation.reference_views import (
     load_reference_views,
     mean_psnr,
 )
+from recon_cli.io.ply import read_ply
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import Splats, with_rows
 
 _VIEWS = 8  # rendered for each file, at most
 
 
+def verify_ply(path: Path, splats: Splats) -> None:
+    """Raises WorkspaceError unless a .ply reads back as exactly these Gaussians."""
+    back = read_ply(path).with_degree(splats.sh_degree)
+    for name, value in splats.parameters().items():
+        read = getattr(back, name)
+        if name == "sh_rest":  # trailing rows of zeros are not stored
+            value, read = with_rows(value, len(splats)), with_rows(read, len(back))
+        if not torch.equal(read, value):
+            raise WorkspaceError(
+                f"{path} reads back with a different {name} than was written.",
+                hint="Check the disk, then run `recon export --again`.")
+
+
 @dataclass(frozen=True, eq=False)
-class Fidelity:
-    """Views that a scene and its files are held against. Test views are none of them.
+class ReferencePsnr:
+    """PSNR of a scene and its files on reference views, none of which is a test view.
 
     Attributes:
         views: with cameras in the world of the files.
@@ -34,25 +51,25 @@ class Fidelity:
     views: Sequence[ReferenceView]
     ctx: StageContext
 
-    def described(self) -> str:
-        """Returns what is looked at, as part of a sentence."""
+    def describe(self) -> str:
+        """Returns the views as part of a sentence."""
         return f"{len(self.views)} views"
 
     def psnr_db(self, splats: Splats) -> float:
         """Returns the mean PSNR of a scene over the views in dB."""
-        there = splats.map(lambda tensor: tensor.to(self.ctx.device))
-        return mean_psnr(there, self.views, there.sh_degree, self.ctx.backend)
+        on_device = splats.map(lambda tensor: tensor.to(self.ctx.device))
+        return mean_psnr(on_device, self.views, on_device.sh_degree, self.ctx.backend)
 
 
-def fidelity(
+def load_reference_psnr(
     scene: Scene, similarity: Similarity, max_size: int, ctx: StageContext
-) -> Fidelity:
-    """Returns the validation views, or some training views where there are none.
+) -> ReferencePsnr:
+    """Loads the validation views, or some training views if there are none.
 
     Args:
         scene: the views in the world of the training.
         similarity: from there to the world of the files.
-        max_size: longest side of the pictures in pixels.
+        max_size: longest side of the images in pixels.
         ctx: backend and device.
 
     Raises:
@@ -65,4 +82,4 @@ def fidelity(
         raise ReconstructionError(
             f"The masks leave nothing of {len(chosen)} views to check the export on.",
             hint=MASK_HINT)
-    return Fidelity(views, ctx)
+    return ReferencePsnr(views, ctx)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import viewmat_from_pose
-from recon_cli.io.transforms import number
+from recon_cli.io.transforms import read_number
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.atomic import read_json, write_json
 
@@ -127,7 +127,7 @@ def _read_pixels(value: Mapping[str, Any], key: str, path: Path) -> int:
 
 def _read_fps(value: Mapping[str, Any], frames: int, path: Path) -> float | None:
     """Returns the frames a second, if need be from the total seconds; None without either."""
-    fps, seconds = (number(value, key, str(path)) for key in ("fps", "seconds"))
+    fps, seconds = (read_number(value, key, str(path)) for key in ("fps", "seconds"))
     if fps is None:
         if seconds is None:
             return None
@@ -139,7 +139,7 @@ def _read_fps(value: Mapping[str, Any], frames: int, path: Path) -> float | None
 
 
 def _read_number(entry: Mapping[str, Any], key: str, where: str) -> float:
-    value = number(entry, key, where)
+    value = read_number(entry, key, where)
     if value is None:
         raise FormatError(f"{where} has no {key}.", hint=_HINT)
     return value

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from recon_cli.errors import ConfigError, StageError
-from recon_cli.export.synthetic_cameras import AROUND
+from recon_cli.export.synthetic_cameras import CAMERAS_AROUND
 from recon_cli.flythrough.camera_path import CameraPath, read_camera_path
 from recon_cli.flythrough.paths import find_look_at, orbit_path, smooth_path
 from recon_cli.flythrough.request import FPS, ORBIT, TRAINING, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene
 from recon_cli.io.calibration import MAX_SIDE
-from recon_cli.io.images import fitted_camera, fitted_size
+from recon_cli.io.images import fit_camera, fit_size
 from recon_cli.machine import free_memory_bytes
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
@@ -67,7 +67,7 @@ def _make_path(request: RenderRequest, trained: TrainedScene) -> CameraPath:
     scene, count = trained.scene, request.frames()
     cameras = [view.camera for view in scene.train]
     if not trained.has_views:
-        cameras = cameras[:AROUND]  # the synthetic cameras after these are in the middle
+        cameras = cameras[:CAMERAS_AROUND]  # the synthetic cameras after these are in the middle
     viewmats = np.stack([camera.viewmat for camera in cameras])
     if request.path == TRAINING:
         viewmats = smooth_path(viewmats, count)
@@ -78,7 +78,7 @@ def _make_path(request: RenderRequest, trained: TrainedScene) -> CameraPath:
     kinds = [(camera.width, camera.height, camera.fy) for camera in cameras]
     usual = cameras[kinds.index(Counter(kinds).most_common(1)[0][0])]
     fov = np.degrees(2 * np.arctan(usual.height / 2 / usual.fy))
-    width, height = fitted_size(usual.width, usual.height, trained.max_size)
+    width, height = fit_size(usual.width, usual.height, trained.max_size)
     return CameraPath(viewmats, np.full(count, fov), width, height)
 
 
@@ -86,7 +86,7 @@ def _resize_view(camera: Camera, request: RenderRequest, trained: TrainedScene) 
     """Returns the camera of a view at the requested size, or at that of training and scores."""
     if request.size or request.width or request.height:
         return camera.resized(*frame_size(camera.width, camera.height, request))
-    return fitted_camera(camera, trained.max_size)
+    return fit_camera(camera, trained.max_size)
 
 
 def _select_views(names: Sequence[str], scene: Scene) -> list[View]:

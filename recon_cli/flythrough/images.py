@@ -14,7 +14,7 @@ from torch import Tensor
 
 from recon_cli.flythrough.paths import visible_depths
 from recon_cli.flythrough.request import ALPHA, DEPTH, RGB
-from recon_cli.io.images import eight_bit, write_png
+from recon_cli.io.images import to_uint8, write_png
 from recon_cli.render import RenderOutput
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
@@ -82,9 +82,9 @@ def write_frame(
     file = f"{name}.png"
     for kind in kinds:
         if kind == RGB:
-            write_png(folder / RGB / file, eight_bit(_array(output.rgb)))
+            write_png(folder / RGB / file, to_uint8(_array(output.rgb)))
         elif kind == ALPHA:
-            write_png(folder / ALPHA / file, eight_bit(_array(output.alpha)))
+            write_png(folder / ALPHA / file, to_uint8(_array(output.alpha)))
         else:
             steps = depth_steps(_array(surfaces.depth), _array(surfaces.alpha), scale.step)
             write_png(folder / DEPTH / file, steps)
@@ -117,7 +117,7 @@ def depth_colors(steps: NDArray[np.uint16], scale: DepthScale) -> NDArray[np.uin
     """Returns RGB [H, W, 3]: red is near, blue is far, black is nothing."""
     nearness = np.clip((scale.far - steps * scale.step) / (scale.far - scale.near), 0, 1)
     level = (_BLUE + (1 - _BLUE) * nearness).astype(np.float32)
-    colors = cv2.applyColorMap(eight_bit(level), cv2.COLORMAP_TURBO)
+    colors = cv2.applyColorMap(to_uint8(level), cv2.COLORMAP_TURBO)
     rgb = np.asarray(colors[:, :, ::-1], np.uint8).copy()
     rgb[steps == 0] = 0
     return rgb

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from recon_cli.context import StageInputs
 from recon_cli.errors import StageError
 from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.export.synthetic_cameras import HINT, made_up_scene
-from recon_cli.io.import_record import Origin
+from recon_cli.export.synthetic_cameras import synthetic_scene
+from recon_cli.io.import_record import NEEDS_VIEWS_HINT, ImportRecord
 from recon_cli.io.ply import read_ply
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
@@ -72,7 +72,7 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
         FormatError: a file of the workspace is damaged.
     """
     inspection = job.inspect()
-    origin = Origin.of(job.workspace.folder("train"))
+    origin = ImportRecord.read(job.workspace.folder("train"))
     if origin and not origin.views:
         _require_fresh(inspection, "train", verb)
         return _open_viewless(job, model, origin)
@@ -88,17 +88,17 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
         world.evidence.up_found, world.evidence.metres)
 
 
-def _open_viewless(job: Job, model: str, origin: Origin) -> TrainedScene:
+def _open_viewless(job: Job, model: str, origin: ImportRecord) -> TrainedScene:
     """Returns an imported scene with synthetic cameras."""
     if model == "pruned":
         raise StageError(
             "There is no pruned model: a scene without views cannot be pruned.",
-            hint=HINT)
+            hint=NEEDS_VIEWS_HINT)
     folder = job.workspace.folder("train")
     config, splats = read_config(folder), read_ply(folder / "splats.ply")
     return TrainedScene(
         "base", splats, _digest(splats), config.sh_degree, config.max_size,
-        made_up_scene(splats, z_up=origin.z_up, max_size=config.max_size), origin.z_up, False,
+        synthetic_scene(splats, z_up=origin.z_up, max_size=config.max_size), origin.z_up, False,
         has_views=False)
 
 

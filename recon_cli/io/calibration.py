@@ -1,4 +1,4 @@
-"""From pixels of a distorted lens to the directions of their rays."""
+"""Checked poses and intrinsics from files, and the undistortion of pixels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import MODELS, Lens
 
 # Entries written with three decimals are off by up to 5e-4, so R R^T by up to
-# 2 * sqrt(3) * 5e-4 = 1.7e-3. A scale that is left in a pose is larger by far.
+# 2 * sqrt(3) * 5e-4 = 1.7e-3. A scale left in a pose is far larger.
 ORTHONORMAL = 2e-3
 FARTHEST = 1e9  # UTM, the largest coordinates in use, reach 1e7 metres
 MAX_SIDE = 1 << 16  # pixels; no image format in use holds a longer side
@@ -25,11 +25,11 @@ _HINT = "Export the poses again, or take the image out of the list."
 def viewmat_from_pose(value: Any, where: str, *, opengl: bool = False) -> NDArray[np.float64]:
     """Returns [4, 4] world to camera, OpenCV axes, of a camera-to-world matrix.
 
-    A rotation that rounding left slightly askew is replaced by the nearest rotation.
+    A rotation that is not orthonormal by rounding is replaced by the nearest rotation.
 
     Args:
         value: 16 numbers row by row, or [4, 4], or [3, 4] without its last row.
-        where: what a message calls the matrix.
+        where: the matrix, for messages.
         opengl: its camera looks along -z with y up, as in OpenGL and Blender.
 
     Raises:
@@ -41,7 +41,7 @@ def viewmat_from_pose(value: Any, where: str, *, opengl: bool = False) -> NDArra
     if askew > ORTHONORMAL or np.linalg.det(rotation) < 0:
         raise FormatError(
             f"{where} is no rigid pose: {_fault(rotation, askew)}. Needed is a rotation with a "
-            "place, without scale or reflection.", hint=_HINT)
+            "position, without scale or reflection.", hint=_HINT)
     left, _, right = np.linalg.svd(rotation)
     nearest = left @ right
     viewmat = np.eye(4)
@@ -65,7 +65,7 @@ def _matrix(value: Any, where: str) -> NDArray[np.float64]:
         raise FormatError(f"{where} holds a number that is not finite.", hint=_HINT)
     if np.abs(pose[:3, 3]).max() > FARTHEST:
         raise FormatError(
-            f"{where} puts the camera at {_numbers(pose[:3, 3])}, which is no place.", hint=_HINT)
+            f"{where} puts the camera at {_numbers(pose[:3, 3])}, out of range.", hint=_HINT)
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHONORMAL:
         raise FormatError(
             f"{where} is no rigid pose: its last row is {_numbers(pose[3])}, needed 0 0 0 1.",
@@ -85,10 +85,10 @@ def _numbers(values: NDArray[np.float64]) -> str:
     return " ".join(f"{value:.4g}" for value in values)
 
 
-def checked_lens(
+def make_lens(
     model: str, width: float, height: float, params: Sequence[float], where: str
 ) -> Lens:
-    """Returns the intrinsics of a file once they can be true.
+    """Returns the intrinsics of a file, checked for plausibility.
 
     Raises:
         FormatError: the model is unknown, or a number is missing, not finite or out of range.
@@ -119,7 +119,7 @@ def lens_from_matrix(
         matrix: fx 0 cx, 0 fy cy, 0 0 1 in its upper left.
         width: image width in pixels.
         height: image height in pixels.
-        where: what a message calls the matrix.
+        where: the matrix, for messages.
         first_center: where the file's convention puts the centre of the first pixel, 0 or 0.5;
             ours is 0.5.
 
@@ -132,7 +132,7 @@ def lens_from_matrix(
     if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]) or abs(matrix[2, 2] - 1) > ORTHONORMAL:
         raise FormatError(f"{where} is no matrix of intrinsics without skew.")
     params = (matrix[0, 0], matrix[1, 1], matrix[0, 2] + shift, matrix[1, 2] + shift)
-    return checked_lens("PINHOLE", width, height, params, where)
+    return make_lens("PINHOLE", width, height, params, where)
 
 
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -142,11 +142,11 @@ _FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 _STEPS = 50
 
 
-def directions(
+def undistort_pixels(
     lens: Lens,
     pixels: NDArray[np.float64],  # [M, 2]
 ) -> NDArray[np.float64]:
-    """Returns [M, 2] x/z and y/z of the rays through pixels, distortion undone.
+    """Returns [M, 2] x/z and y/z of the rays through pixels, without distortion.
 
     Args:
         lens: intrinsics of every model but THIN_PRISM_FISHEYE.
@@ -175,8 +175,8 @@ def directions(
 def _undo(distorted: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverts k1 k2 p1 p2 k3 k4 k5 k6 by the fixed point that cv2.undistortPoints iterates.
 
-    Here rather than by OpenCV, whose versions 4 and 5 take the number of steps in different calls,
-    and whose default of five leaves 0.04 pixels at the corners of a lens with k1 = -0.28.
+    Not by OpenCV, whose versions 4 and 5 set the number of steps by different calls, and whose
+    default of five leaves 0.04 pixels at the corners of a lens with k1 = -0.28.
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = k
     undone = distorted.copy()

@@ -1,4 +1,7 @@
-"""COLMAP models of undistorted views, binary or as text, written by pycolmap."""
+"""COLMAP models of undistorted views: checked binary readers, and a writer by pycolmap.
+
+Binary files are parsed here, so that a damaged one is an error that names the file and the fault.
+"""
 
 from __future__ import annotations
 
@@ -19,85 +22,13 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View, split_views
 
-
-class Reader:
-    """Takes values off a file, and notices when it ends too soon or too late."""
-
-    def __init__(self, path: Path, hint: str) -> None:
-        self._path = path
-        self._hint = hint
-        self._at = 0
-        try:
-            self._data = path.read_bytes()
-        except FileNotFoundError as error:
-            raise FormatError(f"{path} is missing.", hint=hint) from error
-
-    def take(self, layout: str) -> tuple[Any, ...]:
-        """Returns the next values, laid out as `struct` says."""
-        start = self._at
-        self.skip(struct.calcsize(layout))
-        return struct.unpack_from(layout, self._data, start)
-
-    def count(self, *, minimum: int) -> int:
-        """Returns the next value, a number of entries of at least `minimum` bytes each."""
-        (value,) = self.take("<Q")
-        if value * minimum > len(self._data) - self._at:
-            raise damaged(self._path, f"{value} entries promised", self._hint)
-        return int(value)
-
-    def text(self) -> str:
-        """Returns the next text, which ends with a zero byte."""
-        end = self._data.find(b"\0", self._at)
-        if end < 0:
-            raise damaged(self._path, "a name without an end", self._hint)
-        value, self._at = self._data[self._at:end], end + 1
-        return value.decode(errors="replace")
-
-    def skip(self, size: int) -> None:
-        """Passes over `size` bytes."""
-        if self._at + size > len(self._data):
-            raise damaged(self._path, f"only {len(self._data)} bytes", self._hint)
-        self._at += size
-
-    def end(self) -> None:
-        """Raises FormatError when something is left."""
-        if self._at != len(self._data):
-            raise damaged(self._path, f"{len(self._data) - self._at} bytes too many", self._hint)
-
-
-def rotation(quat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the [3, 3] rotation of a quaternion, wxyz, of any length but zero."""
-    quat = quat / np.abs(quat).max()  # so that squares stay finite
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])
-
-
-def rigid(pose: Sequence[float]) -> NDArray[np.float64] | None:
-    """Returns [4, 4] of a quaternion wxyz and a translation; None unless they are a pose."""
-    if not np.isfinite(pose).all() or not any(pose[:4]):
-        return None
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation(np.array(pose[:4]))
-    matrix[:3, 3] = pose[4:]
-    return matrix
-
-
-def damaged(path: Path, what: str, hint: str) -> FormatError:
-    """Returns the error for a file that ends too soon or holds what cannot be."""
-    return FormatError(f"{path} is not a whole COLMAP model: {what}.", hint=hint)
-
-
 _PINHOLE = 1  # COLMAP's id of the model with fx, fy, cx, cy
 _HINT = "Run `recon sfm --again`."
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """The inner side of a camera, in pixels; the centre of the first pixel lies at 0.5."""
+    """Intrinsics in pixels; the centre of the first pixel is at 0.5."""
 
     width: int
     height: int
@@ -118,10 +49,10 @@ def read_scene(
 
     Args:
         undistorted: folder with images/ and sparse/, as COLMAP's image_undistorter lays it out,
-            and masks/ where frames are masked: a gray image of the frame's name for each of them.
-        held_out: names of the frames kept for the score, registered or not.
-        validation: share of the other views that is set apart.
-        denoised: folder of the denoised twins; None for the denoised/ beside images/.
+            and masks/ with a gray image of the name of each masked frame.
+        held_out: names of the frames held out for the score, registered or not.
+        validation: share of the other views that becomes the validation views.
+        denoised: folder of the denoised frames; None for the denoised/ beside images/.
 
     Raises:
         FormatError: the model is missing, damaged, empty or not of pinhole cameras, or an image is
@@ -132,7 +63,7 @@ def read_scene(
     views = []
     for name, camera_id, viewmat in read_images(undistorted / "sparse" / "images.bin"):
         if camera_id not in cameras:
-            raise damaged(
+            raise model_error(
                 undistorted / "sparse", f"{name} has the unknown camera {camera_id}", _HINT)
         inner = cameras[camera_id]
         camera = Camera(
@@ -146,7 +77,8 @@ def read_scene(
     points, colors = read_points(undistorted / "sparse" / "points3D.bin")
     train, chosen, test = split_views(views, held_out, validation=validation)
     if not views or not len(points):
-        raise damaged(undistorted / "sparse", f"{len(views)} views and {len(points)} points", _HINT)
+        raise model_error(
+            undistorted / "sparse", f"{len(views)} views and {len(points)} points", _HINT)
     missing = sorted(held_out - {view.name for view in views})
     error = mean_point_error(undistorted / "sparse" / "points3D.bin")
     return Scene(train, chosen, test, tuple(missing), points, colors, error)
@@ -162,7 +94,7 @@ def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
     views = read_images(sparse / "images.bin")
     missing = [name for name, camera_id, _ in views if camera_id not in cameras]
     if missing:
-        raise damaged(sparse, f"{missing[0]} has an unknown camera", _HINT)
+        raise model_error(sparse, f"{missing[0]} has an unknown camera", _HINT)
     return {name: cameras[camera_id] for name, camera_id, _ in views}
 
 
@@ -200,9 +132,9 @@ def read_images(
         _, *pose, camera_id = reader.take("<I7dI")
         name = reader.text()
         reader.skip(24 * reader.count(minimum=24))  # x, y and point id of each observation
-        viewmat = rigid(pose)
+        viewmat = pose_matrix(pose)
         if viewmat is None:
-            raise damaged(path, f"no pose of {name}", hint)
+            raise model_error(path, f"no pose of {name}", hint)
         images.append((name, camera_id, viewmat))
     reader.end()
     return images
@@ -225,14 +157,14 @@ def read_points(
     rows.sort()
     positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(positions).all():
-        raise damaged(path, "a point that is not finite", hint)
+        raise model_error(path, "a point that is not finite", hint)
     return positions, np.array([row[4:7] for row in rows], np.uint8).reshape(-1, 3)
 
 
 def mean_point_error(path: Path) -> float | None:
     """Returns the mean reprojection error of a points3D.bin in pixels of its images.
 
-    None where no point has any: depth maps give points that were never matched.
+    None if no point has any, as points from depth maps.
 
     Raises:
         FormatError: the file is missing or damaged.
@@ -247,7 +179,7 @@ def mean_point_error(path: Path) -> float | None:
 
 
 def _check_size(path: Path, camera: Camera) -> None:
-    """Raises FormatError unless an image is there and as large as its camera says."""
+    """Raises FormatError unless an image exists and has the size of its camera."""
     try:
         with Image.open(path) as image:  # reads the header only
             size = image.size
@@ -269,14 +201,14 @@ def write_colmap(
 ) -> None:
     """Writes a model of pinhole cameras, whole or not at all.
 
-    Views with the same intrinsics share a camera. Nothing says which view sees which point.
+    Views with the same intrinsics share a camera. No observations are written.
 
     Args:
-        folder: of the model, such as sparse/0; it may not exist yet, or has to be empty.
+        folder: of the model, such as sparse/0; new or empty.
         views: name of each image below the images' folder, and its camera.
         points: in world units.
         colors: RGB.
-        text: write cameras.txt and so on in place of the binary files.
+        text: write cameras.txt and so on instead of the binary files.
 
     Raises:
         InputError: there are no views, or the folder holds something.
@@ -312,3 +244,75 @@ def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:
             pycolmap.Image(image_id=number, name=name, camera_id=ids[inner]),
             pycolmap.Rigid3d(camera.viewmat[:3]))
     return model
+
+
+class Reader:
+    """Reads values from a binary file, and refuses one that ends too soon or too late."""
+
+    def __init__(self, path: Path, hint: str) -> None:
+        self._path = path
+        self._hint = hint
+        self._at = 0
+        try:
+            self._data = path.read_bytes()
+        except FileNotFoundError as error:
+            raise FormatError(f"{path} is missing.", hint=hint) from error
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """Returns the next values, laid out as `struct` says."""
+        start = self._at
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self._data, start)
+
+    def count(self, *, minimum: int) -> int:
+        """Returns the next value, a number of entries of at least `minimum` bytes each."""
+        (value,) = self.take("<Q")
+        if value * minimum > len(self._data) - self._at:
+            raise model_error(self._path, f"{value} entries promised", self._hint)
+        return int(value)
+
+    def text(self) -> str:
+        """Returns the next text, which ends with a zero byte."""
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            raise model_error(self._path, "a name without an end", self._hint)
+        value, self._at = self._data[self._at:end], end + 1
+        return value.decode(errors="replace")
+
+    def skip(self, size: int) -> None:
+        """Skips `size` bytes."""
+        if self._at + size > len(self._data):
+            raise model_error(self._path, f"only {len(self._data)} bytes", self._hint)
+        self._at += size
+
+    def end(self) -> None:
+        """Raises FormatError if bytes are left."""
+        if self._at != len(self._data):
+            rest = len(self._data) - self._at
+            raise model_error(self._path, f"{rest} bytes too many", self._hint)
+
+
+def quat_to_matrix(quat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the [3, 3] rotation of a quaternion, wxyz, of any length but zero."""
+    quat = quat / np.abs(quat).max()  # so that squares stay finite
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])
+
+
+def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
+    """Returns [4, 4] of a quaternion wxyz and a translation; None if they are no pose."""
+    if not np.isfinite(pose).all() or not any(pose[:4]):
+        return None
+    matrix = np.eye(4)
+    matrix[:3, :3] = quat_to_matrix(np.array(pose[:4]))
+    matrix[:3, 3] = pose[4:]
+    return matrix
+
+
+def model_error(path: Path, fault: str, hint: str) -> FormatError:
+    """Returns the error for a damaged file."""
+    return FormatError(f"{path} is not a whole COLMAP model: {fault}.", hint=hint)

@@ -1,12 +1,15 @@
-"""Whole COLMAP models of any camera model, binary or text, with rigs and frames or without.
+"""Whole COLMAP models of any camera model, binary or text, with or without rigs and frames.
 
-Read by our own checked readers for the reasons that io/colmap.py gives. Newer models have rigs and
-frames beside their images, but images.bin and images.txt still hold the composed pose of each image
-(pycolmap 4.2), so rigs and frames are read only where the images file itself is missing.
+Newer models have rigs and frames beside their images,
+but images.bin and images.txt still hold the composed pose of each image (pycolmap 4.2), so rigs and
+frames are read only if the images file itself is missing. Observations and tracks are skipped. The
+layouts are those of COLMAP's src/colmap/scene/reconstruction_io; errors in text name the line.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,16 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.calibration import checked_lens
-from recon_cli.io.colmap import Reader, damaged, read_images, read_points, rigid
-from recon_cli.io.colmap_text import (
-    Sensor,
-    read_cameras_text,
-    read_frames_text,
-    read_images_text,
-    read_points_text,
-    read_rigs_text,
-)
+from recon_cli.io.calibration import make_lens
+from recon_cli.io.colmap import Reader, model_error, pose_matrix, read_images, read_points
 from recon_cli.scene.camera import MODELS, Lens
 
 # COLMAP's ids of its camera models, src/colmap/sensor/models.h and pycolmap 4.2's CameraModelId.
@@ -35,6 +30,15 @@ _IDS = (
 )
 _SENSORS = {0: "CAMERA", 1: "IMU"}
 _HINT = "Copy the model again, or export it again from COLMAP."
+_TEXT_HINT = "Export the model again from COLMAP."
+_COUNT = re.compile(r"# Number of \w+: (\d+)")
+_HEAD = 5  # lines; COLMAP writes three or four comments
+
+Pose = NDArray[np.float64]  # [4, 4]
+Sensor = tuple[str, int]  # its type, such as CAMERA, and its id
+NamedImage = tuple[str, int, Pose]  # name, camera id, world to camera
+Rigs = dict[int, dict[Sensor, Pose]]  # sensor from rig, by rig id
+Frames = list[tuple[int, Pose, list[tuple[Sensor, int]]]]  # rig id, rig from world, image ids
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,22 +47,22 @@ class Model:
 
     Attributes:
         lenses: intrinsics by camera id.
-        images: (name, camera id, [4, 4] world to camera) in the order of the file.
-        unnamed: (camera id, [4, 4] world to camera) by image id, where the file with the names is
+        images: in the order of the file.
+        unnamed: (camera id, [4, 4] world to camera) by image id, if the file with the names is
             missing; else empty.
         points: [P, 3] float64 sparse points.
         colors: [P, 3] uint8 their RGB colours.
     """
 
     lenses: dict[int, Lens]
-    images: list[tuple[str, int, NDArray[np.float64]]]
-    unnamed: dict[int, tuple[int, NDArray[np.float64]]]
+    images: list[NamedImage]
+    unnamed: dict[int, tuple[int, Pose]]
     points: NDArray[np.float64]
     colors: NDArray[np.uint8]
 
 
 def model_suffix(folder: Path) -> str | None:
-    """Returns .bin or .txt for the form of the model in a folder, None where there is none."""
+    """Returns .bin or .txt for the form of the model in a folder, None if there is none."""
     for suffix in (".bin", ".txt"):
         if (folder / f"cameras{suffix}").is_file() and any(
                 (folder / f"{name}{suffix}").is_file() for name in ("images", "frames")):
@@ -67,10 +71,10 @@ def model_suffix(folder: Path) -> str | None:
 
 
 def read_model(folder: Path) -> Model:
-    """Returns the model in a folder; binary where it is there in both forms.
+    """Returns the model in a folder; the binary one if it has both forms.
 
     Raises:
-        FormatError: the folder holds no model, or one that is damaged.
+        FormatError: the folder holds no model, or a damaged one.
     """
     suffix = model_suffix(folder)
     if suffix is None:
@@ -78,18 +82,18 @@ def read_model(folder: Path) -> Model:
     binary = suffix == ".bin"
     cameras, images, points = (
         folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
-    lenses = read_lenses(cameras) if binary else read_cameras_text(cameras)
-    named: list[tuple[str, int, NDArray[np.float64]]] = []
-    unnamed: dict[int, tuple[int, NDArray[np.float64]]] = {}
+    lenses = _read_lenses(cameras) if binary else _read_cameras_text(cameras)
+    named: list[NamedImage] = []
+    unnamed: dict[int, tuple[int, Pose]] = {}
     if images.is_file():
-        named = read_images(images, hint=_HINT) if binary else read_images_text(images)
+        named = read_images(images, hint=_HINT) if binary else _read_images_text(images)
     else:
         unnamed = _compose(folder, binary=binary)
     used = {camera for _, camera, _ in named} | {camera for camera, _ in unnamed.values()}
     if unknown := sorted(used - lenses.keys()):
-        raise damaged(folder, f"images of the unknown camera {unknown[0]}", _HINT)
+        raise model_error(folder, f"images of the unknown camera {unknown[0]}", _HINT)
     if not used:
-        raise damaged(folder, "no image has a pose", _HINT)
+        raise model_error(folder, "no image has a pose", _HINT)
     if not points.is_file():
         return Model(lenses, named, unnamed, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     positions, colors = (
@@ -97,30 +101,12 @@ def read_model(folder: Path) -> Model:
     return Model(lenses, named, unnamed, positions, colors)
 
 
-def read_lenses(path: Path) -> dict[int, Lens]:
-    """Returns the lenses of a cameras.bin by camera id.
-
-    Raises:
-        FormatError: the file is damaged or holds a camera of an unknown model.
-    """
-    reader = Reader(path, _HINT)
-    lenses = {}
-    for _ in range(reader.count(minimum=24)):
-        camera_id, model, width, height = reader.take("<IiQQ")
-        name = _IDS[model] if 0 <= model < len(_IDS) else str(model)
-        params = reader.take(f"<{MODELS[name][1]}d") if name in MODELS else ()
-        lenses[camera_id] = checked_lens(
-            name, width, height, params, f"{path}, camera {camera_id},")
-    reader.end()
-    return lenses
-
-
-def _compose(folder: Path, *, binary: bool) -> dict[int, tuple[int, NDArray[np.float64]]]:
+def _compose(folder: Path, *, binary: bool) -> dict[int, tuple[int, Pose]]:
     """Returns camera id and world to camera of each image id, from rigs and frames."""
     suffix = ".bin" if binary else ".txt"
     rigs_file, frames_file = folder / f"rigs{suffix}", folder / f"frames{suffix}"
-    rigs = _read_rigs(rigs_file) if binary else read_rigs_text(rigs_file)
-    frames = _read_frames(frames_file) if binary else read_frames_text(frames_file)
+    rigs = _read_rigs(rigs_file) if binary else _read_rigs_text(rigs_file)
+    frames = _read_frames(frames_file) if binary else _read_frames_text(frames_file)
     poses = {}
     for rig_id, rig_from_world, data in frames:
         for sensor, image_id in data:
@@ -128,38 +114,52 @@ def _compose(folder: Path, *, binary: bool) -> dict[int, tuple[int, NDArray[np.f
                 continue
             sensor_from_rig = rigs.get(rig_id, {}).get(sensor)
             if sensor_from_rig is None:
-                raise damaged(
-                    rigs_file, f"no place of camera {sensor[1]} in rig {rig_id}", _HINT)
+                raise model_error(
+                    rigs_file, f"no pose of camera {sensor[1]} in rig {rig_id}", _HINT)
             poses[image_id] = sensor[1], sensor_from_rig @ rig_from_world
     return dict(sorted(poses.items()))
 
 
-def _read_rigs(path: Path) -> dict[int, dict[Sensor, NDArray[np.float64]]]:
+# Binary files
+
+
+def _read_lenses(path: Path) -> dict[int, Lens]:
+    reader = Reader(path, _HINT)
+    lenses = {}
+    for _ in range(reader.count(minimum=24)):
+        camera_id, model, width, height = reader.take("<IiQQ")
+        name = _IDS[model] if 0 <= model < len(_IDS) else str(model)
+        params = reader.take(f"<{MODELS[name][1]}d") if name in MODELS else ()
+        lenses[camera_id] = make_lens(
+            name, width, height, params, f"{path}, camera {camera_id},")
+    reader.end()
+    return lenses
+
+
+def _read_rigs(path: Path) -> Rigs:
     reader = Reader(path, _HINT)
     rigs = {}
     for _ in range(reader.count(minimum=8)):
         rig_id, count = reader.take("<II")
-        sensors: dict[Sensor, NDArray[np.float64]] = {}
+        sensors: dict[Sensor, Pose] = {}
         for index in range(count):
             kind, sensor_id = reader.take("<iI")
             sensor = _SENSORS.get(kind, str(kind)), sensor_id
             if index == 0:  # the origin of the rig
                 sensors[sensor] = np.eye(4)
             elif reader.take("<B")[0]:
-                sensors[sensor] = _pose(reader, path)
+                sensors[sensor] = _take_pose(reader, path)
         rigs[rig_id] = sensors
     reader.end()
     return rigs
 
 
-def _read_frames(
-    path: Path,
-) -> list[tuple[int, NDArray[np.float64], list[tuple[Sensor, int]]]]:
+def _read_frames(path: Path) -> Frames:
     reader = Reader(path, _HINT)
     frames = []
     for _ in range(reader.count(minimum=68)):
         _, rig_id = reader.take("<II")
-        pose = _pose(reader, path)
+        pose = _take_pose(reader, path)
         data: list[tuple[Sensor, int]] = []
         for _ in range(reader.take("<I")[0]):
             kind, sensor_id, image_id = reader.take("<iIQ")
@@ -169,8 +169,148 @@ def _read_frames(
     return frames
 
 
-def _pose(reader: Reader, path: Path) -> NDArray[np.float64]:
-    matrix = rigid(reader.take("<7d"))
+def _take_pose(reader: Reader, path: Path) -> Pose:
+    matrix = pose_matrix(reader.take("<7d"))
     if matrix is None:
-        raise damaged(path, "a pose that is not finite or has no rotation", _HINT)
+        raise model_error(path, "a pose that is not finite or has no rotation", _HINT)
     return matrix
+
+
+# Text files
+
+
+def _read_cameras_text(path: Path) -> dict[int, Lens]:
+    cameras = {}
+    for where, words in _rows(path):
+        camera_id, width, height = _integers([words[0], *words[2:4]], where, 3)
+        params = _numbers(words[4:], where, len(words) - 4)
+        cameras[camera_id] = make_lens(words[1], width, height, params, where)
+    _check_complete(path, len(cameras))
+    return cameras
+
+
+def _read_images_text(path: Path) -> list[NamedImage]:
+    images = []
+    lines = iter(_lines(path))
+    for at, line in lines:
+        if not line or line.startswith("#"):
+            continue
+        words = line.split(maxsplit=9)
+        where = f"{path}, line {at},"
+        if len(words) < 10:
+            raise _line_error(where, f"{len(words)} entries, needed 10 of an image")
+        (camera_id,) = _integers(words[8:9], where, 1)
+        pose = _numbers(words[1:8], where, 7)
+        images.append((words[9], camera_id, _parse_pose(pose, where)))
+        next(lines, None)  # its observations, which may be an empty line
+    _check_complete(path, len(images))
+    return images
+
+
+def read_points_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.txt, sorted by point id.
+
+    Raises:
+        FormatError: the file is missing or a line is malformed.
+    """
+    rows = []
+    for where, words in _rows(path, max_words=8):
+        row = _numbers(words[:7], where, 7)
+        if not np.isfinite(row).all() or not all(0 <= value <= 255 for value in row[4:]):
+            raise _line_error(where, "no finite position with a colour of 0 to 255")
+        rows.append(row)
+    _check_complete(path, len(rows))
+    table = np.array(sorted(rows), np.float64).reshape(-1, 7)
+    return np.ascontiguousarray(table[:, 1:4]), table[:, 4:].astype(np.uint8)
+
+
+def _read_rigs_text(path: Path) -> Rigs:
+    rigs = {}
+    for where, words in _rows(path):
+        rig_id, count = _integers(words[:2], where, 2)
+        sensors = {}
+        rest = words[2:]
+        for index in range(count):
+            sensor, rest = _parse_sensor(rest, where), rest[2:]
+            has_pose = index > 0 and _integers(rest[:1], where, 1)[0] != 0
+            rest = rest[1:] if index > 0 else rest  # the first sensor is the origin of the rig
+            if has_pose:
+                sensors[sensor] = _parse_pose(_numbers(rest[:7], where, 7), where)
+                rest = rest[7:]
+            elif index == 0:
+                sensors[sensor] = np.eye(4)
+        rigs[rig_id] = sensors
+    return rigs
+
+
+def _read_frames_text(path: Path) -> Frames:
+    frames = []
+    for where, words in _rows(path):
+        _, rig_id = _integers(words[:2], where, 2)
+        pose = _numbers(words[2:9], where, 7)
+        (count,) = _integers(words[9:10], where, 1)
+        rest = words[10:]
+        if len(rest) != 3 * count:
+            raise _line_error(where, f"{len(rest)} entries after its pose, needed {3 * count}")
+        data = [(_parse_sensor(rest[at:], where), _integers(rest[at + 2:at + 3], where, 1)[0])
+                for at in range(0, len(rest), 3)]
+        frames.append((rig_id, _parse_pose(pose, where), data))
+    return frames
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError as error:
+        raise FormatError(f"{path} is missing.", hint=_TEXT_HINT) from error
+    return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1)]
+
+
+def _check_complete(path: Path, count: int) -> None:
+    """Raises FormatError if a file holds less than COLMAP's comment at its head promises."""
+    for at, line in _lines(path)[:_HEAD]:
+        promised = _COUNT.match(line)
+        if promised and count < int(promised[1]):
+            raise _line_error(
+                f"{path}", f"it ends after {count} of the {promised[1]} entries that line {at} "
+                "promises")
+
+
+def _rows(path: Path, *, max_words: int = -1) -> Iterator[tuple[str, list[str]]]:
+    """Yields the position of each line for messages, and its words, at most `max_words` + 1."""
+    for at, line in _lines(path):
+        if line and not line.startswith("#"):
+            yield f"{path}, line {at},", line.split(maxsplit=max_words)
+
+
+def _numbers(words: Sequence[str], where: str, needed: int) -> list[float]:
+    if len(words) < needed or needed < 0:
+        raise _line_error(where, "it ends too soon")
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise _line_error(where, "a word where a number belongs") from error
+
+
+def _integers(words: Sequence[str], where: str, needed: int) -> list[int]:
+    if len(words) < needed:
+        raise _line_error(where, "it ends too soon")
+    try:
+        return [int(word) for word in words]
+    except ValueError as error:
+        raise _line_error(where, "a word where a whole number belongs") from error
+
+
+def _parse_sensor(words: Sequence[str], where: str) -> Sensor:
+    return (words[0] if words else "", _integers(words[1:2], where, 1)[0])
+
+
+def _parse_pose(numbers: Sequence[float], where: str) -> Pose:
+    matrix = pose_matrix(numbers)
+    if matrix is None:
+        raise _line_error(where, "a pose that is not finite or has no rotation")
+    return matrix
+
+
+def _line_error(where: str, fault: str) -> FormatError:
+    return FormatError(f"{where} is malformed: {fault}.", hint=_TEXT_HINT)

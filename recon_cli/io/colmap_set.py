@@ -1,8 +1,9 @@
-"""COLMAP data sets: a model with its images, wherever the usual programs put the two."""
+"""COLMAP data sets: a model with its images, in the folder layouts of the usual programs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,21 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.colmap_model import Model, model_suffix, read_model
-from recon_cli.io.listed import SUFFIXES, Listed, find_images, inside, is_file
-from recon_cli.io.posed import PosedSet
+from recon_cli.io.colmap_model import Model, NamedImage, model_suffix, read_model
+from recon_cli.io.posed import SUFFIXES, ListedImage, PosedSet, find_images, is_file, resolve_inside
 from recon_cli.scene.camera import MODELS, Lens
 
 _CHECKED = 5  # images, evenly spread
-_POINTS = 5000  # of the model, evenly spread; seen by one view about a tenth of them
-# Over 70 photos of a desk the right pose is off by 21 to 40 of 255, the best wrong one by 39 to 77,
-# and never is the right one off by more than 0.82 of the best wrong one.
+_POINTS = 5000  # of the model, evenly spread; a view shows about a tenth of them
+# Over 70 photos of a desk the right pose is off by 21 to 40 of 255 and the best wrong one by 39 to
+# 77; the right one is never off by more than 0.82 of the best wrong one.
 _BETTER = 0.9
 
 
-def named_in_order(
+def match_names_by_order(
     model: Model, candidates: Iterable[Path], model_at: Path
-) -> tuple[list[tuple[str, int, NDArray[np.float64]]], Path]:
+) -> tuple[list[NamedImage], Path]:
     """Returns (name, camera id, world to camera) of each image, and the folder of the images.
 
     Raises:
@@ -90,8 +90,8 @@ def _difference(
     middle = (np.abs(x - width / 2) < width / 4) & (np.abs(y - height / 2) < height / 4)
     if not middle.any():
         return 255.0
-    seen = rgb[y[middle].astype(int), x[middle].astype(int)]
-    return float(np.median(np.abs(seen - colors[ahead][middle]).max(axis=1)))
+    observed = rgb[y[middle].astype(int), x[middle].astype(int)]
+    return float(np.median(np.abs(observed - colors[ahead][middle]).max(axis=1)))
 
 
 # Where a model lies below the folder that was given, and where its images may lie, as paths from
@@ -128,25 +128,25 @@ def read_colmap(folder: Path) -> PosedSet:
         raise FormatError(f"{folder} holds no COLMAP model.")
     model_at, image_places = folder / place[0], place[1]
     model = read_model(model_at)
-    candidates = [*(folder / name for name in image_places), *_reduced(folder)]
+    candidates = [*(folder / name for name in image_places), *_list_reduced_folders(folder)]
     if model.images:
-        named, images, said = _named(model, candidates, folder)
+        named, images, notices = _locate_images(model, candidates, folder)
     else:
-        named, images = named_in_order(model, candidates, model_at)
-        said = (f"the model lacks the names of its {len(named)} images; they were taken in the "
-                "order of the files, and their colours agree with it",)
+        named, images = match_names_by_order(model, candidates, model_at)
+        notices = (f"the model lacks the names of its {len(named)} images; they were taken in the "
+                   "order of the files, and their colours agree with it",)
     listed = []
     for name, camera, viewmat in sorted(named, key=lambda image: image[0]):
         mask = folder / "masks" / f"{name}.png"  # as COLMAP's --ImageReader.mask_path names them
-        listed.append(Listed(
+        listed.append(ListedImage(
             name, images / name, model.lenses[camera], viewmat,
             mask=mask if is_file(mask) else None))
-    found = find_images(listed, model_at)
+    posed = find_images("colmap", listed, model_at)
     has_points = len(model.points) > 0
-    return PosedSet(
-        "colmap", found.lenses, found.images, found.missing,
-        points=model.points if has_points else None, colors=model.colors if has_points else None,
-        notices=(*said, *_other_models(model_at), *found.notices))
+    return replace(
+        posed, points=model.points if has_points else None,
+        colors=model.colors if has_points else None,
+        notices=(*notices, *_other_models(model_at), *posed.notices))
 
 
 def _find_model(folder: Path) -> tuple[str, tuple[str, ...]] | None:
@@ -159,18 +159,18 @@ def _find_model(folder: Path) -> tuple[str, tuple[str, ...]] | None:
     return None
 
 
-def _reduced(folder: Path) -> list[Path]:
+def _list_reduced_folders(folder: Path) -> list[Path]:
     """Returns images_2, images_4 and so on, the largest images first."""
-    found = [path for path in folder.glob("images_*") if path.name[7:].isdecimal()]
-    return sorted(found, key=lambda path: int(path.name[7:]))
+    folders = [path for path in folder.glob("images_*") if path.name[7:].isdecimal()]
+    return sorted(folders, key=lambda path: int(path.name[7:]))
 
 
-def _named(
+def _locate_images(
     model: Model, candidates: Iterable[Path], folder: Path
-) -> tuple[list[tuple[str, int, NDArray[np.float64]]], Path, tuple[str, ...]]:
-    """Returns the images of the model, the folder where they are, and what to say about it."""
+) -> tuple[list[NamedImage], Path, tuple[str, ...]]:
+    """Returns the images of the model, the folder where they are, and notices."""
     for name, _, _ in model.images:
-        inside(folder, name, f"the COLMAP model in {folder}")
+        resolve_inside(folder, name, f"the COLMAP model in {folder}")
     for place in candidates:
         if any(is_file(place / name) for name, _, _ in model.images):
             reduced = place.name.startswith("images_")
@@ -182,7 +182,7 @@ def _named(
 
 
 def _other_models(model_at: Path) -> tuple[str, ...]:
-    """Returns that COLMAP left several models and only the first was read."""
+    """Returns a notice if COLMAP left several models, of which only the first was read."""
     if model_at.name != "0":
         return ()
     others = [path for path in model_at.parent.iterdir()

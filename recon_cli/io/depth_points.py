@@ -1,123 +1,37 @@
-"""Initial points from depth: a spread of pixels of many frames, thinned evenly over surfaces."""
+"""Initial points from depth: evenly spread pixels of many frames, thinned over surfaces."""
 
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.calibration import directions
+from recon_cli.io.calibration import undistort_pixels
 from recon_cli.io.posed import PosedImage, PosedSet
-from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.scene.camera import Lens
 
-_FARTHEST = float(np.finfo(np.float32).max)
-
-
-@dataclass(frozen=True)
-class DepthFile:
-    """Reads the z-depth of an image from its file.
-
-    Depth of another size than the image is looked up at the nearest pixel along the same ray, for a
-    mean over an edge would be the depth of nothing. The rays are compared without distortion.
-
-    Attributes:
-        path: the file.
-        unit: world units of a value of 1.
-        lens: intrinsics of the image.
-        own: intrinsics of the depth; None where it covers the same field of view.
-    """
-
-    path: Path
-    unit: float
-    lens: Lens
-    own: Lens | None = None
-
-    def __call__(self) -> NDArray[np.float32]:
-        """Returns [H, W] z-depth at the size of the image, in world units, 0 where there is none.
-
-        Raises:
-            FormatError: the file is missing, damaged or no depth.
-        """
-        values = _read(self.path)
-        exact = values.astype(np.float64) * self.unit
-        depth = np.where((exact > 0) & (exact < _FARTHEST), exact, 0).astype(np.float32)
-        height, width = depth.shape
-        own = self.own if self.own is not None else self.lens.resized(width, height)
-        if (width, height) != (own.width, own.height):
-            own = own.resized(width, height)
-        if own == self.lens:
-            return depth
-        columns, inside_x = _nearest(_axis(self.lens, 0), _axis(own, 0), self.lens.width, width)
-        rows, inside_y = _nearest(_axis(self.lens, 1), _axis(own, 1), self.lens.height, height)
-        found: NDArray[np.float32] = depth[np.ix_(rows, columns)]
-        found[~(inside_y[:, None] & inside_x[None, :])] = 0
-        return found
-
-
-def _read(path: Path) -> NDArray[np.generic]:
-    hint = "Copy the file again, or delete it to go without its depth."
-    if not path.is_file():
-        raise FormatError(f"{path} is missing.", hint=hint)
-    try:
-        if path.suffix.lower() == ".npy":
-            values = np.asarray(np.load(path, allow_pickle=False))
-        else:
-            # Not OpenCV, which gives the first rows of a damaged PNG for the whole.
-            with Image.open(path, formats=("PNG", "TIFF")) as image:
-                values = np.asarray(image)
-    except (OSError, ValueError, EOFError, SyntaxError, struct.error, zlib.error) as error:
-        raise FormatError(f"{path} is no depth that can be read: {error}.", hint=hint) from error
-    if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
-        raise FormatError(
-            f"{path} is no depth: it holds {values.dtype} of shape {values.shape}, needed one "
-            "value a pixel.", hint=hint)
-    return values
-
-
-def _axis(lens: Lens, axis: int) -> tuple[float, float]:
-    """Returns focal length and principal point along x or y."""
-    focals, _ = MODELS[lens.model]
-    return lens.params[axis if focals == 2 else 0], lens.params[focals + axis]
-
-
-def _nearest(
-    image: tuple[float, float], own: tuple[float, float], size: int, own_size: int
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Returns the pixel of the depth that each pixel of the image falls in, and whether any."""
-    rays = (np.arange(size) + 0.5 - image[1]) / image[0]
-    # The tiny nudge decides for exact halves, where rounding would.
-    at = np.floor(rays * own[0] + own[1] + 1e-6).astype(np.intp)
-    return at.clip(0, own_size - 1), (at >= 0) & (at < own_size)
-
-
-MAX_POINTS = 100_000  # as many as INRIA's 3DGS draws where a data set has no points of its own
-# Frames that are read, evenly spread: at two a second they cover a walk of 100 s, which is a room,
-# and each costs the reading of an image.
+MAX_POINTS = 100_000  # as many as INRIA's 3DGS draws if a data set has no points
+# Frames that are read, evenly spread: at two a second 100 s of walking, enough for a room.
 MAX_FRAMES = 200
 _SAMPLES = 8  # for each point that is kept, so that thinning can choose where frames overlap
 _HALVINGS = 24  # of the interval of voxel sizes; the count then changes by less than a hundredth
 
 
 def points_from_depth(
-    posed: PosedSet, *, most: int = MAX_POINTS
+    posed: PosedSet, *, max_points: int = MAX_POINTS
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Returns points [P, 3] in the world of the set, and their RGB colours [P, 3].
 
-    Held-out images are left alone: neither their depth nor their colours may be known before the
+    Held-out images are not used: neither their depth nor their colours may be known before the
     score. The same set gives the same points.
 
     Args:
         posed: a set in which some images have depth.
-        most: greatest number of points.
+        max_points: greatest number of points.
 
     Raises:
         InputError: no image that may be used has depth at any pixel.
@@ -127,7 +41,7 @@ def points_from_depth(
     images = _spread(images)
     pixels = sum(posed.lenses[image.lens].width * posed.lenses[image.lens].height
                  for image in images)
-    step = max(1, math.ceil(math.sqrt(pixels / (_SAMPLES * most))))
+    step = max(1, math.ceil(math.sqrt(pixels / (_SAMPLES * max_points))))
     clouds = [_unproject(image, posed.lenses[image.lens], step) for image in images]
     points = np.concatenate([cloud for cloud, _ in clouds]) if clouds else np.zeros((0, 3))
     if not len(points):
@@ -135,8 +49,8 @@ def points_from_depth(
             f"None of the {len(images)} frames with depth has any above 0.",
             hint="Check the depth files and their scale.")
     colors = np.concatenate([color for _, color in clouds])
-    kept = _thin(points, most)
-    return points[kept], colors[kept]
+    rows = _thin(points, max_points)
+    return points[rows], colors[rows]
 
 
 def _spread(images: Sequence[PosedImage]) -> list[PosedImage]:
@@ -153,7 +67,7 @@ def _unproject(
     rgb = _read_rgb(image, lens)[step // 2::step, step // 2::step]
     rows, columns = np.nonzero(depth)
     at = np.stack([columns, rows], axis=1).astype(np.float64) * step + (step // 2 + 0.5)
-    rays = directions(lens, at)
+    rays = undistort_pixels(lens, at)
     z = depth[rows, columns].astype(np.float64)
     camera = np.column_stack([rays * z[:, None], z])
     rotation, shift = image.viewmat[:3, :3], image.viewmat[:3, 3]
@@ -172,16 +86,16 @@ def _read_rgb(image: PosedImage, lens: Lens) -> NDArray[np.uint8]:
     return np.asarray(data[:, :, ::-1], np.uint8)
 
 
-def _thin(points: NDArray[np.float64], most: int) -> NDArray[np.intp]:
+def _thin(points: NDArray[np.float64], max_points: int) -> NDArray[np.intp]:
     """Returns the indices of one point for each voxel, of the smallest voxels that allow it."""
-    if len(points) <= most:
+    if len(points) <= max_points:
         return np.arange(len(points))
     low = points.min(axis=0)
     extent = float((points - low).max())
     small, large = math.log(max(extent, 1e-12)) - 18 * math.log(2), math.log(max(extent, 1e-12)) + 1
     for _ in range(_HALVINGS):
         middle = (small + large) / 2
-        if len(np.unique(_cells(points - low, math.exp(middle)))) > most:
+        if len(np.unique(_cells(points - low, math.exp(middle)))) > max_points:
             small = middle
         else:
             large = middle

@@ -1,20 +1,21 @@
-"""The frames that ingest hands on: their files, their list frames.json, and the held-out views.
+"""The records of ingest: frames.json, and poses.json with points.safetensors of a posed data set.
 
-A masked frame has a twin of its name in masks/: 8-bit gray, 255 where a pixel counts, 0 where it is
-ignored by features, training and scores.
+A masked frame has a mask of its name in masks/: 8-bit gray, 255 where a pixel counts, 0 where
+features, training and scores ignore it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens
@@ -22,6 +23,8 @@ from recon_cli.workspace import atomic
 
 FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = "Delete the folder of ingest in the workspace and run recon ingest again."
+_RERUN = "Run `recon ingest --again`."
+POSES, POINTS = "poses.json", "points.safetensors"
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,10 @@ class Frame:
 
     Attributes:
         name: file name in the folder of frames.
-        time_seconds: time of showing in the video, None for photos and where it is not known.
+        time_seconds: presentation time in the video, None for photos and if unknown.
         source: name of the file that it came from.
         sharpness: variance of its Laplacian, None for photos.
-        held_out: kept for the score, never trained on.
+        held_out: used for the score, never for training.
         group: index of the group of frames that share its intrinsics.
         masked: it has a mask of its name in the folder of masks.
     """
@@ -49,14 +52,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class Group:
-    """Frames that one camera took with one setting of its lens: they share intrinsics.
+    """Frames that share intrinsics: of one camera with one setting of its lens.
 
     Attributes:
-        name: what they came from, for messages.
-        width: of its frames in pixels, as stored.
-        height: of its frames in pixels, as stored.
-        focal_px: focal length in pixels of the stored frames by EXIF, None where unknown.
-        lens: known intrinsics of the stored frames, None where they are to be estimated.
+        name: of their source, for messages.
+        width: of the stored frames in pixels.
+        height: of the stored frames in pixels.
+        focal_px: focal length of the stored frames from EXIF, None if unknown.
+        lens: known intrinsics of the stored frames, None if they are to be estimated.
     """
 
     name: str
@@ -68,11 +71,11 @@ class Group:
 
 @dataclass(frozen=True)
 class FrameList:
-    """What frames.json holds.
+    """The content of frames.json.
 
     Attributes:
-        source: what the capture was taken for: "video", "photos", "mixed", or the layout of a data
-            set with poses.
+        source: kind of the capture: "video", "photos", "mixed", or the layout of a data set with
+            poses.
         groups: at least one.
         frames: sorted by name.
     """
@@ -109,13 +112,59 @@ def _group(value: dict[str, Any]) -> Group:
     return Group(**value, lens=lens)
 
 
-def held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:
-    """Returns which frames are kept for the score.
+@dataclass(frozen=True, eq=False)
+class KnownPoses:
+    """Poses that came with a data set.
+
+    Attributes:
+        viewmats: [4, 4] float64 world to camera by frame name; OpenCV axes.
+        metric: the world's unit is the metre.
+        points: [P, 3] float64 initial points in the same world, None without points.
+        colors: [P, 3] uint8 their RGB colours, None with them.
+    """
+
+    viewmats: Mapping[str, NDArray[np.float64]]
+    metric: bool
+    points: NDArray[np.float64] | None = None
+    colors: NDArray[np.uint8] | None = None
+
+    def write(self, stage: Path) -> None:
+        """Writes both files into ingest's folder."""
+        atomic.write_json(stage / POSES, {
+            "metric": self.metric, "points": self.points is not None,
+            "viewmats": {name: matrix.tolist() for name, matrix in self.viewmats.items()}})
+        if self.points is not None and self.colors is not None:
+            with atomic.replacing(stage / POINTS) as temporary:
+                save_file({"points": np.ascontiguousarray(self.points),
+                           "colors": np.ascontiguousarray(self.colors)}, temporary)
+
+
+def read_poses(path: Path) -> KnownPoses:
+    """Returns what `KnownPoses.write` wrote; `path` is that of poses.json.
+
+    Raises:
+        FormatError: a file is missing or not what was written.
+    """
+    value = atomic.read_json(path)
+    try:
+        viewmats = {
+            name: np.array(matrix, np.float64).reshape(4, 4)
+            for name, matrix in value["viewmats"].items()}
+        if not value["points"]:
+            return KnownPoses(viewmats, bool(value["metric"]))
+        tensors = load_file(path.with_name(POINTS))
+        return KnownPoses(viewmats, bool(value["metric"]), tensors["points"], tensors["colors"])
+    except (AttributeError, KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
+        raise FormatError(f"{path} holds no poses.", hint=_RERUN) from error
+
+
+def choose_held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:
+    """Returns which of all frames are held out for the score.
 
     Args:
         names: of all frames.
-        holdout: (kind, a, b) as `holdout_option.parse_holdout` gives it: each a-th by name from the
-            first on, the share a to b of the names in order, or none.
+        holdout: (kind, a, b) of `config.fields.parse_holdout`: each a-th by name from the first on,
+            the share a to b of the names in order, or none.
     """
     ordered = sorted(names)
     kind, a, b = holdout
@@ -126,47 +175,9 @@ def held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozens
     return frozenset()
 
 
-def prepare(stage: Path) -> Path:
-    """Returns the folder of frames in a stage's folder, made and cleared of half-written files."""
+def prepare_frames_folder(stage: Path) -> Path:
+    """Creates the folder of frames in a stage's folder and clears what a killed run left."""
     folder = stage / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    for leftover in stage.rglob(".*.tmp*"):  # what kill -9 leaves of atomic.replacing
-        leftover.unlink()
+    atomic.clear_leftovers(stage)
     return folder
-
-
-def write_png(path: Path, rgb: NDArray[np.uint8]) -> None:
-    """Writes RGB pixels [H, W, 3] without loss, whole or not at all."""
-    _, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-    atomic.write_bytes(path, data.tobytes())
-
-
-def read_png(path: Path) -> NDArray[np.uint8]:
-    """Returns the pixels of a frame, RGB, [H, W, 3].
-
-    Raises:
-        FormatError: the file holds no picture.
-    """
-    # Not cv2.imread, which cannot open every path on Windows.
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if bgr is None:
-        raise FormatError(f"{path} is no readable picture.", hint=AGAIN)
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-
-
-def fitted_size(width: int, height: int, longest: int) -> tuple[int, int]:
-    """Returns (width, height) of an image whose longer side is reduced to `longest` at most."""
-    if max(height, width) <= longest:
-        return width, height
-    scale = longest / max(height, width)
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
-def fitted(rgb: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
-    """Returns an image reduced by area to at most `longest` pixels on its longer side."""
-    height, width = rgb.shape[:2]
-    size = fitted_size(width, height, longest)
-    if size == (width, height):
-        return rgb
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,4 +1,7 @@
-"""Pixels in and out. One way to reduce an image, because the filter alone can move a score."""
+"""Reading, writing and resizing of images and masks.
+
+There is one way to reduce an image, because the choice of filter alone can move a score.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.io.frames import AGAIN
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.atomic import write_bytes
 
-_COUNTS = 255  # in the file of a mask; anything less is ignored, half-covered edges included
+_COUNTS = 255  # in a mask file; anything less is ignored, half-covered edges included
 
 
-def fitted_size(width: int, height: int, max_size: int) -> tuple[int, int]:
+def fit_size(width: int, height: int, max_size: int) -> tuple[int, int]:
     """Returns (width, height) reduced so that the longer side is at most `max_size`."""
     factor = min(1.0, max_size / max(width, height))
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def fitted_camera(camera: Camera, max_size: int) -> Camera:
-    """Returns the camera of the image that `read_image` gives for the same size."""
-    return camera.resized(*fitted_size(camera.width, camera.height, max_size))
+def fit_camera(camera: Camera, max_size: int) -> Camera:
+    """Returns the camera of an image that was reduced to the same size."""
+    return camera.resized(*fit_size(camera.width, camera.height, max_size))
 
 
 def read_image(path: Path, width: int, height: int) -> NDArray[np.uint8]:
@@ -43,8 +47,8 @@ def read_image(path: Path, width: int, height: int) -> NDArray[np.uint8]:
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     """Returns a mask as [height, width], True where a pixel counts.
 
-    A pixel of the reduced mask counts only if all that it covers does: the same pixel of the
-    image then holds nothing that is to be ignored.
+    A pixel of the reduced mask counts only if all pixels that it covers do, so that the same pixel
+    of the image holds nothing to be ignored.
 
     Raises:
         FormatError: the file is missing or no image.
@@ -59,11 +63,11 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     return np.asarray(ignored == 0)
 
 
-def painted(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def fill_masked(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Returns an image [H, W, 3] whose ignored pixels have the mean colour of those that count.
 
-    SSIM looks at windows, so a pixel that counts sees its neighbours under the mask. What they
-    held must not matter, and black would be an edge that outweighs all contrast beside it.
+    SSIM compares windows, so a pixel that counts depends on its neighbours under the mask. Their
+    content must not matter, and black would be an edge stronger than all contrast around it.
 
     Args:
         image: [H, W, 3].
@@ -77,7 +81,7 @@ def painted(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uin
 def read_masked_image(
     path: Path, mask: Path | None, width: int, height: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Returns an image [height, width, 3], painted under its mask, and the mask [height, width].
+    """Returns an image [height, width, 3], filled under its mask, and the mask [height, width].
 
     The mask is None where every pixel counts.
 
@@ -88,11 +92,11 @@ def read_masked_image(
     if mask is None:
         return image, None
     counts = read_mask(mask, width, height)
-    return (image, None) if counts.all() else (painted(image, counts), counts)
+    return (image, None) if counts.all() else (fill_masked(image, counts), counts)
 
 
-def eight_bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Returns values in [0, 1] as whole steps of 1/255; what lies outside is clipped."""
+def to_uint8(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Returns values rounded to steps of 1/255, clipped to [0, 1]."""
     return np.asarray(np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -103,3 +107,27 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
     if not encoded:
         raise ValueError(f"OpenCV cannot encode an image of shape {image.shape}")
     write_bytes(path, data.tobytes())
+
+
+def read_png(path: Path) -> NDArray[np.uint8]:
+    """Returns the pixels of a frame, RGB, [H, W, 3].
+
+    Raises:
+        FormatError: the file is no image.
+    """
+    # Not cv2.imread, which cannot open every path on Windows.
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if bgr is None:
+        raise FormatError(f"{path} cannot be read as an image.", hint=AGAIN)
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def fit_image(rgb: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """Returns an image reduced by area to at most `longest` pixels on its longer side."""
+    height, width = rgb.shape[:2]
+    size = fit_size(width, height, longest)
+    if size == (width, height):
+        return rgb
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+

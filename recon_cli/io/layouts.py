@@ -1,7 +1,4 @@
-"""Which data sets with poses are known, how each is recognised, and what reads it.
-
-Recognition looks at names of files and folders alone; nothing is opened.
-"""
+"""The layouts of data sets with poses, recognised by names of files and folders alone."""
 
 from __future__ import annotations
 
@@ -19,13 +16,13 @@ from recon_cli.io.transforms import is_transforms, read_transforms
 
 @dataclass(frozen=True)
 class Layout:
-    """A layout that is known.
+    """A known layout.
 
     Attributes:
         name: as `PosedSet.layout` has it.
-        words: what it is called in a sentence.
-        needs: the files that make it, for help texts.
-        fits: whether a path has the layout; opens nothing.
+        words: its name in a sentence.
+        needs: its files, for help texts.
+        fits: returns whether a path has the layout.
         read: returns the data set at such a path.
     """
 
@@ -36,8 +33,8 @@ class Layout:
     read: Callable[[Path], PosedSet]
 
 
-# The first that fits is taken. transforms.json comes before COLMAP, because nerfstudio leaves the
-# model that it was made from beside it, and the file on top is the one that is meant.
+# The first that fits wins. transforms.json comes before COLMAP, because nerfstudio leaves the model
+# that it was made from beside it.
 LAYOUTS: tuple[Layout, ...] = (
     Layout("replica", "a Replica sequence (NICE-SLAM layout)",
            "results/frame%06d.jpg, traj.txt and cam_params.json", is_replica, read_replica),
@@ -59,12 +56,12 @@ def recognise(path: Path) -> str | None:
 def refuse_incomplete(path: Path) -> None:
     """Raises FormatError for a data set that lacks its poses or cameras.
 
-    As photos alone it would lose its poses without a word, and its depth maps would be frames.
+    Read as photos it would silently lose its poses, and its depth maps would be frames.
     """
     if path.name == "results" and is_replica(path.parent):
         raise FormatError(
             f"{path} holds frames and depth maps of a Replica sequence, but no poses.",
-            hint=f"Give {path.parent}; or give {path / 'frame*'} to find the cameras anew.")
+            hint=f"Give {path.parent}; or give {path / 'frame*'} to estimate the cameras.")
     if lacks_cameras(path):
         lacks, images = "a COLMAP model without cameras.bin or cameras.txt", path / "images"
     elif lacks_trajectory(path):
@@ -73,14 +70,14 @@ def refuse_incomplete(path: Path) -> None:
         return
     raise FormatError(
         f"{path} holds {lacks}.",
-        hint=f"Copy that file too, or give {images} to find the cameras anew.")
+        hint=f"Copy that file too, or give {images} to estimate the cameras.")
 
 
 def read_posed(path: Path) -> PosedSet:
     """Returns the data set with poses at a path.
 
     Raises:
-        InputError: the path has no known layout, or none of its images is there.
+        InputError: the path has no known layout, or none of its images exists.
         FormatError: a file of the data set is missing or damaged.
     """
     layout = _find(path)
@@ -93,13 +90,13 @@ def read_posed(path: Path) -> PosedSet:
         if error.hint:
             raise
         raise FormatError(
-            error.message, hint="Copy the data set again, or export it anew.") from error
+            error.message, hint="Copy the data set again, or export it again.") from error
     except OSError as error:  # a folder where a file belongs, or a file that may not be read
         raise FormatError(f"{path} cannot be read: {error}.") from error
 
 
 def describe(posed: PosedSet) -> str:
-    """Returns in words what a data set was taken for, without the notices."""
+    """Returns the layout and content of a data set in words, without the notices."""
     words = next(row.words for row in LAYOUTS if row.name == posed.layout)
     held_out = sum(image.held_out for image in posed.images)
     depth = sum(image.depth is not None for image in posed.images if not image.held_out)

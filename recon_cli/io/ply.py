@@ -1,14 +1,14 @@
-"""The .ply of INRIA's 3D Gaussian Splatting, which viewers agree on.
+"""The .ply of INRIA's 3D Gaussian Splatting, and the point cloud of its opaque Gaussians.
 
-Written is binary little endian, float32: x y z nx ny nz f_dc_0..2 f_rest opacity scale_0..2
-rot_0..3. f_rest is channel-major, opacity a logit, scale a natural logarithm, rot wxyz. Of f_rest
-there is what the scene's degree needs, as INRIA's trainer writes it: f_rest_0..44 at degree 3, up
-to 23 at degree 2, up to 8 at degree 1, none at degree 0. Gaussians of degree 0 in a scene of
-another have zeros there.
+It is written as binary little endian float32: x y z nx ny nz f_dc_0..2 f_rest opacity scale_0..2
+rot_0..3. f_rest is channel-major, opacity a logit, scale a natural logarithm, rot wxyz. f_rest has
+the coefficients of the scene's degree, as INRIA's trainer writes it: f_rest_0..44 at degree 3, to
+23 at degree 2, to 8 at degree 1, none at degree 0. Gaussians of degree 0 in a scene of another
+have zeros there.
 
-Reading takes ASCII and both byte orders, float and double, the properties in any order, and ignores
-those that it does not know. Two infinities that other programs write have a meaning and become
-finite: the logit of an opacity of exactly 0 or 1, and the logarithm of a scale of 0.
+The reader accepts ASCII and both byte orders, float and double, the properties in any order, and
+ignores unknown ones. Two infinities that other programs write are made finite: the logit of an
+opacity of exactly 0 or 1, and the logarithm of a scale of 0.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError
-from recon_cli.io.ply_table import Header, read_header, read_tables
-from recon_cli.io.splats.values import as_splats, refuse_not_finite
-from recon_cli.scene.splats import TERMS, Splats, with_rows
+from recon_cli.errors import FormatError, InputError
+from recon_cli.io.ply_table import Header, read_header, read_tables, write_point_cloud
+from recon_cli.io.splats.values import refuse_not_finite, sigmoid, splats_from_arrays, to_arrays
+from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
 from recon_cli.workspace.atomic import replacing
 
 _REST = [f"f_rest_{i}" for i in range(3 * TERMS[-1])]
@@ -37,12 +37,13 @@ _GROUPS = {
     "log_scales": [f"scale_{i}" for i in range(3)],
     "quats": [f"rot_{i}" for i in range(4)],
 }
-# An opacity of exactly 1 or 0, as PlayCanvas' splat-transform makes of the bytes 255 and 0: the
-# middle of such a step, as `values.logits_of_bytes` reads those bytes.
-_MOST_LOGIT = math.log(254.75 / 0.25)
-# The logarithm of a flat Gaussian's third scale: SuperSplat fills it in for 2D Gaussian Splatting,
-# whose files have no scale_2. A thousandth of a millimetre in metres.
+# For an opacity of exactly 1 or 0, which PlayCanvas' splat-transform makes of the bytes 255 and 0:
+# the middle of such a step, as `values.decode_opacities` decodes those bytes.
+_MAX_LOGIT = math.log(254.75 / 0.25)
+# The third log scale of a flat Gaussian, as SuperSplat sets it for files of 2D Gaussian Splatting,
+# which lack scale_2: a thousandth of a millimetre in metres.
 _FLAT = math.log(1e-6)
+MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
 
 logger = logging.getLogger("recon")
 
@@ -76,13 +77,8 @@ def _header(n: int, sh_degree: int) -> bytes:
     return "\n".join(lines).encode("ascii")
 
 
-def most_gaussians(size: int, sh_degree: int) -> int:
-    """Returns how many Gaussians fit into a .ply of `size` bytes; 0 where not even one does.
-
-    Args:
-        size: of the file.
-        sh_degree: of the Gaussians.
-    """
+def max_gaussians(size: int, sh_degree: int) -> int:
+    """Returns how many Gaussians of a degree fit into a .ply of `size` bytes."""
     each = 4 * len(_properties(sh_degree))
     count = max(0, (size - len(_header(0, sh_degree))) // each)
     while count and len(_header(count, sh_degree)) + each * count > size:  # the count has digits
@@ -93,10 +89,9 @@ def most_gaussians(size: int, sh_degree: int) -> int:
 def read_ply(path: Path) -> Splats:
     """Returns the Gaussians of a .ply as float32 tensors, in the file's order.
 
-    Those behind the last one that has a coefficient other than zero are of degree 0. ASCII and big
-    endian are read as well, numbers of any type, and elements besides the vertices passed over.
-    Infinite logits of opacities, scales of 0 and a third scale that is not there become finite, and
-    a warning counts them.
+    Those after the last one with a coefficient other than zero are of degree 0. Elements besides
+    the vertices are ignored. Infinite logits of opacities, scales of 0 and a missing third scale
+    become finite, and a warning counts them.
 
     Raises:
         FormatError: the file is missing, truncated, of another kind of .ply, or holds other values
@@ -113,7 +108,7 @@ def read_ply(path: Path) -> Splats:
     missing = [name for group in groups.values() for name in group if name not in names]
     if missing and missing != ["scale_2"]:
         raise FormatError(f"{path} lacks the properties {', '.join(missing)}: no Gaussians.")
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, which is refused
+    with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
         columns = {name: table[name].astype(np.float32)
                    for group in groups.values() for name in group if name not in missing}
     if missing:
@@ -123,24 +118,24 @@ def read_ply(path: Path) -> Splats:
     values = {key: np.stack([columns[name] for name in group], axis=1) if group
               else np.zeros((len(table), 0), np.float32) for key, group in groups.items()}
     by_channel = values["sh_rest"].reshape(len(table), 3, len(rest) // 3)
-    return as_splats(path, values | {
+    return splats_from_arrays(path, values | {
         "logit_opacities": values["logit_opacities"][:, 0],
         "sh_rest": by_channel.transpose(0, 2, 1)})
 
 
 def _make_finite(path: Path, columns: dict[str, NDArray[np.float32]]) -> None:
-    """Replaces the infinities that stand for opaque, invisible and flat, and says how many."""
+    """Replaces the infinities that mean opaque, invisible and flat, and logs how many."""
     logits = columns["opacity"]
     certain = np.isinf(logits)
-    logits[certain] = np.copysign(np.float32(_MOST_LOGIT), logits[certain])
+    logits[certain] = np.copysign(np.float32(_MAX_LOGIT), logits[certain])
     if certain.any():
         logger.warning("%s: %s opacities of exactly 0 or 1 are read as %.3f and %.3f", path.name,
                        f"{certain.sum():,}", 0.25 / 255, 254.75 / 255)
     flat = 0
     for name in _GROUPS["log_scales"]:
-        none = np.isneginf(columns[name])
-        columns[name][none] = _FLAT
-        flat += int(none.sum())
+        is_flat = np.isneginf(columns[name])
+        columns[name][is_flat] = _FLAT
+        flat += int(is_flat.sum())
     if flat:
         logger.warning("%s: %s scales of 0 are read as %g units", path.name, f"{flat:,}",
                        math.exp(_FLAT))
@@ -160,3 +155,28 @@ def _vertices(header: Header) -> NDArray[np.void]:
     if row is None:
         raise FormatError(f"{header.path} holds properties of a type that Gaussians do not have.")
     return tables["vertex"]
+
+
+def write_points(path: Path, splats: Splats, *, min_opacity: float = MIN_OPACITY) -> int:
+    """Writes the centres and plain colours of Gaussians, whole or not at all.
+
+    Args:
+        path: of the .ply.
+        splats: the scene; only those that are opaque enough are written.
+        min_opacity: in [0, 1].
+
+    Returns:
+        The number of points.
+
+    Raises:
+        InputError: no Gaussian is opaque enough, or a value is not finite.
+    """
+    table = to_arrays(splats, ".ply")
+    chosen = sigmoid(table["logit_opacities"]) >= min_opacity
+    if not chosen.any():
+        raise InputError(
+            f"None of {len(splats)} Gaussians has an opacity of {min_opacity:g} or more.",
+            hint="Ask for a lower one.")
+    colors = (SH_C0 * table["sh_dc"][chosen] + 0.5).clip(0, 1)
+    write_point_cloud(path, table["means"][chosen], np.rint(colors * 255).astype(np.uint8))
+    return int(chosen.sum())

@@ -1,4 +1,4 @@
-"""Points with colours from a .ply, ASCII or binary of either byte order; faces are passed over."""
+"""Tables of a .ply, ASCII or binary of either byte order, and point clouds in such files."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.workspace.atomic import write_bytes
 
-_HEADER_LIMIT = 1 << 16  # bytes; a header that does not end by then is none
+_HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
 _END = re.compile(rb"\nend_header[ \t]*\r?\n")
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -20,8 +21,11 @@ _TYPES = {
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_DIGITS = 15  # of a count; more rows than that fit on no disk
+_DIGITS = 15  # of a count; larger ones fit on no disk
 _OF_MESHES = ("face", "tristrips", "edge")
+_PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
+_POINT_ROW = np.dtype([(name, "<f4") for name in "xyz"]
+                + [(name, "u1") for name in ("red", "green", "blue")])
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What comes before the data: the format's name, the elements and where the data begin."""
+    """The header: name of the format, elements, and offset of the data."""
 
     path: Path
     format: str
@@ -81,10 +85,10 @@ def read_header(path: Path) -> Header:
 
 
 def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
-    """Returns what a line `element` and the lines `property` below it say."""
+    """Returns the element of a line `element` and the lines `property` below it."""
     head, *properties = lines
     if len(head) != 3 or not head[2].isdecimal() or len(head[2]) > _DIGITS:
-        raise FormatError(f"{path} has a line in its header that is none: {' '.join(head)[:80]}.")
+        raise FormatError(f"{path} has a malformed line in its header: {' '.join(head)[:80]}.")
     name, count = head[1], int(head[2])
     for line in properties:
         is_list = line[0] == "property" and line[1:2] == ["list"] and len(line) == 5
@@ -105,25 +109,25 @@ def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
 def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
     """Returns the rows of every element by its name.
 
-    No memory is taken for rows that the file is too small to hold.
+    No memory is allocated for rows that the file is too small to hold.
 
     Raises:
-        FormatError: the file is longer or shorter than its header says, or an element holds lists,
-            so that nobody knows where it ends: a mesh.
+        FormatError: the file is longer or shorter than its header says, or an element holds lists
+            of unknown length, as in a mesh.
     """
     for element in header.elements:
         if element.count and element.row is None:
-            what = "a mesh" if element.name in _OF_MESHES else "lists"
+            content = "a mesh" if element.name in _OF_MESHES else "lists"
             raise FormatError(
                 f"{header.path} holds other elements than vertices: {element.count} of "
-                f"{element.name}, which is {what}, not Gaussians.")
+                f"{element.name}, which is {content}, not Gaussians.")
     return _read(header, header.elements, exact=True)
 
 
 def read_first_table(header: Header) -> NDArray[np.void]:
     """Returns the rows of the first element, whatever follows.
 
-    No memory is taken for rows that the file is too small to hold.
+    No memory is allocated for rows that the file is too small to hold.
 
     Raises:
         FormatError: the file ends before, or the element holds lists.
@@ -143,7 +147,7 @@ def _read(
     try:
         with header.path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size - header.offset
-            if is_text:  # a number takes a digit and a space, which at the end may be missing
+            if is_text:  # a number takes a digit and a space, except at the end
                 fits = sum(2 * count * len(row.names or ()) for _, count, row in rows) <= size + 1
             else:
                 promised = sum(count * row.itemsize for _, count, row in rows)
@@ -165,9 +169,9 @@ def _read(
     return tables
 
 
-def _wrong_size(header: Header, promised: str, found: str) -> FormatError:
+def _wrong_size(header: Header, promised: str, actual: str) -> FormatError:
     return FormatError(
-        f"{header.path} promises {promised} but holds {found}: it is truncated or damaged.",
+        f"{header.path} promises {promised} but holds {actual}: it is truncated or damaged.",
         hint="Write or copy the file again.")
 
 
@@ -181,7 +185,7 @@ def _text_tables(
     tables, start = {}, 0
     for name, count, row in rows:
         try:
-            tables[name] = _parsed(lines[start:start + count], row)
+            tables[name] = _parse_rows(lines[start:start + count], row)
         except ValueError as error:
             raise FormatError(
                 f"{header.path} has rows of {name} that are not {len(row.names or ())} numbers: "
@@ -190,7 +194,7 @@ def _text_tables(
     return tables
 
 
-def _parsed(lines: list[str], row: np.dtype[np.void]) -> NDArray[np.void]:
+def _parse_rows(lines: list[str], row: np.dtype[np.void]) -> NDArray[np.void]:
     """Returns rows of numbers, or raises ValueError."""
     table = np.zeros(len(lines), row)
     if not lines:
@@ -206,9 +210,6 @@ def _parsed(lines: list[str], row: np.dtype[np.void]) -> NDArray[np.void]:
         with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
             table[name] = values
     return table
-
-
-_PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 
 def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
@@ -238,3 +239,20 @@ def _rows(header: Header) -> NDArray[np.void]:
     if not set(_PLACE) <= set(names):
         raise FormatError(f"{header.path} has points with the properties {', '.join(names)}.")
     return rows
+
+
+def write_point_cloud(
+    path: Path,
+    points: NDArray[np.floating],  # [P, 3]
+    colors: NDArray[np.uint8],  # [P, 3]
+) -> None:
+    """Writes points and their RGB colours, whole or not at all: float32 and uchar."""
+    rows = np.empty(len(points), _POINT_ROW)
+    for at, name in enumerate(("x", "y", "z")):
+        rows[name] = points[:, at]
+    for at, name in enumerate(("red", "green", "blue")):
+        rows[name] = colors[:, at]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
+             *(f"property float {name}" for name in "xyz"),
+             *(f"property uchar {name}" for name in ("red", "green", "blue")), "end_header", ""]
+    write_bytes(path, "\n".join(lines).encode("ascii") + rows.tobytes())

@@ -1,34 +1,140 @@
-"""What a data set knows beyond its images: poses in poses.json, points in points.safetensors."""
+"""Data sets with known cameras: what their readers return, and the files that they list.
+
+A reader lists images with lenses and poses (`ListedImage`); `find_images` keeps those whose file
+exists, each with a lens of its size, as a `PosedSet`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+import struct
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from PIL import Image
 
-from recon_cli.errors import FormatError
-from recon_cli.scene.camera import Lens
-from recon_cli.workspace import atomic
+from recon_cli.errors import FormatError, InputError
+from recon_cli.scene.camera import MODELS, Lens
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")
+_MAX_DEPTH = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """Reads the z-depth of an image from its file.
+
+    Depth of another size than the image is looked up at the nearest pixel along the same ray:
+    interpolation over an edge would give the depth of nothing. The rays are compared without
+    distortion.
+
+    Attributes:
+        path: the file.
+        unit: world units of a value of 1.
+        lens: intrinsics of the image.
+        own: intrinsics of the depth; None if it covers the same field of view.
+    """
+
+    path: Path
+    unit: float
+    lens: Lens
+    own: Lens | None = None
+
+    def __call__(self) -> NDArray[np.float32]:
+        """Returns [H, W] z-depth at the size of the image, in world units, 0 where unknown.
+
+        Raises:
+            FormatError: the file is missing, damaged or no depth.
+        """
+        values = _read_depth(self.path).astype(np.float64) * self.unit
+        depth = np.where((values > 0) & (values < _MAX_DEPTH), values, 0).astype(np.float32)
+        height, width = depth.shape
+        own = self.own if self.own is not None else self.lens.resized(width, height)
+        if (width, height) != (own.width, own.height):
+            own = own.resized(width, height)
+        if own == self.lens:
+            return depth
+        columns, inside_x = _nearest_pixels(self.lens, own, 0, self.lens.width, width)
+        rows, inside_y = _nearest_pixels(self.lens, own, 1, self.lens.height, height)
+        resampled: NDArray[np.float32] = depth[np.ix_(rows, columns)]
+        resampled[~(inside_y[:, None] & inside_x[None, :])] = 0
+        return resampled
+
+
+def _read_depth(path: Path) -> NDArray[np.generic]:
+    hint = "Copy the file again, or delete it to go without its depth."
+    if not path.is_file():
+        raise FormatError(f"{path} is missing.", hint=hint)
+    try:
+        if path.suffix.lower() == ".npy":
+            values = np.asarray(np.load(path, allow_pickle=False))
+        else:
+            # Not OpenCV, which returns the first rows of a damaged PNG as the whole.
+            with Image.open(path, formats=("PNG", "TIFF")) as image:
+                values = np.asarray(image)
+    except (OSError, ValueError, EOFError, SyntaxError, struct.error, zlib.error) as error:
+        raise FormatError(f"{path} cannot be read as depth: {error}.", hint=hint) from error
+    if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
+        raise FormatError(
+            f"{path} is no depth: it holds {values.dtype} of shape {values.shape}, needed one "
+            "value a pixel.", hint=hint)
+    return values
+
+
+def _nearest_pixels(
+    image: Lens, own: Lens, axis: int, size: int, own_size: int
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Returns the pixel of the depth that each pixel of the image falls in, and whether any."""
+    focal, center = _axis(image, axis)
+    own_focal, own_center = _axis(own, axis)
+    rays = (np.arange(size) + 0.5 - center) / focal
+    # The tiny offset decides exact halves, which rounding would otherwise do.
+    at = np.floor(rays * own_focal + own_center + 1e-6).astype(np.intp)
+    return at.clip(0, own_size - 1), (at >= 0) & (at < own_size)
+
+
+def _axis(lens: Lens, axis: int) -> tuple[float, float]:
+    """Returns focal length and principal point along x or y."""
+    focals, _ = MODELS[lens.model]
+    return lens.params[axis if focals == 2 else 0], lens.params[focals + axis]
+
+
+@dataclass(frozen=True, eq=False)
+class ListedImage:
+    """An image as a data set lists it, whether or not its file exists.
+
+    Attributes:
+        name: unique within the set.
+        path: where its file should be.
+        lens: intrinsics as the data set gives them, whatever the size of the file.
+        viewmat: [4, 4] float64 world to camera, OpenCV axes.
+        held_out: the data set itself holds it out for the score.
+        depth: reads its depth, None without depth.
+        mask: file of a mask, None without mask.
+    """
+
+    name: str
+    path: Path
+    lens: Lens
+    viewmat: NDArray[np.float64]
+    held_out: bool = False
+    depth: DepthFile | None = None
+    mask: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One image whose camera is known.
+    """An image whose camera is known; the fields are those of `ListedImage`.
 
     Attributes:
-        name: unique within the set, as the data set names it.
-        path: its file.
-        lens: index into the lenses of the set.
-        viewmat: [4, 4] float64 world to camera, OpenCV axes.
-        held_out: the data set itself keeps it for the score.
-        depth: reads z-depth, [H, W] float32 in world units, 0 where there is none; None where the
-            image has no depth.
-        mask: file of a mask, None where there is none.
+        lens: index into the lenses of the set, which are of the size of the files.
+        depth: reads z-depth, [H, W] float32 in world units, 0 where unknown.
     """
 
     name: str
@@ -36,7 +142,7 @@ class PosedImage:
     lens: int
     viewmat: NDArray[np.float64]
     held_out: bool = False
-    depth: Callable[[], NDArray[np.float32]] | None = None
+    depth: DepthFile | None = None
     mask: Path | None = None
 
 
@@ -45,14 +151,14 @@ class PosedSet:
     """A data set with poses.
 
     Attributes:
-        layout: what it was taken for: "colmap", "transforms", "replica" or "scannet".
+        layout: "colmap", "transforms", "replica" or "scannet".
         lenses: intrinsics at the full size of the images.
         images: in the order of the data set.
-        missing: images that it lists, but whose files are gone.
+        missing: names of images that it lists, but whose files do not exist.
         metric: its unit is the metre.
         sequence: its images are frames of one walk, in order.
         splits: it says itself which images are held out.
-        points: [P, 3] float64 sparse points in its world, None where it has none.
+        points: [P, 3] float64 sparse points in its world, None if it has none.
         colors: [P, 3] uint8 their RGB colours, None with them.
         notices: what the user should know about how it was read.
     """
@@ -69,51 +175,123 @@ class PosedSet:
     notices: tuple[str, ...] = ()
 
 
-POSES, POINTS = "poses.json", "points.safetensors"
-_AGAIN = "Run `recon ingest --again`."
+def find_images(
+    layout: str, listed: Sequence[ListedImage], where: Path, *, missing: Sequence[str] = ()
+) -> PosedSet:
+    """Returns the images whose files exist, with lenses scaled to the size of the files.
 
+    Sizes are those of the pixels in the file: EXIF orientation is not applied, as COLMAP does not.
 
-@dataclass(frozen=True, eq=False)
-class KnownPoses:
-    """Poses that came with a data set.
-
-    Attributes:
-        viewmats: [4, 4] float64 world to camera by frame name; OpenCV axes.
-        metric: the world's unit is the metre.
-        points: [P, 3] float64 initial points in the same world, None where there are none.
-        colors: [P, 3] uint8 their RGB colours, None with them.
-    """
-
-    viewmats: Mapping[str, NDArray[np.float64]]
-    metric: bool
-    points: NDArray[np.float64] | None = None
-    colors: NDArray[np.uint8] | None = None
-
-    def write(self, stage: Path) -> None:
-        """Writes both files into ingest's folder."""
-        atomic.write_json(stage / POSES, {
-            "metric": self.metric, "points": self.points is not None,
-            "viewmats": {name: matrix.tolist() for name, matrix in self.viewmats.items()}})
-        if self.points is not None and self.colors is not None:
-            with atomic.replacing(stage / POINTS) as temporary:
-                save_file({"points": np.ascontiguousarray(self.points),
-                           "colors": np.ascontiguousarray(self.colors)}, temporary)
-
-
-def read_poses(path: Path) -> KnownPoses:
-    """Returns what `KnownPoses.write` wrote; `path` is that of poses.json.
+    Args:
+        layout: of the data set.
+        listed: in its order.
+        where: its folder, for messages.
+        missing: names of further images that it lists, known to be missing.
 
     Raises:
-        FormatError: a file is missing or not what was written.
+        FormatError: two images have one name, or one is of another size than its lens without all
+            others being so by the same factor.
+        InputError: no image exists.
     """
-    value = atomic.read_json(path)
+    names = [*(item.name for item in listed), *missing]
+    if duplicates := [name for name, count in Counter(names).items() if count > 1]:
+        raise FormatError(
+            f"{where} lists {len(duplicates)} images more than once, the first is "
+            f"{duplicates[0]}.", hint="Leave one pose for each image.")
+    existing = [item for item in listed if is_file(item.path)]
+    if not existing:
+        first = f" The first is {names[0]}." if names else ""
+        raise InputError(
+            f"{where} lists {len(names)} images, but none of their files is there.{first}",
+            hint="Put the images where the data set says, or give the folder that holds both.")
+    missing = (*(item.name for item in listed if not is_file(item.path)), *missing)
+    sizes = [image_size(item.path) for item in existing]
+    factor = _check_sizes(existing, sizes)
+    lenses: dict[Lens, int] = {}
+    images = []
+    for item, size in zip(existing, sizes, strict=True):
+        lens = item.lens if size == (item.lens.width, item.lens.height) else (
+            item.lens.resized(*size))
+        images.append(PosedImage(
+            item.name, item.path, lenses.setdefault(lens, len(lenses)), item.viewmat,
+            item.held_out, item.depth and replace(item.depth, lens=lens), item.mask))
+    notices = []
+    if missing:
+        notices.append(f"{len(missing)} of the {len(names)} images that it lists are missing, "
+                       f"the first is {missing[0]}")
+    if factor != 1:
+        notices.append(f"its images are {factor:.4g} times as large as its cameras say, so the "
+                       "intrinsics were scaled")
+    return PosedSet(layout, tuple(lenses), tuple(images), missing, notices=tuple(notices))
+
+
+def _check_sizes(items: Sequence[ListedImage], sizes: Sequence[tuple[int, int]]) -> float:
+    """Returns by which factor the files are larger than their lenses."""
+    factor = float(np.median([
+        width / item.lens.width for item, (width, _) in zip(items, sizes, strict=True)]))
+    slack = 0 if factor == 1 else 1  # pixels; sizes of reduced images are rounded
+    for item, (width, height) in zip(items, sizes, strict=True):
+        off = max(abs(width - factor * item.lens.width), abs(height - factor * item.lens.height))
+        if off > slack:
+            raise FormatError(
+                f"{item.path} is {width}x{height} pixels, but its camera "
+                f"{item.lens.width}x{item.lens.height}; most images are {factor:.4g} times as "
+                "wide as their cameras, which is no common factor.",
+                hint="Use the images that the poses were made for, all of them or all reduced "
+                "by one factor; the size is that of the file, before any EXIF rotation.")
+    return factor
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Returns (width, height) of an image from its header.
+
+    Raises:
+        FormatError: the file is no image.
+    """
     try:
-        viewmats = {
-            name: np.array(matrix, np.float64).reshape(4, 4)
-            for name, matrix in value["viewmats"].items()}
-        if not value["points"]:
-            return KnownPoses(viewmats, bool(value["metric"]))
-        tensors = load_file(path.with_name(POINTS))
-        return KnownPoses(viewmats, bool(value["metric"]), tensors["points"], tensors["colors"])
-    except (AttributeError, KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
-        raise FormatError(f"{path} holds no poses.", hint=_AGAIN) from error
+        with warnings.catch_warnings():
+            # Pillow warns from 89 megapixels and refuses from twice that.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=_FORMATS) as image:
+                return image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FormatError(
+            f"{path} cannot be read as an image.", hint="Copy the image again.") from error
+
+
+def is_file(path: Path) -> bool:
+    """Returns whether a path from a file's text is a file; a name that is too long is none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def resolve_inside(folder: Path, name: object, where: str) -> Path:
+    """Returns folder/name for a relative name that stays in the folder.
+
+    A data set may come from anywhere, so it may not name files elsewhere on the disk, not even
+    images. Links below the folder are its owner's and are followed.
+
+    Args:
+        folder: the folder of the data set.
+        name: a path as the data set writes it, with either kind of slash.
+        where: the entry, for messages.
+
+    Raises:
+        FormatError: the name is no text, absolute, or leads out of the folder.
+    """
+    if not isinstance(name, str) or not name.strip() or "\0" in name:
+        raise FormatError(f"{where} has no file name.")
+    path = PurePosixPath(name if is_file(folder / name) else name.replace("\\", "/"))
+    depth = 0
+    for part in path.parts:
+        depth += -1 if part == ".." else 1
+        if depth < 0:
+            break
+    drive = len(path.parts[0]) == 2 and path.parts[0][1] == ":" if path.parts else False
+    if path.is_absolute() or drive or depth < 0:
+        raise FormatError(
+            f"{where} names {name}, which lies outside {folder}.",
+            hint="Put the files below that folder and name them relative to it.")
+    return folder / path

@@ -1,16 +1,16 @@
 """Replica sequences in the layout of NICE-SLAM.
 
 results/frame%06d.jpg (or .png), results/depth%06d.png, traj.txt with one camera-to-world matrix
-a frame (OpenCV axes, metres), and cam_params.json beside it or one level up, where all rooms share
-it.
-The numbers in the names count, not the order: depth may be there for some frames only. A folder
-test/ of the same layout holds novel views, which are kept for the score.
+a frame (OpenCV axes, metres), and cam_params.json beside it or one level up, shared by all rooms.
+Frames are matched by number, not by order: some may lack depth. A folder test/ of the same layout
+holds novel views, which are held out for the score.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.calibration import checked_lens, viewmat_from_pose
-from recon_cli.io.depth_points import DepthFile
-from recon_cli.io.listed import Listed, find_images
-from recon_cli.io.posed import PosedSet
+from recon_cli.io.calibration import make_lens, viewmat_from_pose
+from recon_cli.io.posed import DepthFile, ListedImage, PosedSet, find_images
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace.atomic import read_json
 
@@ -56,10 +54,8 @@ def read_replica(folder: Path) -> PosedSet:
     splits = (folder / "test" / "results").is_dir()
     if splits:
         listed += _list_sequence(folder / "test", lens, scale, held_out=True)
-    found = find_images(listed, folder)
-    return PosedSet(
-        "replica", found.lenses, found.images, found.missing, metric=True, sequence=True,
-        splits=splits, notices=found.notices)
+    return replace(
+        find_images("replica", listed, folder), metric=True, sequence=True, splits=splits)
 
 
 def _read_params(folder: Path) -> tuple[Lens, float]:
@@ -82,13 +78,13 @@ def _read_params(folder: Path) -> tuple[Lens, float]:
         ) from error
     if not (math.isfinite(scale) and scale > 0):
         raise FormatError(f"{path} has the depth scale {scale:g}; needed is one above 0.")
-    lens = checked_lens("PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5), str(path))
+    lens = make_lens("PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5), str(path))
     return lens, scale
 
 
 def _list_sequence(
     folder: Path, lens: Lens, scale: float, *, held_out: bool = False
-) -> list[Listed]:
+) -> list[ListedImage]:
     """Returns the frames of one results/ folder by number."""
     files = {}
     for path in (folder / "results").iterdir():
@@ -104,7 +100,7 @@ def _list_sequence(
         path = files.get(number, folder / "results" / f"frame{number:0{digits}d}{suffix}")
         viewmat = viewmat_from_pose(rows[number], f"{folder / _TRAJ}, line {number + 1},")
         depth = path.with_name(path.stem.replace("frame", "depth") + ".png")
-        listed.append(Listed(
+        listed.append(ListedImage(
             prefix + path.name, path, lens, viewmat, held_out,
             DepthFile(depth, 1 / scale, lens) if depth.is_file() else None))
     return listed
@@ -137,7 +133,7 @@ def _read_rows(path: Path) -> list[NDArray[np.float64]]:
         try:
             row = np.array(line.split(), np.float64)
         except ValueError as error:
-            raise FormatError(f"{path}, line {at}, holds something else than numbers.") from error
+            raise FormatError(f"{path}, line {at}, holds something other than numbers.") from error
         if row.size != 16:
             raise FormatError(
                 f"{path}, line {at}, has {row.size} numbers, needed 16 of a 4x4 pose.")

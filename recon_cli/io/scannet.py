@@ -7,6 +7,7 @@ ScanNet unprojects whole pixel indices (sensorData.h), so its pixel centres lie 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import lens_from_matrix, viewmat_from_pose
-from recon_cli.io.depth_points import DepthFile
-from recon_cli.io.listed import Listed, find_images, image_size
-from recon_cli.io.posed import PosedSet
+from recon_cli.io.posed import DepthFile, ListedImage, PosedSet, find_images, image_size
 from recon_cli.scene.camera import Lens
 
 _MILLIMETRE = 1e-3  # ScanNet's depth shift is 1000
@@ -35,14 +34,14 @@ def read_scannet(folder: Path) -> PosedSet:
         InputError: no frame has an image and a pose.
         FormatError: a pose or the intrinsics are missing or damaged.
     """
-    colors = _numbered(folder / "color", _COLORS)
-    poses = _numbered(folder / "pose", (".txt",))
+    colors = _list_numbered(folder / "color", _COLORS)
+    poses = _list_numbered(folder / "pose", (".txt",))
     if not colors or not poses:
         raise InputError(
             f"{folder} has {len(colors)} images in color/ and {len(poses)} poses in pose/.",
             hint="Export both with ScanNet's SensReader.")
     lens = _read_lens(folder, "color", image_size(next(iter(colors.values()))))
-    depths = _numbered(folder / "depth", (".png",))
+    depths = _list_numbered(folder / "depth", (".png",))
     own = _read_lens(folder, "depth", image_size(next(iter(depths.values())))) if depths else None
     listed, lost = [], 0
     for number, path in colors.items():
@@ -51,19 +50,17 @@ def read_scannet(folder: Path) -> PosedSet:
             lost += 1
             continue
         depth = (DepthFile(depths[number], _MILLIMETRE, lens, own) if number in depths else None)
-        listed.append(Listed(path.name, path, lens, viewmat, depth=depth))
+        listed.append(ListedImage(path.name, path, lens, viewmat, depth=depth))
     if not listed:
         raise InputError(
             f"{folder} has no frame with a pose: tracking was lost in all {len(colors)}.",
             hint="Give the photos alone (color/), so that `recon` finds the poses itself.")
-    found = find_images(listed, folder)
-    notices = (f"{lost} frames have no pose, for tracking was lost, and are left out",) * bool(lost)
-    return PosedSet(
-        "scannet", found.lenses, found.images, metric=True, sequence=True,
-        notices=notices + found.notices)
+    posed = find_images("scannet", listed, folder)
+    notices = (f"{lost} frames whose tracking was lost have no pose and are left out",) * bool(lost)
+    return replace(posed, metric=True, sequence=True, notices=notices + posed.notices)
 
 
-def _numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+def _list_numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Returns the files that are named by a number, in its order."""
     if not folder.is_dir():
         return {}
@@ -105,7 +102,7 @@ def _read_numbers(path: Path) -> NDArray[np.float64]:
     try:
         values = np.array(words, np.float64)
     except ValueError as error:
-        raise FormatError(f"{path} holds something else than numbers.") from error
+        raise FormatError(f"{path} holds something other than numbers.") from error
     if values.size not in (9, 16):
         raise FormatError(f"{path} has {values.size} numbers, needed the 16 of a 4x4 matrix.")
     side = 3 if values.size == 9 else 4

@@ -1,29 +1,38 @@
 """transforms.json of nerfstudio and instant-ngp; transforms_train/val/test.json of NeRF's scenes.
 
-Camera-to-world matrices with OpenGL axes become world to camera with OpenCV axes; the world stays
-as it is. nerfstudio's applied_transform was applied to poses and points alike and is not undone.
+Poses are camera to world with OpenGL axes (x right, y up, looking along -z), converted from and to
+world to camera with OpenCV axes; the world stays as it is. Intrinsics are in pixels with the centre
+of the first one at 0.5. nerfstudio's applied_transform was applied to poses and points alike and is
+not undone.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError
-from recon_cli.io.calibration import checked_lens, viewmat_from_pose
-from recon_cli.io.depth_points import DepthFile
-from recon_cli.io.listed import SUFFIXES, Listed, find_images, image_size, inside, is_file
+from recon_cli.errors import FormatError, InputError
+from recon_cli.io.calibration import make_lens, viewmat_from_pose
 from recon_cli.io.ply_table import read_ply_points
-from recon_cli.io.posed import PosedSet
-from recon_cli.scene.camera import Lens
-from recon_cli.workspace.atomic import read_json
+from recon_cli.io.posed import (
+    SUFFIXES,
+    DepthFile,
+    ListedImage,
+    PosedSet,
+    find_images,
+    image_size,
+    is_file,
+    resolve_inside,
+)
+from recon_cli.scene.camera import Camera, Lens
+from recon_cli.workspace.atomic import read_json, write_json
 
 _FISHEYE = ("OPENCV_FISHEYE",)
 # They share one meaning of k1, k2, p1, p2, and leave at zero what they do not have.
@@ -31,8 +40,12 @@ _PERSPECTIVE = (
     "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV",
 )
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # COLMAP's order in FULL_OPENCV
-
 _LARGEST = sys.float_info.max
+_OPENGL = np.diag([1.0, -1, -1, 1])  # from OpenGL's camera axes to OpenCV's
+_FILE = "transforms.json"
+_PARTS = ("train", "val", "test")
+_DEPTH_UNIT = 1e-3  # nerfstudio's default: depth in millimetres
+_HINT = "Export it again from the program that it came from."
 
 
 def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
@@ -46,29 +59,29 @@ def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Le
     Raises:
         FormatError: no focal length is given, the camera model is unknown, or a number is not one.
     """
-    width = number(entry, "w", where) or float(size[0])
-    height = number(entry, "h", where) or float(size[1])
+    width = read_number(entry, "w", where) or float(size[0])
+    height = read_number(entry, "h", where) or float(size[1])
     fx = _focal(entry, "x", width, where)
     fy = _focal(entry, "y", height, where)
     if fx is None and fy is None:
         raise FormatError(
             f"{where} has no focal length: neither fl_x nor camera_angle_x.",
             hint="Add fl_x, fl_y, cx, cy, w and h in pixels.")
-    cx, cy = number(entry, "cx", where), number(entry, "cy", where)
+    cx, cy = read_number(entry, "cx", where), read_number(entry, "cy", where)
     inner = (
         fx if fx is not None else fy, fy if fy is not None else fx,
         width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     model, coefficients = _distortion(entry, where)
     params = [value for value in (*inner, *coefficients) if value is not None]
-    return checked_lens(model, width, height, params, where)
+    return make_lens(model, width, height, params, where)
 
 
 def _focal(entry: Mapping[str, Any], axis: str, side: float, where: str) -> float | None:
     """Returns the focal length along an axis, given as such or as the angle of view."""
-    focal = number(entry, f"fl_{axis}", where)
+    focal = read_number(entry, f"fl_{axis}", where)
     if focal is not None:
         return focal
-    angle = number(entry, f"camera_angle_{axis}", where)
+    angle = read_number(entry, f"camera_angle_{axis}", where)
     if angle is None:
         return None
     if not 0 < angle < math.pi:
@@ -80,7 +93,7 @@ def _focal(entry: Mapping[str, Any], axis: str, side: float, where: str) -> floa
 def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float, ...]]:
     """Returns the camera model and its distortion coefficients."""
     named = entry.get("camera_model", "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV")
-    values = {key: number(entry, key, where) or 0.0 for key in _COEFFICIENTS}
+    values = {key: read_number(entry, key, where) or 0.0 for key in _COEFFICIENTS}
     if named in _FISHEYE:
         if values["p1"] or values["p2"]:
             raise FormatError(f"{where}: {named} has no tangential distortion p1, p2.")
@@ -102,7 +115,7 @@ def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float,
     return "OPENCV", tuple(values[key] for key in ("k1", "k2", "p1", "p2"))
 
 
-def number(entry: Mapping[str, Any], key: str, where: str) -> float | None:
+def read_number(entry: Mapping[str, Any], key: str, where: str) -> float | None:
     """Returns the number under a key, None where there is none.
 
     Raises:
@@ -117,15 +130,9 @@ def number(entry: Mapping[str, Any], key: str, where: str) -> float | None:
     return float(value)
 
 
-_FILE = "transforms.json"
-_PARTS = ("train", "val", "test")
-_DEPTH_UNIT = 1e-3  # nerfstudio's default: depth in millimetres
-_HINT = "Export it again from the program that it came from."
-
-
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """One entry of a file. `part` is train, val, test, "" for none of them, or None if not said."""
+    """One entry of a file; `part` is train, val, test, "" for none of them, or None if unknown."""
 
     entry: Mapping[str, Any]
     where: str
@@ -149,8 +156,8 @@ def is_transforms(path: Path) -> bool:
 def read_transforms(path: Path) -> PosedSet:
     """Returns the frames of a transforms.json, or of transforms_train/val/test.json.
 
-    Where the set names test views, these are held out and its validation views are left out, as the
-    literature scores it; where it names validation views alone, those are held out.
+    If the set names test views, these are held out and its validation views are left out, as the
+    literature scores it; if it names validation views alone, those are held out.
 
     Raises:
         InputError: no image is there.
@@ -159,21 +166,25 @@ def read_transforms(path: Path) -> PosedSet:
     frames: list[_Frame] = []
     for file, part in _files(path):
         frames += _read_frames(file, part)
-    frames, doubled = _without_copies(frames)
-    parts = {frame.part for frame in frames}
-    held_out = "test" if "test" in parts else "val"
-    kept = [frame for frame in frames if frame.part in (None, "train", held_out)]
-    names = _short_names(kept)
-    listed = [_list_frame(frame, name, held_out) for frame, name in zip(kept, names, strict=True)
-              if is_file(frame.path)]
-    gone = [name for frame, name in zip(kept, names, strict=True) if not is_file(frame.path)]
-    found = find_images(listed, path, gone=gone)
-    points, colors, said = _read_points(path if path.is_file() else path / _FILE)
-    metric = any(image.depth is not None for image in found.images)
-    return PosedSet(
-        "transforms", found.lenses, found.images, found.missing, metric=metric,
-        splits=any(image.held_out for image in found.images), points=points, colors=colors,
-        notices=(*doubled, *_left_out(frames, kept), *found.notices, *said))
+    frames, notices = _drop_duplicates(frames)
+    held_out = "test" if "test" in {frame.part for frame in frames} else "val"
+    used = [frame for frame in frames if frame.part in (None, "train", held_out)]
+    left_out = len(frames) - len(used)
+    if left_out:
+        notices.append(f"{left_out} frames are left out: the set keeps them for validation, or "
+                       "lists them in no part")
+    listed, missing = [], []
+    for frame, name in zip(used, _short_names(used), strict=True):
+        if is_file(frame.path):
+            listed.append(_list_frame(frame, name, held_out))
+        else:
+            missing.append(name)
+    posed = find_images("transforms", listed, path, missing=missing)
+    points, colors, point_notices = _read_points(path if path.is_file() else path / _FILE)
+    return replace(
+        posed, metric=any(image.depth is not None for image in posed.images),
+        splits=any(image.held_out for image in posed.images), points=points, colors=colors,
+        notices=(*notices, *posed.notices, *point_notices))
 
 
 def _files(path: Path) -> list[tuple[Path, str | None]]:
@@ -191,17 +202,17 @@ def _read_frames(file: Path, part: str | None) -> list[_Frame]:
     entries = value.get("frames") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{file} lists no frames.", hint=_HINT)
-    shared = {key: item for key, item in value.items() if key != "frames"}
-    parts = _read_parts(shared, file)
+    common = {key: item for key, item in value.items() if key != "frames"}
+    parts = _read_parts(common, file)
     frames = []
     for at, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise FormatError(f"{file}, frame {at}, is no entry with names.", hint=_HINT)
         text = entry.get("file_path")
-        path = _with_suffix(inside(file.parent, text, f"{file}, frame {at},"))
+        path = _with_suffix(resolve_inside(file.parent, text, f"{file}, frame {at},"))
         own = part if parts is None else parts.get(_plain(text), "")
         frames.append(_Frame(
-            {**shared, **entry}, f"{file}, frame {text},", file.parent, path, own))
+            {**common, **entry}, f"{file}, frame {text},", file.parent, path, own))
     return frames
 
 
@@ -237,12 +248,12 @@ def _with_suffix(path: Path) -> Path:
     return next((file for file in named if is_file(file)), path)
 
 
-def _without_copies(frames: Sequence[_Frame]) -> tuple[list[_Frame], tuple[str, ...]]:
-    """Returns the frames without those said twice with one pose, and a notice about them."""
-    kept: dict[Path, _Frame] = {}
+def _drop_duplicates(frames: Sequence[_Frame]) -> tuple[list[_Frame], list[str]]:
+    """Returns the frames without those listed twice with the same pose, and a notice."""
+    unique: dict[Path, _Frame] = {}
     copies = []
     for frame in frames:
-        first = kept.setdefault(frame.path, frame)
+        first = unique.setdefault(frame.path, frame)
         if first is frame:
             continue
         if first.entry.get("transform_matrix") != frame.entry.get("transform_matrix"):
@@ -251,11 +262,11 @@ def _without_copies(frames: Sequence[_Frame]) -> tuple[list[_Frame], tuple[str, 
                 hint="Leave one pose for each image.")
         copies.append(frame.listed)
         if _rank(frame.part) > _rank(first.part):
-            kept[frame.path] = frame
-    if not copies:
-        return list(kept.values()), ()
-    return list(kept.values()), (
-        f"{len(copies)} images are listed more than once, the first is {copies[0]}",)
+            unique[frame.path] = frame
+    notices = []
+    if copies:
+        notices.append(f"{len(copies)} images are listed more than once, the first is {copies[0]}")
+    return list(unique.values()), notices
 
 
 def _rank(part: str | None) -> int:
@@ -273,12 +284,12 @@ def _short_names(frames: Sequence[_Frame]) -> list[str]:
     return ["/".join(path[shared:]) for path in parts]
 
 
-def _list_frame(frame: _Frame, name: str, held_out: str) -> Listed:
+def _list_frame(frame: _Frame, name: str, held_out: str) -> ListedImage:
     viewmat = viewmat_from_pose(
         frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
     depth, unit = _beside(frame, "depth_file_path"), _unit(frame)
-    return Listed(
+    return ListedImage(
         name, frame.path, lens, viewmat, frame.part == held_out,
         None if depth is None else DepthFile(depth, unit, lens),
         _beside(frame, "mask_path"))
@@ -292,7 +303,7 @@ def _beside(frame: _Frame, key: str) -> Path | None:
     """
     if frame.entry.get(key) is None:
         return None
-    path = inside(frame.folder, frame.entry[key], f"{frame.where} {key}")
+    path = resolve_inside(frame.folder, frame.entry[key], f"{frame.where} {key}")
     if not is_file(path):
         raise FormatError(
             f"{frame.where} names the {key} {path}, which is missing.",
@@ -301,7 +312,7 @@ def _beside(frame: _Frame, key: str) -> Path | None:
 
 
 def _unit(frame: _Frame) -> float:
-    unit = number(frame.entry, "depth_unit_scale_factor", frame.where)
+    unit = read_number(frame.entry, "depth_unit_scale_factor", frame.where)
     if unit is not None and unit <= 0:
         raise FormatError(
             f"{frame.where} has depth_unit_scale_factor = {unit:g}; needed is one above 0.",
@@ -309,25 +320,79 @@ def _unit(frame: _Frame) -> float:
     return _DEPTH_UNIT if unit is None else unit
 
 
-def _left_out(frames: Sequence[_Frame], kept: Sequence[_Frame]) -> tuple[str, ...]:
-    rest = len(frames) - len(kept)
-    return (f"{rest} frames are left out: the set keeps them for validation, or lists them in no "
-            "part",) * bool(rest)
-
-
 def _read_points(
     file: Path,
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None, tuple[str, ...]]:
-    """Returns nerfstudio's sparse points and their colours, and what to say about them."""
+    """Returns nerfstudio's sparse points and their colours, and notices."""
     if not file.is_file():
         return None, None, ()
     name = read_json(file).get("ply_file_path")
     if name is None:
         return None, None, ()
-    path = inside(file.parent, name, f"{file}, ply_file_path,")
+    path = resolve_inside(file.parent, name, f"{file}, ply_file_path,")
     if not is_file(path):
         return None, None, (f"its points {name} are missing",)
     points, colors = read_ply_points(path)
     if colors is None:
         return points, np.full(points.shape, 128, np.uint8), (f"its points {name} have no colours",)
     return points, colors, ()
+
+
+def write_transforms(
+    path: Path,
+    views: Sequence[tuple[str, Camera]],
+    *,
+    held_out: Collection[str] = (),
+    points: str | None = None,
+) -> None:
+    """Writes the cameras of images, whole or not at all.
+
+    Intrinsics that all cameras share are written once. With held-out images the lists
+    train_filenames, val_filenames and test_filenames are written; the last two are those images,
+    because nerfstudio requires both.
+
+    Args:
+        path: of the transforms.json.
+        views: path of each image below the folder of `path`, with slashes, and its camera.
+        held_out: those of the image paths that are not to be trained on.
+        points: path of a .ply of sparse points below that folder; None where there is none.
+
+    Raises:
+        InputError: there are no views.
+        ValueError: a path leaves the folder, appears twice, or is held out but no view.
+    """
+    if not views:
+        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+    names = [name for name, _ in views]
+    for name in (*names, *([points] if points else ())):
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise ValueError(f"{name} is no path below the folder of {path}")
+    if len(set(names)) < len(names) or not set(held_out) <= set(names):
+        raise ValueError("duplicate views, or held-out ones that do not exist")
+    inner = [_intrinsics(camera) for _, camera in views]
+    shared = all(intrinsics == inner[0] for intrinsics in inner)
+    value: dict[str, Any] = {"camera_model": "PINHOLE", **(inner[0] if shared else {})}
+    if points:
+        value["ply_file_path"] = points
+    if held_out:
+        test = [name for name in names if name in held_out]
+        value |= {"train_filenames": [name for name in names if name not in held_out],
+                  "val_filenames": test, "test_filenames": test}
+    value["frames"] = [
+        {"file_path": name, **({} if shared else intrinsics), "transform_matrix": _pose(camera)}
+        for (name, camera), intrinsics in zip(views, inner, strict=True)]
+    write_json(path, value)
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    return {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
+            "w": camera.width, "h": camera.height}
+
+
+def _pose(camera: Camera) -> list[list[float]]:
+    """Returns camera to world with OpenGL axes, [4, 4]."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera.viewmat[:3, :3].T
+    pose[:3, 3] = camera.center
+    rows: list[list[float]] = (pose @ _OPENGL).tolist()
+    return rows

@@ -12,7 +12,8 @@ from markupsafe import Markup
 from recon_cli.config.stages import TrainConfig
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap import read_scene
-from recon_cli.io.frames import FOLDER, Frame, fitted, read_frame_list, read_png
+from recon_cli.io.frames import FOLDER, Frame, read_frame_list
+from recon_cli.io.images import fit_image, read_png
 from recon_cli.report import floor_plan
 from recon_cli.report.chart import draw_mark, legend_item
 from recon_cli.report.gallery import data_uri, encode_sheet
@@ -70,7 +71,7 @@ def read_capture(stages: Statuses) -> Capture:
 def _read_thumbs(folder: Path, frames: Sequence[Frame]) -> list[tuple[str, Markup]]:
     some = frames[:: max(1, -(-len(frames) // _THUMBS))]
     return [(frame.name, data_uri(
-        fitted(read_png(folder / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY))
+        fit_image(read_png(folder / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY))
         for frame in some]
 
 

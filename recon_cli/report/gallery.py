@@ -17,7 +17,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.frames import fitted, fitted_size, read_png
+from recon_cli.io.images import fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.report.records import Metrics, ViewRow
 
@@ -193,10 +193,11 @@ def _encode_view(
     name: str, scores: _ViewScores, pixels: _ViewPixels, encoding: Encoding
 ) -> GalleryView:
     longest, quality = encoding.longest, encoding.quality
-    truth = fitted(pixels.truth, longest)
+    truth = fit_image(pixels.truth, longest)
     return GalleryView(
         name, truth.shape[1], truth.shape[0], data_uri(truth, quality),
-        {key: data_uri(fitted(image, longest), quality) for key, image in pixels.renders.items()},
+        {key: data_uri(fit_image(image, longest), quality)
+         for key, image in pixels.renders.items()},
         {key: data_uri(draw_difference(pixels.truth, image, pixels.hidden, longest), quality)
          for key, image in pixels.renders.items()},
         scores, pixels.hidden is not None)
@@ -214,7 +215,7 @@ def data_uri(image: NDArray[np.uint8], quality: int) -> Markup:
 def encode_sheet(image: NDArray[np.uint8]) -> Markup:
     """Returns a contact sheet as large as its share of the file allows."""
     for encoding in (_SHEET, *ENCODINGS):
-        uri = data_uri(fitted(image, encoding.longest), encoding.quality)
+        uri = data_uri(fit_image(image, encoding.longest), encoding.quality)
         if len(uri) <= _SHEET_BYTES:
             break
     return uri
@@ -238,7 +239,7 @@ def draw_difference(
     difference = cv2.absdiff(truth, render)
     # channel by channel: a mean over the last axis takes six times as long
     error = (difference[..., 0].astype(np.float32) + difference[..., 1] + difference[..., 2]) / 3
-    size = fitted_size(error.shape[1], error.shape[0], longest)
+    size = fit_size(error.shape[1], error.shape[0], longest)
     if size != error.shape[::-1]:
         error = cv2.resize(error, size, interpolation=cv2.INTER_AREA)
     colors = apply_colormap(np.rint(error * GAIN).clip(0, 255).astype(np.uint8))

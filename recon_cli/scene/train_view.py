@@ -23,7 +23,7 @@ class TrainView:
     Attributes:
         camera: at the size of the image.
         image: [H, W, 3] uint8; a fourth of the memory of float32. Under the mask it holds one
-            colour that stands for nothing (`io.images.painted`).
+            colour that stands for nothing (`io.images.fill_masked`).
         mask: [H, W], True where a pixel counts; None where all do.
     """
 

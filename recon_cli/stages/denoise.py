@@ -17,6 +17,7 @@ from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io import frames as store
+from recon_cli.io.images import read_png, write_png
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import DenoiseSummary
 
@@ -44,7 +45,7 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
     """
     ingest = inputs.folders["ingest"]
     names = [frame.name for frame in store.read_frame_list(ingest).frames]
-    outcomes = _process(config, names, ingest / store.FOLDER, store.prepare(out), ctx)
+    outcomes = _process(config, names, ingest / store.FOLDER, store.prepare_frames_folder(out), ctx)
     atomic.write_json(out / NOISE, {
         outcome.name: {"sigma_255": outcome.sigma, "denoised": outcome.filtered}
         for outcome in outcomes
@@ -77,14 +78,14 @@ def _process(
 
 def _frame(config: DenoiseConfig, source: Path, target: Path) -> _Outcome:
     """Measures one frame and writes it, filtered or as it is, unless it is there already."""
-    rgb = store.read_png(source)
+    rgb = read_png(source)
     sigma = round(estimate_noise(rgb), 4)
     filtered = config.mode == "force" or (config.mode == "auto" and sigma >= config.threshold)
     if not target.exists():
         if filtered:
             # With --force the estimate is taken to be too low.
             noise = max(sigma, config.threshold)
-            store.write_png(target, FILTERS[config.filter](rgb, noise, config.strength))
+            write_png(target, FILTERS[config.filter](rgb, noise, config.strength))
         else:
             _copy(source, target)
     return _Outcome(source.name, sigma, filtered)

@@ -41,8 +41,8 @@ from recon_cli.evaluation.reference_views import (
     sizes_of,
 )
 from recon_cli.evaluation.scores import ModelScore, csv_table, model_table, paper_table, view_table
-from recon_cli.io.images import eight_bit, write_png
-from recon_cli.io.import_record import Origin
+from recon_cli.io.images import to_uint8, write_png
+from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import read_ply
 from recon_cli.scene.scene import Scene
 from recon_cli.train.runner import LOG, read_config, seconds_at
@@ -72,7 +72,7 @@ class _Evaluation:
     out: Path
     folders: Mapping[str, Path]  # of train and prune, by model
     config: RunConfig  # of the training
-    origin: Origin | None
+    origin: ImportRecord | None
     scene: Scene
     held_out: Sequence[ReferenceView]
     seen: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
@@ -170,14 +170,15 @@ def _load(
     folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
     return _Evaluation(
-        out, folders, train_config, Origin.of(inputs.folders["train"]), scene, held_out, seen, ctx)
+        out, folders, train_config, ImportRecord.read(inputs.folders["train"]), scene, held_out,
+        seen, ctx)
 
 
 def _save_pictures(
     out: Path, model: str, view: ReferenceView, image: NDArray[np.float32]
 ) -> None:
     """Saves the render of a held-out view, and its difference from the photo."""
-    name, rendered = f"{Path(view.name).stem}.png", eight_bit(image)
+    name, rendered = f"{Path(view.name).stem}.png", to_uint8(image)
     _save(out / "renders" / model / name, rendered)
     difference = np.abs(rendered.astype(np.int16) - view.image) * _GAIN
     if view.mask is not None:

@@ -1,81 +1,89 @@
 """export: a .ply that other viewers open, read back and compared before it counts as written.
 
-Other formats lie beside it, each read back and scored. What options take away first (`lighter`) is
-told in Gaussians and dB. transform.json says how the scene that was trained became the scene that
-is handed out.
+Other formats are written beside it, each read back and scored. What options remove first is
+reported in Gaussians and dB. transform.json holds the similarity from the trained scene to the
+exported one.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from recon_cli.config.stages import ExportConfig
-from recon_cli.context import StageContext, StageInputs, Summary
-from recon_cli.errors import StageError, WorkspaceError
-from recon_cli.export.coordinate_frame import Frame, frame_of
-from recon_cli.export.exporter import Hand
-from recon_cli.export.synthetic_cameras import refuse_without_views
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.errors import StageError
+from recon_cli.export.coordinate_frame import ExportFrame, choose_frame
+from recon_cli.export.exporter import Exporter
+from recon_cli.export.verify import verify_ply
+from recon_cli.io.import_record import NEEDS_VIEWS_HINT, ImportRecord, has_views
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.scene.splats import Splats, transformed, with_rows
+from recon_cli.scene.splats import transformed
 from recon_cli.workspace.atomic import write_json
+from recon_cli.workspace.summaries import ExportSummary
 
 TRANSFORM = "transform.json"
+_CAMERA_FORMATS = ("colmap", "transforms.json")
 
 
-def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
-    """Writes splats.ply, the other formats and transform.json, and returns what they hold."""
+def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> ExportSummary:
+    """Writes splats.ply, the other formats and transform.json."""
     if config.model == "pruned" and "prune" not in inputs.folders:
         raise StageError(
-            "The pruned model was asked for, but there is none that is fresh.",
+            "The pruned model was requested, but there is no fresh one.",
             hint="Run `recon prune` first, or export with --model base.")
-    refuse_without_views(config, inputs)
+    _refuse_without_views(config, inputs)
     pruned = "prune" in inputs.folders and config.model != "base"
-    frame = frame_of(config, inputs)
+    frame = choose_frame(config, inputs)
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
     if not frame.similarity.is_identity:
         splats = transformed(splats, frame.similarity)
-    hand = Hand(config, inputs, out, frame, ctx)
-    splats, changes = hand.lightened(splats)
+    exporter = Exporter(config, inputs, out, frame, ctx)
+    splats, changes = exporter.reduce(splats)
     path = out / "splats.ply"
     others = [name for name in config.formats if name != "ply"]
     with ctx.progress.bar("export", 2 + len(others), unit="file") as bar:
         write_ply(path, splats)
         bar.advance()
-        verify(path, splats)
+        verify_ply(path, splats)
         bar.advance()
         files = {}
         for name in others:
-            files[name] = hand.out_as(name, splats)
+            files[name] = exporter.write(name, splats)
             bar.advance()
     _write_transform(out / TRANSFORM, frame)
-    return {
-        "model": "pruned" if pruned else "base", "file": "splats.ply", "gaussians": len(splats),
-        "bytes": path.stat().st_size, "transform": frame.similarity.to_json(),
-        **({"changes": [change.record() for change in changes]} if changes else {}),
-        **({"files": files} if files else {}),
-    }
+    return ExportSummary(
+        model="pruned" if pruned else "base", file=path.name, gaussians=len(splats),
+        bytes=path.stat().st_size, transform=frame.similarity.to_json(),
+        changes=tuple(changes) or None, files=files or None)
 
 
-def _write_transform(path: Path, frame: Frame) -> None:
+def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
+    """Raises StageError if an option needs views, and an imported scene has none that fit."""
+    record = ImportRecord.read(inputs.folders["train"])
+    if record and record.doubt and config.drop_floaters:
+        raise StageError(
+            f"--drop-floaters needs views of the scene, but {record.doubt}.",
+            hint="Run `recon import` with another --frame, or from a file in the right one.")
+    if has_views(inputs.folders):
+        return
+    refused = [f"--format {name}" for name in config.formats if name in _CAMERA_FORMATS]
+    if config.drop_floaters:
+        refused.append("--drop-floaters")
+    if config.max_mb is not None:
+        refused.append("--max-mb")
+    if config.scale_between is not None:
+        refused.append("--scale-between")
+    if refused:
+        raise StageError(
+            f"{' and '.join(refused)} cannot be used: the scene was imported without views.",
+            hint=NEEDS_VIEWS_HINT)
+
+
+def _write_transform(path: Path, frame: ExportFrame) -> None:
     write_json(path, {
         "from": "the world of sfm, in which the scene was trained; without views, that of the file "
         "that was imported",
         "to": "splats.ply beside this file",
         "similarity": frame.similarity.to_json(),
-        "measurement": frame.measured.to_json() if frame.measured else None,
+        "measurement": frame.measurement.to_json() if frame.measurement else None,
     })
-
-
-def verify(path: Path, splats: Splats) -> None:
-    """Raises WorkspaceError unless the file reads back as exactly these Gaussians."""
-    back = read_ply(path).with_degree(splats.sh_degree)
-    for name, value in splats.parameters().items():
-        read = getattr(back, name)
-        if name == "sh_rest":  # rows of zeros at the end are read as no rows
-            value, read = with_rows(value, len(splats)), with_rows(read, len(back))
-        if not torch.equal(read, value):
-            raise WorkspaceError(
-                f"{path} reads back with another {name} than was written.",
-                hint="Check the disk, then run `recon export --again`.")

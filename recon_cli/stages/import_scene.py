@@ -1,8 +1,8 @@
 """import: a scene that was made elsewhere takes the place of a trained one.
 
-Leaves splats.ply in the world of the workspace, config.json (what a run on this scene would have
-been told: size of the views, degree, validation) and import.json. Where there are views, the scene
-is held against some of them first.
+Writes splats.ply in the world of the workspace, config.json (as a training that ended with this
+scene would have left it: size of the views, degree, validation) and import.json. If there are
+views, the scene is compared with some of them first.
 """
 
 from __future__ import annotations
@@ -10,23 +10,24 @@ from __future__ import annotations
 from pathlib import Path
 
 from recon_cli.config.stages import MIN_GAUSSIANS, ImportConfig, RunConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, InputError
 from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.export.import_alignment import Match, match, world_of
-from recon_cli.io.import_record import Origin
+from recon_cli.export.import_alignment import Alignment, align_to_views, read_world
+from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import write_ply
 from recon_cli.io.splats.registry import format_of
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.train.runner import write_config
 from recon_cli.workspace.digests import digest_file
+from recon_cli.workspace.summaries import ImportSummary
 
 _MIP = b"SplatRenderMode: mip"  # a comment of Brush and others
 _HEAD_BYTES = 1 << 16
 
 
-def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
-    """Writes the scene of the one source into `out` and returns what it holds.
+def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> ImportSummary:
+    """Writes the scene of the one source into `out`.
 
     Raises:
         FormatError: the file is of no known format, damaged or empty.
@@ -41,61 +42,62 @@ def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     splats = form.read(path)
     if not len(splats):
         raise FormatError(f"{path} holds no Gaussians.")
-    found = _matched(splats, config, inputs, ctx)
-    if found is not None:
-        splats = transformed(splats, found.similarity)
+    alignment = _align(splats, config, inputs, ctx)
+    if alignment is not None:
+        splats = transformed(splats, alignment.similarity)
     z_up = form.name == "glb" if config.axes is None else config.axes == "z-up"
-    origin = Origin(path.name, form.name, digest_file(path).sha256, len(splats), splats.sh_degree,
-                    z_up, views=found is not None, doubt=found.doubt if found else "")
+    record = ImportRecord(
+        path.name, form.name, digest_file(path).sha256, len(splats), splats.sh_degree, z_up,
+        views=alignment is not None, doubt=alignment.doubt if alignment else "")
     write_ply(out / "splats.ply", splats)
-    write_config(out, _run_config(config, splats))
-    origin.write(out)
-    notices = [*([origin.doubt] if origin.doubt else []), *_antialiased(path)]
+    write_config(out, _equivalent_run_config(config, splats))
+    record.write(out)
+    notices = [*([record.doubt] if record.doubt else []), *_antialiasing_notice(path)]
     for text in notices:
         ctx.notice(text)
-    return {
-        "imported_from": origin.file, "format": origin.format, "gaussians": len(splats),
-        "sh_degree": splats.sh_degree, "sha256": origin.sha256[:12], **_told(found),
-        **({"notices": notices} if notices else {}),
-    }
+    return _summarize(record, alignment, notices)
 
 
-def _matched(
+def _align(
     splats: Splats, config: ImportConfig, inputs: StageInputs, ctx: StageContext
-) -> Match | None:
-    """Returns how the scene fits the training views; None where there are none."""
+) -> Alignment | None:
+    """Returns how the scene fits the training views; None if there are none."""
     if not {"ingest", "sfm"} <= inputs.folders.keys():
         return None
     scene = load_scene(inputs, validation=config.validation)
-    return match(
-        splats, scene, world_of(inputs.folders["sfm"]), config.frame, config.max_size, ctx)
+    return align_to_views(
+        splats, scene, read_world(inputs.folders["sfm"]), config.frame, config.max_size, ctx)
 
 
-def _run_config(config: ImportConfig, splats: Splats) -> RunConfig:
-    """Returns the options of a run that would have ended with this scene, as far as they matter."""
+def _equivalent_run_config(config: ImportConfig, splats: Splats) -> RunConfig:
+    """Returns the options of a training that would have ended with this scene."""
     return RunConfig(
         max_size=config.max_size, validation=config.validation, sh_degree=splats.sh_degree,
         max_gaussians=max(MIN_GAUSSIANS, len(splats)), images="original", far="off",
         exposure="off", poses="off")
 
 
-def _antialiased(path: Path) -> list[str]:
-    """Returns a sentence where a .ply says that it is to be drawn as by Mip-Splatting."""
+def _antialiasing_notice(path: Path) -> list[str]:
+    """Returns a sentence if a .ply says that it was trained by Mip-Splatting."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).partition(b"end_header")[0]
     if not head.startswith(b"ply") or _MIP not in head:
         return []
-    return [f"{path.name} was trained to be drawn with antialiasing ({_MIP.decode()}), which is "
-            "not done here: what is smaller than a pixel looks too thick"]
+    return [f"{path.name} was trained for antialiased rendering ({_MIP.decode()}), which is not "
+            "supported: what is smaller than a pixel looks too thick"]
 
 
-def _told(found: Match | None) -> Summary:
-    if found is None:
-        return {"views": 0}
-    return {
-        "views": found.views, "frame": found.frame,
-        "training_psnr_db": round(found.psnr_db[found.frame], 3),
-        "flat_psnr_db": round(found.flat_db, 3),
-        "tried_psnr_db": {name: round(value, 3) for name, value in found.psnr_db.items()},
-        "transform": found.similarity.to_json(),
-    }
+def _summarize(
+    record: ImportRecord, alignment: Alignment | None, notices: list[str]
+) -> ImportSummary:
+    return ImportSummary(
+        imported_from=record.file, format=record.format, gaussians=record.gaussians,
+        sh_degree=record.sh_degree, sha256=record.sha256[:12],
+        views=alignment.views if alignment else 0,
+        frame=alignment.frame if alignment else None,
+        training_psnr_db=round(alignment.psnr_db[alignment.frame], 3) if alignment else None,
+        flat_psnr_db=round(alignment.flat_db, 3) if alignment else None,
+        tried_psnr_db={name: round(value, 3) for name, value in alignment.psnr_db.items()}
+        if alignment else None,
+        transform=alignment.similarity.to_json() if alignment else None,
+        notices=tuple(notices) or None)

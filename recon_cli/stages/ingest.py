@@ -41,7 +41,7 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     for path in inputs.sources:
         if not path.exists():
             raise InputError(f"{path} does not exist.", hint="Check the path.")
-    store.prepare(out)
+    store.prepare_frames_folder(out)
     parts = _ingest(config, inputs.sources, out, ctx)
     source = merge_sources(parts)
     held = _held_out(source, config, ctx)
@@ -73,7 +73,7 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
 def _held_out(source: IngestedSource, config: IngestConfig, ctx: StageContext) -> frozenset[str]:
     """Returns the names of the held-out frames: the data set's choice, else ours."""
     if not source.splits:
-        return store.held_out(
+        return store.choose_held_out(
             [frame.name for frame in source.frames], parse_holdout(config.holdout))
     held = frozenset(frame.name for frame in source.frames if frame.held_out)
     ctx.notice(f"The data set itself holds out {len(held)} views; --holdout has no effect.")

@@ -12,7 +12,7 @@ from pathlib import Path
 from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.errors import ConfigError, TrainingError
-from recon_cli.io.ply import most_gaussians, write_ply
+from recon_cli.io.ply import max_gaussians, write_ply
 from recon_cli.scene.splats import Splats
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.prune_loop import prune_to, prune_while_good
@@ -60,7 +60,7 @@ def _target(config: PruneConfig, splats: Splats) -> int:
     if config.max_gaussians is not None:
         return min(n, config.max_gaussians)
     if config.max_mb is not None:
-        count = most_gaussians(int(1e6 * config.max_mb), splats.sh_degree)
+        count = max_gaussians(int(1e6 * config.max_mb), splats.sh_degree)
         if count == 0:
             raise ConfigError(
                 f"max_mb is {config.max_mb:g}, but a .ply of one Gaussian is larger.",

@@ -21,7 +21,7 @@ from recon_cli.config.stages import PruneConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.io.import_record import Origin
+from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import read_ply
 from recon_cli.train.fit import Task, validation_psnr
 from recon_cli.train.importance import Importance
@@ -179,7 +179,7 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
         ConfigError: the middle of a run is asked for that took place elsewhere.
     """
     train = inputs.folders["train"]
-    origin = Origin.of(train)
+    origin = ImportRecord.read(train)
     if origin and config.at == "mid":
         raise ConfigError(
             f"at is mid, but the scene was imported from {origin.file}: the middle of its training "

@@ -18,7 +18,7 @@ from recon_cli.context import StageContext
 from recon_cli.errors import TrainingError
 from recon_cli.evaluation.metrics import leaves_enough
 from recon_cli.evaluation.reference_views import MASK_HINT, notice_hidden, sizes_of
-from recon_cli.io.images import fitted_camera, read_masked_image
+from recon_cli.io.images import fit_camera, read_masked_image
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.scene import Scene, View
@@ -129,7 +129,7 @@ def load_views(
     """Returns the views at the training size, without those whose mask leaves next to nothing."""
     loaded, hidden = [], []
     for view in views:
-        camera = fitted_camera(view.camera, config.max_size)
+        camera = fit_camera(view.camera, config.max_size)
         path = view.denoised if config.images == "denoised" else view.original
         image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
         if leaves_enough(mask):
@@ -161,7 +161,7 @@ def _memory(
     scene: Scene, config: RunConfig, ctx: StageContext, *, gaussians: int
 ) -> MemoryEstimate:
     views = (*scene.train, *scene.validation)
-    width, height = sizes_of([fitted_camera(view.camera, config.max_size) for view in views])[0]
+    width, height = sizes_of([fit_camera(view.camera, config.max_size) for view in views])[0]
     return estimate(
         views=len(views), width=width, height=height, gaussians=gaussians,
         fused=ctx.backend == "numba", sh_degree=config.sh_degree,

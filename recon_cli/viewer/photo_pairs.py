@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recon_cli.context import StageContext
 from recon_cli.evaluation.metrics import leaves_enough, psnr
 from recon_cli.evaluation.reference_views import render_on_black
-from recon_cli.io.images import eight_bit, fitted_camera, fitted_size, read_image, read_masked_image
+from recon_cli.io.images import fit_camera, fit_size, read_image, read_masked_image, to_uint8
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.scene.scene import View
 from recon_cli.scene.splats import Splats
@@ -40,7 +40,7 @@ class PhotoPairs:
         Raises:
             FormatError: it cannot be read.
         """
-        camera = fitted_camera(view.camera, self._max_size)
+        camera = fit_camera(view.camera, self._max_size)
         return read_masked_image(view.original, view.mask, camera.width, camera.height)
 
     def render_view(self, view: View, splats: Splats) -> tuple[NDArray[np.uint8], float | None]:
@@ -53,11 +53,11 @@ class PhotoPairs:
             FormatError: the photo cannot be read.
         """
         truth, mask = self.load_photo(view)
-        camera, device = fitted_camera(view.camera, self._max_size), self._ctx.device
+        camera, device = fit_camera(view.camera, self._max_size), self._ctx.device
         on_device = splats.map(lambda tensor: tensor.to(device))
         rgb = render_on_black(on_device, camera, splats.sh_degree, self._ctx.backend).rgb
         image: NDArray[np.float32] = rgb.cpu().numpy()
-        return eight_bit(image), psnr(image, truth, mask) if leaves_enough(mask) else None
+        return to_uint8(image), psnr(image, truth, mask) if leaves_enough(mask) else None
 
     def thumbnail(self, view: View) -> NDArray[np.uint8]:
         """Returns a small picture of a view.
@@ -66,6 +66,6 @@ class PhotoPairs:
             FormatError: the photo cannot be read.
         """
         if view.name not in self._thumbnails:
-            size = fitted_size(view.camera.width, view.camera.height, _THUMBNAIL)
+            size = fit_size(view.camera.width, view.camera.height, _THUMBNAIL)
             self._thumbnails[view.name] = read_image(view.original, *size)
         return self._thumbnails[view.name]

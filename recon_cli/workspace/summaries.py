@@ -72,6 +72,8 @@ def _decoded(kind: Any, item: Any) -> Any:
         return None if item is None else _decoded(arguments[0], item)
     if origin is tuple and isinstance(item, (list, tuple)):
         return tuple(_decoded(arguments[0], part) for part in item)
+    if origin is Mapping and isinstance(item, Mapping):
+        return {key: _decoded(arguments[1], part) for key, part in item.items()}
     if isinstance(kind, type) and issubclass(kind, JsonRecord):
         return kind.from_json(item)
     return item
@@ -291,3 +293,97 @@ class SfmSummary(JsonRecord):
     def trusted(self) -> bool | None:
         """Whether the verdict trusts the model; None without a verdict."""
         return None if self.verdict is None else bool(self.verdict["trusted"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportSummary(JsonRecord):
+    """The scene that was imported, and how well it fits the views of the workspace.
+
+    Attributes:
+        imported_from: name of the file.
+        format: of the file.
+        gaussians: count.
+        sh_degree: of the colours.
+        sha256: of the file, its first 12 digits.
+        views: training views that it was compared with; 0 without views, and None below.
+        frame: coordinate frame of the file, "source" or "workspace".
+        training_psnr_db: on these views.
+        flat_psnr_db: of flat images in the mean colours of the views.
+        tried_psnr_db: by frame that was tried.
+        transform: similarity from the file to the workspace.
+        notices: for the user; None where there are none.
+    """
+
+    imported_from: str
+    format: str
+    gaussians: int
+    sh_degree: int
+    sha256: str
+    views: int
+    frame: str | None = None
+    training_psnr_db: float | None = None
+    flat_psnr_db: float | None = None
+    tried_psnr_db: Mapping[str, float] | None = None
+    transform: Mapping[str, Any] | None = None
+    notices: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportChange(JsonRecord):
+    """What an option of export removed.
+
+    Attributes:
+        option: name of the field.
+        gaussians: that are left.
+        gaussians_before: count.
+        degree: of the colours that is left.
+        degree_before: of the colours.
+        psnr_change_db: on the views that the export is checked on.
+    """
+
+    option: str
+    gaussians: int
+    gaussians_before: int
+    degree: int
+    degree_before: int
+    psnr_change_db: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportedFile(JsonRecord):
+    """A file or folder beside the exported .ply; the size and loss are None for cameras and points.
+
+    Attributes:
+        file: its name.
+        bytes: its size.
+        smaller: size of the .ply over its size.
+        psnr_change_db: on the views that the export is checked on.
+    """
+
+    file: str
+    bytes: int | None = None
+    smaller: float | None = None
+    psnr_change_db: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSummary(JsonRecord):
+    """What export wrote.
+
+    Attributes:
+        model: "base" or "pruned".
+        file: name of the .ply.
+        gaussians: count.
+        bytes: size of the .ply.
+        transform: similarity from the world of the training to that of the files.
+        changes: what options removed, in order; None where nothing was asked for.
+        files: the other formats by name; None where there are none.
+    """
+
+    model: str
+    file: str
+    gaussians: int
+    bytes: int
+    transform: Mapping[str, Any]
+    changes: tuple[ExportChange, ...] | None = None
+    files: Mapping[str, ExportedFile] | None = None

@@ -19,9 +19,8 @@ from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.export.cleanup import islands
-from recon_cli.export.floaters import floaters, sightings
-from recon_cli.export.verify import fidelity
+from recon_cli.export.cleanup import count_sightings, find_floaters, find_islands
+from recon_cli.export.verify import load_reference_psnr
 from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.render.registry import resolve
@@ -85,7 +84,7 @@ def main(workspaces: tuple[Path, ...]) -> None:
         config, draw = read_config(root / "train"), np.random.default_rng(0)
         scene = load_scene(StageInputs({name: root / name for name in ("ingest", "sfm")}),
                            validation=config.validation)
-        views, held = load_views(scene.train, config, ctx), fidelity(
+        views, held = load_views(scene.train, config, ctx), load_reference_psnr(
             scene, Similarity(), config.max_size, ctx)
         splats = read_ply(root / "train" / "splats.ply")
         clean = held.psnr_db(splats)
@@ -94,7 +93,7 @@ def main(workspaces: tuple[Path, ...]) -> None:
                 ("as trained", (splats, torch.zeros(len(splats), dtype=torch.bool))),
                 (f"{PLANTED} floaters", spoilt)):
             begin = time.perf_counter()
-            found = floaters(whole, views, backend=backend)
+            found = find_floaters(whole, views, backend=backend)
             seconds, gone = time.perf_counter() - begin, found.all
             click.echo(
                 f"{root.name}, {name}: unseen {int(found.unseen.sum())}, in front "
@@ -108,7 +107,7 @@ def main(workspaces: tuple[Path, ...]) -> None:
                 ("as trained", (splats, torch.zeros(len(splats), dtype=torch.bool))),
                 ("an island", spoilt)):
             near = whole.within(scene.center.tolist(), scene.reach)
-            gone = islands(whole, near, sightings(whole, views, backend=backend) > 0)
+            gone = find_islands(whole, near, count_sightings(whole, views, backend=backend) > 0)
             click.echo(
                 f"{root.name}, {name}: {int(gone.sum())} in islands, planted "
                 f"{int((gone & planted).sum())} of {int(planted.sum())}; "

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.export.import_alignment import SOURCE, match
+from recon_cli.export.import_alignment import SOURCE, align_to_views
 from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import resolve
 from recon_cli.scene.similarity import Similarity
@@ -39,7 +39,7 @@ def main(workspaces: tuple[Path, ...]) -> None:
         for degrees, extents, scale in MOVES:
             turn = Rotation.from_rotvec([0, 0, np.radians(degrees)]).as_matrix()
             away = middle - scale * turn @ middle + [extents * scene.extent, 0, 0]
-            found = match(splats, scene, Similarity(scale, turn, away), SOURCE, 400, ctx)
+            found = align_to_views(splats, scene, Similarity(scale, turn, away), SOURCE, 400, ctx)
             click.echo(f"{root.name}: turned {degrees} degrees, moved {extents} extents, "
                        f"{scale}x: {found.psnr_db[SOURCE] - found.flat_db:+.1f} dB")
 

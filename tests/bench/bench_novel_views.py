@@ -19,7 +19,7 @@ from pose_errors import similarity
 
 from recon_cli.evaluation.metrics import psnr, ssim
 from recon_cli.io.colmap import read_scene
-from recon_cli.io.images import fitted_camera, read_image
+from recon_cli.io.images import fit_camera, read_image
 from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
@@ -59,7 +59,7 @@ def main(workspace: Path, room: Path) -> None:
             viewmat = np.eye(4)
             viewmat[:3, :3] = world[:3, :3] @ R.T
             viewmat[:3, 3] = scale * world[:3, 3] - viewmat[:3, :3] @ t
-            camera = fitted_camera(
+            camera = fit_camera(
                 Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, viewmat),
                 config.max_size)
             truth = read_image(image, camera.width, camera.height)

@@ -43,7 +43,7 @@ from browser import launch_browser, watch_page
 
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.experiments.synthetic_room import room
-from recon_cli.io.images import eight_bit, fitted_camera
+from recon_cli.io.images import fit_camera, to_uint8
 from recon_cli.pipeline.execute import render_context
 from recon_cli.pipeline.plan import Job
 from recon_cli.render import render
@@ -142,14 +142,14 @@ def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
         (client,) = server.get_clients().values()
         for one in content.views:
             if one.part == HELD_OUT:
-                camera = fitted_camera(one.view.camera, content.max_size)
+                camera = fit_camera(one.view.camera, content.max_size)
                 with torch.no_grad():
                     ours = render(splats, camera, torch.zeros(3), 0, backend=ctx.backend).rgb
                 page.page.set_viewport_size({"width": camera.width, "height": camera.height})
                 asked = elsewhere.submit(drawn, client, content, camera)
                 while not asked.done():
                     page.page.wait_for_timeout(20)
-                found.append(psnr(asked.result(), eight_bit(ours.numpy())))
+                found.append(psnr(asked.result(), to_uint8(ours.numpy())))
                 yield (f"{one.view.name} {camera.width}x{camera.height}: {found[-1]:.2f} dB "
                        "between the browser and recon")
     yield f"least {min(found):.2f} dB, mean {statistics.fmean(found):.2f} dB"

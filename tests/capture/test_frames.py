@@ -9,13 +9,11 @@ from recon_cli.io.frames import (
     Frame,
     FrameList,
     Group,
-    fitted,
-    held_out,
-    prepare,
+    choose_held_out,
+    prepare_frames_folder,
     read_frame_list,
-    read_png,
-    write_png,
 )
+from recon_cli.io.images import fit_image, read_png, write_png
 from recon_cli.scene.camera import Lens
 
 NAMES = [f"{index:06d}.png" for index in range(20)]
@@ -29,7 +27,7 @@ NAMES = [f"{index:06d}.png" for index in range(20)]
     ("none", []),
 ])
 def test_held_out_frames_go_by_sorted_name(holdout, indices):
-    held = held_out(NAMES[::-1], parse_holdout(holdout))
+    held = choose_held_out(NAMES[::-1], parse_holdout(holdout))
     assert held == {NAMES[index] for index in indices}
 
 
@@ -68,17 +66,17 @@ def test_a_broken_frame_is_no_picture(tmp_path, content):
 
 def test_large_frames_are_reduced_by_area():
     rgb = texture(40, 60, coarseness=1)
-    assert fitted(rgb, 60) is rgb
-    halved = fitted(rgb, 30)
+    assert fit_image(rgb, 60) is rgb
+    halved = fit_image(rgb, 30)
     mean = rgb.reshape(20, 2, 30, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(halved, mean, atol=0.5)  # rounding to 8 bits
-    assert fitted(rgb.transpose(1, 0, 2), 30).shape == (30, 20, 3)
+    assert fit_image(rgb.transpose(1, 0, 2), 30).shape == (30, 20, 3)
 
 
 def test_leftovers_of_a_killed_run_are_cleared_and_frames_are_kept(tmp_path):
-    folder = prepare(tmp_path)
+    folder = prepare_frames_folder(tmp_path)
     (folder / "000001.png").write_bytes(b"kept")
     (folder / ".000002.png.tmp123.png").write_bytes(b"half")
     (tmp_path / ".frames.json.tmp123.json").write_bytes(b"half")
-    assert prepare(tmp_path) == folder
+    assert prepare_frames_folder(tmp_path) == folder
     assert [path.name for path in tmp_path.rglob("*")] == ["frames", "000001.png"]

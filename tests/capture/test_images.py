@@ -17,7 +17,7 @@ from recon_cli.capture.images import (
     read_photo,
 )
 from recon_cli.errors import InputError
-from recon_cli.io.frames import write_png
+from recon_cli.io.images import write_png
 
 ORIENTATION, GPS = 0x0112, 0x8825
 

@@ -9,7 +9,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from recon_cli.evaluation.metrics import leaves_enough, load_lpips, psnr, ssim
-from recon_cli.io.images import eight_bit
+from recon_cli.io.images import to_uint8
 from recon_cli.train.losses import photometric_loss
 
 TRUTH = np.random.default_rng(0).integers(0, 256, (32, 40, 3), dtype=np.uint8)
@@ -118,7 +118,7 @@ def test_with_zeros_around_the_border_counts():
 def test_a_picture_of_8_bits_is_scored_as_the_file_holds_it():
     truth = np.full((16, 16, 3), 100, np.uint8)
     image = np.full((16, 16, 3), 100.4 / 255, np.float32)
-    assert psnr(eight_bit(image), truth) == 100.0
+    assert psnr(to_uint8(image), truth) == 100.0
     assert psnr(image, truth) == pytest.approx(-20 * np.log10(0.4 / 255), abs=1e-3)
 
 

@@ -1,7 +1,7 @@
 import pytest
 
 from recon_cli.errors import FormatError
-from recon_cli.io.colmap_text import read_points_text
+from recon_cli.io.colmap_model import read_points_text
 
 HEAD = "# 3D point list\n# Number of points: 3, mean track length: 2\n"
 ROWS = ["1 0 0 1 9 9 9 0.5\n", "2 0 0 2 9 9 9 0.5\n", "3 0 0 3 9 9 9 0.5\n"]

@@ -62,7 +62,7 @@ def test_held_out_images_give_no_points(posed):
 
 
 def test_there_are_no_more_points_than_asked_for_and_they_are_spread_evenly(posed):
-    points, colors = points_from_depth(posed, most=50)
+    points, colors = points_from_depth(posed, max_points=50)
     assert 25 <= len(points) <= 50
     assert len(colors) == len(points)
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
@@ -71,7 +71,7 @@ def test_there_are_no_more_points_than_asked_for_and_they_are_spread_evenly(pose
 
 
 def test_the_same_set_gives_the_same_points(posed):
-    first, again = points_from_depth(posed, most=50), points_from_depth(posed, most=50)
+    first, again = (points_from_depth(posed, max_points=50) for _ in range(2))
     np.testing.assert_array_equal(first[0], again[0])
     np.testing.assert_array_equal(first[1], again[1])
 

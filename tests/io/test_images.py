@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from recon_cli.errors import FormatError
-from recon_cli.io.images import eight_bit, painted, read_mask, read_masked_image, write_png
+from recon_cli.io.images import fill_masked, read_mask, read_masked_image, to_uint8, write_png
 
 
 def written(path, mask):
@@ -48,7 +48,7 @@ def test_half_covered_edges_of_a_mask_are_ignored(tmp_path):
 
 def test_ignored_pixels_are_painted_in_the_mean_of_the_others():
     image = np.array([[[10, 20, 30], [30, 40, 51], [255, 0, 255]]], np.uint8)
-    result = painted(image, np.array([[True, True, False]]))
+    result = fill_masked(image, np.array([[True, True, False]]))
     assert result.tolist() == [[[10, 20, 30], [30, 40, 51], [20, 30, 40]]]
     assert image[0, 2].tolist() == [255, 0, 255]
 
@@ -87,4 +87,4 @@ def test_gray_and_sixteen_bits_survive_a_png(tmp_path):
 
 def test_eight_bits_round_to_the_nearest_step_and_clip():
     values = np.array([-1, 0, 0.49 / 255, 0.51 / 255, 1, 7], np.float32)
-    np.testing.assert_array_equal(eight_bit(values), [0, 0, 0, 1, 255, 255])
+    np.testing.assert_array_equal(to_uint8(values), [0, 0, 0, 1, 255, 255])

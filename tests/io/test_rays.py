@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon_cli.io.calibration import directions
+from recon_cli.io.calibration import undistort_pixels
 from recon_cli.scene.camera import Lens
 
 K = np.array([[400.0, 0, 320.5], [0, 410, 240.25], [0, 0, 1]])
@@ -15,7 +15,7 @@ SPACE = np.column_stack([RAYS, np.ones(len(RAYS))])
 def test_a_pinhole_is_undone_in_closed_form():
     pixels = np.array([[320.5, 240.25], [720.5, 445.25]])
     np.testing.assert_array_equal(
-        directions(Lens("PINHOLE", 640, 480, INNER), pixels), [[0, 0], [1, 0.5]])
+        undistort_pixels(Lens("PINHOLE", 640, 480, INNER), pixels), [[0, 0], [1, 0.5]])
 
 
 @pytest.mark.parametrize(("model", "coefficients"), [
@@ -24,7 +24,7 @@ def test_a_pinhole_is_undone_in_closed_form():
 def test_perspective_distortion_is_undone(model, coefficients):
     pixels = cv2.projectPoints(SPACE, np.zeros(3), np.zeros(3), K, np.array(coefficients))[0][:, 0]
     lens = Lens(model, 640, 480, (*INNER, *coefficients))
-    np.testing.assert_allclose(directions(lens, pixels), RAYS, atol=1e-12)
+    np.testing.assert_allclose(undistort_pixels(lens, pixels), RAYS, atol=1e-12)
 
 
 def test_models_with_one_focal_length_are_undone():
@@ -33,7 +33,7 @@ def test_models_with_one_focal_length_are_undone():
         padded = np.array([*coefficients, 0, 0, 0, 0])[:5] * [1, len(coefficients) > 1, 0, 0, 0]
         pixels = cv2.projectPoints(SPACE, np.zeros(3), np.zeros(3), square, padded)[0][:, 0]
         lens = Lens(model, 640, 480, (400.0, 320.5, 240.25, *coefficients))
-        np.testing.assert_allclose(directions(lens, pixels), RAYS, atol=1e-12)
+        np.testing.assert_allclose(undistort_pixels(lens, pixels), RAYS, atol=1e-12)
 
 
 @pytest.mark.parametrize(("model", "coefficients"), [
@@ -47,9 +47,9 @@ def test_a_fisheye_is_undone(model, coefficients):
     focals = (400.0, 410.0) if model == "OPENCV_FISHEYE" else (400.0,)
     pixels = RAYS * scale[:, None] * [focals[0], focals[-1]] + [320.5, 240.25]
     lens = Lens(model, 640, 480, (*focals, 320.5, 240.25, *coefficients))
-    np.testing.assert_allclose(directions(lens, pixels), RAYS, atol=1e-7)
+    np.testing.assert_allclose(undistort_pixels(lens, pixels), RAYS, atol=1e-7)
 
 
 def test_a_lens_that_nothing_undoes_is_refused():
     with pytest.raises(ValueError, match="THIN_PRISM_FISHEYE"):
-        directions(Lens("THIN_PRISM_FISHEYE", 4, 4, (1.0,) * 12), np.zeros((1, 2)))
+        undistort_pixels(Lens("THIN_PRISM_FISHEYE", 4, 4, (1.0,) * 12), np.zeros((1, 2)))

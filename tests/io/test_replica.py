@@ -87,7 +87,7 @@ def test_a_trajectory_of_another_length_is_refused_with_both_numbers(folder, row
 @pytest.mark.parametrize(("edit", "said"), [
     (lambda words: ["nan", *words[1:]], "line 3, holds a number that is not finite"),
     (lambda words: words[:12], "line 3, has 12 numbers"),
-    (lambda words: ["oops", *words[1:]], "line 3, holds something else"),
+    (lambda words: ["oops", *words[1:]], "line 3, holds something other"),
     (lambda words: ["2.0", *words[1:]], "line 3, is no rigid pose")])
 def test_a_damaged_line_of_the_trajectory_is_named(folder, edit, said):
     lines = (folder / "traj.txt").read_text().splitlines()
@@ -128,7 +128,7 @@ def test_a_depth_file_cut_short_anywhere_is_refused_when_it_is_read(folder, shar
     path = folder / "results" / "depth000000.png"
     data = path.read_bytes()
     path.write_bytes(data[:int(share * len(data))])
-    with pytest.raises(FormatError, match="no depth"):
+    with pytest.raises(FormatError, match="cannot be read as depth"):
         read_replica(folder).images[0].depth()
 
 

@@ -15,7 +15,7 @@ def test_frames_come_in_the_order_of_their_numbers_without_lost_ones(tmp_path):
     posed = read_scannet(posed_sets.make_scannet(tmp_path, frames=12, lost=(1, 3)))
     assert [image.name for image in posed.images] == [
         f"{number}.jpg" for number in (0, 2, *range(4, 12))]
-    assert posed.notices == ("2 frames have no pose, for tracking was lost, and are left out",)
+    assert posed.notices == ("2 frames whose tracking was lost have no pose and are left out",)
     assert (posed.metric, posed.sequence, posed.splits) == (True, True, False)
 
 
@@ -72,7 +72,7 @@ def test_intrinsics_for_images_of_another_size_are_refused(folder):
 
 
 @pytest.mark.parametrize(("text", "said"), [
-    ("1 2 3", "has 3 numbers"), ("a " * 16, "something else"), ("nan " * 16, "not finite"),
+    ("1 2 3", "has 3 numbers"), ("a " * 16, "something other"), ("nan " * 16, "not finite"),
     ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "scaled by 2")])
 def test_a_damaged_pose_is_named(folder, text, said):
     (folder / "pose" / "2.txt").write_text(text)

@@ -253,7 +253,7 @@ def test_one_image_of_another_size_is_refused(tmp_path):
 def test_a_file_that_is_no_image_is_named(tmp_path):
     posed_sets.make_transforms(tmp_path)
     (tmp_path / "images" / "0002.png").write_text("no image")
-    with pytest.raises(FormatError, match=r"0002\.png is no image"):
+    with pytest.raises(FormatError, match=r"0002\.png cannot be read as an image"):
         read_transforms(tmp_path)
 
 

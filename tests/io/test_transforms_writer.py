@@ -9,9 +9,8 @@ import pytest
 from recon_cli.errors import InputError
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.colmap_set import read_colmap
-from recon_cli.io.splats.points import write_point_cloud
-from recon_cli.io.transforms import read_transforms
-from recon_cli.io.transforms_writer import write_transforms
+from recon_cli.io.ply_table import write_point_cloud
+from recon_cli.io.transforms import read_transforms, write_transforms
 from recon_cli.scene.camera import Camera
 
 POINTS = np.array([[0.5, -1.25, 3], [1, 2, 4.5]])

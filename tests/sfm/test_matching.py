@@ -12,7 +12,7 @@ from PIL import Image
 from sfm_inputs import texture
 
 from recon_cli.errors import FormatError
-from recon_cli.io.frames import write_png
+from recon_cli.io.images import write_png
 from recon_cli.scene.camera import Lens
 from recon_cli.sfm import database
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter

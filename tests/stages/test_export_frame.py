@@ -140,7 +140,7 @@ def test_the_transform_is_recorded_after_the_scale(inputs):
     out, summary = exported(
         inputs, transform=flat(MOVED), scale_between=("000000.png", "000006.png", 3.0))
     record = json.loads((out / "transform.json").read_text())
-    assert summary["transform"] == record["similarity"]
+    assert summary.transform == record["similarity"]
     found = Similarity.from_json(record["similarity"])
     ends = np.array([record["measurement"]["a_xyz"], record["measurement"]["b_xyz"]])
     metres = 3.0 / np.linalg.norm(ends[0] - ends[1])
@@ -151,7 +151,7 @@ def test_the_transform_is_recorded_after_the_scale(inputs):
 def test_up_is_the_axis_that_was_asked_for(inputs, name):
     up_is_z(inputs)
     _, summary = exported(inputs, up=name)
-    rotation = Similarity.from_json(summary["transform"]).rotation
+    rotation = Similarity.from_json(summary.transform).rotation
     assert np.array_equal(rotation @ [0, 0, 1], AXES[name])  # to the bit
     assert np.array_equal(rotation @ [1, 0, 0], [1, 0, 0])  # and nothing else turns
 
@@ -160,7 +160,7 @@ def test_up_is_the_axis_that_was_asked_for(inputs, name):
 def test_where_up_was_not_found_the_cameras_say_it_and_this_is_said(inputs, name, caplog):
     caplog.set_level(logging.WARNING, "recon")
     _, summary = exported(inputs, up=name)
-    rotation = Similarity.from_json(summary["transform"]).rotation
+    rotation = Similarity.from_json(summary.transform).rotation
     assert np.allclose(rotation @ [0, -1, 0], AXES[name], atol=1e-6)  # the tiny cameras have y down
     assert any("mean up of the cameras" in line for line in caplog.messages)
 
@@ -225,7 +225,7 @@ def test_a_matrix_with_six_decimals_is_made_a_rotation(inputs):
     rounded = Similarity(1.5, TURN, np.zeros(3)).matrix.round(5) + 1e-5
     rounded[3] = [0, 0, 0, 1]
     _, summary = exported(inputs, transform=tuple(rounded.ravel().tolist()))
-    found = Similarity.from_json(summary["transform"])
+    found = Similarity.from_json(summary.transform)
     assert np.allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
     assert found.scale == pytest.approx(1.5, abs=1e-4)
 

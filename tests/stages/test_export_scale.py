@@ -39,7 +39,7 @@ def test_a_measured_scene_is_larger_and_looks_the_same(inputs, tmp_path):
     after = read_ply(tmp_path / "out" / "splats.ply")
     assert torch.allclose(after.means, 3 * before.means, rtol=1e-6)
     assert torch.equal(after.sh_rest, before.sh_rest)
-    similarity = Similarity.from_json(summary["transform"])
+    similarity = Similarity.from_json(summary.transform)
     assert similarity.scale == pytest.approx(3, rel=1e-9)
     viewmat = np.eye(4)
     viewmat[2, 3] = 2
@@ -63,7 +63,7 @@ def test_an_export_that_measures_nothing_says_that_nothing_was_moved(inputs, tmp
     summary = export.run(ExportConfig(), inputs, tmp_path / "out", StageContext())
     record = json.loads((tmp_path / "out" / "transform.json").read_text())
     assert Similarity.from_json(record["similarity"]).is_identity
-    assert summary["transform"] == record["similarity"]
+    assert summary.transform == record["similarity"]
     assert record["measurement"] is None
     assert (tmp_path / "out" / "splats.ply").read_bytes() == (
         tmp_path / "train" / "splats.ply").read_bytes()

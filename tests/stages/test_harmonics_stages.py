@@ -10,6 +10,7 @@ from tiny_scene import make_inputs
 
 from recon_cli.config.stages import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.export import verify
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.stages import evaluate, export, prune, train
 from recon_cli.train import runner
@@ -95,8 +96,8 @@ def test_an_export_of_any_degree_and_share_is_read_back(tmp_path, degree, colore
     inputs = StageInputs({**inputs.folders, "train": tmp_path / "train"})
     summary = export.run(ExportConfig(), inputs, tmp_path / "out", CONTEXT)
     assert summary["gaussians"] == 30
-    export.verify(tmp_path / "out" / "splats.ply", splats)
+    verify.verify_ply(tmp_path / "out" / "splats.ply", splats)
     write_ply(tmp_path / "out" / "splats.ply", with_harmonics(splats, degree, 0))
     if colored and degree:
         with pytest.raises(Exception, match="another sh_rest"):
-            export.verify(tmp_path / "out" / "splats.ply", splats)
+            verify.verify_ply(tmp_path / "out" / "splats.ply", splats)

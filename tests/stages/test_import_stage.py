@@ -51,9 +51,9 @@ def test_the_scene_of_the_workspace_is_taken_as_it_is(inputs, tmp_path):
     path = written(tmp_path / "a.ply", truth())
     summary = brought_in(path, inputs, tmp_path / "train")
     assert (tmp_path / "train" / "splats.ply").read_bytes() == path.read_bytes()
-    assert (summary["imported_from"], summary["frame"]) == ("a.ply", "workspace")
-    assert summary["training_psnr_db"] > 40  # nothing but 8 bits apart
-    assert "notices" not in summary
+    assert (summary.imported_from, summary.frame) == ("a.ply", "workspace")
+    assert summary.training_psnr_db > 40  # nothing but 8 bits apart
+    assert summary.notices is None
 
 
 def test_a_scene_of_the_source_is_moved_and_its_harmonics_turned(inputs, tmp_path):
@@ -62,14 +62,14 @@ def test_a_scene_of_the_source_is_moved_and_its_harmonics_turned(inputs, tmp_pat
     whole.sh_rest = 0.2 * colored
     path = written(tmp_path / "a.ply", transformed(whole, WORLD.inverse()))
     summary = brought_in(path, inputs, tmp_path / "train")
-    assert summary["frame"] == "source"
+    assert summary.frame == "source"
     back = read_ply(tmp_path / "train" / "splats.ply")
     assert torch.allclose(back.means, whole.means, atol=1e-4)
     assert torch.allclose(back.log_scales, whole.log_scales, atol=1e-5)
     assert torch.allclose(back.sh_rest, whole.sh_rest, atol=1e-5)
     assert not torch.allclose(read_ply(path).sh_rest, whole.sh_rest, atol=1e-2)
-    assert summary["tried_psnr_db"]["source"] > summary["tried_psnr_db"]["workspace"] + 10
-    assert summary["transform"] == WORLD.to_json()
+    assert summary.tried_psnr_db["source"] > summary.tried_psnr_db["workspace"] + 10
+    assert summary.transform == WORLD.to_json()
 
 
 def test_a_scene_in_the_wrong_frame_is_said_to_be_so_wherever_it_is_scored(
@@ -78,9 +78,9 @@ def test_a_scene_in_the_wrong_frame_is_said_to_be_so_wherever_it_is_scored(
     path = written(tmp_path / "a.ply", transformed(truth(), WORLD.inverse()))
     with caplog.at_level(logging.WARNING, "recon"):
         summary = brought_in(path, inputs, tmp_path / "train", frame="workspace")
-    assert "does not show what the views show" in summary["notices"][0]
-    assert summary["notices"][0] in caplog.text
-    assert summary["training_psnr_db"] < summary["flat_psnr_db"]
+    assert "does not show what the views show" in summary.notices[0]
+    assert summary.notices[0] in caplog.text
+    assert summary.training_psnr_db < summary.flat_psnr_db
     (tmp_path / "evaluate").mkdir()
     folders = StageInputs({**inputs.folders, "train": tmp_path / "train"})
     evaluate.run(evaluate.EvaluateConfig(), folders, tmp_path / "evaluate", CONTEXT)
@@ -92,13 +92,13 @@ def test_a_scene_that_is_only_a_little_off_is_doubted(inputs, tmp_path):
     off = Similarity(translation=np.array([0.15, 0.1, 0.0]))
     path = written(tmp_path / "a.ply", transformed(truth(), off))
     summary = brought_in(path, inputs, tmp_path / "train", frame="workspace")
-    assert "differs a little" in summary["notices"][0]
+    assert "differs a little" in summary.notices[0]
 
 
 def test_without_views_nothing_is_moved_and_the_record_says_so(tmp_path):
     path = written(tmp_path / "a.ply", truth())
     summary = brought_in(path, None, tmp_path / "train")
-    assert summary["views"] == 0
+    assert summary.views == 0
     record = json.loads((tmp_path / "train" / "import.json").read_text())
     assert (record["gaussians"], record["views"], record["z_up"]) == (60, False, False)
     assert (tmp_path / "train" / "splats.ply").read_bytes() == path.read_bytes()
@@ -109,7 +109,7 @@ def test_every_format_comes_in(tmp_path, name):
     path = tmp_path / f"a.{name}"
     FORMATS[name].write(path, truth())
     summary = brought_in(path, None, tmp_path / "train")
-    assert (summary["format"], summary["gaussians"]) == (name, 60)
+    assert (summary.format, summary.gaussians) == (name, 60)
     assert len(read_ply(tmp_path / "train" / "splats.ply")) == 60
     assert read_config(tmp_path / "train").max_gaussians == 60
 
@@ -164,5 +164,5 @@ def test_a_scene_that_wants_antialiasing_is_said_to(tmp_path):
     path = written(tmp_path / "a.ply", truth())
     path.write_bytes(path.read_bytes().replace(
         b"element", b"comment SplatRenderMode: mip\nelement", 1))
-    (notice,) = brought_in(path, None, tmp_path / "train")["notices"]
-    assert "drawn with antialiasing" in notice
+    (notice,) = brought_in(path, None, tmp_path / "train").notices
+    assert "antialiased rendering" in notice

@@ -73,7 +73,7 @@ def test_without_views_files_are_written_and_checked(alone, capsys):
         path.name for path in (alone / "export").iterdir()}
     assert states(alone)["export"] == "fresh"
     assert recon("export", alone, "--format", "spz", "--max-loss", "0", "--again") == 5
-    assert "made-up cameras" in capsys.readouterr().err
+    assert "synthetic cameras" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [

@@ -9,9 +9,9 @@ from facts import assert_facts
 from ingest_media import blocks, files, listed, take, walk, write_photos, write_video
 from PIL import Image
 
-from recon_cli.capture import from_video
+from recon_cli.capture import from_photos, from_video
 from recon_cli.config.stages import IngestConfig
-from recon_cli.io import frames as store
+from recon_cli.io import images
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notice
         assert frame["source"] == "walk.mp4"
         assert frame["sharpness"] > 0
         assert frame["held_out"] == (place % 8 == 0)
-        rgb = store.read_png(tmp_path / "out" / "frames" / frame["name"])
+        rgb = images.read_png(tmp_path / "out" / "frames" / frame["name"])
         truth = walk(40)[index].astype(float)
         # Half of the colour resolution is lost in the video, and interpolated over the edges of the
         # blocks; the wrong frame is off by 50.
@@ -169,7 +169,7 @@ def test_photos_become_frames_that_keep_their_names(tmp_path, notices):
     for index, frame in enumerate(found["frames"]):
         assert frame["name"] == frame["source"] == f"IMG_{index:04d}.png"
         assert frame["time_seconds"] is frame["sharpness"] is None
-        stored = store.read_png(tmp_path / "out" / "frames" / frame["name"])
+        stored = images.read_png(tmp_path / "out" / "frames" / frame["name"])
         np.testing.assert_array_equal(stored, blocks(48, 64, seed=index))
     assert notices() == []
 
@@ -196,7 +196,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_the_same(
     source = video if kind == "video" else write_photos(tmp_path / "room", 20)
     take(source, tmp_path / "whole")
     written = []
-    write = store.write_png
+    write = images.write_png
 
     def interrupted(path, rgb):
         if len(written) == 7:
@@ -204,7 +204,8 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_the_same(
         written.append(path.name)
         write(path, rgb)
 
-    monkeypatch.setattr(store, "write_png", interrupted)
+    for module in (from_photos, from_video):
+        monkeypatch.setattr(module, "write_png", interrupted)
     with pytest.raises(KeyboardInterrupt):
         take(source, tmp_path / "again")
     assert not (tmp_path / "again" / "frames.json").exists()
@@ -214,8 +215,9 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_the_same(
     assert sorted(before) == sorted(written)
 
     rewritten = []
-    monkeypatch.setattr(
-        store, "write_png", lambda path, rgb: (rewritten.append(path.name), write(path, rgb)))
+    for module in (from_photos, from_video):
+        monkeypatch.setattr(
+            module, "write_png", lambda path, rgb: (rewritten.append(path.name), write(path, rgb)))
     take(source, tmp_path / "again")
     assert files(tmp_path / "again") == files(tmp_path / "whole")
     assert not set(rewritten) & set(written)

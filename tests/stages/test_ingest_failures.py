@@ -11,7 +11,7 @@ from ingest_media import blocks, files, listed, take, walk, write_photos, write_
 from PIL import Image
 
 from recon_cli.errors import InputError
-from recon_cli.io import frames as store
+from recon_cli.io import images
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_a_video_corrupted_in_the_middle_goes_on_around_the_damage(
     assert summary.decoded_frames == 60 - summary.lost_frames
     assert f"{summary.lost_frames} of 60 frames are lost" in notices()[0]
     for frame in listed(tmp_path / "out")["frames"]:
-        rgb = store.read_png(tmp_path / "out" / "frames" / frame["name"])
+        rgb = images.read_png(tmp_path / "out" / "frames" / frame["name"])
         truth = walk(60)[int(frame["time_seconds"] * 10 + 0.5)].astype(float)
         assert np.abs(rgb - truth).mean() < 20
 
@@ -204,7 +204,7 @@ def test_a_full_disk_leaves_no_half_written_frame(video, tmp_path, monkeypatch, 
     left = sorted((tmp_path / "out" / "frames").iterdir())
     assert 0 < len(left) <= 3
     for path in left:
-        store.read_png(path)
+        images.read_png(path)
     monkeypatch.setattr(os, "fsync", flush)
     take(source, tmp_path / "out")
     take(source, tmp_path / "undisturbed")

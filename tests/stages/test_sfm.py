@@ -13,7 +13,7 @@ from sfm_inputs import every_nth, run, write_inputs
 from recon_cli.context import StageContext
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images, read_scene
-from recon_cli.io.frames import read_png
+from recon_cli.io.images import read_png
 from recon_cli.sfm import database
 from recon_cli.sfm.job import STEPS
 from recon_cli.workspace.atomic import clear_leftovers

@@ -6,7 +6,7 @@ import torch
 from scenes import camera_at, random_splats
 
 from recon_cli.config.stages import TrainConfig
-from recon_cli.io.images import painted
+from recon_cli.io.images import fill_masked
 from recon_cli.render import render
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
@@ -30,7 +30,7 @@ def photograph(seed=0):
 def masked_view():
     mask = np.ones((41, 60), bool)
     mask[8:25, 20:41] = False
-    return TrainView(CAMERA, painted(photograph(), mask), mask)
+    return TrainView(CAMERA, fill_masked(photograph(), mask), mask)
 
 
 def step_of(splats, view, backend, gain):

@@ -17,7 +17,7 @@ from tiny_task import (
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import FormatError, TrainingError
-from recon_cli.io.images import painted
+from recon_cli.io.images import fill_masked
 from recon_cli.render import available_backends, render
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
@@ -40,7 +40,7 @@ def masked_task(backend, device="cpu"):
         for i, view in enumerate(views):
             mask = np.ones((30, 40), bool)
             mask[5:20, 4 + 5 * i:18 + 5 * i] = False
-            views[i] = TrainView(view.camera, painted(view.image, mask), mask)
+            views[i] = TrainView(view.camera, fill_masked(view.image, mask), mask)
     return task
 
 

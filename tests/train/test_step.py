@@ -6,7 +6,7 @@ import torch
 from scenes import camera_at, joined, one_splat, random_splats
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.io.images import painted
+from recon_cli.io.images import fill_masked
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
@@ -59,7 +59,7 @@ def exact(splats, view, degree=3):
 def test_a_masked_step_gives_the_gradients_of_the_masked_loss(backend):
     splats = random_splats(200, seed=13, dtype=torch.float32)
     mask = blob_mask()
-    view = TrainView(CAMERA, painted(photograph(), mask), mask)
+    view = TrainView(CAMERA, fill_masked(photograph(), mask), mask)
     loss, gradients, _ = gradients_of(splats, view, backend)
     true_loss, expected = exact(splats, view)
     assert loss == pytest.approx(true_loss, abs=1e-6)
@@ -85,7 +85,8 @@ def test_what_the_photograph_shows_under_the_mask_changes_nothing(backend):
     for seed in (1, 2):
         image = photograph()
         image[~mask] = photograph(seed)[~mask]
-        results.append(gradients_of(splats, TrainView(CAMERA, painted(image, mask), mask), backend))
+        view = TrainView(CAMERA, fill_masked(image, mask), mask)
+        results.append(gradients_of(splats, view, backend))
     assert results[0][0] == results[1][0]
     assert all(torch.equal(results[0][1][name], results[1][1][name]) for name in results[0][1])
 
@@ -97,7 +98,7 @@ def test_a_gaussian_seen_only_under_the_mask_gets_no_gradient_and_moves_no_other
               for color in ((1.0, 0.0, 0.0), (0.0, 0.3, 0.9))]
     others = random_splats(100, seed=13, dtype=torch.float32)
     mask = blob_mask()
-    view = TrainView(CAMERA, painted(photograph(), mask), mask)
+    view = TrainView(CAMERA, fill_masked(photograph(), mask), mask)
     results = [gradients_of(joined(others, each), view, backend) for each in hidden]
     for loss, gradients, statistics in results:
         assert loss == results[0][0]
@@ -113,7 +114,7 @@ def test_a_gaussian_seen_only_under_the_mask_gets_no_gradient_and_moves_no_other
 @every_cpu_backend
 def test_a_view_that_is_ignored_altogether_has_no_loss_and_no_gradient(backend):
     mask = np.zeros((41, 60), bool)
-    view = TrainView(CAMERA, painted(photograph(), mask), mask)
+    view = TrainView(CAMERA, fill_masked(photograph(), mask), mask)
     loss, gradients, _ = gradients_of(random_splats(50, dtype=torch.float32), view, backend)
     assert loss == pytest.approx(0, abs=1e-6)
     assert not any(value.any() for value in gradients.values())

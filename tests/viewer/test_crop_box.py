@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scenes import random_splats
 
-from recon_cli.export.reduce import cropped
+from recon_cli.export.reduce import crop
 from recon_cli.viewer.crop_box import CropBox, box_around
 
 
@@ -12,7 +12,7 @@ def test_what_is_shown_is_what_export_keeps_of_the_same_words():
     splats = random_splats(500, seed=4, dtype=torch.float32)
     box = CropBox.between((-0.51234567, -1.0, 1e-5), (0.75, 0.33333333, 9.87654))
     numbers = tuple(float(word) for word in box.arguments.split())
-    kept = cropped(splats, numbers)
+    kept = crop(splats, numbers)
     assert 0 < len(kept) < 500
     torch.testing.assert_close(kept.means, splats.means[torch.from_numpy(box.contains(splats))])
 

@@ -9,7 +9,7 @@ import viser.transforms
 from viewing import complaints, nodes, opened, until, view
 
 from recon_cli.evaluation.metrics import psnr
-from recon_cli.io.images import eight_bit, read_image
+from recon_cli.io.images import read_image, to_uint8
 from recon_cli.render import render
 from recon_cli.viewer.content import TRAINING
 from recon_cli.viewer.session import Session
@@ -51,7 +51,7 @@ def test_the_page_draws_what_recon_renders_and_asks_nobody_else(shown, page, els
         ours = render(shown.content.models["pruned"].splats, camera, torch.zeros(3), 3).rgb
     drawn = picture(elsewhere, page, client, camera)
     # viser cuts Gaussians off at two standard deviations and drops the faintest
-    assert psnr(drawn.astype(np.float32), eight_bit(ours.numpy())) > 27
+    assert psnr(drawn.astype(np.float32), to_uint8(ours.numpy())) > 27
     assert not complaints(page)
     assert all(shown.address in address or address.startswith(("data:", "blob:"))
                for address in page.addresses)

@@ -1,10 +1,10 @@
 """The compressed .ply of PlayCanvas and SuperSplat: 16 bytes a Gaussian, in chunks of 256.
 
-Each chunk has the least and greatest position, log scale and colour of its Gaussians, between which
-11, 10 and 11 bits say where a position or log scale lies, and 8 where a colour does. Opacity has 8
-bits after the sigmoid, a rotation 2 for which component is largest and 10 for each of the others.
-Harmonics, where the scene has any, are a third element of bytes between -4 and 4. Axes are those of
-the plain .ply. The layout is read off https://github.com/playcanvas/splat-transform.
+Each chunk has the bounds of the positions, log scales and colours of its Gaussians; within them a
+position or log scale has 11, 10 and 11 bits and a colour 8 per channel. Opacity has 8 bits after
+the sigmoid, a rotation 2 for the index of the largest component and 10 for each of the others.
+Harmonics, if any, are a third element of bytes between -4 and 4. Axes are those of the plain .ply.
+Source of the layout: https://github.com/playcanvas/splat-transform.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from recon_cli.io.ply_table import Element, read_header, read_tables
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
-    as_splats,
-    from_smallest_three,
-    logits_of_bytes,
+    decode_opacities,
+    decode_smallest_three,
+    encode_opacities,
+    encode_smallest_three,
     morton_order,
-    opacity_bytes,
     refuse_above,
-    smallest_three,
-    writable,
+    splats_from_arrays,
+    validate_splats,
 )
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.workspace.atomic import replacing
@@ -48,13 +48,12 @@ Words = NDArray[np.uint32]
 def write_compressed_ply(path: Path, splats: Splats) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
 
-    Log scales below -20 become -20, coefficients outside -4 to 4 are clipped, and no coefficient
-    stays 0.
+    Log scales below -20 become -20, coefficients are clipped to -4 to 4, and none stays 0.
 
     Raises:
         FormatError: there are no Gaussians, one is too large, or a parameter is not finite.
     """
-    values = writable(path, splats)
+    values = validate_splats(path, splats)
     order = morton_order(values.means.numpy())
     means, log_scales, quats, logits, sh_dc, sh_rest = (
         value.numpy()[order] for value in (
@@ -63,11 +62,12 @@ def write_compressed_ply(path: Path, splats: Splats) -> None:
     refuse_above(path, log_scales, _SCALE_RANGE)
     parts = [means, np.maximum(log_scales, -_SCALE_RANGE),
              (SH_C0 * sh_dc.astype(np.float64) + 0.5).astype(np.float32)]
-    bounds, (place, scale, color) = zip(*[_bounded(part) for part in parts], strict=True)
-    alpha = opacity_bytes(logits).astype(np.uint32)
+    bounds, (place, scale, color) = zip(*[_bound_chunks(part) for part in parts], strict=True)
+    alpha = encode_opacities(logits).astype(np.uint32)
     words = np.stack([
-        _joined(place, _BITS, _SHIFTS), _rotation_words(quats), _joined(scale, _BITS, _SHIFTS),
-        _joined(color, (8, 8, 8), (24, 16, 8)) | alpha], axis=1)
+        _join_bits(place, _BITS, _SHIFTS), _rotation_words(quats),
+        _join_bits(scale, _BITS, _SHIFTS),
+        _join_bits(color, (8, 8, 8), (24, 16, 8)) | alpha], axis=1)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header(len(splats), sh_rest.shape[1]))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
@@ -84,8 +84,8 @@ def _header(n: int, terms: int) -> bytes:
     return "\n".join(lines).encode("ascii")
 
 
-def _bounded(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
-    """Returns the bounds [chunks, 6] of values [N, 3], and where in them each lies, 0 to 1."""
+def _bound_chunks(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
+    """Returns the bounds [chunks, 6] of values [N, 3], and their positions in them, 0 to 1."""
     starts = np.arange(0, len(values), _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     rows = np.arange(len(values)) // _CHUNK
@@ -94,27 +94,27 @@ def _bounded(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
     return np.concatenate([low, high], axis=1), share
 
 
-def _joined(
+def _join_bits(
     shares: NDArray[np.floating], bits: tuple[int, ...], shifts: tuple[int, ...]
 ) -> Words:
-    """Returns words [N] of shares [N, 3] of the greatest number of that many bits."""
+    """Returns words [N] of shares [N, 3], each in that many bits."""
     most = (1 << np.array(bits)) - 1
     fields = np.clip(np.rint(shares * most), 0, most).astype(np.uint32)
     return np.asarray(np.bitwise_or.reduce(fields << np.array(shifts, np.uint32), axis=1))
 
 
 def _rotation_words(quats: Floats) -> Words:
-    largest, others = smallest_three(quats)
+    largest, others = encode_smallest_three(quats)
     shares = others / np.sqrt(2) + 0.5
     index = largest.astype(np.uint32) << np.uint32(30)
-    return index | _joined(shares, (10, 10, 10), (20, 10, 0))
+    return index | _join_bits(shares, (10, 10, 10), (20, 10, 0))
 
 
 def _harmonic_bytes(sh_rest: Floats) -> Bytes:
     """Returns [N, 3 T] bytes, channel-major.
 
-    0 lies between two bytes, which stand for plus and minus 1/64. Neighbours take turns, else all
-    Gaussians without harmonics would lean the same way and tint the whole scene.
+    0 is between two bytes, which mean plus and minus 1/64. They alternate, otherwise all Gaussians
+    without harmonics would tint the whole scene the same way.
     """
     steps = np.floor(sh_rest / _STEP) + 128
     turns = 127 + np.arange(len(sh_rest))[:, None, None] % 2
@@ -126,13 +126,13 @@ def _harmonic_bytes(sh_rest: Floats) -> Bytes:
 def read_compressed_ply(path: Path) -> Splats:
     """Returns the Gaussians of a compressed .ply in the file's order and degree.
 
-    Older files without bounds of colours are read too.
+    Older files without bounds of colours are supported.
 
     Raises:
         FormatError: the file is missing, damaged, or another kind of .ply.
     """
     header = read_header(path)
-    kinds = {each.name: _kinds(each) for each in header.elements}
+    kinds = {each.name: _property_types(each) for each in header.elements}
     colored = not kinds.get("chunk", {}).keys().isdisjoint(_COLOR)
     if not (_has(kinds.get("chunk", {}), _BOUNDS if colored else _PLACE + _SCALE, "f4")
             and _has(kinds.get("vertex", {}), _PACKED, "u4")):
@@ -143,20 +143,20 @@ def read_compressed_ply(path: Path) -> Splats:
     if not n or len(chunk) != -(-n // _CHUNK):
         raise FormatError(f"{path} has {len(chunk)} chunks of {_CHUNK} for {n} Gaussians.")
     place, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
-    shares = _shares(color, (8, 8, 8), (24, 16, 8))
-    colors = _between(chunk, _COLOR, shares) if colored else shares
-    return as_splats(path, {
-        "means": _between(chunk, _PLACE, _shares(place, _BITS, _SHIFTS)),
+    shares = _split_bits(color, (8, 8, 8), (24, 16, 8))
+    colors = _interpolate(chunk, _COLOR, shares) if colored else shares
+    return splats_from_arrays(path, {
+        "means": _interpolate(chunk, _PLACE, _split_bits(place, _BITS, _SHIFTS)),
         "quats": _rotations(rotation),
-        "log_scales": _between(chunk, _SCALE, _shares(scale, _BITS, _SHIFTS)),
-        "logit_opacities": logits_of_bytes((color & 255).astype(np.uint8)),
+        "log_scales": _interpolate(chunk, _SCALE, _split_bits(scale, _BITS, _SHIFTS)),
+        "logit_opacities": decode_opacities((color & 255).astype(np.uint8)),
         "sh_dc": (colors - 0.5) / SH_C0,
         "sh_rest": _harmonics(path, tables, n),
     })
 
 
-def _kinds(element: Element) -> dict[str, str]:
-    """Returns the types of an element's properties, such as f4, whatever their byte order."""
+def _property_types(element: Element) -> dict[str, str]:
+    """Returns the types of an element's properties, such as f4, without byte order."""
     fields = element.row.fields if element.row is not None else None
     return {name: field[0].str[1:] for name, field in (fields or {}).items()}
 
@@ -165,7 +165,7 @@ def _has(kinds: dict[str, str], names: list[str], kind: str) -> bool:
     return all(kinds.get(name) == kind for name in names)
 
 
-def _shares(
+def _split_bits(
     words: Words, bits: tuple[int, ...], shifts: tuple[int, ...]
 ) -> NDArray[np.float64]:
     """Returns [N, 3] shares of words [N]: the inverse of `_joined`."""
@@ -173,10 +173,10 @@ def _shares(
     return (words[:, None] >> np.array(shifts, np.uint32) & most) / most
 
 
-def _between(
+def _interpolate(
     chunk: NDArray[np.void], names: list[str], shares: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns what shares [N, 3] of the chunks' bounds stand for."""
+    """Returns the values of shares [N, 3] of the chunks' bounds."""
     with np.errstate(invalid="ignore"):  # bounds that are not finite make NaN, which is refused
         bounds = np.stack([chunk[name].astype(np.float64) for name in names], axis=1)
         rows = np.arange(len(shares)) // _CHUNK
@@ -185,8 +185,8 @@ def _between(
 
 
 def _rotations(words: Words) -> Floats:
-    others = (_shares(words, (10, 10, 10), (20, 10, 0)) - 0.5) * np.sqrt(2)
-    return from_smallest_three((words >> 30).astype(np.int64), others.astype(np.float32))
+    others = (_split_bits(words, (10, 10, 10), (20, 10, 0)) - 0.5) * np.sqrt(2)
+    return decode_smallest_three((words >> 30).astype(np.int64), others.astype(np.float32))
 
 
 def _harmonics(path: Path, tables: dict[str, NDArray[np.void]], n: int) -> Floats:
@@ -199,6 +199,6 @@ def _harmonics(path: Path, tables: dict[str, NDArray[np.void]], n: int) -> Float
             3 * terms for terms in TERMS[1:]] or any(kinds[name][0] != "u1" for name in names):
         raise FormatError(f"{path} has harmonics that do not make a degree of its Gaussians.")
     steps = np.stack([table[name] for name in names], axis=1).astype(np.float32)
-    steps[steps > 0] += 0.5  # a byte stands for the middle of its step, but 0 and 255 for the ends
+    steps[steps > 0] += 0.5  # a byte means the middle of its step, but 0 and 255 the ends
     steps[steps > 255] = 256
     return ((steps - 128) * np.float32(_STEP)).reshape(n, 3, -1).transpose(0, 2, 1)

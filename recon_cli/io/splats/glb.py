@@ -1,20 +1,23 @@
-"""glTF with Gaussians: the binary .glb of KHR_gaussian_splatting.
+"""glTF with Gaussians: the binary .glb of KHR_gaussian_splatting, and its container.
 
 One primitive of points: POSITION; ROTATION, a unit quaternion xyzw; SCALE, the standard deviations
 themselves; OPACITY, after the sigmoid; SH_DEGREE_l_COEF_n, in INRIA's basis, signs and order; and
 COLOR_0 for programs that know nothing of Gaussians. All are float32 but COLOR_0. Drafts of the
 extension had logarithms in SCALE; a file that has numbers below 0 there is refused.
 
-The world of glTF is right-handed with +Y up. A scene is turned into it when it is written, with its
-coefficients, and turned back when it is read: by `Z_UP` for a scene whose z is up, by `Y_DOWN` for
+The world of glTF is right-handed with +Y up. A scene is rotated into it, with its coefficients,
+when it is written, and back when it is read: by `Z_UP` for a scene whose z is up, by `Y_DOWN` for
 one with the axes of a camera (x right, y down, z forward); one with y up stays.
 
-The extension is https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/
-KHR_gaussian_splatting.
+Every length and offset of the container is checked against the file before it is used. Sources:
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6 and 4, and
+https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting.
 """
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,103 +26,42 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.errors import InputError
-from recon_cli.io.splats.glb_container import Container, contained
-from recon_cli.io.splats.values import arrays, colored_rows, logit, sigmoid, unit_quats
+from recon_cli.errors import FormatError, InputError
+from recon_cli.io.splats.values import logit, normalize_quats, sigmoid, to_arrays, trim_zero_rows
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined, transformed
 from recon_cli.workspace.atomic import write_bytes
 
-
-def placed_meshes(container: Container) -> Iterator[tuple[dict[str, Any], Similarity]]:
-    """Yields the meshes of the scene that is shown first, each with what leads it to the world.
-
-    Raises:
-        FormatError: nodes are missing, form a ring, or stretch, shear or mirror a mesh, which
-            Gaussians do not survive as such.
-    """
-    scene = container.entry("scenes", container.json.get("scene", 0))
-    left = [(node, np.eye(4)) for node in _indices(container, scene, "nodes")]
-    seen: set[int] = set()
-    while left:
-        index, above = left.pop()
-        if index in seen:
-            raise container.damaged(f"the node {index} twice: no tree")
-        seen.add(index)
-        node = container.entry("nodes", index)
-        with np.errstate(over="ignore", invalid="ignore"):  # such a matrix is refused below
-            matrix = above @ _matrix(container, node)
-        left += [(child, matrix) for child in _indices(container, node, "children")]
-        if "mesh" in node:
-            yield container.entry("meshes", node["mesh"]), _similarity(container, matrix)
-
-
-def _indices(container: Container, entry: dict[str, Any], name: str) -> list[int]:
-    value = entry.get(name, [])
-    if not isinstance(value, list) or not all(type(index) is int for index in value):
-        raise container.damaged(f"{name} = {value!r:.40}; needed are numbers of nodes")
-    return value
-
-
-def _matrix(container: Container, node: dict[str, Any]) -> NDArray[np.float64]:
-    """Returns the matrix [4, 4] of a node, given as such or as its three parts."""
-    if "matrix" in node:
-        return _numbers(container, node, "matrix", np.eye(4).ravel()).reshape(4, 4).T
-    x, y, z, w = _numbers(container, node, "rotation", np.array([0.0, 0, 0, 1]))
-    turn = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn * _numbers(container, node, "scale", np.ones(3))
-    matrix[:3, 3] = _numbers(container, node, "translation", np.zeros(3))
-    return matrix
-
-
-def _numbers(
-    container: Container, node: dict[str, Any], name: str, default: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    value = node.get(name)
-    if value is None:
-        return default
-    largest = float(np.finfo(np.float32).max)
-    if not isinstance(value, list) or len(value) != len(default) or not all(
-            type(one) in (int, float) and abs(one) <= largest for one in value):
-        raise container.damaged(f"{name} = {value!r:.40}; needed are {len(default)} numbers")
-    return np.array(value, np.float64)
-
-
-def _similarity(container: Container, matrix: NDArray[np.float64]) -> Similarity:
-    try:
-        return Similarity.from_matrix(matrix)
-    except ValueError as error:
-        raise container.damaged(
-            "a node that stretches, shears or mirrors its Gaussians") from error
-
-
-# [3, 3] from the scene's axes to those of glTF; numbers that are whole keep positions exact.
+# [3, 3] from the scene's axes to those of glTF; whole numbers keep positions exact.
 Z_UP: NDArray[np.float64] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 Y_DOWN: NDArray[np.float64] = np.diag([1.0, -1, -1])
 Y_UP: NDArray[np.float64] = np.eye(3)
-# As `asset.extras` tells which of them a scene had.
+# By the names under which `asset.extras` records the axes of the scene.
 _AXES = {"z up": Z_UP, "y down": Y_DOWN, "y up": Y_UP}
-_SAID = "scene_axes"
-
+_AXES_KEY = "scene_axes"
 _NAME = "KHR_gaussian_splatting"
-_PLAIN = (_NAME, "KHR_mesh_quantization")  # what can be read of extensions that a file demands
+_SUPPORTED = (_NAME, "KHR_mesh_quantization")  # of the extensions that a file may require
 _COLOR_SPACE = "srgb_rec709_display"
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
-# The opacity next to 1 that float32 can tell from it: a logit has to be finite.
+# Distance from 1 of the nearest opacity below it in float32: a logit has to be finite.
 _LEAST_OPACITY = 2.0 ** -24
 _LEAST_SCALE = float(np.finfo(np.float32).tiny)  # a flat Gaussian has a scale of 0
 _LEAST_BYTES = 12  # of a Gaussian: its position
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_MAGIC, _VERSION = b"glTF", 2
+_JSON, _BIN = b"JSON", b"BIN\0"
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_JSON_LIMIT = 1 << 22  # bytes; a scene needs a thousandth of it
+_LARGEST = (1 << 32) - 1  # bytes: the header's length has 32 bits
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_HINT = "Write or copy the file again."
 
 
 def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -> None:
     """Writes `splats` to `path`, whole or not at all, in their order.
 
-    Quaternions lose their length. An opacity nearer to 1 than float32 can tell becomes 1.
+    Quaternions are normalized. An opacity nearer to 1 than float32 can represent becomes 1.
 
     Args:
         path: of the .glb.
@@ -130,11 +72,11 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
         InputError: there are no Gaussians, a value is not finite or a scale beyond float32, or
             the file would exceed 4 GiB.
     """
-    table = arrays(transformed(splats, Similarity(rotation=axes)), ".glb")
+    table = to_arrays(transformed(splats, Similarity(rotation=axes)), ".glb")
     with np.errstate(over="ignore"):
         scales = np.exp(table["log_scales"])
     if not np.isfinite(scales).all():
-        raise InputError("The scene holds Gaussians that are larger than any number.")
+        raise InputError("The scene holds Gaussians whose size overflows float32.")
     opacities = sigmoid(table["logit_opacities"])[:, None]
     colors = (SH_C0 * table["sh_dc"] + 0.5).clip(0, 1)
     columns: dict[str, NDArray[Any]] = {
@@ -146,28 +88,28 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
         f"{_NAME}:SH_DEGREE_0_COEF_0": table["sh_dc"],
     }
     degree = TERMS.index(table["sh_rest"].shape[1])
-    columns |= {name: table["sh_rest"][:, at] for at, name in enumerate(_coefficients(degree))}
-    described = _described(columns)
+    columns |= {name: table["sh_rest"][:, at] for at, name in enumerate(_coefficient_names(degree))}
+    gltf = _describe(columns)
     for name, known in _AXES.items():
         if np.array_equal(axes, known):
-            described["asset"]["extras"] = {_SAID: name}
-    write_bytes(path, contained(described, b"".join(
+            gltf["asset"]["extras"] = {_AXES_KEY: name}
+    write_bytes(path, pack_glb(gltf, b"".join(
         np.ascontiguousarray(column).tobytes() for column in columns.values())))
 
 
 def nearest_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the one of the known axes whose up is nearest to a unit vector [3]."""
+    """Returns Z_UP, Y_DOWN or Y_UP, whichever has its up nearest to a unit vector [3]."""
     return max(_AXES.values(), key=lambda axes: float(axes[1] @ up))
 
 
-def _coefficients(degree: int) -> list[str]:
+def _coefficient_names(degree: int) -> list[str]:
     """Returns the names of the attributes of degrees 1 to `degree`, in the order of `sh_rest`."""
-    return [f"{_NAME}:SH_DEGREE_{one}_COEF_{at}"
-            for one in range(1, degree + 1) for at in range(2 * one + 1)]
+    return [f"{_NAME}:SH_DEGREE_{band}_COEF_{at}"
+            for band in range(1, degree + 1) for at in range(2 * band + 1)]
 
 
-def _described(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Returns the JSON for columns that lie one behind the other."""
+def _describe(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Returns the JSON for columns that are stored one after the other."""
     views, accessors, start = [], [], 0
     for at, (name, column) in enumerate(columns.items()):
         views.append({"buffer": 0, "byteOffset": start, "byteLength": column.nbytes,
@@ -191,104 +133,311 @@ def _described(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     }
 
 
+def pack_glb(value: dict[str, Any], data: bytes) -> bytes:
+    """Returns the bytes of a .glb with this JSON and this binary chunk.
+
+    Raises:
+        InputError: they are more than a .glb can hold.
+    """
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    length = _HEADER.size + 2 * _CHUNK.size + len(text) + len(data)
+    if length > _LARGEST:
+        raise InputError(
+            f"The scene takes {length} bytes as a .glb, which holds {_LARGEST} at most.",
+            hint="Prune it, or write another format.")
+    return b"".join([
+        _HEADER.pack(_MAGIC, _VERSION, length), _CHUNK.pack(len(text), _JSON), text,
+        _CHUNK.pack(len(data), _BIN), data])
+
+
 def read_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> Splats:
-    """Returns the Gaussians of a .glb as float32 tensors; other points and meshes are left out.
+    """Returns the Gaussians of a .glb as float32 tensors; other points and meshes are skipped.
 
     The order is the file's; where several primitives hold Gaussians, those with coefficients come
     first. Behind the last one of a primitive that has any, Gaussians are of degree 0.
 
     Args:
         path: of the .glb.
-        axes: [3, 3] rotation from the axes that are wanted to those of glTF, as in `write_glb`;
-            None for those that the file says the scene had, or else `Z_UP`.
+        axes: [3, 3] rotation from the wanted axes to those of glTF, as in `write_glb`; None for
+            those that the file records, or else `Z_UP`.
 
     Raises:
-        FormatError: the file is missing or damaged, holds no Gaussians, or asks for more than is
-            known here: compression, another kernel, linear colours, nodes that stretch.
+        FormatError: the file is missing or damaged, holds no Gaussians, or needs what is not
+            supported: compression, another kernel, linear colours, nodes that stretch.
     """
     container = Container(path)
     required = container.json.get("extensionsRequired", [])
-    if not isinstance(required, list) or not all(name in _PLAIN for name in required):
-        raise container.damaged(f"what needs the extensions {required!r:.200}")
+    if not isinstance(required, list) or not all(name in _SUPPORTED for name in required):
+        raise container.error(f"content that needs the extensions {required!r:.200}")
     parts, total = [], 0
-    for mesh, place in placed_meshes(container):
-        for primitive, said in _primitives(container, mesh):
-            part = _read_primitive(container, primitive, said)
+    for mesh, similarity in walk_meshes(container):
+        for primitive, extension in _find_primitives(container, mesh):
+            part = _read_primitive(container, primitive, extension)
             total += len(part)
             if total * _LEAST_BYTES > container.size:
-                raise container.damaged(f"{total} Gaussians in {container.size} bytes")
-            parts.append(transformed(part, place))
+                raise container.error(f"{total} Gaussians in {container.size} bytes")
+            parts.append(transformed(part, similarity))
     if not parts:
-        raise container.damaged(f"no Gaussians: no primitive with {_NAME}")
+        raise container.error(f"no Gaussians: no primitive with {_NAME}")
     degree = max(part.sh_degree for part in parts)
     splats = parts[0] if len(parts) == 1 else joined(
         [part.with_degree(degree) for part in parts])[0]
     if not all(torch.isfinite(value).all() for value in splats.parameters().values()):
-        raise container.damaged("values beyond any number")
+        raise container.error("values that overflow float32")
     if axes is None:
-        axes = _AXES.get(_said_axes(container.json), Z_UP)
+        axes = _AXES.get(_read_axes(container.json), Z_UP)
     return transformed(splats, Similarity(rotation=axes.T))
 
 
-def _said_axes(value: Mapping[str, Any]) -> str:
-    """Returns which axes a file says the scene had; empty where it says nothing."""
+def _read_axes(value: Mapping[str, Any]) -> str:
+    """Returns the name of the scene's axes that a file records; empty if it records none."""
     inner: Any = value
-    for key in ("asset", "extras", _SAID):
+    for key in ("asset", "extras", _AXES_KEY):
         inner = inner.get(key) if isinstance(inner, Mapping) else None
     return inner if isinstance(inner, str) else ""
 
 
-def _primitives(
+def _find_primitives(
     container: Container, mesh: dict[str, Any]
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Yields the primitives of Gaussians, each with what the extension says of it."""
+    """Yields the primitives of Gaussians, each with its entry of the extension."""
     primitives = mesh.get("primitives")
     if not isinstance(primitives, list):
-        raise container.damaged("a mesh without primitives")
+        raise container.error("a mesh without primitives")
     for primitive in primitives:
         extensions = primitive.get("extensions", {}) if isinstance(primitive, dict) else None
         if not isinstance(extensions, dict):
-            raise container.damaged("a primitive that is none")
-        said = extensions.get(_NAME)
-        if isinstance(said, dict):
-            yield primitive, said
+            raise container.error("a malformed primitive")
+        extension = extensions.get(_NAME)
+        if isinstance(extension, dict):
+            yield primitive, extension
 
 
 def _read_primitive(
-    container: Container, primitive: dict[str, Any], said: dict[str, Any]
+    container: Container, primitive: dict[str, Any], extension: dict[str, Any]
 ) -> Splats:
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict) or primitive.get("mode") != _POINTS:
-        raise container.damaged("Gaussians that are no points")
-    if said.get("extensions"):
-        raise container.damaged(f"Gaussians with the extensions {said['extensions']!r:.200}")
+        raise container.error("Gaussians that are not points")
+    if extension.get("extensions"):
+        raise container.error(f"Gaussians with the extensions {extension['extensions']!r:.200}")
     for name, known in (("kernel", "ellipse"), ("colorSpace", _COLOR_SPACE)):
-        if said.get(name) != known:
-            raise container.damaged(f"the {name} {said.get(name)!r:.40}; {known} can be read")
+        value = extension.get(name)
+        if value != known:
+            raise container.error(f"the {name} {value!r:.40}; {known} can be read")
 
     def values(name: str, kind: str) -> NDArray[np.float64]:
         if name not in attributes:
-            raise container.damaged(f"Gaussians without {name}")
+            raise container.error(f"Gaussians without {name}")
         return container.values(attributes[name], kind)
 
     means = values("POSITION", "VEC3")
     scales, opacities = values(f"{_NAME}:SCALE", "VEC3"), values(f"{_NAME}:OPACITY", "SCALAR")
     if scales.min() < 0 or opacities.min() < 0 or opacities.max() > 1:
-        raise container.damaged("scales below 0 or opacities beyond 0 to 1: a draft of the format?")
-    present = [name for name in _coefficients(3) if name in attributes]
-    if len(present) not in TERMS or present != _coefficients(TERMS.index(len(present))):
-        raise container.damaged(f"{len(present)} coefficients, which make no degree")
+        raise container.error("scales below 0 or opacities beyond 0 to 1: a draft of the format?")
+    present = [name for name in _coefficient_names(3) if name in attributes]
+    if len(present) not in TERMS or present != _coefficient_names(TERMS.index(len(present))):
+        raise container.error(f"{len(present)} coefficients, which make no degree")
     rest = [values(name, "VEC3") for name in present]
     table: dict[str, NDArray[Any]] = {
         "means": means,
-        "quats": unit_quats(values(f"{_NAME}:ROTATION", "VEC4")[:, [3, 0, 1, 2]]),
+        "quats": normalize_quats(values(f"{_NAME}:ROTATION", "VEC4")[:, [3, 0, 1, 2]]),
         "log_scales": np.log(np.maximum(scales, _LEAST_SCALE)),
         "logit_opacities": logit(opacities[:, 0], _LEAST_OPACITY),
         "sh_dc": values(f"{_NAME}:SH_DEGREE_0_COEF_0", "VEC3"),
     }
     if {len(column) for column in (*table.values(), *rest)} != {len(means)}:
-        raise container.damaged("attributes of different lengths")
-    table["sh_rest"] = colored_rows(
+        raise container.error("attributes of different lengths")
+    table["sh_rest"] = trim_zero_rows(
         np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3)))
     return Splats(**{name: torch.from_numpy(value.astype(np.float32))
                      for name, value in table.items()})
+
+
+def walk_meshes(container: Container) -> Iterator[tuple[dict[str, Any], Similarity]]:
+    """Yields the meshes of the default scene, each with its similarity to the world.
+
+    Raises:
+        FormatError: nodes are missing, form a cycle, or stretch, shear or mirror a mesh, after
+            which its Gaussians would be none.
+    """
+    scene = container.entry("scenes", container.json.get("scene", 0))
+    pending = [(node, np.eye(4)) for node in _indices(container, scene, "nodes")]
+    visited: set[int] = set()
+    while pending:
+        index, parent = pending.pop()
+        if index in visited:
+            raise container.error(f"the node {index} twice: no tree")
+        visited.add(index)
+        node = container.entry("nodes", index)
+        with np.errstate(over="ignore", invalid="ignore"):  # such a matrix is refused below
+            matrix = parent @ _matrix(container, node)
+        pending += [(child, matrix) for child in _indices(container, node, "children")]
+        if "mesh" in node:
+            yield container.entry("meshes", node["mesh"]), _similarity(container, matrix)
+
+
+def _indices(container: Container, entry: dict[str, Any], name: str) -> list[int]:
+    value = entry.get(name, [])
+    if not isinstance(value, list) or not all(type(index) is int for index in value):
+        raise container.error(f"{name} = {value!r:.40}; needed are numbers of nodes")
+    return value
+
+
+def _matrix(container: Container, node: dict[str, Any]) -> NDArray[np.float64]:
+    """Returns the matrix [4, 4] of a node, given as a matrix or as its three parts."""
+    if "matrix" in node:
+        return _numbers(container, node, "matrix", np.eye(4).ravel()).reshape(4, 4).T
+    x, y, z, w = _numbers(container, node, "rotation", np.array([0.0, 0, 0, 1]))
+    rotation = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * _numbers(container, node, "scale", np.ones(3))
+    matrix[:3, 3] = _numbers(container, node, "translation", np.zeros(3))
+    return matrix
+
+
+def _numbers(
+    container: Container, node: dict[str, Any], name: str, default: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    value = node.get(name)
+    if value is None:
+        return default
+    largest = float(np.finfo(np.float32).max)
+    if not isinstance(value, list) or len(value) != len(default) or not all(
+            type(item) in (int, float) and abs(item) <= largest for item in value):
+        raise container.error(f"{name} = {value!r:.40}; needed are {len(default)} numbers")
+    return np.array(value, np.float64)
+
+
+def _similarity(container: Container, matrix: NDArray[np.float64]) -> Similarity:
+    try:
+        return Similarity.from_matrix(matrix)
+    except ValueError as error:
+        raise container.error(
+            "a node that stretches, shears or mirrors its Gaussians") from error
+
+
+class Container:
+    """An open .glb.
+
+    Attributes:
+        json: its JSON object.
+        size: bytes of its binary chunk.
+
+    Raises:
+        FormatError: from every method, if the file does not hold what it promises.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEADER.size + _CHUNK.size)
+                if len(head) < _HEADER.size + _CHUNK.size or not head.startswith(_MAGIC):
+                    raise FormatError(f"{path} is no .glb.")
+                data = head + file.read()
+        except OSError as error:
+            raise FormatError(f"{path} cannot be read: {error}.") from error
+        _, version, length = _HEADER.unpack_from(data)
+        if version != _VERSION:
+            raise self.error(f"version {version} of the container; version 2 can be read")
+        if length != len(data):
+            raise self.error(f"{len(data)} bytes where its header promises {length}")
+        kind, text, at = self._chunk(data, _HEADER.size)
+        if kind != _JSON or len(text) > _JSON_LIMIT:
+            raise self.error(f"a first chunk {kind!r} of {len(text)} bytes, needed is JSON")
+        self._bytes = memoryview(b"")
+        if at < len(data):
+            kind, self._bytes, _ = self._chunk(data, at)
+            if kind != _BIN:
+                raise self.error(f"a second chunk {kind!r}, needed is BIN")
+        self.size = len(self._bytes)
+        self.json = self._parse(text)
+
+    def error(self, content: str) -> FormatError:
+        """Returns the error for this file holding `content`."""
+        return FormatError(f"{self._path} holds {content}.", hint=_HINT)
+
+    def entry(self, group: str, index: object) -> dict[str, Any]:
+        """Returns an entry of nodes, meshes, accessors and so on."""
+        entries = self.json.get(group)
+        if (not isinstance(entries, list) or type(index) is not int
+                or not 0 <= index < len(entries) or not isinstance(entries[index], dict)):
+            raise self.error(f"no {group} {index!r:.40}")
+        entry: dict[str, Any] = entries[index]
+        return entry
+
+    def values(self, accessor: object, kind: str) -> NDArray[np.float64]:
+        """Returns the values [N, C] of an accessor of a type such as VEC3.
+
+        Normalized integers are converted to 0 to 1, or -1 to 1.
+        """
+        entry = self.entry("accessors", accessor)
+        component = entry.get("componentType")
+        if (entry.get("type") != kind or type(component) is not int
+                or component not in _COMPONENTS or "sparse" in entry):
+            raise self.error(
+                f"an accessor of {entry.get('type')!r:.40} and {component!r:.40}, not of {kind}")
+        item, width = np.dtype(_COMPONENTS[component]), _WIDTHS[kind]
+        count = self._whole(entry, "count", 1)
+        part, stride = self._view(entry.get("bufferView"), item.itemsize * width)
+        start = self._whole(entry, "byteOffset", 0, default=0)
+        if start + stride * (count - 1) + item.itemsize * width > len(part):
+            raise self.error(f"an accessor of {count} values that end after their buffer")
+        table = np.ndarray((count, width), item, part, start, (stride, item.itemsize))
+        with np.errstate(invalid="ignore"):  # of a NaN that signals
+            values = table.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise self.error("values that are not finite")
+        if entry.get("normalized") is True and item.kind in "iu":
+            values = np.maximum(values / np.iinfo(item).max, -1)
+        return values
+
+    def _view(self, index: object, least: int) -> tuple[memoryview, int]:
+        """Returns the bytes of a buffer view and the stride of its values of `least` bytes."""
+        view = self.entry("bufferViews", index)
+        buffer = self.entry("buffers", view.get("buffer"))
+        if view["buffer"] != 0 or "uri" in buffer:
+            raise self.error("values in another file, or in none")
+        start = self._whole(view, "byteOffset", 0, default=0)
+        length = self._whole(view, "byteLength", 1)
+        stride = self._whole(view, "byteStride", least, default=least)
+        if start + length > self.size:
+            raise self.error(f"a view of {length} bytes that ends after the {self.size} there")
+        return self._bytes[start:start + length], stride
+
+    def _whole(
+        self, part: dict[str, Any], name: str, least: int, *, default: int | None = None
+    ) -> int:
+        value = part.get(name, default)
+        if type(value) is not int or not least <= value <= _LARGEST:
+            raise self.error(f"{name} = {value!r:.40}; needed is at least {least}")
+        return value
+
+    def _chunk(self, data: bytes, at: int) -> tuple[bytes, memoryview, int]:
+        """Returns the type and the bytes of a chunk, and the offset of the next."""
+        if at + _CHUNK.size > len(data):
+            raise self.error("a chunk that is cut short")
+        length, kind = _CHUNK.unpack_from(data, at)
+        start = at + _CHUNK.size
+        if start + length > len(data):
+            raise self.error(f"a chunk of {length} bytes that ends after the file")
+        return kind, memoryview(data)[start:start + length], start + length
+
+    def _parse(self, text: memoryview) -> dict[str, Any]:
+        try:
+            value = json.loads(bytes(text), parse_constant=_no_constant)
+        except (ValueError, RecursionError) as error:
+            raise self.error(f"JSON that cannot be read: {error}") from error
+        if not isinstance(value, dict):
+            raise self.error("JSON that is no object")
+        return value
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")

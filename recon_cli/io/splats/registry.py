@@ -1,4 +1,4 @@
-"""The formats of Gaussians by name, and which one a file is in."""
+"""The formats of Gaussians by name, and the format of a file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class SplatFormat:
     """One format.
 
     Attributes:
-        name: and, after a dot, the end of its files' names.
+        name: also the suffix of its files, after a dot.
         read: returns the Gaussians of a file; raises FormatError.
-        write: writes a file, whole or not at all; raises InputError for what does not fit.
+        write: writes a file, whole or not at all; raises InputError if a value does not fit.
     """
 
     name: str
@@ -32,7 +32,7 @@ class SplatFormat:
     write: Callable[[Path, Splats], None]
 
 
-FORMATS: dict[str, SplatFormat] = {one.name: one for one in (
+FORMATS: dict[str, SplatFormat] = {row.name: row for row in (
     SplatFormat("compressed.ply", read_compressed_ply, write_compressed_ply),  # before "ply"
     SplatFormat("ply", read_ply, write_ply),
     SplatFormat("splat", read_splat, write_splat),
@@ -44,14 +44,14 @@ FORMATS: dict[str, SplatFormat] = {one.name: one for one in (
 
 
 def format_of(path: Path) -> SplatFormat:
-    """Returns the format that the end of a file's name stands for.
+    """Returns the format of a file by the end of its name.
 
     Raises:
-        FormatError: it stands for none.
+        FormatError: the name ends in none.
     """
-    for name, found in FORMATS.items():
+    for name, row in FORMATS.items():
         if path.name.lower().endswith(f".{name}"):
-            return found
+            return row
     raise FormatError(
         f"{path} is of no known format of Gaussians.",
         hint="Known are " + ", ".join(f".{name}" for name in FORMATS) + ".")
@@ -63,10 +63,10 @@ def read_splats(path: Path) -> Splats:
     Raises:
         FormatError: its format is not known, or the file is damaged.
     """
-    found = format_of(path)
+    row = format_of(path)
     try:
-        return found.read(path)
+        return row.read(path)
     except FormatError as error:
         error.hint = error.hint or (
-            f"Copy or export it again; if it is no .{found.name}, rename it to what it is.")
+            f"Copy or export it again; if it is no .{row.name}, rename it to its real format.")
         raise

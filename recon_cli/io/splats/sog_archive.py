@@ -1,16 +1,17 @@
-"""The zip of a .sog: JSON and lossless images, none of them taken larger than it may be.
+"""The zip of a .sog and its meta.json, checked before they are trusted.
 
-Nothing is unpacked to the disk. Sizes in a zip's directory are what its writer claims, so every
-entry is read up to a bound that the number of Gaussians sets, and that number is bound by the size
-of the file.
+Nothing is unpacked to the disk. Sizes in a zip's directory are only claims, so every entry is read
+up to a bound that follows from the number of Gaussians, which the size of the file bounds in turn.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import sys
 import zipfile
 import zlib
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,23 +20,26 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from recon_cli.errors import FormatError
+from recon_cli.io.splats.codebooks import BOOK, Floats
 
 META = "meta.json"
 _META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
-_SMALL = 1 << 20  # Gaussians or pixels that are taken without asking how: a few hundred MB
-_START, _ENTRY = b"PK\x03\x04", b"PK\x01\x02"  # of a zip, and of each entry of its directory
+_SMALL = 1 << 20  # Gaussians or pixels that are always accepted: a few hundred MB
+_START, _ENTRY = b"PK\x03\x04", b"PK\x01\x02"  # of the file, and of each entry of its directory
 _ENTRIES = 64  # a .sog has eight
 _HEADER = 1 << 16  # bytes of an image beside its pixels
 _HINT = "Write or copy the file again."
-_DATE = (1980, 1, 1, 0, 0, 0)  # the first one that a zip can hold: the same scene, the same bytes
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the others do not stop at a bound
+_DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip can hold: the same scene, the same bytes
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others cannot be stopped at a bound
+_MAX_ENTRIES = 65536  # of a palette: labels are 16 bits
+_MAX_COUNT = 16383 * 16383  # pixels of the largest WebP
 
 
 class Archive:
     """An open .sog.
 
     Raises:
-        FormatError: from every method, where the file does not hold what it promises.
+        FormatError: from every method, if the file does not hold what it promises.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,7 +50,7 @@ class Archive:
                     raise FormatError(f"{path} is no .sog.")
                 self._data = _START + file.read()
             if self._data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
-                raise self.damaged(f"more than {_ENTRIES} entries: no .sog")
+                raise self.error(f"more than {_ENTRIES} entries: no .sog")
             self._zip = zipfile.ZipFile(io.BytesIO(self._data))
         except OSError as error:
             raise FormatError(f"{path} cannot be read: {error}.") from error
@@ -54,32 +58,32 @@ class Archive:
             raise FormatError(f"{path} is no .sog: {error}.", hint=_HINT) from error
         self._entries = {entry.filename: entry for entry in self._zip.infolist()}
         if len(self._entries) < len(self._zip.infolist()):
-            raise self.damaged("two entries of one name")
+            raise self.error("two entries of one name")
         for name in self._entries:
-            if _leaves(name):
-                raise self.damaged(f"the entry {name!r:.80}, which leaves the archive")
+            if _escapes(name):
+                raise self.error(f"the entry {name!r:.80}, which leaves the archive")
 
-    def damaged(self, found: str) -> FormatError:
-        """Returns the error that says what was found in this file."""
-        return FormatError(f"{self._path} holds {found}.", hint=_HINT)
+    def error(self, content: str) -> FormatError:
+        """Returns the error for this file holding `content`."""
+        return FormatError(f"{self._path} holds {content}.", hint=_HINT)
 
     def meta(self) -> dict[str, Any]:
-        """Returns what meta.json says."""
+        """Returns the object in meta.json."""
         try:
             value = json.loads(self._read(META, _META_LIMIT), parse_constant=_no_constant)
         except (ValueError, RecursionError) as error:
-            raise self.damaged(f"a {META} that cannot be read: {error}") from error
+            raise self.error(f"a {META} that cannot be read: {error}") from error
         if not isinstance(value, dict):
-            raise self.damaged(f"a {META} that is no set of names")
+            raise self.error(f"a {META} that is no object")
         return value
 
     def check_count(self, count: int) -> None:
-        """Raises FormatError for more Gaussians than a file of this size can be trusted to hold.
+        """Raises FormatError for more Gaussians than a file of this size is likely to hold.
 
         They take about 16 bytes each; images of one colour take none, however large they are.
         """
         if count > _SMALL + len(self._data):
-            raise self.damaged(f"{count} Gaussians in {len(self._data)} bytes, as it claims")
+            raise self.error(f"{count} Gaussians in {len(self._data)} bytes, as it claims")
 
     def pixels(
         self, name: str, count: int, *, size: tuple[int, int] | None = None
@@ -88,56 +92,56 @@ class Archive:
 
         Args:
             name: of its entry.
-            count: pixels that it has at least, and not many more.
-            size: (width, height) that it has to have; None for any.
+            count: least number of its pixels, which may be only a few more.
+            size: (width, height) that it must have; None for any.
         """
         most = max(4 * count, _SMALL)
         data = self._read(name, 4 * most + _HEADER)
         if data[8:16] == b"WEBPVP8 ":
-            raise self.damaged(f"{name}, which is compressed with losses: its numbers are gone")
+            raise self.error(f"{name}, which has lossy compression that destroys its values")
         self._check_size(_webp_size(data), name, count, most, size)
         try:
             with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
                 if image.mode not in ("RGB", "RGBA") or getattr(image, "n_frames", 1) != 1:
-                    raise self.damaged(f"{name}, which is no single image of 8 bits a channel")
+                    raise self.error(f"{name}, which is no single image of 8 bits a channel")
                 self._check_size(image.size, name, count, most, size)
                 return np.asarray(image.convert("RGBA"))
         except (OSError, UnidentifiedImageError, ValueError, SyntaxError, zlib.error,
                 Image.DecompressionBombError) as error:
-            raise self.damaged(f"{name}, which is no image: {error}") from error
+            raise self.error(f"{name}, which is no image: {error}") from error
 
     def _check_size(
-        self, found: tuple[int, int] | None, name: str, count: int, most: int,
+        self, actual: tuple[int, int] | None, name: str, count: int, most: int,
         needed: tuple[int, int] | None,
     ) -> None:
-        if found is None:
+        if actual is None:
             return
-        width, height = found
+        width, height = actual
         if not count <= width * height <= most:
-            raise self.damaged(f"{name} of {width}x{height} pixels for {count} values")
-        if needed is not None and found != needed:
-            raise self.damaged(
+            raise self.error(f"{name} of {width}x{height} pixels for {count} values")
+        if needed is not None and actual != needed:
+            raise self.error(
                 f"{name} of {width}x{height} pixels, needed are {needed[0]}x{needed[1]}")
 
     def _read(self, name: str, most: int) -> bytes:
         entry = self._entries.get(name)
         if entry is None:
-            raise self.damaged(f"no entry {name!r:.80}")
+            raise self.error(f"no entry {name!r:.80}")
         if entry.flag_bits & 1 or entry.compress_type not in _METHODS:
-            raise self.damaged(f"the entry {name}, which is encrypted or compressed unusually")
+            raise self.error(f"the entry {name}, which is encrypted or compressed unusually")
         try:
             with self._zip.open(entry) as file:
                 data = file.read(most + 1)
                 whole = len(data) <= most and not file.read(1)
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError,
                 NotImplementedError) as error:
-            raise self.damaged(f"the entry {name}, which cannot be unpacked: {error}") from error
+            raise self.error(f"the entry {name}, which cannot be unpacked: {error}") from error
         if not whole:
-            raise self.damaged(f"the entry {name}, which unpacks to more than {most} bytes")
+            raise self.error(f"the entry {name}, which unpacks to more than {most} bytes")
         return data
 
 
-def packed(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
+def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
     """Returns the bytes of a .sog; the same arguments give the same bytes.
 
     Args:
@@ -149,11 +153,11 @@ def packed(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
         text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
         archive.writestr(zipfile.ZipInfo(META, _DATE), text)
         for name, pixels in images.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), webp(pixels))
+            archive.writestr(zipfile.ZipInfo(name, _DATE), encode_webp(pixels))
     return data.getvalue()
 
 
-def webp(pixels: NDArray[np.uint8]) -> bytes:
+def encode_webp(pixels: NDArray[np.uint8]) -> bytes:
     """Returns a lossless WebP of [H, W, 3] or [H, W, 4], exact under an alpha of 0 too."""
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(
@@ -162,9 +166,9 @@ def webp(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
-    """Returns (width, height) by the header of a WebP (RFC 9649); None for other images.
+    """Returns (width, height) from the header of a WebP (RFC 9649); None for other images.
 
-    The decoder of Pillow takes memory for both when the file is opened, before its size is known.
+    Pillow's decoder allocates memory when it opens a file, before it reports the size.
     """
     if data[8:12] != b"WEBP" or len(data) < 30:
         return None
@@ -174,11 +178,127 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
     return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
 
 
-def _leaves(name: str) -> bool:
-    """Returns whether a path would lie outside of the folder that it is unpacked to."""
+def _escapes(name: str) -> bool:
+    """Returns whether a path would lead out of the folder that it is unpacked to."""
     path = PurePosixPath(name.replace("\\", "/"))
     return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name
 
 
 def _no_constant(name: str) -> float:
     raise ValueError(f"{name} is no number of JSON")
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """Coefficients of degrees 1 and up, as meta.json describes them.
+
+    Attributes:
+        count: entries of the palette.
+        degree: 1 to 3.
+        codebook: at most 256 numbers.
+        files: names of the palette's image and of the labels'.
+    """
+
+    count: int
+    degree: int
+    codebook: Floats
+    files: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Meta:
+    """The checked content of meta.json.
+
+    Attributes:
+        count: Gaussians.
+        low: [3] least logarithm of a position by axis.
+        high: [3] greatest.
+        means: names of the images of the low and the high bytes.
+        scales: codebook of the logarithms of scales.
+        scales_file: name of their image.
+        quats_file: name of the image of quaternions.
+        sh0: codebook of the colours.
+        sh0_file: name of the image of colours and opacities.
+        harmonics: None at degree 0.
+    """
+
+    count: int
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    means: tuple[str, ...]
+    scales: Floats
+    scales_file: str
+    quats_file: str
+    sh0: Floats
+    sh0_file: str
+    harmonics: Harmonics | None
+
+
+def read_meta(archive: Archive) -> Meta:
+    """Returns the checked meta.json of an archive.
+
+    Raises:
+        FormatError: it is missing or not of the format.
+    """
+    value = archive.meta()
+    if "version" not in value and isinstance(value.get("means"), dict):
+        raise archive.error("version 1 of the format, which is not supported")
+    if _whole(value, "version", 0, sys.maxsize, archive) != 2:
+        raise archive.error(f"version {value['version']} of the format; version 2 can be read")
+    means, scales, quats, sh0 = (
+        _part(value, name, archive) for name in ("means", "scales", "quats", "sh0"))
+    return Meta(
+        count=_whole(value, "count", 1, _MAX_COUNT, archive),
+        low=_numbers(means, "mins", 3, 3, archive), high=_numbers(means, "maxs", 3, 3, archive),
+        means=_files(means, 2, archive),
+        scales=_book(scales, archive), scales_file=_files(scales, 1, archive)[0],
+        quats_file=_files(quats, 1, archive)[0],
+        sh0=_book(sh0, archive), sh0_file=_files(sh0, 1, archive)[0],
+        harmonics=_harmonics(value, archive))
+
+
+def _harmonics(value: dict[str, Any], archive: Archive) -> Harmonics | None:
+    if value.get("shN") is None:
+        return None
+    part = _part(value, "shN", archive)
+    return Harmonics(
+        _whole(part, "count", 1, _MAX_ENTRIES, archive), _whole(part, "bands", 1, 3, archive),
+        _book(part, archive), _files(part, 2, archive))
+
+
+def _part(value: dict[str, Any], name: str, archive: Archive) -> dict[str, Any]:
+    part = value.get(name)
+    if not isinstance(part, dict):
+        raise archive.error(f"a meta.json without {name}")
+    return part
+
+
+def _whole(part: dict[str, Any], name: str, low: int, high: int, archive: Archive) -> int:
+    value = part.get(name)
+    if type(value) is not int or not low <= value <= high:
+        raise archive.error(f"{name} = {value!r:.40}; needed is {low} to {high}")
+    return value
+
+
+def _book(part: dict[str, Any], archive: Archive) -> Floats:
+    return _numbers(part, "codebook", 1, BOOK, archive).astype(np.float32)
+
+
+def _numbers(
+    part: dict[str, Any], name: str, least: int, most: int, archive: Archive
+) -> NDArray[np.float64]:
+    """Returns finite numbers that fit into float32."""
+    value = part.get(name)
+    largest = float(np.finfo(np.float32).max)
+    if not isinstance(value, list) or not least <= len(value) <= most or not all(
+            type(item) in (int, float) and abs(item) <= largest for item in value):
+        raise archive.error(f"{name} = {value!r:.40}; needed are {most} finite numbers")
+    return np.array(value, np.float64)
+
+
+def _files(part: dict[str, Any], count: int, archive: Archive) -> tuple[str, ...]:
+    value = part.get("files")
+    if not isinstance(value, list) or len(value) != count or not all(
+            isinstance(name, str) for name in value):
+        raise archive.error(f"files = {value!r:.40}; needed are {count} names")
+    return tuple(value)

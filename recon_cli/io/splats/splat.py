@@ -2,7 +2,7 @@
 
 A row is the position (3 float32), the standard deviations (3 float32), RGBA (4 bytes) and the
 rotation (4 bytes, q * 128 + 128, wxyz). Axes and units are those of the .ply. Viewers show the
-first Gaussians first, so the most important ones lead.
+first Gaussians first, so they are sorted by importance.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.values import (
     Floats,
-    as_splats,
-    logits_of_bytes,
-    nearest_bytes,
-    opacity_bytes,
+    decode_opacities,
+    encode_opacities,
     refuse_above,
     refuse_not_finite,
-    writable,
+    round_to_bytes,
+    splats_from_arrays,
+    validate_splats,
 )
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.workspace.atomic import write_bytes
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-_LEAST = np.finfo(np.float32).tiny  # stands for a scale of 0, which has no logarithm
+_LEAST = np.finfo(np.float32).tiny  # replaces a scale of 0, which has no logarithm
 _LARGEST = 88.0  # of a log scale; the exponential of more is infinite in float32
 # First bytes of .ply, SPZ, gzip and zip. As a position they would be 1e-32 and less, or 1e10.
 _OTHER_FORMATS = (b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b\x08\0", b"PK\x03\x04")
@@ -37,21 +37,21 @@ _OTHER_FORMATS = (b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b\x08\0", b"PK\x03\x04")
 def write_splat(path: Path, splats: Splats) -> None:
     """Writes `splats` to `path`, whole or not at all, in descending order of opacity x volume.
 
-    Harmonics of degrees 1 and up are left out, and colours outside 0 to 1 are clipped.
+    Harmonics of degrees 1 and up are dropped, and colours are clipped to 0 to 1.
 
     Raises:
         FormatError: there are no Gaussians, one is too large, or a parameter is not finite.
     """
-    values = writable(path, splats)
+    values = validate_splats(path, splats)
     log_scales = values.log_scales.numpy()
     refuse_above(path, log_scales, _LARGEST)
     logits = values.logit_opacities.numpy()
     rows = np.empty(len(splats), _ROW)
     rows["means"] = values.means.numpy()
     rows["scales"] = np.maximum(np.exp(log_scales), _LEAST)
-    rows["rgba"][:, :3] = nearest_bytes(255 * (SH_C0 * values.sh_dc.numpy() + 0.5))
-    rows["rgba"][:, 3] = opacity_bytes(logits)
-    rows["quats"] = nearest_bytes(values.quats.numpy() * 128 + 128)
+    rows["rgba"][:, :3] = round_to_bytes(255 * (SH_C0 * values.sh_dc.numpy() + 0.5))
+    rows["rgba"][:, 3] = encode_opacities(logits)
+    rows["quats"] = round_to_bytes(values.quats.numpy() * 128 + 128)
     write_bytes(path, rows[_by_importance(logits, log_scales)].tobytes())
 
 
@@ -84,11 +84,11 @@ def read_splat(path: Path) -> Splats:
     refuse_not_finite(path, {"positions": rows["means"], "scales": scales})
     if (scales < 0).any():
         raise FormatError(f"{path} holds negative scales: it is damaged or no .splat file.")
-    return as_splats(path, {
+    return splats_from_arrays(path, {
         "means": rows["means"],
         "quats": (rows["quats"].astype(np.float32) - 128) / 128,
         "log_scales": np.log(np.maximum(scales, _LEAST)),
-        "logit_opacities": logits_of_bytes(rows["rgba"][:, 3]),
+        "logit_opacities": decode_opacities(rows["rgba"][:, 3]),
         "sh_dc": (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0,
         "sh_rest": np.zeros((len(rows), 0, 3)),
     })

@@ -1,34 +1,42 @@
-"""SPZ, Niantic's compact format: 20 bytes a Gaussian and one for each coefficient, then packed.
+"""SPZ, Niantic's compact format: 20 bytes a Gaussian and one for each coefficient, then compressed.
 
-https://github.com/nianticlabs/spz. Positions are fixed point numbers of 24 bits, log scales and
-colours bytes, opacities bytes after the sigmoid, rotations the smallest three components of the
-quaternion (bytes of x, y and z in version 2), harmonics bytes of 1/128. Axes are RUB (y up) where
-the .ply and the scenes here are RDF: y and z are negated on the way, with the rotations and
-harmonics that go along.
+Source: https://github.com/nianticlabs/spz. Positions are fixed point numbers of 24 bits, log scales
+and colours bytes, opacities bytes after the sigmoid, rotations the smallest three components of the
+quaternion (bytes of x, y and z in version 2), harmonics bytes of 1/128. Axes are RUB (y up), in
+a .ply RDF: y and z are negated, with the rotations and harmonics.
+
+Versions 2 and 3 are one gzip stream (or the same bytes plain): a header of 16 bytes, then
+positions, opacities, colours, scales, rotations and harmonics. Version 4 has an uncompressed header
+of 32 bytes and table of sizes, and one zstd stream for each array that is not empty. Version 1 was
+never released and is not supported. Never more is unpacked than the header's count implies.
 """
 
 from __future__ import annotations
 
+import gzip
+import struct
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.spz_container import SpzHeader, pack, unpack
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
-    as_splats,
-    contents,
-    from_smallest_three,
-    logits_of_bytes,
-    nearest_bytes,
-    opacity_bytes,
+    decode_opacities,
+    decode_smallest_three,
+    encode_opacities,
+    encode_smallest_three,
+    flip_yz,
+    read_contents,
     refuse_above,
-    smallest_three,
-    turned_about_x,
-    writable,
+    round_to_bytes,
+    splats_from_arrays,
+    validate_splats,
 )
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.workspace.atomic import write_bytes
@@ -39,15 +47,24 @@ _SCALE_STEPS, _SCALE_OFFSET = 16, 10  # byte = (log scale + 10) * 16
 _LARGEST_SCALE = 255 / _SCALE_STEPS - _SCALE_OFFSET
 _COLOR = 0.15  # byte = (0.15 * dc + 0.5) * 255, so that dc of -3.33 to 3.33 fit
 _HARMONIC = 128
-# In steps of 2 of the 256: a trained scene of degree 3 packs to 1/8.2 of its .ply in place of 1/7.0
-# and loses nothing that shows (.003 dB); in steps of 4 it loses .2 dB. Niantic's program takes 8
-# and 16.
+# In steps of 2 of the 256 a trained scene of degree 3 packs to 1/8.2 of its .ply instead of 1/7.0
+# and loses .003 dB; in steps of 4 it loses .2 dB. Niantic's program uses 8 and 16.
 _HARMONIC_STEP = 2
 _MAGNITUDE = 511  # of a component of a rotation; 9 bits and a sign
 _WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
-
-
-VERSIONS = (2, 3, 4)  # that are read and written
+VERSIONS = (2, 3, 4)
+_MAGIC = b"NGSP"
+_HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits, flags, streams
+_MORE = struct.Struct("<I12x")  # of version 4: where the table of sizes begins
+_SIZES = struct.Struct("<QQ")  # packed, unpacked
+_EXTENSION = struct.Struct("<II")  # type, bytes that follow
+_HAS_EXTENSIONS = 2
+_EXTENSIONS_LIMIT = 1 << 20  # bytes
+_ADOBE, _ORBIT_CAMERA = 0xADBE, 0xADBE0002
+_MAX_FRACTIONAL_BITS = 24
+# Limit of what a file may unpack to. A scene whose harmonics are all 0 reaches 5 times its size.
+_HARMLESS_BYTES, _MAX_RATIO = 1 << 24, 128
+_ZSTD_LEVEL = 12  # that of Niantic's program
 
 
 def write_spz(path: Path, splats: Splats, *, version: int = 3) -> None:
@@ -63,16 +80,16 @@ def write_spz(path: Path, splats: Splats, *, version: int = 3) -> None:
 def spz_bytes(
     path: Path, splats: Splats, *, version: int = 3, harmonic_step: int = _HARMONIC_STEP
 ) -> bytes:
-    """Returns `splats` as an SPZ file.
+    """Returns the bytes of an SPZ file of `splats`.
 
     Log scales below -10 become -10, coefficients outside -1 to 127/128 and dc outside -3.33 to 3.33
     are clipped. Positions get the 12 fractional bits of Niantic's program, fewer in a scene that
     is wider than 2048 units, and never fewer than 8. Harmonics are in steps of 1/64 unless given.
 
     Args:
-        path: of the file that they are for, for messages.
+        path: of the file, for messages.
         splats: of any degree.
-        version: 3, which all readers of today know; 2, for older ones, with coarser rotations;
+        version: 3, which all current readers support; 2, for older ones, with coarser rotations;
             or 4.
         harmonic_step: in 1/128; 1 is the finest.
 
@@ -81,19 +98,19 @@ def spz_bytes(
             not finite.
     """
     if version not in VERSIONS:
-        raise ValueError(f"version {version} of SPZ is not written, {VERSIONS} are")
-    values = turned_about_x(writable(path, splats))
+        raise ValueError(f"SPZ version {version} is none of {VERSIONS}")
+    values = flip_yz(validate_splats(path, splats))
     means, quats, log_scales = (
         value.numpy() for value in (values.means, values.quats, values.log_scales))
     refuse_above(path, log_scales, _LARGEST_SCALE)
     bits = _fractional_bits(path, means)
     return pack(SpzHeader(version, len(splats), values.sh_degree, bits), [
         _position_bytes(means, bits),
-        opacity_bytes(values.logit_opacities.numpy()),
-        nearest_bytes(255 * (_COLOR * values.sh_dc.numpy() + 0.5)),
-        nearest_bytes(_SCALE_STEPS * (log_scales + _SCALE_OFFSET)),
+        encode_opacities(values.logit_opacities.numpy()),
+        round_to_bytes(255 * (_COLOR * values.sh_dc.numpy() + 0.5)),
+        round_to_bytes(_SCALE_STEPS * (log_scales + _SCALE_OFFSET)),
         _vector_bytes(quats) if version < 3 else _rotation_bytes(quats),
-        nearest_bytes(_HARMONIC + harmonic_step * np.rint(
+        round_to_bytes(_HARMONIC + harmonic_step * np.rint(
             values.sh_rest.numpy() * (_HARMONIC / harmonic_step))),
     ])
 
@@ -105,19 +122,19 @@ def read_spz(path: Path) -> Splats:
         FormatError: the file is missing, damaged, of another format or version, or promises more
             than it holds.
     """
-    return spz_splats(path, contents(path))
+    return spz_splats(path, read_contents(path))
 
 
 def spz_splats(path: Path, data: bytes) -> Splats:
-    """Returns the Gaussians of an SPZ file whose bytes are there already; see `read_spz`."""
+    """Returns the Gaussians of the bytes of an SPZ file; see `read_spz`."""
     header, (places, opacities, colors, scales, rotations, harmonics) = unpack(path, data)
     n = header.count
     shape = (n, TERMS[header.sh_degree], 3)
-    return turned_about_x(as_splats(path, {
+    return flip_yz(splats_from_arrays(path, {
         "means": _positions(places, header.fractional_bits),
         "quats": _rotations(rotations.reshape(n, -1)),
         "log_scales": _floats(scales).reshape(n, 3) / _SCALE_STEPS - _SCALE_OFFSET,
-        "logit_opacities": logits_of_bytes(opacities),
+        "logit_opacities": decode_opacities(opacities),
         "sh_dc": (_floats(colors).reshape(n, 3) / 255 - 0.5) / _COLOR,
         "sh_rest": (_floats(harmonics).reshape(shape) - _HARMONIC) / _HARMONIC,
     }))
@@ -153,7 +170,7 @@ def _positions(data: Bytes, bits: int) -> Floats:
 
 def _rotation_bytes(quats: Floats) -> Bytes:
     """Returns [N, 4] bytes of unit quaternions wxyz; in the file components are in order xyzw."""
-    largest, others = smallest_three(quats[:, _XYZW])
+    largest, others = encode_smallest_three(quats[:, _XYZW])
     magnitude = np.rint(np.abs(others) * (np.sqrt(2) * _MAGNITUDE)).astype(np.uint32)
     fields = np.minimum(magnitude, _MAGNITUDE) | np.uint32(512) * (others < 0)
     words = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
@@ -162,7 +179,7 @@ def _rotation_bytes(quats: Floats) -> Bytes:
 
 def _vector_bytes(quats: Floats) -> Bytes:
     """Returns [N, 3] bytes of x, y and z, where w is at least 0."""
-    return nearest_bytes(np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] * 127.5 + 127.5)
+    return round_to_bytes(np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] * 127.5 + 127.5)
 
 
 def _rotations(data: Bytes) -> Floats:
@@ -176,4 +193,174 @@ def _rotations(data: Bytes) -> Floats:
     sizes = (fields & _MAGNITUDE) / (np.sqrt(2) * _MAGNITUDE)
     others = np.where(fields & 512, -sizes, sizes).astype(np.float32)
     largest: NDArray[np.int64] = (word[:, 0] >> 30).astype(np.int64)
-    return from_smallest_three(largest, others)[:, _WXYZ]
+    return decode_smallest_three(largest, others)[:, _WXYZ]
+
+
+@dataclass(frozen=True)
+class SpzHeader:
+    """Version, count, degree and precision of the arrays.
+
+    Attributes:
+        version: 2, 3 or 4.
+        count: Gaussians, N.
+        sh_degree: 0 to 3.
+        fractional_bits: of the positions.
+    """
+
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
+        rotation = 3 if self.version < 3 else 4
+        each = (9, 1, 3, 3, rotation, 3 * TERMS[self.sh_degree])
+        return tuple(self.count * size for size in each)
+
+
+def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
+    """Returns the file of the six arrays, each of the header's size."""
+    raw = [array.tobytes() for array in arrays]
+    assert tuple(len(item) for item in raw) == header.sizes
+    fields = (_MAGIC, header.version, header.count, header.sh_degree, header.fractional_bits, 0)
+    if header.version < 4:
+        return gzip.compress(_HEAD.pack(*fields, 0) + b"".join(raw), 6, mtime=0)
+    raw = [item for item in raw if item]
+    packed = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(item) for item in raw]
+    sizes = [_SIZES.pack(len(small), len(large)) for small, large in zip(packed, raw, strict=True)]
+    head = _HEAD.pack(*fields, len(raw)) + _MORE.pack(_HEAD.size + _MORE.size)
+    return b"".join([head, *sizes, *packed])
+
+
+def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
+    """Returns the header and the six arrays of a file.
+
+    Args:
+        path: for messages.
+        data: its content.
+
+    Raises:
+        FormatError: the data is damaged, of another format or version, promises more than a file
+            of its size can hold, or holds less or more than it promises.
+    """
+    try:
+        if data.startswith(b"\x1f\x8b"):
+            header, body = _unpack_gzip(path, data)
+        elif data.startswith(_MAGIC):
+            header, flags, streams = _parse(path, data[:_HEAD.size], len(data))
+            if header.version == 4:
+                body = _unpack_streams(path, data, header, flags, streams)
+            else:
+                body = _without_extensions(path, data[_HEAD.size:], header, flags)
+        else:
+            raise FormatError(f"{path} is no SPZ file.")
+    except (zlib.error, zstandard.ZstdError) as error:
+        raise FormatError(f"{path} cannot be unpacked: {error}.") from error
+    ends = np.cumsum(header.sizes)[:-1]
+    return header, np.split(np.frombuffer(body, np.uint8), ends)
+
+
+def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
+    """Returns the header, its flags and the number of streams, checked against the file's size."""
+    if len(head) < _HEAD.size:
+        raise _truncated_error(path)
+    magic, version, count, degree, bits, flags, streams = _HEAD.unpack(head)
+    if magic != _MAGIC:
+        raise FormatError(f"{path} is no SPZ file.")
+    if version not in VERSIONS:
+        raise FormatError(f"{path} is of SPZ version {version}; 2, 3 and 4 can be read.")
+    if degree >= len(TERMS):
+        raise FormatError(f"{path} has harmonics of degree {degree}; at most 3 can be read.")
+    if bits > _MAX_FRACTIONAL_BITS:
+        raise FormatError(f"{path} has positions of {bits} fractional bits, above 24: damaged.")
+    header = SpzHeader(version, count, degree, bits)
+    if not count or sum(header.sizes) > _HARMLESS_BYTES + _MAX_RATIO * size:
+        raise FormatError(
+            f"{path} promises {count} Gaussians, which do not fit into its {size} bytes.",
+            hint="Copy the file again, or export it again from its source.")
+    return header, flags, streams
+
+
+def _unpack_gzip(path: Path, data: bytes) -> tuple[SpzHeader, bytes]:
+    stream = zlib.decompressobj(wbits=31)
+    head = stream.decompress(data, _HEAD.size)
+    header, flags, _ = _parse(path, head, len(data))
+    if header.version == 4:
+        raise FormatError(f"{path} is of version 4 but packed as older ones are: it is damaged.")
+    limit = sum(header.sizes) + (_EXTENSIONS_LIMIT if flags & _HAS_EXTENSIONS else 0)
+    body = stream.decompress(stream.unconsumed_tail, limit)
+    if stream.decompress(stream.unconsumed_tail, 1) or stream.unused_data:
+        raise _too_long_error(path)
+    if not stream.eof:
+        raise _truncated_error(path)
+    return header, _without_extensions(path, body, header, flags)
+
+
+def _without_extensions(path: Path, body: bytes, header: SpzHeader, flags: int) -> bytes:
+    size = sum(header.sizes)
+    if len(body) < size:
+        raise _truncated_error(path)
+    if flags & _HAS_EXTENSIONS:
+        _check_extensions(path, body[size:])
+    elif len(body) > size:
+        raise _too_long_error(path)
+    return body[:size]
+
+
+def _unpack_streams(
+    path: Path, data: bytes, header: SpzHeader, flags: int, streams: int
+) -> bytes:
+    promised = [size for size in header.sizes if size]
+    begin = _HEAD.size + _MORE.size
+    if len(data) < begin:
+        raise _truncated_error(path)
+    table = _MORE.unpack_from(data, _HEAD.size)[0]
+    start = table + _SIZES.size * streams
+    if streams != len(promised) or table < begin or start > len(data):
+        raise FormatError(f"{path} has {streams} streams instead of {len(promised)}: damaged.")
+    if flags & _HAS_EXTENSIONS:
+        _check_extensions(path, data[begin:table])
+    parts = []
+    for i, size in enumerate(promised):
+        packed, unpacked = _SIZES.unpack_from(data, table + _SIZES.size * i)
+        stream, start = data[start:start + packed], start + packed
+        # The zstd frame states a size too, and zstandard would allocate that much.
+        if unpacked != size or zstandard.frame_content_size(stream) not in (-1, size):
+            raise FormatError(f"{path} has a stream of {unpacked} bytes instead of {size}.")
+        parts.append(zstandard.ZstdDecompressor().decompress(
+            stream, max_output_size=size, allow_extra_data=False))
+        if len(parts[-1]) != size:
+            raise _truncated_error(path)
+    if start != len(data):
+        raise _too_long_error(path) if start < len(data) else _truncated_error(path)
+    return b"".join(parts)
+
+
+def _check_extensions(path: Path, data: bytes) -> None:
+    """Raises FormatError for damaged extensions and for those that change what the arrays mean.
+
+    Those of unknown vendors are ignored, as the format requires. Of Adobe's the limits of an orbit
+    camera are harmless; others rotate the axes or scale the harmonics.
+    """
+    start = 0
+    while start < len(data):
+        if start + _EXTENSION.size > len(data):
+            raise _truncated_error(path)
+        kind, size = _EXTENSION.unpack_from(data, start)
+        if kind >> 16 == _ADOBE and kind != _ORBIT_CAMERA:
+            raise FormatError(
+                f"{path} has the extension {kind:#x}, which changes what its values mean.",
+                hint="Write it again without extensions.")
+        start += _EXTENSION.size + size
+    if start > len(data):
+        raise _truncated_error(path)
+
+
+def _truncated_error(path: Path) -> FormatError:
+    return FormatError(f"{path} ends too early: it is truncated.", hint="Copy the file again.")
+
+
+def _too_long_error(path: Path) -> FormatError:
+    return FormatError(f"{path} holds more than its header promises: it is damaged or malicious.")

@@ -1,4 +1,4 @@
-"""What any splat file needs of the Gaussians that go into it."""
+"""Checks, orders and encodings of Gaussians that several splat formats share."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import Splats, with_rows
 
-_BITS = 21  # an axis; three make a word of 63
+_BITS = 21  # per axis; three make a word of 63
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
     """Returns rows of points [N, 3] along a Z-order curve (Morton 1966) through their box.
 
-    Points that share one of its 2^63 cells keep their order.
+    Points in the same one of its 2^63 cells keep their order.
     """
     exact = points.astype(np.float64)
     low, high = exact.min(axis=0), exact.max(axis=0)
@@ -33,7 +33,7 @@ def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Returns numbers of 21 bits with two zeros between each two bits."""
+    """Returns numbers of 21 bits with two zeros between adjacent bits."""
     for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
                         (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):
         values = (values | values << np.uint64(shift)) & np.uint64(mask)
@@ -44,7 +44,7 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 
-def contents(path: Path) -> bytes:
+def read_contents(path: Path) -> bytes:
     """Returns the bytes of a file.
 
     Raises:
@@ -57,18 +57,18 @@ def contents(path: Path) -> bytes:
         raise FormatError(f"{path} cannot be read: {error}.") from error
 
 
-def writable(path: Path, splats: Splats) -> Splats:
-    """Returns the Gaussians as a writer needs them: those of `arrays` as tensors.
+def validate_splats(path: Path, splats: Splats) -> Splats:
+    """Returns the Gaussians normalized and checked for writing: `to_arrays` as tensors.
 
     Raises:
         FormatError: there are no Gaussians, or a parameter is not finite.
     """
     return Splats(**{
-        name: torch.from_numpy(value) for name, value in arrays(splats, path.name).items()})
+        name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()})
 
 
-def as_splats(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
-    """Returns what was read from `path` as float32 tensors, in the file's order.
+def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
+    """Returns the values of a file as float32 tensors, in the file's order.
 
     Those behind the last one that has a coefficient other than zero are of degree 0.
 
@@ -80,15 +80,15 @@ def as_splats(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
     Raises:
         FormatError: a value is not finite.
     """
-    with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite, which is refused
+    with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
     refuse_not_finite(path, plain)
-    plain["sh_rest"] = colored_rows(plain["sh_rest"]).copy()
+    plain["sh_rest"] = trim_zero_rows(plain["sh_rest"]).copy()
     return Splats(**{name: torch.from_numpy(value) for name, value in plain.items()})
 
 
 def refuse_above(path: Path, log_scales: Floats, most: float) -> None:
-    """Raises FormatError where a Gaussian is greater than the format can say."""
+    """Raises FormatError if a Gaussian is larger than the format can hold."""
     count = int((log_scales.max(axis=1) > most).sum())
     if count:
         raise FormatError(
@@ -97,31 +97,31 @@ def refuse_above(path: Path, log_scales: Floats, most: float) -> None:
             hint="Remove them, scale the scene down, or write a .ply.")
 
 
-def opacity_bytes(logits: Floats) -> Bytes:
+def encode_opacities(logits: Floats) -> Bytes:
     """Returns opacities [N] in 255 steps."""
-    return nearest_bytes(255 * sigmoid(logits))
+    return round_to_bytes(255 * sigmoid(logits))
 
 
-def logits_of_bytes(values: Bytes) -> NDArray[np.float64]:
+def decode_opacities(values: Bytes) -> NDArray[np.float64]:
     """Returns logits [N] of opacities in 255 steps.
 
-    The first and the last step are half as wide as the others and stand for their middle, not for
-    0 and 1, whose logits are infinite.
+    The first and the last step are half as wide as the others and are decoded as their middle, not
+    as 0 and 1, whose logits are infinite.
     """
     share = np.clip(values.astype(np.float64), 0.25, 254.75) / 255
     return np.asarray(np.log(share) - np.log1p(-share))
 
 
-def nearest_bytes(values: NDArray[Any]) -> Bytes:
-    """Returns values rounded to bytes; what lies outside becomes 0 or 255."""
+def round_to_bytes(values: NDArray[Any]) -> Bytes:
+    """Returns values rounded to bytes, clipped to 0 to 255."""
     return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
 
 
-def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Returns of unit quaternions [N, 4] which component is largest [N], and the others [N, 3].
+def encode_smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Returns the index of the largest component [N] of unit quaternions [N, 4], and the others.
 
-    q and -q are one rotation: signs are such that the largest component is positive, so that it
-    follows from the others, none of which is above 1 / sqrt(2).
+    q and -q are the same rotation: the sign is chosen so that the largest component is positive
+    and follows from the others [N, 3], none of which is above 1 / sqrt(2).
     """
     largest = np.abs(quats).argmax(axis=1)
     value = np.take_along_axis(quats, largest[:, None], axis=1)
@@ -129,8 +129,8 @@ def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     return largest, signed[_others(largest)].reshape(-1, 3)
 
 
-def from_smallest_three(largest: NDArray[np.int64], others: Floats) -> Floats:
-    """Returns quaternions [N, 4] from what `smallest_three` gave."""
+def decode_smallest_three(largest: NDArray[np.int64], others: Floats) -> Floats:
+    """Returns quaternions [N, 4]: the inverse of `encode_smallest_three`."""
     quats = np.empty((len(others), 4), np.float32)
     quats[_others(largest)] = others.ravel()
     missing = np.sqrt(np.maximum(0, 1 - (others * others).sum(axis=1)))
@@ -142,13 +142,13 @@ def _others(largest: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray(np.arange(4) != largest[:, None])
 
 
-def turned_about_x(splats: Splats) -> Splats:
-    """Returns the Gaussians with y and z negated, as between axes RDF and RUB; twice is nothing.
+def flip_yz(splats: Splats) -> Splats:
+    """Returns the Gaussians with y and z negated, as between axes RDF and RUB; its own inverse.
 
     Only signs change, so that nothing is rounded.
     """
     signs = splats.means.new_tensor([1.0, -1, -1])
-    direction = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)  # where no function is 0
+    direction = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)  # where no basis function is 0
     parity = (basis_rest(direction * signs, 3) / basis_rest(direction, 3)).round()
     of_terms = parity[:splats.sh_rest.shape[1], None].to(splats.means)
     return replace(
@@ -159,15 +159,15 @@ def turned_about_x(splats: Splats) -> Splats:
 _Float = TypeVar("_Float", bound=np.floating[Any])
 
 
-def arrays(splats: Splats, kind: str) -> dict[str, NDArray[np.float32]]:
+def to_arrays(splats: Splats, kind: str) -> dict[str, NDArray[np.float32]]:
     """Returns the raw parameters as float32 arrays by name, `sh_rest` for all N Gaussians.
 
-    Quaternions are of unit length; zeros, which stand for no rotation, become 1 0 0 0. Where no
-    Gaussian has coefficients, `sh_rest` is [N, 0, 3].
+    Quaternions are normalized; zeros, which mean no rotation, become 1 0 0 0. If no Gaussian has
+    coefficients, `sh_rest` is [N, 0, 3].
 
     Args:
         splats: raw parameters on any device.
-        kind: what a message calls the file, such as ".sog".
+        kind: name of the file or format for messages, such as ".sog".
 
     Raises:
         FormatError: there are no Gaussians, or a value is not finite.
@@ -180,20 +180,20 @@ def arrays(splats: Splats, kind: str) -> dict[str, NDArray[np.float32]]:
     values["sh_rest"] = with_rows(values["sh_rest"], len(splats))
     table = {name: value.numpy() for name, value in values.items()}
     refuse_not_finite(f"The scene for a {kind}", table)
-    table["quats"] = unit_quats(table["quats"])
+    table["quats"] = normalize_quats(table["quats"])
     return table
 
 
-def refuse_not_finite(what: object, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Raises FormatError that names each column with NaN or infinity, and how many it has."""
+def refuse_not_finite(source: object, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Raises FormatError with the count of NaN and infinities in each column that has any."""
     bad = {name: int(np.size(value) - np.isfinite(value).sum()) for name, value in columns.items()}
     bad = {name: count for name, count in bad.items() if count}
     if bad:
-        found = ", ".join(f"{name} ({count})" for name, count in bad.items())
-        raise FormatError(f"{what} holds values that are not finite in {found}.")
+        listed = ", ".join(f"{name} ({count})" for name, count in bad.items())
+        raise FormatError(f"{source} holds values that are not finite in {listed}.")
 
 
-def unit_quats(quats: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+def normalize_quats(quats: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     """Returns quaternions [N, 4] wxyz of unit length; zeros become no rotation."""
     wide = quats.astype(np.float64)
     wide[~wide.any(axis=1)] = [1, 0, 0, 0]
@@ -209,7 +209,7 @@ def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def logit(opacities: NDArray[np.float64], least: float) -> NDArray[np.float32]:
-    """Returns the logits of opacities in [0, 1], which are first kept `least` away from both ends.
+    """Returns the logits of opacities in [0, 1], clipped to `least` away from both ends.
 
     An opacity of exactly 0 or 1 has no finite logit.
     """
@@ -217,7 +217,7 @@ def logit(opacities: NDArray[np.float64], least: float) -> NDArray[np.float32]:
     return np.asarray(np.log(inner / (1 - inner)), np.float32)
 
 
-def colored_rows(sh_rest: NDArray[_Float]) -> NDArray[_Float]:
-    """Returns coefficients [N, T, 3] without the rows of zeros at the end."""
+def trim_zero_rows(sh_rest: NDArray[_Float]) -> NDArray[_Float]:
+    """Returns coefficients [N, T, 3] without trailing rows of zeros."""
     rows = np.flatnonzero(sh_rest.any(axis=(1, 2)))
     return sh_rest[: rows[-1] + 1 if len(rows) else 0]

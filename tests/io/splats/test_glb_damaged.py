@@ -14,8 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.glb import read_glb, write_glb
-from recon_cli.io.splats.glb_container import contained
+from recon_cli.io.splats.glb import pack_glb, read_glb, write_glb
 
 EXT = "KHR_gaussian_splatting"
 COUNT = 20
@@ -34,7 +33,7 @@ def good(tmp_path_factory):
 def edited(good, edit):
     value = json.loads(json.dumps(good[0]))
     edit(value)
-    return contained(value, good[1])
+    return pack_glb(value, good[1])
 
 
 def refused(tmp_path, data, said):
@@ -61,7 +60,7 @@ def of(value, group, name):
     (head(10, (b"JSON", b"{} ")), "header promises 10"),
     (head(None, (b"BIN\0", b"{} ")), "needed is JSON"),
     (head(None, (b"JSON", b"{}  "), (b"JSON", b"{}  ")), "needed is BIN"),
-    (head(None, (b"JSON", b"[]  ")), "no set of names"),
+    (head(None, (b"JSON", b"[]  ")), "that is no object"),
     (head(None, (b"JSON", b"{}  ")), "no scenes 0"),
     (head(None, (b"JSON", b"{")), "cannot be read"),
     (head(None, (b"JSON", b"\xff\xff")), "cannot be read"),
@@ -70,7 +69,7 @@ def of(value, group, name):
     (head(None, (b"JSON", b'{"a":NaN}')), "NaN is no number"),
     (head(None, (b"JSON", b"9" * 5000)), "cannot be read"),
     (head(None, (b"JSON", b"[" + b"{}," * 2_000_000 + b"0]")), "6000003 bytes, needed is JSON"),
-    (struct.pack("<4sIII4s", b"glTF", 2, 20, 1 << 31, b"JSON"), "ends behind the file"),
+    (struct.pack("<4sIII4s", b"glTF", 2, 20, 1 << 31, b"JSON"), "ends after the file"),
     (head(None, (b"JSON", b"{}")) + b"abc", "header promises"),
     (head(25, (b"JSON", b"{}")) + b"abc", "cut short"),
 ])
@@ -84,10 +83,10 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("key", "number", "said"), [
-    ("count", 10**9, "end behind their buffer"), ("count", 2**70, "count = "),
+    ("count", 10**9, "end after their buffer"), ("count", 2**70, "count = "),
     ("count", 0, "count = 0"), ("count", 20.0, "count = 20.0"), ("count", None, "count = None"),
-    ("count", 19, "different lengths"), ("count", 21, "end behind their buffer"),
-    ("byteOffset", 1, "end behind their buffer"), ("byteOffset", -4, "byteOffset = -4"),
+    ("count", 19, "different lengths"), ("count", 21, "end after their buffer"),
+    ("byteOffset", 1, "end after their buffer"), ("byteOffset", -4, "byteOffset = -4"),
     ("bufferView", 99, "no bufferViews 99"), ("bufferView", None, "no bufferViews None"),
     ("bufferView", -1, "no bufferViews -1"), ("componentType", 5130, "an accessor of"),
     ("componentType", [5126], "an accessor of"), ("type", "VEC4", "an accessor of"),
@@ -98,9 +97,9 @@ def test_an_accessor_that_lies_is_refused(tmp_path, good, key, number, said):
 
 
 @pytest.mark.parametrize(("key", "number", "said"), [
-    ("byteLength", 10**9, "ends behind the"), ("byteLength", 0, "byteLength = 0"),
-    ("byteOffset", 10**9, "ends behind the"), ("byteOffset", -1, "byteOffset = -1"),
-    ("byteStride", 1 << 20, "end behind their buffer"), ("byteStride", 4, "byteStride = 4"),
+    ("byteLength", 10**9, "ends after the"), ("byteLength", 0, "byteLength = 0"),
+    ("byteOffset", 10**9, "ends after the"), ("byteOffset", -1, "byteOffset = -1"),
+    ("byteStride", 1 << 20, "end after their buffer"), ("byteStride", 4, "byteStride = 4"),
     ("byteStride", 0, "byteStride = 0"), ("buffer", 1, "no buffers 1"),
     ("buffer", "0", "no buffers '0'")])
 def test_a_view_that_lies_is_refused(tmp_path, good, key, number, said):
@@ -126,8 +125,8 @@ def test_a_view_that_lies_is_refused(tmp_path, good, key, number, said):
     (lambda value: value.update(extensionsRequired=["EXT_meshopt_compression"]), "meshopt"),
     (lambda value: value.update(extensionsRequired=[{}]), "needs the extensions"),
     (lambda value: value["meshes"][0].update(primitives=0), "without primitives"),
-    (lambda value: value["meshes"][0].update(primitives=[0]), "that is none"),
-    (lambda value: value["meshes"][0]["primitives"][0].update(mode=4), "no points"),
+    (lambda value: value["meshes"][0].update(primitives=[0]), "a malformed primitive"),
+    (lambda value: value["meshes"][0]["primitives"][0].update(mode=4), "not points"),
     (lambda value: value["meshes"][0]["primitives"][0]["extensions"][EXT].update(
         extensions={"KHR_gaussian_splatting_compression_spz_2": {}}), "spz_2"),
     (lambda value: value["meshes"][0]["primitives"][0]["extensions"][EXT].update(
@@ -166,7 +165,7 @@ def test_a_value_that_is_none_is_refused(tmp_path, good, name, number, said):
     value, data = good
     start = of(value, "bufferViews", name)["byteOffset"] + 8
     data = data[:start] + np.array([number], "<f4").tobytes() + data[start + 4:]
-    refused(tmp_path, contained(value, data), said)
+    refused(tmp_path, pack_glb(value, data), said)
 
 
 def test_a_nan_that_signals_is_refused_without_a_warning(tmp_path, good):
@@ -175,7 +174,7 @@ def test_a_nan_that_signals_is_refused_without_a_warning(tmp_path, good):
     data = data[:start] + (0x7FA00000).to_bytes(4, "little") + data[start + 4:]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        refused(tmp_path, contained(value, data), "not finite")
+        refused(tmp_path, pack_glb(value, data), "not finite")
 
 
 def _survives(path, data):
@@ -192,17 +191,17 @@ CAREFUL = settings(
 @CAREFUL
 @given(st.data())
 def test_no_bytes_give_anything_but_gaussians_or_a_reason(tmp_path, good, data):
-    _survives(tmp_path / "a.glb", data.draw(damage.changed_bytes(contained(*good))))
+    _survives(tmp_path / "a.glb", data.draw(damage.changed_bytes(pack_glb(*good))))
 
 
 @CAREFUL
 @given(st.data())
 def test_no_json_gives_anything_but_gaussians_or_a_reason(tmp_path, good, data):
     value = data.draw(damage.changed_json(good[0]))
-    _survives(tmp_path / "a.glb", contained(value, good[1]))
+    _survives(tmp_path / "a.glb", pack_glb(value, good[1]))
 
 
 @CAREFUL
 @given(st.data())
 def test_no_numbers_give_anything_but_gaussians_or_a_reason(tmp_path, good, data):
-    _survives(tmp_path / "a.glb", contained(good[0], data.draw(damage.changed_bytes(good[1]))))
+    _survives(tmp_path / "a.glb", pack_glb(good[0], data.draw(damage.changed_bytes(good[1]))))

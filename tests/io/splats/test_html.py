@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from splat_cases import damaged, read_or_refused
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.html import first_look, read_html, write_html
+from recon_cli.io.splats.html import default_view, read_html, write_html
 from recon_cli.io.splats.spz import read_spz, spz_bytes
 from recon_cli.scene.camera import Camera
 
@@ -145,7 +145,7 @@ def test_a_camera_that_sees_nothing_turns_about_something_all_the_same(tmp_path)
 @pytest.mark.parametrize("up", np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0, 0.8]]]))
 def test_without_cameras_the_page_opens_in_front_of_the_scene(up):
     splats = room(400)
-    _, found = first_look(splats, up)
+    _, found = default_view(splats, up)
     middle = splats.means.median(dim=0).values.double().numpy()
     place = found.viewmat[:3, :3] @ middle + found.viewmat[:3, 3]
     reach = np.quantile(np.linalg.norm(splats.means.double().numpy() - middle, axis=1), 0.9)

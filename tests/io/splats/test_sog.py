@@ -14,7 +14,7 @@ from scenes import camera_at, with_harmonics
 from recon_cli.errors import InputError
 from recon_cli.io.ply import write_ply
 from recon_cli.io.splats.sog import read_sog, write_sog
-from recon_cli.io.splats.sog_archive import webp
+from recon_cli.io.splats.sog_archive import encode_webp
 from recon_cli.render.registry import render
 
 ROUNDING = 1e-6  # of float32, of values about 1
@@ -137,7 +137,7 @@ def test_neighbours_in_space_are_neighbours_in_the_file(tmp_path):
 def test_images_are_exact_under_any_alpha(channels):
     pixels = np.random.default_rng(0).integers(0, 256, (37, 53, channels), np.uint8)
     pixels[:20, :, -1] = 0
-    with Image.open(io.BytesIO(webp(pixels))) as image:
+    with Image.open(io.BytesIO(encode_webp(pixels))) as image:
         np.testing.assert_array_equal(np.asarray(image), pixels)
 
 

@@ -8,7 +8,7 @@ import torch
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
-from recon_cli.export.synthetic_cameras import ASSUMED_DB, Likeness, made_up_scene
+from recon_cli.export.synthetic_cameras import ASSUMED_DB, SelfPsnr, synthetic_scene
 from recon_cli.scene.splats import SH_C0, Splats
 
 CONTEXT = StageContext(backend="numba")
@@ -36,7 +36,7 @@ def center(view):
 
 @pytest.mark.parametrize(("z_up", "up"), [(True, [0, 0, 1]), (False, [0, -1, 0])])
 def test_four_cameras_look_at_the_middle_from_outside_and_four_outward_from_within(z_up, up):
-    scene = made_up_scene(gaussians(shell() + np.array([5.0, 0, 0])), z_up=z_up, max_size=90)
+    scene = synthetic_scene(gaussians(shell() + np.array([5.0, 0, 0])), z_up=z_up, max_size=90)
     around, inside = scene.train[:4], scene.train[4:]
     for view in around:
         place = view.camera.viewmat @ [5, 0, 0, 1]
@@ -54,7 +54,7 @@ def test_the_camera_within_stands_where_there_is_most_space():
     """A ball that is full on one side."""
     draw = np.random.default_rng(1).uniform(-2, 2, (4000, 3))
     full = draw[(np.linalg.norm(draw, axis=1) < 2) & (draw[:, 0] > -0.2)]
-    scene = made_up_scene(gaussians(np.concatenate([full, shell()])), z_up=True, max_size=60)
+    scene = synthetic_scene(gaussians(np.concatenate([full, shell()])), z_up=True, max_size=60)
     assert center(scene.train[4])[0] < -0.2
 
 
@@ -63,22 +63,22 @@ def test_far_and_faint_gaussians_move_no_camera():
     far = gaussians([*near, *(100 * shell(n=100))])
     faint = gaussians([*near, *([[3.0, 3, 3]] * 5000)])
     faint.logit_opacities[len(near):] = -5
-    plain = made_up_scene(gaussians(near), z_up=True, max_size=60)
-    assert np.allclose(center(made_up_scene(faint, z_up=True, max_size=60).train[0]),
+    plain = synthetic_scene(gaussians(near), z_up=True, max_size=60)
+    assert np.allclose(center(synthetic_scene(faint, z_up=True, max_size=60).train[0]),
                        center(plain.train[0]))
-    assert np.allclose(center(made_up_scene(far, z_up=True, max_size=60).train[0]),
+    assert np.allclose(center(synthetic_scene(far, z_up=True, max_size=60).train[0]),
                        center(plain.train[0]), atol=0.5)
 
 
 def test_the_loss_is_that_of_a_scene_which_is_30_db_from_its_photos():
     whole = gaussians(shell(), scale=0.3)
-    scene = made_up_scene(whole, z_up=True, max_size=60)
-    found = Likeness.of(whole, scene, CONTEXT)
+    scene = synthetic_scene(whole, z_up=True, max_size=60)
+    found = SelfPsnr.of(whole, scene, CONTEXT)
     assert found.psnr_db(whole) == pytest.approx(ASSUMED_DB)
     darker = gaussians(shell(), scale=0.3, gray=0.4)
     expected = []
     for camera, before, seen in found.views:
-        change = Likeness.of(darker, scene, CONTEXT).views
+        change = SelfPsnr.of(darker, scene, CONTEXT).views
         after = next(image for other, image, _ in change if other is camera)
         expected.append(-10 * np.log10(1e-3 + ((after - before)[seen] ** 2).mean()))
     assert found.psnr_db(darker) == pytest.approx(np.mean(expected), abs=1e-4)
@@ -88,4 +88,4 @@ def test_the_loss_is_that_of_a_scene_which_is_30_db_from_its_photos():
 def test_a_scene_that_nobody_sees_is_refused():
     clear = gaussians(shell(), opacity=0.002)
     with pytest.raises(ReconstructionError, match="sees anything"):
-        Likeness.of(clear, made_up_scene(clear, z_up=True, max_size=60), CONTEXT)
+        SelfPsnr.of(clear, synthetic_scene(clear, z_up=True, max_size=60), CONTEXT)

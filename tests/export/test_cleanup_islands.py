@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon_cli.export.cleanup import islands
+from recon_cli.export.cleanup import find_islands
 from recon_cli.scene.splats import Splats, joined
 
 
@@ -38,7 +38,7 @@ def found(scene, other, *, near=None, seen=None):
     """Which of `other` are islands; none of `scene` may be."""
     both, order = joined([scene, other])
     everywhere = torch.ones(len(both), dtype=torch.bool)
-    goes = islands(both, everywhere if near is None else near[order],
+    goes = find_islands(both, everywhere if near is None else near[order],
                    None if seen is None else seen[order])
     assert not goes[order < len(scene)].any()
     return goes[order >= len(scene)]
@@ -102,4 +102,4 @@ def test_what_is_too_faint_to_be_drawn_holds_nothing_together(room):
 
 def test_a_scene_of_a_few_has_no_islands():
     scene = ball((0, 0, 0), n=10)
-    assert not islands(scene, torch.ones(10, dtype=torch.bool), None).any()
+    assert not find_islands(scene, torch.ones(10, dtype=torch.bool), None).any()

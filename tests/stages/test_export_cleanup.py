@@ -49,9 +49,9 @@ def test_planted_floaters_go_and_the_views_gain(given, tmp_path, caplog):
     inputs, floats = given
     caplog.set_level(logging.INFO, "recon")
     summary = exported(inputs, tmp_path, drop_floaters=True)
-    (change,) = summary["changes"]
-    assert change["option"] == "drop_floaters"
-    assert change["psnr_change_db"] > 5
+    (change,) = summary.changes
+    assert change.option == "drop_floaters"
+    assert change.psnr_change_db > 5
     whole = read_ply(inputs.folders["train"] / "splats.ply")
     left = {tuple(mean) for mean in read_ply(tmp_path / "splats.ply").means.tolist()}
     assert not left & {tuple(mean) for mean in whole.means[floats].tolist()}
@@ -65,9 +65,9 @@ def test_the_same_goes_whatever_the_units_of_the_export(given, tmp_path):
     for at, scale in enumerate((None, ("000001.png", "000006.png", 7.0))):
         (tmp_path / str(at)).mkdir()
         counts.append(exported(inputs, tmp_path / str(at), drop_floaters=True, drop_islands=True,
-                               scale_between=scale)["changes"])
+                               scale_between=scale).changes)
     for one, two in zip(*counts, strict=True):
-        assert one["gaussians"] == two["gaussians"]
+        assert one.gaussians == two.gaussians
 
 
 def test_floaters_and_islands_go_before_the_crop(given, tmp_path):
@@ -75,13 +75,13 @@ def test_floaters_and_islands_go_before_the_crop(given, tmp_path):
     low, high = (float(truth().means[:, 0].quantile(q)) for q in (0.1, 0.9))
     summary = exported(inputs, tmp_path, drop_floaters=True, drop_islands=True, sh_degree=0,
                        crop=(low, -1e3, -1e3, high, 1e3, 1e3))
-    assert [one["option"] for one in summary["changes"]] == [
+    assert [one.option for one in summary.changes] == [
         "drop_floaters", "drop_islands", "crop"]
 
 
 def test_nothing_goes_unasked(given, tmp_path):
     inputs, _ = given
-    assert "changes" not in exported(inputs, tmp_path)
+    assert exported(inputs, tmp_path).changes is None
     assert len(read_ply(tmp_path / "splats.ply")) == len(truth()) + 3
 
 
@@ -94,7 +94,7 @@ def test_islands_go_without_views_and_floaters_are_refused(tmp_path):
                  tmp_path / "train", CONTEXT)
     inputs = StageInputs({"train": tmp_path / "train"})
     summary = exported(inputs, tmp_path, drop_islands=True)
-    assert summary["gaussians"] == 900
+    assert summary.gaussians == 900
     assert read_ply(tmp_path / "splats.ply").means[:, 2].abs().max() == 0
     with pytest.raises(StageError, match="--drop-floaters"):
         exported(inputs, tmp_path, drop_floaters=True)
@@ -109,7 +109,7 @@ def test_a_scene_in_another_frame_is_not_cleaned_by_the_views(given, tmp_path):
     import_scene.run(ImportConfig(), StageInputs(
         {name: inputs.folders[name] for name in ("ingest", "sfm")}, (tmp_path / "away.ply",)),
         tmp_path / "train", CONTEXT)
-    with pytest.raises(StageError, match="goes by the views"):
+    with pytest.raises(StageError, match="--drop-floaters needs views"):
         exported(StageInputs({**inputs.folders, "train": tmp_path / "train"}), tmp_path,
                  drop_floaters=True)
 

@@ -10,7 +10,7 @@ from tiny_stages import CONTEXT
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
-from recon_cli.export.reduce import of_size
+from recon_cli.export.reduce import fit_to_size
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import FORMATS
 from recon_cli.stages import export
@@ -39,15 +39,15 @@ def test_a_crop_keeps_the_centres_in_the_box_and_says_what_went(inputs, whole, t
     summary = exported(inputs, tmp_path, crop=box)
     kept = whole.means[whole.means[:, 0] <= middle[0]]
     assert torch.equal(read_ply(tmp_path / "splats.ply").means, kept)
-    (change,) = summary["changes"]
-    assert (change["gaussians"], change["gaussians_before"]) == (len(kept), len(whole))
-    assert change["psnr_change_db"] < -0.5  # half of the scene is gone
+    (change,) = summary.changes
+    assert (change.gaussians, change.gaussians_before) == (len(kept), len(whole))
+    assert change.psnr_change_db < -0.5  # half of the scene is gone
     assert any(line.startswith(f"crop: {len(kept)} of {len(whole)}") for line in caplog.messages)
 
 
 def test_a_crop_is_in_units_of_the_exported_scene(inputs, whole, tmp_path):
     scaled = exported(inputs, tmp_path, scale_between=("000000.png", "000006.png", 7.0))
-    scale = scaled["transform"]["scale"]
+    scale = scaled.transform["scale"]
     middle = float(scale * whole.means[:, 0].median())
     exported(inputs, tmp_path, scale_between=("000000.png", "000006.png", 7.0),
              crop=(-1e6, -1e6, -1e6, middle * (1 + 1e-6), 1e6, 1e6))
@@ -67,8 +67,8 @@ def test_a_lower_degree_cuts_the_harmonics_off(inputs, whole, tmp_path):
     back = read_ply(tmp_path / "splats.ply")
     assert back.sh_degree == 1
     assert torch.equal(back.sh_rest, whole.sh_rest[:len(back.sh_rest), :3])
-    (change,) = summary["changes"]
-    assert (change["degree"], change["degree_before"]) == (1, 3)
+    (change,) = summary.changes
+    assert (change.degree, change.degree_before) == (1, 3)
 
 
 @pytest.mark.parametrize("name", ["ply", "spz", "sog"])
@@ -78,10 +78,10 @@ def test_a_file_is_no_larger_than_asked_for(inputs, whole, tmp_path, name):
     most = 0.6 * path.stat().st_size / 1e6
     summary = exported(inputs, tmp_path, format=name, max_mb=most)
     assert path.stat().st_size <= 1e6 * most
-    (change,) = summary["changes"]
-    assert change["gaussians"] < len(whole) or change["degree"] < 3
-    assert len(FORMATS[name].read(path)) == change["gaussians"]
-    assert summary["gaussians"] == change["gaussians"]
+    (change,) = summary.changes
+    assert change.gaussians < len(whole) or change.degree < 3
+    assert len(FORMATS[name].read(path)) == change.gaussians
+    assert summary.gaussians == change.gaussians
 
 
 def test_the_size_is_met_by_what_looks_best(whole):
@@ -91,7 +91,7 @@ def test_the_size_is_met_by_what_looks_best(whole):
         asked.append((splats.sh_degree, len(splats)))
         return -abs(splats.sh_degree - 1)  # a scene that looks best at degree 1
 
-    best = of_size(
+    best = fit_to_size(
         whole, 68 * 40 + 2000, size_of=lambda splats: len(splats) * (
             68 + 12 * (0, 3, 8, 15)[splats.sh_degree]) + 1500,
         score_of=lambda splats: torch.arange(len(splats)).double(), psnr_db=psnr_db)
@@ -111,5 +111,5 @@ def test_what_no_gaussian_fits_into_is_refused(inputs, tmp_path):
 
 def test_a_limit_that_is_met_anyway_changes_nothing(inputs, whole, tmp_path):
     summary = exported(inputs, tmp_path, max_mb=100.0)
-    assert summary["changes"][0]["gaussians"] == len(whole)
+    assert summary.changes[0].gaussians == len(whole)
     assert torch.equal(read_ply(tmp_path / "splats.ply").means, whole.means)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import random_splats
 
-from recon_cli.export.floaters import floaters, harms, sightings
+from recon_cli.export.cleanup import count_sightings, find_floaters, measure_harm
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats, joined
@@ -64,7 +64,7 @@ def test_harm_is_what_the_error_falls_by_without_that_one(masked):
     rng = np.random.default_rng(0)
     views = [TrainView(camera(x), rng.integers(0, 256, (32, 32, 3)).astype(np.uint8),
                        rng.random((32, 32)) < 0.6 if masked else None) for x in (-0.2, 0.3)]
-    found, total = harms(splats, views, backend="torch")
+    found, total = measure_harm(splats, views, backend="torch")
     assert total == pytest.approx(error(splats, views), rel=1e-9)
     for row in range(len(splats)):
         without = splats.select(torch.arange(len(splats)) != row)
@@ -79,12 +79,12 @@ def room():
 
 
 def found_in(splats, views):
-    return floaters(splats, views, backend="numba")
+    return find_floaters(splats, views, backend="numba")
 
 
 def test_nothing_is_taken_from_what_views_show(room):
     made, views = room
-    seen = sightings(made, views, backend="numba") > 0
+    seen = count_sightings(made, views, backend="numba") > 0
     found = found_in(made, views)
     assert torch.equal(found.unseen, ~seen)
     assert not found.in_front.any()
