@@ -298,14 +298,17 @@ def _field(config: type[StageConfig], name: str, text: str, *, expert: bool) -> 
     flag = name.replace("_", "-")
 
     def store(ctx: click.Context, _parameter: click.Parameter, value: Any) -> None:
-        if value is not None:
-            ctx.ensure_object(Call).settings.setdefault(section, {})[name] = (
-                info.read(value) if info.read else value)
+        if value is None or (info.repeatable and not value):
+            return
+        if info.repeatable:
+            value = ",".join(value)
+        ctx.ensure_object(Call).settings.setdefault(section, {})[name] = (
+            info.read(value) if info.read else value)
 
     return click.option(
         f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}",
         f"{section}_{name}", cls=Option, expert=expert, type=_click_type(kind, info), default=None,
-        expose_value=False, callback=store, help=text,
+        multiple=info.repeatable, expose_value=False, callback=store, help=text,
         metavar=None if info.choices else info.metavar or _METAVARS.get(kind))
 
 

@@ -32,6 +32,7 @@ class OptionInfo:
         automatic: what None means.
         metavar: how --help names the value.
         read: makes the value of the one word that is typed.
+        repeatable: whether the option may be given several times; the texts are joined by commas.
     """
 
     help: str
@@ -45,6 +46,7 @@ class OptionInfo:
     automatic: str = ""
     metavar: str = ""
     read: Callable[[str], Any] | None = None
+    repeatable: bool = False
 
 
 def option(default: Any, help: str, **info: Any) -> Any:

@@ -349,8 +349,8 @@ class ExportConfig(StageConfig):
         None, "Maximum size of the first format; degree and number of Gaussians are reduced by "
         "validation PSNR.", unit="MB", minimum=0.0, automatic="no limit")
     format: str = option(
-        "ply", f"Formats besides the .ply, with commas between: {', '.join(EXPORT_FORMATS)}.",
-        metavar="NAME,...")
+        "ply", "Formats besides the .ply, with commas between or repeated: "
+        f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...", repeatable=True)
     max_loss: float | None = option(
         None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
         automatic="0.3; 3 for .splat, which has no harmonics")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from recon_cli.cli import cli
 from recon_cli.commands import options
@@ -18,6 +19,7 @@ from recon_cli.config.stages import (
     PruneConfig,
     TrainConfig,
 )
+from recon_cli.errors import ConfigError
 
 EVERY_OPTION = [
     pytest.param(parameter, id=f"{verb} {parameter.opts[0]}")
@@ -128,6 +130,31 @@ def test_a_matrix_is_read_from_its_file_when_it_is_typed(tmp_path: Path) -> None
     numbers = [2, 0, 0, 0.5, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
     assert parsed(ExportConfig, "--transform", str(path)) == {"transform": numbers}
     assert ExportConfig(transform=numbers).hashed_fields()["transform"] == numbers
+
+
+@pytest.mark.parametrize(("words", "formats"), [
+    (["html,spz"], ("html", "spz")), (["html", "spz"], ("html", "spz")),
+    (["html,spz", "glb", "spz"], ("html", "spz", "glb")), (["spz", "spz"], ("spz",))])
+def test_a_repeated_format_adds_to_the_others(
+        words: list[str], formats: tuple[str, ...]) -> None:
+    typed = [part for word in words for part in ("--format", word)]
+    config = ExportConfig(**parsed(ExportConfig, *typed))  # type: ignore[arg-type]
+    assert config.formats == formats
+
+
+def test_a_format_that_is_not_typed_leaves_the_setting_alone(tmp_path: Path) -> None:
+    assert parsed(ExportConfig) == {}
+    (tmp_path / "recon.toml").write_text('[export]\nformat = "spz,glb"\n')
+    words = ["export", "-w", str(tmp_path), "--print-config"]
+    runner = CliRunner()
+    assert 'format = "spz,glb"' in runner.invoke(cli, words).output
+    assert 'format = "html,sog"' in runner.invoke(
+        cli, [*words, "--format", "html", "--format", "sog"]).output
+
+
+def test_an_empty_format_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"compressed\.ply"):
+        ExportConfig(**parsed(ExportConfig, "--format", "spz", "--format", ""))  # type: ignore[arg-type]
 
 
 def test_an_axis_may_begin_with_a_dash() -> None:
