@@ -18,7 +18,7 @@ from recon_cli.io.ply import read_ply
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.freshness import WorkspaceCheck
-from recon_cli.scene.gravity import camera_up, find_gravity
+from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.train.runner import read_config
@@ -26,7 +26,6 @@ from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.summaries import SfmSummary
 
 _NEEDS = ("ingest", "train", "sfm")  # training runs sfm first where that is missing too
-
 
 logger = logging.getLogger("recon")
 
@@ -56,7 +55,7 @@ class TrainedScene:
         if gravity.up is not None:
             return gravity.up
         logger.warning("up is not known; the mean up of the cameras is used: %s", gravity.reason)
-        return camera_up(viewmats).up
+        return mean_up(viewmats)
 
 
 def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> TrainedScene:

@@ -17,7 +17,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from recon_cli.report.chart import draw_mark
-from recon_cli.scene.gravity import MIN_CAMERAS, camera_up, find_gravity
+from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene, View
 
 WIDTH = 640  # pixels of the drawing; the page scales it
@@ -47,10 +47,8 @@ def find_axes(scene: Scene, *, z_up: bool) -> PlanAxes:
         return PlanAxes(np.eye(3)[:2], known=True)
     viewmats = np.stack([view.camera.viewmat for views in by_part(scene).values()
                          for view in views])
-    gravity = find_gravity(scene.points, viewmats).up if len(viewmats) >= MIN_CAMERAS else None
-    up = gravity
-    if up is None:
-        up = (camera_up(viewmats).up if len(viewmats) >= MIN_CAMERAS else -viewmats[0, 1, :3])
+    gravity = find_gravity(scene.points, viewmats).up
+    up = mean_up(viewmats) if gravity is None else gravity
     right = np.eye(3)[np.argmin(np.abs(up))]
     right = right - (right @ up) * up
     right = right / np.linalg.norm(right)

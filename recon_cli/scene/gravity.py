@@ -212,6 +212,11 @@ def camera_up(viewmats: NDArray[np.float64]) -> CameraUp:
         float(np.degrees(error)), upright, _normal(down)[2] < error)
 
 
+def mean_up(viewmats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the unit vector [3] that is up for cameras [C, 4, 4]; for one or two, the first's."""
+    return camera_up(viewmats).up if len(viewmats) >= MIN_CAMERAS else -viewmats[0, 1, :3]
+
+
 def _normal(axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
     """Returns the direction at right angles to most of `axes` [C, 3], and how sure it is.
 

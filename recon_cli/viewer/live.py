@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import ReconError
 from recon_cli.flythrough.paths import visible_depths
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.gravity import MIN_CAMERAS, camera_up
+from recon_cli.scene.gravity import mean_up
 from recon_cli.scene.splats import Splats
 from recon_cli.viewer.content import FAR, browser_camera, move_browser, set_initial_camera
 from recon_cli.viewer.gaussians import pack_splats
@@ -142,6 +142,4 @@ class LiveView:
                 return np.array([0.0, 0.0, 1.0])
         except (ReconError, OSError):
             pass  # the cameras give an approximate up
-        if len(cameras) < MIN_CAMERAS:
-            return np.asarray(-cameras[0].viewmat[1, :3])
-        return camera_up(np.stack([camera.viewmat for camera in cameras])).up
+        return mean_up(np.stack([camera.viewmat for camera in cameras]))
