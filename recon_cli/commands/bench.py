@@ -59,8 +59,8 @@ def bench(ctx: click.Context, call: Call, /, outputs: OutputFiles, **typed: Any)
         _refuse_own_options(ctx)
         return
     compute = settings.build(ComputeConfig, call.settings)
-    request = load("recon_cli.experiments.bench_run.BenchRequest")
-    run = load("recon_cli.experiments.bench_run.run")
+    request = load("recon_cli.experiments.rasterizer_benchmark.BenchRequest")
+    run = load("recon_cli.experiments.rasterizer_benchmark.run")
     click.echo(run(
         request(**typed, outputs=outputs, device=compute.device, threads=compute.threads),
         TqdmProgress()))

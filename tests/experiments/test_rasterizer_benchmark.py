@@ -79,7 +79,7 @@ def test_what_cannot_be_done_is_refused_before_anything_is_measured(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "recon_cli.experiments.bench_run.measure", lambda *_: pytest.fail("measured"))
+        "recon_cli.experiments.rasterizer_benchmark.measure", lambda *_: pytest.fail("measured"))
     Path("plain.md").write_text("no marks")
     Path("other.json").write_text("{}")
     assert main(["bench", *words]) == code

@@ -10,9 +10,8 @@ import pytest
 
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
 from recon_cli.evaluation.tables import Table, number, percent
-from recon_cli.experiments import bench_report, outputs
+from recon_cli.experiments import outputs, rasterizer_benchmark
 from recon_cli.experiments.accuracy import Accuracy
-from recon_cli.experiments.bench_report import head, tables
 from recon_cli.experiments.bench_result import (
     FIGURES,
     SCHEMA,
@@ -27,7 +26,6 @@ from recon_cli.experiments.bench_result import (
     ratio,
     read_record,
 )
-from recon_cli.experiments.bench_run import BenchRequest, parse_size
 from recon_cli.experiments.host import (
     FLOPS_BACKWARD,
     FLOPS_FORWARD,
@@ -40,6 +38,7 @@ from recon_cli.experiments.host import (
     timing_of,
 )
 from recon_cli.experiments.outputs import OutputFiles
+from recon_cli.experiments.rasterizer_benchmark import BenchRequest, head, parse_size, tables
 from recon_cli.machine import cpu_model
 
 EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)
@@ -265,12 +264,12 @@ def test_a_page_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 def test_the_front_holds_what_nothing_else_beats() -> None:
     points = [(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (2.0, 2.0), (4.0, 1.0)]
-    assert bench_report.pareto_front(points) == [1, 3, 0]
-    assert bench_report.pareto_front([]) == []
+    assert rasterizer_benchmark.pareto_front(points) == [1, 3, 0]
+    assert rasterizer_benchmark.pareto_front([]) == []
 
 
 def test_the_points_are_backends_and_timed_approximations() -> None:
-    points = bench_report.candidates_of(next(iter(result().scenes.values())))
+    points = rasterizer_benchmark.candidates_of(next(iter(result().scenes.values())))
     assert [(p.name, p.ms, p.image_error) for p in points] == [
         ("numba", 30.0, 1e-7), ("torch", 240.0, 1e-7), ("rough", 20.0, 0.01)]
 
@@ -279,7 +278,7 @@ def test_the_points_are_backends_and_timed_approximations() -> None:
 def test_the_picture_is_drawn(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     path = tmp_path / f"front{suffix}"
-    bench_report.draw(result(), path)
+    rasterizer_benchmark.draw(result(), path)
     assert path.stat().st_size > 5000
     assert list(tmp_path.iterdir()) == [path]
 
