@@ -196,8 +196,6 @@ def write_colmap(
     views: Sequence[tuple[str, Camera]],
     points: NDArray[np.float64],  # [P, 3]
     colors: NDArray[np.uint8],  # [P, 3]
-    *,
-    text: bool = False,
 ) -> None:
     """Writes a model of pinhole cameras, whole or not at all.
 
@@ -208,7 +206,6 @@ def write_colmap(
         views: name of each image below the images' folder, and its camera.
         points: in world units.
         colors: RGB.
-        text: write cameras.txt and so on instead of the binary files.
 
     Raises:
         InputError: there are no views, or the folder holds something.
@@ -223,7 +220,7 @@ def write_colmap(
     partial = folder.with_name(f".{folder.name}.tmp{os.getpid()}")
     partial.mkdir(parents=True)
     try:
-        (model.write_text if text else model.write_binary)(partial)
+        model.write_binary(partial)
         if folder.exists():
             folder.rmdir()
         partial.rename(folder)

@@ -22,10 +22,10 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.ply_table import Header, read_header, read_tables, write_point_cloud
+from recon_cli.io.ply_table import Header, read_header, read_tables
 from recon_cli.io.splats.values import refuse_not_finite, sigmoid, splats_from_arrays, to_arrays
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
-from recon_cli.workspace.atomic import replacing
+from recon_cli.workspace.atomic import replacing, write_bytes
 
 _REST = [f"f_rest_{i}" for i in range(3 * TERMS[-1])]
 _GROUPS = {
@@ -157,26 +157,23 @@ def _vertices(header: Header) -> NDArray[np.void]:
     return tables["vertex"]
 
 
-def write_points(path: Path, splats: Splats, *, min_opacity: float = MIN_OPACITY) -> int:
-    """Writes the centres and plain colours of Gaussians, whole or not at all.
-
-    Args:
-        path: of the .ply.
-        splats: the scene; only those that are opaque enough are written.
-        min_opacity: in [0, 1].
-
-    Returns:
-        The number of points.
+def write_points(path: Path, splats: Splats) -> None:
+    """Writes centres and plain colours of the opaque Gaussians as a point cloud.
 
     Raises:
         InputError: no Gaussian is opaque enough, or a value is not finite.
     """
     table = to_arrays(splats, ".ply")
-    chosen = sigmoid(table["logit_opacities"]) >= min_opacity
-    if not chosen.any():
+    opaque = sigmoid(table["logit_opacities"]) >= MIN_OPACITY
+    if not opaque.any():
         raise InputError(
-            f"None of {len(splats)} Gaussians has an opacity of {min_opacity:g} or more.",
-            hint="Ask for a lower one.")
-    colors = (SH_C0 * table["sh_dc"][chosen] + 0.5).clip(0, 1)
-    write_point_cloud(path, table["means"][chosen], np.rint(colors * 255).astype(np.uint8))
-    return int(chosen.sum())
+            f"None of {len(splats)} Gaussians has an opacity of {MIN_OPACITY:g} or more.")
+    colors = np.rint((SH_C0 * table["sh_dc"][opaque] + 0.5).clip(0, 1) * 255).astype(np.uint8)
+    names = (*"xyz", "red", "green", "blue")
+    kinds = {name: ("float", "<f4") if name in "xyz" else ("uchar", "u1") for name in names}
+    rows = np.empty(len(colors), [(name, kind) for name, (_, kind) in kinds.items()])
+    for name, column in zip(names, (*table["means"][opaque].T, *colors.T), strict=True):
+        rows[name] = column
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}",
+             *(f"property {kind} {name}" for name, (kind, _) in kinds.items()), "end_header", ""]
+    write_bytes(path, "\n".join(lines).encode("ascii") + rows.tobytes())

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.workspace.atomic import write_bytes
 
 _HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
 _END = re.compile(rb"\nend_header[ \t]*\r?\n")
@@ -24,8 +23,6 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _DIGITS = 15  # of a count; larger ones fit on no disk
 _OF_MESHES = ("face", "tristrips", "edge")
 _PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
-_POINT_ROW = np.dtype([(name, "<f4") for name in "xyz"]
-                + [(name, "u1") for name in ("red", "green", "blue")])
 
 
 @dataclass(frozen=True)
@@ -239,20 +236,3 @@ def _rows(header: Header) -> NDArray[np.void]:
     if not set(_PLACE) <= set(names):
         raise FormatError(f"{header.path} has points with the properties {', '.join(names)}.")
     return rows
-
-
-def write_point_cloud(
-    path: Path,
-    points: NDArray[np.floating],  # [P, 3]
-    colors: NDArray[np.uint8],  # [P, 3]
-) -> None:
-    """Writes points and their RGB colours, whole or not at all: float32 and uchar."""
-    rows = np.empty(len(points), _POINT_ROW)
-    for at, name in enumerate(("x", "y", "z")):
-        rows[name] = points[:, at]
-    for at, name in enumerate(("red", "green", "blue")):
-        rows[name] = colors[:, at]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
-             *(f"property float {name}" for name in "xyz"),
-             *(f"property uchar {name}" for name in ("red", "green", "blue")), "end_header", ""]
-    write_bytes(path, "\n".join(lines).encode("ascii") + rows.tobytes())

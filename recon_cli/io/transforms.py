@@ -343,7 +343,6 @@ def write_transforms(
     views: Sequence[tuple[str, Camera]],
     *,
     held_out: Collection[str] = (),
-    points: str | None = None,
 ) -> None:
     """Writes the cameras of images, whole or not at all.
 
@@ -355,7 +354,6 @@ def write_transforms(
         path: of the transforms.json.
         views: path of each image below the folder of `path`, with slashes, and its camera.
         held_out: those of the image paths that are not to be trained on.
-        points: path of a .ply of sparse points below that folder; None where there is none.
 
     Raises:
         InputError: there are no views.
@@ -364,7 +362,7 @@ def write_transforms(
     if not views:
         raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
     names = [name for name, _ in views]
-    for name in (*names, *([points] if points else ())):
+    for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise ValueError(f"{name} is no path below the folder of {path}")
     if len(set(names)) < len(names) or not set(held_out) <= set(names):
@@ -372,8 +370,6 @@ def write_transforms(
     inner = [_intrinsics(camera) for _, camera in views]
     shared = all(intrinsics == inner[0] for intrinsics in inner)
     value: dict[str, Any] = {"camera_model": "PINHOLE", **(inner[0] if shared else {})}
-    if points:
-        value["ply_file_path"] = points
     if held_out:
         test = [name for name in names if name in held_out]
         value |= {"train_filenames": [name for name in names if name not in held_out],

@@ -9,7 +9,6 @@ import pytest
 from recon_cli.errors import InputError
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.colmap_set import read_colmap
-from recon_cli.io.ply_table import write_point_cloud
 from recon_cli.io.transforms import read_transforms, write_transforms
 from recon_cli.scene.camera import Camera
 
@@ -43,13 +42,10 @@ def assert_same(posed, views, folder=""):
 @pytest.mark.parametrize("other", [{}, {"fx": 40.5, "cy": 12.25}])
 def test_transforms_come_back_as_they_were(tmp_path, other):
     views = made(tmp_path, **other)
-    write_point_cloud(tmp_path / "points.ply", POINTS, COLORS)
-    write_transforms(tmp_path / "transforms.json", views, points="points.ply")
+    write_transforms(tmp_path / "transforms.json", views)
     posed = read_transforms(tmp_path)
     assert_same(posed, views, "images/")
     assert len(posed.lenses) == 1 + bool(other)
-    np.testing.assert_array_equal(posed.points, POINTS)
-    np.testing.assert_array_equal(posed.colors, COLORS)
 
 
 def test_a_camera_that_looks_ahead_looks_along_minus_z_in_the_file(tmp_path):
@@ -78,18 +74,15 @@ def test_a_path_that_leaves_the_folder_is_refused(tmp_path, name):
     assert not (tmp_path / "transforms.json").exists()
 
 
-@pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("other", [{}, {"fx": 40.5}])
-def test_colmap_models_come_back_as_they_were(tmp_path, text, other):
+def test_colmap_models_come_back_as_they_were(tmp_path, other):
     views = [(name.removeprefix("images/"), camera) for name, camera in made(tmp_path, **other)]
-    write_colmap(tmp_path / "sparse" / "0", views, POINTS, COLORS, text=text)
+    write_colmap(tmp_path / "sparse" / "0", views, POINTS, COLORS)
     posed = read_colmap(tmp_path)
     assert_same(posed, views)
     assert len(posed.lenses) == 1 + bool(other)
     np.testing.assert_array_equal(posed.points, POINTS)
     np.testing.assert_array_equal(posed.colors, COLORS)
-    suffixes = {path.suffix for path in (tmp_path / "sparse" / "0").iterdir()}
-    assert suffixes == {".txt" if text else ".bin"}
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):

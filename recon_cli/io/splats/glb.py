@@ -27,7 +27,14 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.splats.values import logit, normalize_quats, sigmoid, to_arrays, trim_zero_rows
+from recon_cli.io.splats.values import (
+    logit,
+    normalize_quats,
+    parse_json_object,
+    sigmoid,
+    to_arrays,
+    trim_zero_rows,
+)
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined, transformed
 from recon_cli.workspace.atomic import write_bytes
@@ -431,13 +438,6 @@ class Container:
 
     def _parse(self, text: memoryview) -> dict[str, Any]:
         try:
-            value = json.loads(bytes(text), parse_constant=_no_constant)
-        except (ValueError, RecursionError) as error:
+            return parse_json_object(bytes(text))
+        except ValueError as error:
             raise self.error(f"JSON that cannot be read: {error}") from error
-        if not isinstance(value, dict):
-            raise self.error("JSON that is no object")
-        return value
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number of JSON")

@@ -25,7 +25,15 @@ from numpy.typing import NDArray
 
 from recon_cli.io.splats.codebooks import fit_codebook, fit_palette, nearest_entries
 from recon_cli.io.splats.sog_archive import Archive, Meta, pack_archive, read_meta
-from recon_cli.io.splats.values import Bytes, Floats, logit, sigmoid, to_arrays, trim_zero_rows
+from recon_cli.io.splats.values import (
+    Bytes,
+    Floats,
+    encode_smallest_three,
+    logit,
+    sigmoid,
+    to_arrays,
+    trim_zero_rows,
+)
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.workspace.atomic import write_bytes
 
@@ -190,10 +198,8 @@ def morton_codes(places: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def pack_quats(quats: Floats) -> Bytes:
     """Returns unit quaternions [N, 4] as the three smaller components and a tag [N, 4]."""
-    greatest = np.abs(quats).argmax(axis=1)
-    sign = np.where(np.take_along_axis(quats, greatest[:, None], 1) < 0, -1, 1)
-    others = (quats * sign)[np.arange(4) != greatest[:, None]].reshape(-1, 3)
-    steps = np.rint((others * _ROOT2 + 1) / 2 * 255).clip(0, 255)
+    greatest, others = encode_smallest_three(quats)
+    steps = np.rint((others.astype(np.float64) * _ROOT2 + 1) / 2 * 255).clip(0, 255)
     return np.column_stack([steps, _TAG + greatest]).astype(np.uint8)
 
 

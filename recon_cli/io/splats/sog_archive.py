@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.codebooks import BOOK, Floats
+from recon_cli.io.splats.values import parse_json_object
 
 META = "meta.json"
 _META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
@@ -69,13 +70,11 @@ class Archive:
 
     def meta(self) -> dict[str, Any]:
         """Returns the object in meta.json."""
+        text = self._read(META, _META_LIMIT)
         try:
-            value = json.loads(self._read(META, _META_LIMIT), parse_constant=_no_constant)
-        except (ValueError, RecursionError) as error:
+            return parse_json_object(text)
+        except ValueError as error:
             raise self.error(f"a {META} that cannot be read: {error}") from error
-        if not isinstance(value, dict):
-            raise self.error(f"a {META} that is no object")
-        return value
 
     def check_count(self, count: int) -> None:
         """Raises FormatError for more Gaussians than a file of this size is likely to hold.
@@ -182,10 +181,6 @@ def _escapes(name: str) -> bool:
     """Returns whether a path would lead out of the folder that it is unpacked to."""
     path = PurePosixPath(name.replace("\\", "/"))
     return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number of JSON")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -55,6 +56,25 @@ def read_contents(path: Path) -> bytes:
             return file.read(os.fstat(file.fileno()).st_size)  # a device has no end
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {error}.") from error
+
+
+def parse_json_object(text: bytes) -> dict[str, Any]:
+    """Returns a JSON object from an untrusted file.
+
+    Raises:
+        ValueError: the text is no JSON object, holds NaN, or is nested too deeply.
+    """
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(value, dict):
+        raise ValueError("it is no object")
+    return value
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
 
 
 def validate_splats(path: Path, splats: Splats) -> Splats:

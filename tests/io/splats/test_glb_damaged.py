@@ -60,7 +60,7 @@ def of(value, group, name):
     (head(10, (b"JSON", b"{} ")), "header promises 10"),
     (head(None, (b"BIN\0", b"{} ")), "needed is JSON"),
     (head(None, (b"JSON", b"{}  "), (b"JSON", b"{}  ")), "needed is BIN"),
-    (head(None, (b"JSON", b"[]  ")), "that is no object"),
+    (head(None, (b"JSON", b"[]  ")), "it is no object"),
     (head(None, (b"JSON", b"{}  ")), "no scenes 0"),
     (head(None, (b"JSON", b"{")), "cannot be read"),
     (head(None, (b"JSON", b"\xff\xff")), "cannot be read"),

@@ -84,7 +84,7 @@ def test_what_is_changed_below_is_whole(tmp_path, good):
     (pack({"meta.json": "{"}), "cannot be read"),
     (pack({"meta.json": "[" * 100_000}), "cannot be read"),
     (pack({"meta.json": '{"version":' + "9" * 5000 + "}"}), "cannot be read"),
-    (pack({"meta.json": "[]"}), "that is no object"), (pack({"meta.json": "{}"}), "version = None"),
+    (pack({"meta.json": "[]"}), "it is no object"), (pack({"meta.json": "{}"}), "version = None"),
     (pack({"meta.json": b"\xff\xfe"}), "cannot be read"),
     (pack({"meta.json": '{"version": 2, "count": NaN}'}), "NaN is no number"),
     (pack({"meta.json": '{"means": {"shape": [1, 3]}}'}), "version 1"),
