@@ -25,17 +25,11 @@ logger = logging.getLogger("recon")
 
 @dataclass(frozen=True, eq=False)
 class ExportFrame:
-    """The coordinate frame of the exported files.
+    """The coordinate frame of the exported files."""
 
-    Attributes:
-        similarity: to it from the world of the training.
-        up: [3] unit vector in it; the mean up of the cameras if up was not found.
-        measurement: that gave the scale; None if nothing was measured.
-    """
-
-    similarity: Similarity
-    up: NDArray[np.float64]
-    measurement: Measurement | None
+    similarity: Similarity  # to it from the world of the training
+    up: NDArray[np.float64]  # [3] unit vector in it; the mean up of the cameras if up was not found
+    measurement: Measurement | None  # that gave the scale; None if nothing was measured
 
 
 def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:

@@ -36,21 +36,13 @@ _DOUBTFUL, _EVIDENT = 8.0, 2.0
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How well a scene fits the training views, in one or several candidate frames.
+    """How well a scene fits the training views, in one or several candidate frames."""
 
-    Attributes:
-        frame: that was chosen.
-        similarity: from the file to the workspace.
-        psnr_db: on the views, by frame that was tried.
-        flat_db: of flat images in the mean colours of the views.
-        views: count.
-    """
-
-    frame: str
-    similarity: Similarity
-    psnr_db: Mapping[str, float]
-    flat_db: float
-    views: int
+    frame: str  # that was chosen
+    similarity: Similarity  # from the file to the workspace
+    psnr_db: Mapping[str, float]  # on the views, by frame that was tried
+    flat_db: float  # of flat images in the mean colours of the views
+    views: int  # count
 
     @property
     def doubt(self) -> str:

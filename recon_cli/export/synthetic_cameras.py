@@ -85,14 +85,11 @@ class SelfPsnr:
 
     It is what a scene that shows photos at ASSUMED_DB would get: the error there and the
     difference to the renders add up as variances do. Only pixels that show something count.
-
-    Attributes:
-        views: cameras, what the whole scene shows there, [H, W, 3] in [0, 1], and where, [H, W].
-        ctx: backend and device.
     """
 
+    # cameras, what the whole scene shows there, [H, W, 3] in [0, 1], and where, [H, W]
     views: tuple[tuple[Camera, NDArray[np.float32], NDArray[np.bool_]], ...]
-    ctx: StageContext
+    ctx: StageContext  # backend and device
 
     @staticmethod
     def of(splats: Splats, scene: Scene, ctx: StageContext) -> SelfPsnr:

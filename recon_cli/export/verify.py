@@ -41,15 +41,10 @@ def verify_ply(path: Path, splats: Splats) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ReferencePsnr:
-    """PSNR of a scene and its files on reference views, none of which is a test view.
+    """PSNR of a scene and its files on reference views, none of which is a test view."""
 
-    Attributes:
-        views: with cameras in the world of the files.
-        ctx: backend and device.
-    """
-
-    views: Sequence[ReferenceView]
-    ctx: StageContext
+    views: Sequence[ReferenceView]  # with cameras in the world of the files
+    ctx: StageContext  # backend and device
 
     def describe(self) -> str:
         """Returns the views as part of a sentence."""

@@ -43,22 +43,15 @@ Frames = list[tuple[int, Pose, list[tuple[Sensor, int]]]]  # rig id, rig from wo
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A COLMAP model without its observations.
+    """A COLMAP model without its observations."""
 
-    Attributes:
-        lenses: intrinsics by camera id.
-        images: in the order of the file.
-        unnamed: (camera id, [4, 4] world to camera) by image id, if the file with the names is
-            missing; else empty.
-        points: [P, 3] float64 sparse points.
-        colors: [P, 3] uint8 their RGB colours.
-    """
-
-    lenses: dict[int, Lens]
-    images: list[NamedImage]
+    lenses: dict[int, Lens]  # intrinsics by camera id
+    images: list[NamedImage]  # in the order of the file
+    # (camera id, [4, 4] world to camera) by image id, if the file with the names is missing; else
+    # empty
     unnamed: dict[int, tuple[int, Pose]]
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
+    points: NDArray[np.float64]  # [P, 3] float64 sparse points
+    colors: NDArray[np.uint8]  # [P, 3] uint8 their RGB colours
 
 
 def model_suffix(folder: Path) -> str | None:

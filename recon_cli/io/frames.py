@@ -29,60 +29,37 @@ POSES, POINTS = "poses.json", "points.safetensors"
 
 @dataclass(frozen=True)
 class Frame:
-    """One stored frame.
+    """One stored frame."""
 
-    Attributes:
-        name: file name in the folder of frames.
-        time_seconds: presentation time in the video, None for photos and if unknown.
-        source: name of the file that it came from.
-        sharpness: variance of its Laplacian, None for photos.
-        held_out: used for the score, never for training.
-        group: index of the group of frames that share its intrinsics.
-        masked: it has a mask of its name in the folder of masks.
-    """
-
-    name: str
-    time_seconds: float | None
-    source: str
-    sharpness: float | None
-    held_out: bool
-    group: int = 0
-    masked: bool = False
+    name: str  # file name in the folder of frames
+    time_seconds: float | None  # presentation time in the video, None for photos and if unknown
+    source: str  # name of the file that it came from
+    sharpness: float | None  # variance of its Laplacian, None for photos
+    held_out: bool  # used for the score, never for training
+    group: int = 0  # index of the group of frames that share its intrinsics
+    masked: bool = False  # it has a mask of its name in the folder of masks
 
 
 @dataclass(frozen=True)
 class Group:
-    """Frames that share intrinsics: of one camera with one setting of its lens.
+    """Frames that share intrinsics: of one camera with one setting of its lens."""
 
-    Attributes:
-        name: of their source, for messages.
-        width: of the stored frames in pixels.
-        height: of the stored frames in pixels.
-        focal_px: focal length of the stored frames from EXIF, None if unknown.
-        lens: known intrinsics of the stored frames, None if they are to be estimated.
-    """
-
-    name: str
-    width: int
-    height: int
-    focal_px: float | None = None
+    name: str  # of their source, for messages
+    width: int  # of the stored frames in pixels
+    height: int  # of the stored frames in pixels
+    focal_px: float | None = None  # focal length of the stored frames from EXIF, None if unknown
+    # known intrinsics of the stored frames, None if they are to be estimated
     lens: Lens | None = None
 
 
 @dataclass(frozen=True)
 class FrameList:
-    """The content of frames.json.
+    """The content of frames.json."""
 
-    Attributes:
-        source: kind of the capture: "video", "photos", "mixed", or the layout of a data set with
-            poses.
-        groups: at least one.
-        frames: sorted by name.
-    """
-
+    # kind of the capture: "video", "photos", "mixed", or the layout of a data set with poses
     source: str
-    groups: tuple[Group, ...]
-    frames: tuple[Frame, ...]
+    groups: tuple[Group, ...]  # at least one
+    frames: tuple[Frame, ...]  # sorted by name
 
     def write(self, stage: Path) -> None:
         """Writes the list into ingest's folder."""
@@ -114,19 +91,14 @@ def _group(value: dict[str, Any]) -> Group:
 
 @dataclass(frozen=True, eq=False)
 class KnownPoses:
-    """Poses that came with a data set.
+    """Poses that came with a data set."""
 
-    Attributes:
-        viewmats: [4, 4] float64 world to camera by frame name; OpenCV axes.
-        metric: the world's unit is the metre.
-        points: [P, 3] float64 initial points in the same world, None without points.
-        colors: [P, 3] uint8 their RGB colours, None with them.
-    """
-
+    # [4, 4] float64 world to camera by frame name; OpenCV axes
     viewmats: Mapping[str, NDArray[np.float64]]
-    metric: bool
+    metric: bool  # the world's unit is the metre
+    # [P, 3] float64 initial points in the same world, None without points
     points: NDArray[np.float64] | None = None
-    colors: NDArray[np.uint8] | None = None
+    colors: NDArray[np.uint8] | None = None  # [P, 3] uint8 their RGB colours, None with them
 
     def write(self, stage: Path) -> None:
         """Writes both files into ingest's folder."""

@@ -16,27 +16,16 @@ _FILE = "import.json"
 
 @dataclass(frozen=True)
 class ImportRecord(JsonRecord):
-    """What is known about an imported scene.
+    """What is known about an imported scene."""
 
-    Attributes:
-        file: name of the file that it was read from.
-        format: of the file, by its name in `io.splats.registry`.
-        sha256: of the file.
-        gaussians: count.
-        sh_degree: of the colours.
-        z_up: up is z in the file; else it is -y. Given or assumed, never measured.
-        views: it was compared with views of this workspace.
-        doubt: why it may not be in their frame, as a sentence; empty if it fits.
-    """
-
-    file: str
-    format: str
-    sha256: str
-    gaussians: int
-    sh_degree: int
-    z_up: bool
-    views: bool
-    doubt: str = ""
+    file: str  # name of the file that it was read from
+    format: str  # of the file, by its name in `io.splats.registry`
+    sha256: str  # of the file
+    gaussians: int  # count
+    sh_degree: int  # of the colours
+    z_up: bool  # up is z in the file; else it is -y. Given or assumed, never measured
+    views: bool  # it was compared with views of this workspace
+    doubt: str = ""  # why it may not be in their frame, as a sentence; empty if it fits
 
     def write(self, folder: Path) -> None:
         """Writes it into the folder of the scene."""

@@ -16,21 +16,13 @@ from recon_cli.io.transforms import is_transforms, read_transforms
 
 @dataclass(frozen=True)
 class Layout:
-    """A known layout.
+    """A known layout."""
 
-    Attributes:
-        name: as `PosedSet.layout` has it.
-        words: its name in a sentence.
-        needs: its files, for help texts.
-        fits: returns whether a path has the layout.
-        read: returns the data set at such a path.
-    """
-
-    name: str
-    words: str
-    needs: str
-    fits: Callable[[Path], bool]
-    read: Callable[[Path], PosedSet]
+    name: str  # as `PosedSet.layout` has it
+    words: str  # its name in a sentence
+    needs: str  # its files, for help texts
+    fits: Callable[[Path], bool]  # returns whether a path has the layout
+    read: Callable[[Path], PosedSet]  # returns the data set at such a path
 
 
 # The first that fits wins. transforms.json comes before COLMAP, because nerfstudio leaves the model

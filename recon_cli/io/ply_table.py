@@ -27,17 +27,11 @@ _PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 @dataclass(frozen=True)
 class Element:
-    """A table of the file.
+    """A table of the file."""
 
-    Attributes:
-        name: as the header has it.
-        count: how many rows the header promises.
-        row: the type of a row; None where a property is a list.
-    """
-
-    name: str
-    count: int
-    row: np.dtype[np.void] | None
+    name: str  # as the header has it
+    count: int  # how many rows the header promises
+    row: np.dtype[np.void] | None  # the type of a row; None where a property is a list
 
 
 @dataclass(frozen=True)

@@ -33,18 +33,12 @@ class DepthFile:
     Depth of another size than the image is looked up at the nearest pixel along the same ray:
     interpolation over an edge would give the depth of nothing. The rays are compared without
     distortion.
-
-    Attributes:
-        path: the file.
-        unit: world units of a value of 1.
-        lens: intrinsics of the image.
-        own: intrinsics of the depth; None if it covers the same field of view.
     """
 
-    path: Path
-    unit: float
-    lens: Lens
-    own: Lens | None = None
+    path: Path  # the file
+    unit: float  # world units of a value of 1
+    lens: Lens  # intrinsics of the image
+    own: Lens | None = None  # intrinsics of the depth; None if it covers the same field of view
 
     def __call__(self) -> NDArray[np.float32]:
         """Returns [H, W] z-depth at the size of the image, in world units, 0 where unknown.
@@ -107,72 +101,45 @@ def _axis(lens: Lens, axis: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class ListedImage:
-    """An image as a data set lists it, whether or not its file exists.
+    """An image as a data set lists it, whether or not its file exists."""
 
-    Attributes:
-        name: unique within the set.
-        path: where its file should be.
-        lens: intrinsics as the data set gives them, whatever the size of the file.
-        viewmat: [4, 4] float64 world to camera, OpenCV axes.
-        held_out: the data set itself holds it out for the score.
-        depth: reads its depth, None without depth.
-        mask: file of a mask, None without mask.
-    """
-
-    name: str
-    path: Path
-    lens: Lens
-    viewmat: NDArray[np.float64]
-    held_out: bool = False
-    depth: DepthFile | None = None
-    mask: Path | None = None
+    name: str  # unique within the set
+    path: Path  # where its file should be
+    lens: Lens  # intrinsics as the data set gives them, whatever the size of the file
+    viewmat: NDArray[np.float64]  # [4, 4] float64 world to camera, OpenCV axes
+    held_out: bool = False  # the data set itself holds it out for the score
+    depth: DepthFile | None = None  # reads its depth, None without depth
+    mask: Path | None = None  # file of a mask, None without mask
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image whose camera is known; the fields are those of `ListedImage`.
-
-    Attributes:
-        lens: index into the lenses of the set, which are of the size of the files.
-        depth: reads z-depth, [H, W] float32 in world units, 0 where unknown.
-    """
+    """An image whose camera is known; the fields are those of `ListedImage`."""
 
     name: str
     path: Path
-    lens: int
+    lens: int  # index into the lenses of the set, which are of the size of the files
     viewmat: NDArray[np.float64]
     held_out: bool = False
-    depth: DepthFile | None = None
+    depth: DepthFile | None = None  # reads z-depth, [H, W] float32 in world units, 0 where unknown
     mask: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PosedSet:
-    """A data set with poses.
+    """A data set with poses."""
 
-    Attributes:
-        layout: "colmap", "transforms", "replica" or "scannet".
-        lenses: intrinsics at the full size of the images.
-        images: in the order of the data set.
-        missing: names of images that it lists, but whose files do not exist.
-        metric: its unit is the metre.
-        sequence: its images are frames of one walk, in order.
-        splits: it says itself which images are held out.
-        points: [P, 3] float64 sparse points in its world, None if it has none.
-        colors: [P, 3] uint8 their RGB colours, None with them.
-        notices: what the user should know about how it was read.
-    """
-
-    layout: str
-    lenses: tuple[Lens, ...]
-    images: tuple[PosedImage, ...]
-    missing: tuple[str, ...] = ()
-    metric: bool = False
-    sequence: bool = False
-    splits: bool = False
+    layout: str  # "colmap", "transforms", "replica" or "scannet"
+    lenses: tuple[Lens, ...]  # intrinsics at the full size of the images
+    images: tuple[PosedImage, ...]  # in the order of the data set
+    missing: tuple[str, ...] = ()  # names of images that it lists, but whose files do not exist
+    metric: bool = False  # its unit is the metre
+    sequence: bool = False  # its images are frames of one walk, in order
+    splits: bool = False  # it says itself which images are held out
+    # [P, 3] float64 sparse points in its world, None if it has none
     points: NDArray[np.float64] | None = None
-    colors: NDArray[np.uint8] | None = None
-    notices: tuple[str, ...] = ()
+    colors: NDArray[np.uint8] | None = None  # [P, 3] uint8 their RGB colours, None with them
+    notices: tuple[str, ...] = ()  # what the user should know about how it was read
 
 
 def find_images(

@@ -19,16 +19,11 @@ from recon_cli.scene.splats import Splats
 
 @dataclass(frozen=True)
 class SplatFormat:
-    """One format.
+    """One format."""
 
-    Attributes:
-        name: also the suffix of its files, after a dot.
-        read: returns the Gaussians of a file; raises FormatError.
-        write: writes a file, whole or not at all; raises InputError if a value does not fit.
-    """
-
-    name: str
-    read: Callable[[Path], Splats]
+    name: str  # also the suffix of its files, after a dot
+    read: Callable[[Path], Splats]  # returns the Gaussians of a file; raises FormatError
+    # writes a file, whole or not at all; raises InputError if a value does not fit
     write: Callable[[Path, Splats], None]
 
 

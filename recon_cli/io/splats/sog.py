@@ -218,21 +218,13 @@ def unpack_quats(packed: Bytes) -> Floats | None:
 
 @dataclass(frozen=True, eq=False)
 class Palette:
-    """Coefficients as pixels.
+    """Coefficients as pixels."""
 
-    Attributes:
-        count: entries.
-        degree: 1 to 3.
-        codebook: [256] ascending.
-        entries: [ceil(count / 64), 64 T, 3] the image of the entries.
-        labels: [N] an entry for each Gaussian.
-    """
-
-    count: int
-    degree: int
-    codebook: Floats
-    entries: Bytes
-    labels: NDArray[np.int64]
+    count: int  # entries
+    degree: int  # 1 to 3
+    codebook: Floats  # [256] ascending
+    entries: Bytes  # [ceil(count / 64), 64 T, 3] the image of the entries
+    labels: NDArray[np.int64]  # [N] an entry for each Gaussian
 
 
 def pack_harmonics(sh_rest: Floats, colored: int, rng: np.random.Generator) -> Palette:

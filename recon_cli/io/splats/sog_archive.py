@@ -185,48 +185,28 @@ def _escapes(name: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Coefficients of degrees 1 and up, as meta.json describes them.
+    """Coefficients of degrees 1 and up, as meta.json describes them."""
 
-    Attributes:
-        count: entries of the palette.
-        degree: 1 to 3.
-        codebook: at most 256 numbers.
-        files: names of the palette's image and of the labels'.
-    """
-
-    count: int
-    degree: int
-    codebook: Floats
-    files: tuple[str, ...]
+    count: int  # entries of the palette
+    degree: int  # 1 to 3
+    codebook: Floats  # at most 256 numbers
+    files: tuple[str, ...]  # names of the palette's image and of the labels'
 
 
 @dataclass(frozen=True, eq=False)
 class Meta:
-    """The checked content of meta.json.
+    """The checked content of meta.json."""
 
-    Attributes:
-        count: Gaussians.
-        low: [3] least logarithm of a position by axis.
-        high: [3] greatest.
-        means: names of the images of the low and the high bytes.
-        scales: codebook of the logarithms of scales.
-        scales_file: name of their image.
-        quats_file: name of the image of quaternions.
-        sh0: codebook of the colours.
-        sh0_file: name of the image of colours and opacities.
-        harmonics: None at degree 0.
-    """
-
-    count: int
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    means: tuple[str, ...]
-    scales: Floats
-    scales_file: str
-    quats_file: str
-    sh0: Floats
-    sh0_file: str
-    harmonics: Harmonics | None
+    count: int  # Gaussians
+    low: NDArray[np.float64]  # [3] least logarithm of a position by axis
+    high: NDArray[np.float64]  # [3] greatest
+    means: tuple[str, ...]  # names of the images of the low and the high bytes
+    scales: Floats  # codebook of the logarithms of scales
+    scales_file: str  # name of their image
+    quats_file: str  # name of the image of quaternions
+    sh0: Floats  # codebook of the colours
+    sh0_file: str  # name of the image of colours and opacities
+    harmonics: Harmonics | None  # None at degree 0
 
 
 def read_meta(archive: Archive) -> Meta:

@@ -198,19 +198,12 @@ def _rotations(data: Bytes) -> Floats:
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """Version, count, degree and precision of the arrays.
+    """Version, count, degree and precision of the arrays."""
 
-    Attributes:
-        version: 2, 3 or 4.
-        count: Gaussians, N.
-        sh_degree: 0 to 3.
-        fractional_bits: of the positions.
-    """
-
-    version: int
-    count: int
-    sh_degree: int
-    fractional_bits: int
+    version: int  # 2, 3 or 4
+    count: int  # Gaussians, N
+    sh_degree: int  # 0 to 3
+    fractional_bits: int  # of the positions
 
     @property
     def sizes(self) -> tuple[int, ...]:
