@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from recon_cli.progress import NullProgress, Progress
 
@@ -17,42 +17,61 @@ if TYPE_CHECKING:
     from recon_cli.scene.splats import Splats
     from recon_cli.scene.train_view import TrainView
 
-class Watcher(Protocol):
-    """Is told how a training goes. It may read what it is given and change nothing.
 
-    Its methods are called between steps, so what takes long belongs elsewhere; they raise nothing.
+@dataclass(frozen=True)
+class TrainReport:
+    """How the run stands.
+
+    Attributes:
+        iteration: steps done.
+        loss: of this step.
+        validation_psnr_db: mean over the validation views; None where there are none.
+        gaussians: count.
+        seconds: of this call, so far.
+        cpu_seconds: of all threads of this process in this call, so far.
+        goes_on_at: the iteration to which the run jumps now; None where it just goes on.
     """
 
-    def begin(
-        self, label: str, until: int, cameras: Sequence[Camera], splats: Splats
-    ) -> None:
-        """Hears of a training that begins or goes on.
+    iteration: int
+    loss: float
+    validation_psnr_db: float | None
+    gaussians: int
+    seconds: float
+    cpu_seconds: float = 0.0
+    goes_on_at: int | None = None
+
+
+class TrainCallback:
+    """Is called between the steps of a training; may read what it is given and change nothing.
+
+    By default it does nothing. What takes long belongs elsewhere, and an exception ends the fit.
+    """
+
+    def on_begin(self, label: str, until: int, cameras: Sequence[Camera], splats: Splats) -> None:
+        """Is called before the first step of a run that begins or is resumed.
 
         Args:
-            label: what is trained, as the progress bar calls it.
+            label: what is trained, as the progress bar names it.
             until: steps at its end.
             cameras: of the training views.
             splats: to begin with.
         """
 
-    def step(self, iteration: int, splats: Splats) -> None:
-        """Is called after each step with the Gaussians as they are; the next step changes them."""
+    def on_step(self, iteration: int, splats: Splats) -> None:
+        """Is called after steps, at least those that `needs_step` names.
 
-    def report(self, iteration: int, validation_psnr_db: float | None) -> None:
-        """Hears the mean PSNR of the validation views, None where there are none."""
+        The next step changes the Gaussians in place.
+        """
 
+    def on_report(self, report: TrainReport) -> None:
+        """Is called every hundred steps or so and at the end, before `on_step`."""
 
-class Nobody:
-    """Looks away."""
+    def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
+        """Returns whether `on_step` must be called after this step.
 
-    def begin(self, label: str, until: int, cameras: Sequence[Camera], splats: Splats) -> None:
-        """Ignores the training."""
-
-    def step(self, iteration: int, splats: Splats) -> None:
-        """Ignores the step."""
-
-    def report(self, iteration: int, validation_psnr_db: float | None) -> None:
-        """Ignores the report."""
+        Between such steps the host may run ahead of the device.
+        """
+        return False
 
 
 @dataclass(eq=False)
@@ -145,7 +164,7 @@ class StageContext:
         threads: CPU threads to use.
         record: called with (done, total) whenever that much would survive a crash;
             `recon status` shows it as partial (412/600).
-        watcher: looks on while Gaussians are trained.
+        callbacks: called while Gaussians are trained.
         ranks: the processes that train together, which this one leads.
     """
 
@@ -154,7 +173,7 @@ class StageContext:
     backend: str = "torch"
     threads: int = 1
     record: Callable[[int, int], None] = _ignore
-    watcher: Watcher = field(default_factory=Nobody)
+    callbacks: tuple[TrainCallback, ...] = ()
     ranks: Ranks = ALONE
 
     def notice(self, text: str) -> None:

@@ -21,7 +21,7 @@ from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.plan import Target
 from recon_cli.stages import stage
 from recon_cli.train.plan import QUALITIES
-from recon_cli.train.runner import read_config
+from recon_cli.train.train_data import read_config
 from recon_cli.workspace.layout import Workspace
 
 

@@ -12,7 +12,7 @@ from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig, TrainConfig
-from recon_cli.context import Nobody, Watcher
+from recon_cli.context import TrainCallback
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress, format_duration
@@ -28,7 +28,7 @@ def run_stages(
     sources: tuple[Path, ...] = (),
     base: Settings | None = None,
     forced: Settings | None = None,
-    watcher: Watcher | None = None,
+    callbacks: tuple[TrainCallback, ...] = (),
     table: Sequence[Stage] = (),
 ) -> None:
     """Runs stages one after the other, or prints their options.
@@ -40,7 +40,7 @@ def run_stages(
         sources: the user's files, for ingest.
         base: defaults of the verb; recon.toml, --config and options win over them.
         forced: settings that the verb implies; they win over everything.
-        watcher: observes the training.
+        callbacks: of the training.
         table: of all stages; STAGES if empty.
     """
     table = table or STAGES
@@ -55,7 +55,7 @@ def run_stages(
         return
     job = Job(
         Workspace(call.workspace), file_settings, compute, TqdmProgress(), report_outcome, table,
-        watcher or Nobody(), call.ranks)
+        callbacks, call.ranks)
     targets = [
         Target(row.name, config, () if row.needs else sources)
         for row, config in zip(rows, configs.values(), strict=True)]

@@ -89,11 +89,13 @@ def train(call: Call, with_prune: bool, with_view: bool) -> None:
     """Fit Gaussians; denoise and sfm run first where needed."""
     for name in call.settings.get("prune", {}) if not with_prune else ():
         raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
-    with show_training(call) if with_view and not call.print_config else nullcontext() as watcher:
+    with show_training(call) if with_view and not call.print_config else nullcontext() as live:
+        callbacks = () if live is None else (live,)
         if with_prune:
-            run_stages(call, "train --prune", ["train", "prune"], forced=MID, watcher=watcher)
+            run_stages(
+                call, "train --prune", ["train", "prune"], forced=MID, callbacks=callbacks)
         else:
-            run_stages(call, "train", ["train"], watcher=watcher)
+            run_stages(call, "train", ["train"], callbacks=callbacks)
 
 
 @verb("import")

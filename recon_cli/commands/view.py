@@ -16,7 +16,7 @@ from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.context import Watcher
+from recon_cli.context import TrainCallback
 from recon_cli.errors import InputError
 from recon_cli.lazy import load
 from recon_cli.workspace.layout import Workspace
@@ -69,8 +69,8 @@ def view(
 
 
 @contextmanager
-def show_training(call: Call) -> Iterator[Watcher]:
-    """Yields a watcher that shows a training in the browser, on this machine alone.
+def show_training(call: Call) -> Iterator[TrainCallback]:
+    """Yields a callback that shows a training in the browser, on this machine alone.
 
     Raises:
         ConfigError: no port is free.

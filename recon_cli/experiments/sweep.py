@@ -12,7 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon_cli.config.stages import PRUNE_SCORES, PruneConfig
+from torch import Tensor
+
+from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.evaluation.reference_views import MeanScore, mean_score
@@ -22,11 +24,12 @@ from recon_cli.experiments.variants import run_grid
 from recon_cli.pipeline import execute, plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.stages import stage
-from recon_cli.train.fit import Report, Task, fit
-from recon_cli.train.importance import Importance
-from recon_cli.train.prune_run import Course, course_of
-from recon_cli.train.pruning import Advance, remaining, removals, remove, scored, survivors
+from recon_cli.train.fit import fit
+from recon_cli.train.importance import SCORES, Importance
+from recon_cli.train.prune_loop import PruneRun, prune_loop, remaining
+from recon_cli.train.prune_run import PruneSource, load_prune_source
 from recon_cli.train.state import TrainState
+from recon_cli.train.task import Task
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 
@@ -66,45 +69,45 @@ def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
     with disk_errors(root, "sweeping"), job.workspace.writing("prune --sweep"):
         context = execute.stage_context(job, row, lambda _done, _total: None)
         inputs = StageInputs({name: job.workspace.folder(name) for name in row.needs})
-        course = course_of(config, inputs, root, context)
-        views, steps = len(course.task.validation), course.until - course.first
+        source = load_prune_source(config, inputs, context)
+        views, steps = len(source.task.validation), source.until - source.first
         if not views:
             raise TrainingError(
                 "A sweep is scored on validation views, but the run has none.",
                 hint="Run `recon train --validation 0.05` first.")
-        state = course.start()
-        before = score_validation(state, course.task)
+        state = source.begin()
+        before = score_validation(state, source.task)
         with job.progress.bar("sweep", count_trials(ratios), unit="run") as bar:
-            trials = sweep(course, ratios, on_trial=bar.advance)
+            trials = sweep(source, ratios, on_trial=bar.advance)
         of_train = job.workspace.manifest("train")
         atomic.write_json(root / RESULT, {
             "of_train": of_train.digest if of_train else None, "validation_views": views,
-            "at": config.at, "rounds": course.rounds, "recovery_steps": steps,
+            "at": config.at, "rounds": source.rounds, "recovery_steps": steps,
             "equal_seconds_of": config.score, "before": dataclasses.asdict(before),
             "trials": [dataclasses.asdict(trial) for trial in trials]})
         draw_if_possible(lambda path: draw(trials, before.psnr_db, path), root / PICTURE)
     return (
         f"PSNR in dB and SSIM on {views} validation views, right after the last removal and after "
-        f"{steps} steps of recovery with up to {course.rounds} rounds. Before: "
+        f"{steps} steps of recovery with up to {source.rounds} rounds. Before: "
         f"{len(state.splats):,} Gaussians, {before.psnr_db:.2f}, {before.ssim:.4f}.\n\n"
         f"{table(trials, config.score)}")
 
 
 def count_trials(ratios: Sequence[float]) -> int:
     """Returns how many trials a sweep makes."""
-    return 1 + len(ratios) * (len(PRUNE_SCORES) + 1)
+    return 1 + len(ratios) * (len(SCORES) + 1)
 
 
 def sweep(
-    course: Course, ratios: Sequence[float], *, on_trial: Callable[[], None]
+    source: PruneSource, ratios: Sequence[float], *, on_trial: Callable[[], None]
 ) -> list[SweepTrial]:
     """Returns the control with equal steps, then for every ratio all scores and their control.
 
     Equal seconds are those of the score that the options name.
     """
-    steps = course.until - course.first
-    _train_on(course, None, min(_WARM_STEPS, steps))
-    control = _train_on(course, None, steps)
+    steps = source.until - source.first
+    _train_on(source, None, min(_WARM_STEPS, steps))
+    control = _train_on(source, None, steps)
     on_trial()
     of_options = control
 
@@ -112,61 +115,59 @@ def sweep(
         nonlocal of_options
         if score == NONE:
             share = of_options.seconds / max(control.seconds, 1e-9)
-            trial = _train_on(course, ratio, max(1, round(share * steps)))
+            trial = _train_on(source, ratio, max(1, round(share * steps)))
         else:
-            trial = _prune(course, score, ratio)
-            of_options = trial if score == course.config.score else of_options
+            trial = _prune(source, score, ratio)
+            of_options = trial if score == source.config.score else of_options
         on_trial()
         return trial
 
-    by_score = run_grid({score: score for score in (*PRUNE_SCORES, NONE)}, ratios, measure)
+    by_score = run_grid({score: score for score in (*SCORES, NONE)}, ratios, measure)
     return [control, *(trial for by_ratio in zip(*by_score.values(), strict=True)
                        for trial in by_ratio)]
 
 
-def _train_on(course: Course, ratio: float | None, steps: int) -> SweepTrial:
+def _train_on(source: PruneSource, ratio: float | None, steps: int) -> SweepTrial:
     """Trains on without removing anything."""
-    state, begin = course.start(), time.perf_counter()
-    task = course.recovering(course.first, course.first + steps)
-    advancing(task)(state, course.first + steps, None)
-    seconds = time.perf_counter() - begin
-    return SweepTrial(
-        NONE, ratio, len(state.splats), steps, seconds, None, score_validation(state, task))
+    state, until = source.begin(), source.first + steps
+    run = _SweepRun(state, source.recovery(source.first, until), source.first, until, rounds=0)
+    return run.trial(NONE, ratio, len(state.splats))
 
 
-def _prune(course: Course, name: str, ratio: float) -> SweepTrial:
+def _prune(source: PruneSource, score: str, ratio: float) -> SweepTrial:
     """Prunes by one score to one ratio."""
-    state, first, until = course.start(), course.first, course.until
-    task, n = course.recovering(first, until), len(state.splats)
-    removed, seconds = None, 0.0
-    rounds = removals(n, remaining(n, ratio), course.rounds, until - first)
-    for removal in rounds:
-        begin = time.perf_counter()
-        score = scored(
-            state, task, first + removal.after, name=name, beta=course.config.beta,
-            advance=advancing(task))
-        remove(state, survivors(score, removal.count))
-        seconds += time.perf_counter() - begin
-    if rounds:
-        removed = score_validation(state, task)
-    begin = time.perf_counter()
-    advancing(task)(state, until, None)
-    seconds += time.perf_counter() - begin
-    return SweepTrial(name, ratio, len(state.splats), until - first, seconds, removed,
-                      score_validation(state, task))
+    state, first, until = source.begin(), source.first, source.until
+    run = _SweepRun(state, source.recovery(first, until), first, until, rounds=source.rounds,
+                    score=score, beta=source.config.beta)
+    return run.trial(score, ratio, remaining(len(state.splats), ratio))
 
 
-def advancing(task: Task) -> Advance:
-    """Returns the function that trains; validation views are not looked at meanwhile."""
-    blind = dataclasses.replace(task, validation=[])
+class _SweepRun(PruneRun):
+    """Trains without a look at the validation views, and scores the model off the clock."""
 
-    def ignore(_: TrainState | Report) -> None:
-        """Keeps nothing."""
+    _removed: MeanScore | None = None
+    _scoring_seconds = 0.0
 
-    def advance(state: TrainState, until: int, importance: Importance | None) -> None:
-        fit(state, blind, until, on_step=ignore, on_report=ignore, importance=importance)
+    def trial(self, name: str, ratio: float | None, target: int) -> SweepTrial:
+        """Returns what becomes of the model that is pruned to `target` Gaussians."""
+        self._target, begin = target, time.perf_counter()
+        prune_loop(self, target)
+        seconds = time.perf_counter() - begin - self._scoring_seconds
+        return SweepTrial(
+            name, ratio, len(self.state.splats), self.until - self.first, seconds, self._removed,
+            score_validation(self.state, self.task))
 
-    return advance
+    def advance(self, until: int, importance: Importance | None = None) -> None:
+        """Trains up to a step."""
+        fit(self.state, dataclasses.replace(self.task, validation=[]), until, (), importance)
+
+    def remove(self, score: Tensor, count: int) -> None:
+        """Removes all but `count` Gaussians and scores the rest if no removal follows."""
+        super().remove(score, count)
+        if count == self._target:
+            begin = time.perf_counter()
+            self._removed = score_validation(self.state, self.task)
+            self._scoring_seconds = time.perf_counter() - begin
 
 
 def score_validation(state: TrainState, task: Task) -> MeanScore:
@@ -197,7 +198,7 @@ def draw(trials: Sequence[SweepTrial], before_db: float, path: Path) -> None:
     """Draws PSNR against the fraction removed, a line a score and the controls, into a .svg."""
     with drawing(path, 8, 5.5) as figure:
         axes = figure.subplots()
-        for name in (*PRUNE_SCORES, NONE):
+        for name in (*SCORES, NONE):
             line = [(trial.ratio, trial.recovered.psnr_db) for trial in trials
                     if trial.score == name and trial.ratio is not None]
             style = {"color": "0.3", "linestyle": "--", "label": "no prune, equal seconds"}

@@ -14,12 +14,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.context import StageContext
+from recon_cli.context import StageContext, TrainCallback
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.evaluation.reference_views import (
     MASK_HINT,
@@ -36,24 +36,15 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.feature_trials import PARTS
-from recon_cli.train.fit import Task, fit
-from recon_cli.train.importance import Importance
+from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.plan import first_count
 from recon_cli.train.planning import model_parts, parts_needed
-from recon_cli.train.pruning import (
-    RATIO,
-    Recovery,
-    remaining,
-    removals,
-    remove,
-    rounds_within,
-    scored,
-    survivors,
-)
-from recon_cli.train.runner import load_task
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.prune_loop import RATIO, PruneRun, prune_loop, remaining, rounds_within
+from recon_cli.train.schedule import RecoverySchedule, Schedule
 from recon_cli.train.state import TrainState
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import load_task
 
 PILOT_STEPS = 200  # the count changes twice in them at the usual hundred steps
 _WARM_STEPS = 10  # caches and threads; the kernels are compiled before
@@ -189,30 +180,37 @@ def score_as_ply(
     return mean_score(written, views, sh_degree, ctx.backend), size
 
 
-class Advance(Protocol):
-    """Trains a state by a task up to a step; the scores of its steps go into `importance`."""
-
-    def __call__(self, task: Task, until: int, importance: Importance | None = None) -> None:
-        """Trains."""
-
-
-def prune_rest(
-    state: TrainState, task: Task, prune: MidPrune, until: int, advance: Advance
-) -> None:
-    """Removes the Gaussians that matter least to the training views and trains the rest."""
+def prune_run(
+    state: TrainState, task: Task, prune: MidPrune, until: int, callbacks: Sequence[TrainCallback]
+) -> PruneRun:
+    """Returns the run that prunes a state at its step and trains until `until`."""
     config, first = prune.config, state.iteration
-    recovery = until - first
+    epoch = task.schedule.epoch(len(task.train))
     if prune.restarts:
-        plan = Recovery(task.schedule.config, first=first, until=until)
-        task = dataclasses.replace(task, schedule=plan)
-    rounds = config.rounds or rounds_within(recovery, len(task.train))
-    n, ratio = len(state.splats), RATIO if config.ratio is None else config.ratio
-    for removal in removals(n, remaining(n, ratio), rounds, recovery):
-        score = scored(
-            state, task, first + removal.after, name=config.score, beta=config.beta,
-            advance=lambda _state, to, importance: advance(task, to, importance))
-        remove(state, survivors(score, removal.count))
-    advance(task, until)
+        schedule = RecoverySchedule(task.schedule.config, first=first, until=until)
+        task = dataclasses.replace(task, schedule=schedule)
+    return PruneRun(
+        state, task, first, until, rounds=config.rounds or rounds_within(until - first, epoch),
+        score=config.score, beta=config.beta, callbacks=callbacks)
+
+
+class _TrialCallback(TrainCallback):
+    """Calls `take_score` after certain steps, and `on_step` after each."""
+
+    def __init__(
+        self, stops: Sequence[int], take_score: Callable[[], None], on_step: Callable[[], None]
+    ) -> None:
+        self._stops, self._take_score, self._on_step = stops, take_score, on_step
+
+    def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
+        """Returns True: the progress bar counts every step."""
+        return True
+
+    def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
+        """Scores the model where that is due."""
+        self._on_step()
+        if iteration in self._stops:
+            self._take_score()
 
 
 def run_trial(
@@ -241,22 +239,17 @@ def run_trial(
             state.iteration, round(wall, 3), round(cpu, 3), len(splats), size, score.psnr_db,
             score.ssim))
 
-    def advance(task: Task, until: int, importance: Importance | None = None) -> None:
-        while state.iteration < until:
-            stop = min(until, *(stop for stop in stops if stop > state.iteration))
-            fit(state, task, stop, on_step=lambda _state: on_step(),
-                on_report=lambda _report: None, importance=importance)
-            if stop in stops:
-                take_score()
-
+    callbacks = (_TrialCallback(stops, take_score, on_step),)
     if 0 in stops:
         take_score()
     prune = run.variant.prune
-    if prune is not None:  # at least one step is left for recovery
-        advance(task, min(run.iterations - 1, round(prune.at * run.iterations)))
-        prune_rest(state, task, prune, run.iterations, advance)
-    else:
-        advance(task, run.iterations)
+    if prune is None:
+        fit(state, task, run.iterations, callbacks)
+    else:  # at least one step is left for recovery
+        fit(state, task, min(run.iterations - 1, round(prune.at * run.iterations)), callbacks)
+        ratio = RATIO if prune.config.ratio is None else prune.config.ratio
+        prune_loop(prune_run(state, task, prune, run.iterations, callbacks),
+                   remaining(len(state.splats), ratio))
     return tuple(points)
 
 

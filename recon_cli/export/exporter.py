@@ -35,7 +35,7 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.importance import Importance, add_views
-from recon_cli.train.runner import load_views, read_config
+from recon_cli.train.train_data import load_views, read_config
 from recon_cli.workspace.summaries import ExportChange, ExportedFile
 
 # dB on the validation views, unless --max-loss is given; .splat has no harmonics

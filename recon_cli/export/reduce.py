@@ -12,7 +12,7 @@ from torch import Tensor
 
 from recon_cli.errors import ConfigError
 from recon_cli.scene.splats import Splats
-from recon_cli.train.pruning import survivors
+from recon_cli.train.prune_loop import survivors
 from recon_cli.workspace.summaries import ExportChange
 
 Box = tuple[float, float, float, float, float, float]  # x, y, z of the lowest corner, the highest

@@ -21,7 +21,7 @@ from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
-from recon_cli.train.runner import read_config
+from recon_cli.train.train_data import read_config
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.summaries import SfmSummary
 

@@ -15,7 +15,7 @@ from recon_cli import machine
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.context import ALONE, Nobody, Ranks, StageContext, StageInputs, Watcher
+from recon_cli.context import ALONE, Ranks, StageContext, StageInputs, TrainCallback
 from recon_cli.errors import BackendError, ConfigError, ManifestError, ReconError
 from recon_cli.lazy import load
 from recon_cli.pipeline.freshness import WorkspaceCheck
@@ -55,7 +55,7 @@ class Job:
         progress: opens progress bars.
         report: called with every stage that was run or is up to date.
         table: the stages.
-        watcher: observes the training; no part of what is computed.
+        callbacks: called while Gaussians are trained; they do not affect the result.
         ranks: the processes that train together, which this one leads.
     """
 
@@ -65,7 +65,7 @@ class Job:
     progress: Progress = field(default_factory=NullProgress)
     report: Callable[[Outcome], None] = _ignore
     table: Sequence[Stage] = STAGES
-    watcher: Watcher = field(default_factory=Nobody)
+    callbacks: tuple[TrainCallback, ...] = ()
     ranks: Ranks = ALONE
 
     def inspect(self) -> WorkspaceCheck:
@@ -180,7 +180,7 @@ def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> S
     """Returns the context of a stage, with device and threads set up."""
     if row.renders:
         context = render_context(job.compute, job.progress, job.ranks)
-        return dataclasses.replace(context, record=record, watcher=job.watcher)
+        return dataclasses.replace(context, record=record, callbacks=job.callbacks)
     threads = job.compute.threads or machine.usable_threads()
     return StageContext(progress=job.progress, threads=threads, record=record)
 

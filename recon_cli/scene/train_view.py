@@ -1,9 +1,8 @@
-"""TODO: say why this module exists."""
+"""A view in memory, as training and scoring read it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,9 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.scene.camera import Camera
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import write_ply
 from recon_cli.io.splats.registry import format_of
 from recon_cli.scene.splats import Splats, transformed
-from recon_cli.train.runner import write_config
+from recon_cli.train.train_data import write_config
 from recon_cli.workspace.digests import digest_file
 from recon_cli.workspace.summaries import ImportSummary
 

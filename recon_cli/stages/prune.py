@@ -14,38 +14,48 @@ from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import max_gaussians, write_ply
 from recon_cli.scene.splats import Splats
+from recon_cli.train.callbacks import seconds_at
 from recon_cli.train.fit import validation_psnr
-from recon_cli.train.prune_loop import prune_to, prune_while_good
-from recon_cli.train.prune_run import Round, course_of
-from recon_cli.train.pruning import RATIO, remaining
-from recon_cli.train.runner import LOG, seconds_at
+from recon_cli.train.prune_loop import RATIO, prune_loop, remaining
+from recon_cli.train.prune_run import (
+    Round,
+    StoredPruneRun,
+    load_prune_source,
+    prune_while_good,
+)
+from recon_cli.train.runner import LOG
 from recon_cli.train.state import TrainState
 
 
 def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
     """Prunes, recovers and returns what was removed and what it cost."""
-    course = course_of(config, inputs, out, ctx)
-    before = course.start()
-    n, psnr_before = len(before.splats), validation_psnr(before, course.task)
-    steps = before.steps
+    source = load_prune_source(config, inputs, ctx)
+    start = source.begin()
+    n, steps, psnr_before = len(start.splats), start.steps, validation_psnr(start, source.task)
+    target = _target(config, start.splats)
+    del start
+    run = StoredPruneRun(source, out, ctx)
     if config.max_psnr_drop is None:
-        state, rounds = prune_to(course, _target(config, before.splats))
+        prune_loop(run, target)
+        run.end_round()
     elif psnr_before is None:
         raise TrainingError(
             "--max-psnr-drop is measured on validation views, but the run has none.",
             hint="Run `recon train --validation 0.05` first, or prune by --ratio.")
     else:
-        state, rounds = prune_while_good(course, psnr_before, config.max_psnr_drop)
-        if len(state.splats) == n:
-            ctx.notice(f"nothing was removed: {rounds[0].removed:.1%} already cost more than "
-                       f"{config.max_psnr_drop:g} dB" if rounds else "nothing was removed")
+        prune_while_good(run, psnr_before, config.max_psnr_drop)
+        if len(run.state.splats) == n:
+            ctx.notice(f"nothing was removed: {run.done[0].removed:.1%} already cost more than "
+                       f"{config.max_psnr_drop:g} dB" if run.done else "nothing was removed")
+    run.write_rounds()
+    state = run.state
     write_ply(out / "splats.ply", state.splats)
-    course.clear()
+    run.clear()
     return {
-        **_summary(config, state, rounds, n), "iterations": state.steps,
+        **_summary(config, state, run.done, n), "iterations": state.steps,
         "recovery_steps": state.steps - steps,
         "validation_psnr_db_before": psnr_before,
-        "validation_psnr_db": validation_psnr(state, course.task),
+        "validation_psnr_db": validation_psnr(state, source.task),
         "train_seconds": seconds_at(out / LOG, state.iteration),
     }
 

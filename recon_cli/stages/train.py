@@ -16,10 +16,10 @@ from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs, Summary
 from recon_cli.evaluation.reference_views import load_scene, size_summary
 from recon_cli.io.ply import write_ply
-from recon_cli.train.fit import Task
 from recon_cli.train.planning import first_or_saved, model_parts, planned_task, recorded_plan
-from recon_cli.train.runner import CHECKPOINT, LOG, run_fit
+from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
+from recon_cli.train.task import Task
 
 
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
@@ -28,9 +28,9 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     task = planned_task(config, scene, out, ctx)
     ctx.notice_idle(task.schedule.config.batch_views)
     state = first_or_saved(task, scene, out / CHECKPOINT)
-    run_fit(
-        state, task, task.schedule.config.iterations, out, ctx, label="train",
-        keep={task.schedule.mid: "mid.safetensors"})
+    until = task.schedule.config.iterations
+    run_fit(state, task, until, Segment(
+        out, "train", until, keep={task.schedule.mid: "mid.safetensors"}), ctx)
     save_state(out / "final.safetensors", state)
     write_ply(out / "splats.ply", state.splats)
     (out / CHECKPOINT).unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -24,9 +24,7 @@ from recon_cli.train.gradient import DeferredStep, gradient_step
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import TrainState
 from recon_cli.train.stepper import Stepper, control, next_view, skip
-
-if TYPE_CHECKING:
-    from recon_cli.train.fit import Task
+from recon_cli.train.task import Task
 
 _FARTHEST = 100  # steps between two meetings, so that Ctrl-C and a progress bar need not wait
 

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.pyramid import reduced
+from recon_cli.train.task import reduced
 
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart

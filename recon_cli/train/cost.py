@@ -15,14 +15,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.context import Ranks
+from recon_cli.context import Ranks, TrainCallback
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.train.densify import budget
 from recon_cli.train.densify.statistics import Gathered
-from recon_cli.train.fit import Task, fit, report_every, validation_psnr
+from recon_cli.train.fit import fit, report_every, validation_psnr
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, new_state, save_state
+from recon_cli.train.task import Task
 
 # Of the Gaussians that stand for trained ones. With .3 a step takes what a real one of the same
 # level and count takes, within 10%, with the .1 that training begins with up to 25% less (room
@@ -164,6 +165,24 @@ class _Enough(Exception):  # noqa: N818 - an event, not an error
     """The time for timing is used up."""
 
 
+class _StepTimer(TrainCallback):
+    """Marks the time after each step and ends the fit once `seconds` are used up."""
+
+    def __init__(self, clock: Clock, seconds: float) -> None:
+        self._clock, self._seconds = clock, seconds
+        self.marks = [clock()]
+
+    def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
+        """Returns True: the device must be waited for."""
+        return True
+
+    def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
+        """Marks the time."""
+        self.marks.append(self._clock())
+        if self.marks[-1] >= self.marks[0] + self._seconds and len(self.marks) > 1 + _WARM:
+            raise _Enough
+
+
 class _Probe:
     """Times steps on Gaussians of its own."""
 
@@ -207,17 +226,10 @@ class _Probe:
         state = self._state(splats)
         state.iteration = _middle(self._task.schedule, level)
         state.queue = list(self._views)
-        marks = [self._now()]
-
-        def on_step(_: TrainState) -> None:
-            marks.append(self._now())
-            if marks[-1] >= marks[0] + self._each and len(marks) > 1 + _WARM:
-                raise _Enough
-
+        timer = _StepTimer(self._now, self._each)
         with suppress(_Enough):
-            fit(state, self._task, state.iteration + len(self._views), on_step=on_step,
-                on_report=_nothing)
-        times = [1e3 * (end - begin) for begin, end in pairwise(marks)]
+            fit(state, self._task, state.iteration + len(self._views), (timer,))
+        times = [1e3 * (end - begin) for begin, end in pairwise(timer.marks)]
         return statistics.median(times[_WARM:])
 
     def report(self) -> LevelCost:
@@ -243,10 +255,6 @@ class _Probe:
         if self._task.device.type == "cuda":  # pragma: no cover
             torch.cuda.synchronize(self._task.device)
         return self._clock()
-
-
-def _nothing(_: object) -> None:
-    """Ignores what it is told."""
 
 
 def _middle(schedule: Schedule, level: int) -> int:

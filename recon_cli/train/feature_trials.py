@@ -22,11 +22,11 @@ from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.background import FarContent, faces, far_content
 from recon_cli.train.exposure import Estimate, estimated
-from recon_cli.train.fit import Task, fit
+from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.poses import worth_a_trial
-from recon_cli.train.pyramid import reduced
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.task import Task, reduced
 
 # A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
 # alone were .07 +- .06 dB apart (17 views, 500 steps at 200 pixels): the errors decide as well.
@@ -316,8 +316,7 @@ class _Bench:
                      task.backend, task.device, camera_error=task.camera_error)
         # reduced views would be reduced once more in the search for what lies far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
-        fit(state, small, _STEPS, on_step=lambda _: None, on_report=lambda _: None,
-            looks=lambda _: False)
+        fit(state, small, _STEPS)
         return [mean_psnr(state.splats, [reduced(view, LEVEL)], config.sh_degree, task.backend,
                           corrected=True) for view in held_out]
 

@@ -19,6 +19,8 @@ from recon_cli.render import Statistics, render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 
+# all that are known; `recon prune` offers those that beat a random choice, and the paper's
+SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
 _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
 _BETA_SHIPPED = 0.1  # LightGaussian's --v_pow
 
@@ -88,7 +90,7 @@ class Importance:
         """Returns the score [N] float64 by which Gaussians are ranked; the lowest go first.
 
         Args:
-            name: one of PRUNE_SCORES.
+            name: one of SCORES.
             splats: the N Gaussians as they are now.
             beta: exponent of the volume in the paper's score.
             generator: draws the random score, and nothing else.

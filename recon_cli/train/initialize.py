@@ -14,9 +14,9 @@ from recon_cli.errors import TrainingError
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimated
-from recon_cli.train.fit import Task
 from recon_cli.train.poses import WORTH_PX, Poses
 from recon_cli.train.state import TrainState, load_state, new_state
+from recon_cli.train.task import Task
 
 _OPACITY = 0.1  # initial opacity of the reference implementation
 _NEIGHBOURS = 3

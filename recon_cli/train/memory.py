@@ -6,10 +6,21 @@ The figures per Gaussian and per pixel are counted from what the code allocates 
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
+import torch
+
+from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext
 from recon_cli.errors import TrainingError
+from recon_cli.evaluation.reference_views import sizes_of
+from recon_cli.io.images import fit_camera
+from recon_cli.machine import free_memory_bytes
+from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import TERMS
+
+logger = logging.getLogger("recon")
 
 _FLOATS = 14  # of a Gaussian, its higher SH coefficients apart
 _LARGEST = 4  # numbers of the largest parameter, these apart: a quaternion
@@ -104,3 +115,37 @@ def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
 
 def _megabytes(count: int) -> str:
     return f"{count / 1e6:,.0f} MB"
+
+
+def gaussians_that_fit(scene: Scene, config: RunConfig, ctx: StageContext) -> int:
+    """Returns how many Gaussians memory has room for, before the images are loaded."""
+    one = _memory(scene, config, ctx, gaussians=1)
+    return room(one, _free_bytes(ctx))
+
+
+def _memory(
+    scene: Scene, config: RunConfig, ctx: StageContext, *, gaussians: int
+) -> MemoryEstimate:
+    views = (*scene.train, *scene.validation)
+    width, height = sizes_of([fit_camera(view.camera, config.max_size) for view in views])[0]
+    return estimate(
+        views=len(views), width=width, height=height, gaussians=gaussians,
+        fused=ctx.backend == "numba", sh_degree=config.sh_degree,
+        masks=sum(view.mask is not None for view in views))
+
+
+def _free_bytes(ctx: StageContext) -> int:
+    return (torch.cuda.mem_get_info()[0] if ctx.device == "cuda"
+            else free_memory_bytes() // ctx.ranks.local)
+
+
+def check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
+    """Says what the run will take, and refuses what does not fit.
+
+    Raises:
+        TrainingError: there is not enough memory.
+    """
+    needed = _memory(scene, config, ctx, gaussians=config.max_gaussians)
+    free = _free_bytes(ctx)
+    logger.info("training takes %s at most; %.0f MB are free", needed.described(), free / 1e6)
+    refuse_what_does_not_fit(needed, free)

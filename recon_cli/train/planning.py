@@ -18,18 +18,18 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate, with_exchange
 from recon_cli.train.feature_trials import PARTS, Candidate, Needs, described, examine
-from recon_cli.train.fit import Task
 from recon_cli.train.initialize import first_state, saved_state
+from recon_cli.train.memory import gaussians_that_fit
 from recon_cli.train.plan import Facts, Plan
-from recon_cli.train.runner import (
-    gaussians_that_fit,
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.state import TrainState
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import (
     load_task,
     load_views,
     read_config,
     write_config,
 )
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import TrainState
 from recon_cli.workspace.atomic import read_json, write_json
 
 PLAN = "plan.json"

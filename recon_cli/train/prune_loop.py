@@ -1,74 +1,167 @@
-"""Removal in rounds: to a count, or as far as the validation views allow."""
+"""Pruning in rounds: which Gaussians go, how many when, and the loop that removes and fine-tunes.
+
+All by rank, never by a threshold: equal scores would otherwise go as a group. Scores of single
+Gaussians say nothing about pairs: of two that stand in for each other both look dispensable, and
+removed together they leave a hole. So each round removes a part, and the next one scores what has
+recovered. The loop works in memory; `prune_run` keeps its progress on disk.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-from recon_cli.train.fit import Task, validation_psnr
-from recon_cli.train.prune_run import GOOD, Course, Round
-from recon_cli.train.pruning import remaining, removals
-from recon_cli.train.state import TrainState, save_state
+import torch
+from torch import Tensor
 
-# Share that a round of the search removes at first; halved whenever that was too much, down to the
-# least, which bounds how far from the largest possible ratio the search may end.
-_SEARCH_SHARE = 0.25
-_LEAST_SHARE = 0.05
+from recon_cli.context import TrainCallback
+from recon_cli.scene.train_view import TrainView
+from recon_cli.train.densify.statistics import Gathered
+from recon_cli.train.fit import fit
+from recon_cli.train.importance import Importance, add_views
+from recon_cli.train.state import TrainState
+from recon_cli.train.task import Task
 
-
-def prune_to(course: Course, target: int) -> tuple[TrainState, list[Round]]:
-    """Removes all but `target` Gaussians round by round and returns what recovered."""
-    done, first, until = course.read(), course.first, course.until
-    number, task = len(done), course.recovering(first, until)
-    state = course.state(number)
-    n = done[0].gaussians_before if done else len(state.splats)
-    plan = removals(n, min(n, target), course.rounds, until - first)
-    for removal in plan[number:]:
-        score = course.scored(task, number, state, first + removal.after)
-        _settle(done, state, course.task)
-        course.remove(number, state, score, removal.count, done)
-        number += 1
-    course.advance(task, number, state, until)
-    _settle(done, state, course.task)
-    course.write(done)
-    return state, done
+RATIO = 0.5  # that is removed where no limit is given
+# Share of the recovery by which the last round is over; what is left mends it. docs/pruning.md
+LAST_ROUND = 0.5
+_LEAST_ROUNDS, _MOST_ROUNDS = 3, 8  # more gained nothing. docs/pruning.md
 
 
-def prune_while_good(
-    course: Course, psnr_before: float, max_drop: float
-) -> tuple[TrainState, list[Round]]:
-    """Removes as many as cost at most `max_drop` dB and returns the last state that was good.
+@dataclass(frozen=True)
+class Removal:
+    """One round of a plan.
 
-    A round that costs too much is taken back, and a smaller one is tried from the state before.
+    Attributes:
+        after: recovery steps before it.
+        count: Gaussians that stay.
     """
-    steps = (course.until - course.first) // course.rounds
-    done, good = course.read(), course.out / GOOD
-    while True:
-        number = len(done)
-        state = course.state(number)
-        score = None
-        if number:
-            until = done[-1].iteration + steps
-            task = course.recovering(done[-1].iteration, until)
-            score = course.scored(task, number, state, until)
-            _settle(done, state, course.task)
-            if psnr_before - (done[-1].validation_psnr_db or 0.0) <= max_drop:
-                save_state(good, state)
-            else:
-                done[-1] = dataclasses.replace(done[-1], kept=False)
-                state, score = course.load(good) if good.exists() else course.start(), None
-        share = _SEARCH_SHARE * 0.5 ** sum(not one.kept for one in done)
-        count = remaining(len(state.splats), share)
-        if share < _LEAST_SHARE or count == len(state.splats):
-            break
-        if score is None:
-            score = course.scored(course.task, number, state, state.iteration)
-        course.remove(number, state, score, count, done)
-    course.write(done)
-    return state, done
+
+    after: int
+    count: int
 
 
-def _settle(done: list[Round], state: TrainState, task: Task) -> None:
-    """Notes how the last round ended."""
-    if done:
-        done[-1] = dataclasses.replace(
-            done[-1], validation_psnr_db=validation_psnr(state, task))
+def remaining(n: int, ratio: float) -> int:
+    """Returns how many of n Gaussians stay when a share of `ratio` goes; at least one."""
+    return max(1, n - int(ratio * n))
+
+
+def rounds_within(recovery: int, views: int) -> int:
+    """Returns how many rounds a recovery has room for: one an epoch, 3 to 8.
+
+    An epoch between two removals scores every view by its training steps alone.
+    """
+    return min(_MOST_ROUNDS, max(_LEAST_ROUNDS, int(LAST_ROUND * recovery) // max(1, views)))
+
+
+def plan_removals(n: int, target: int, rounds: int, recovery: int) -> tuple[Removal, ...]:
+    """Returns the rounds that lead from n Gaussians to `target`.
+
+    Each round removes the same share of what is there. They are evenly spread up to LAST_ROUND of
+    the recovery, so that training steps come before the first one and score it; a single round
+    comes at once. Rounds that would remove nothing are left out.
+
+    Args:
+        n: Gaussians now.
+        target: Gaussians at the end, 1 to n.
+        rounds: at most this many.
+        recovery: steps in all.
+    """
+    plan: list[Removal] = []
+    for k in range(rounds):
+        after = round(LAST_ROUND * recovery * (k + 1) / rounds) if rounds > 1 else 0
+        count = target if k == rounds - 1 else round(n * (target / n) ** ((k + 1) / rounds))
+        if count < (plan[-1].count if plan else n):
+            plan.append(Removal(after, count))
+    return tuple(plan)
+
+
+def survivors(score: Tensor, count: int) -> Tensor:
+    """Returns the rows [K] of the `count` highest scores, ascending.
+
+    Of equal scores the later rows go first. At least one row stays.
+    """
+    order = torch.argsort(score, descending=True, stable=True)
+    return order[: max(1, count)].sort().values
+
+
+def remove(state: TrainState, rows: Tensor) -> None:
+    """Goes on with the Gaussians at `rows` alone; they keep their moments."""
+    splats = state.splats.select(rows)
+    state.optimizer.replace(splats, rows)
+    state.gathered = Gathered.zeros(len(splats), splats.means.device)
+
+
+class PruneRun:
+    """A model in memory that is pruned in rounds and trained in between.
+
+    Args:
+        state: changed in place.
+        task: views, and the schedule of the steps after `first`.
+        first: steps done before the first removal.
+        until: steps done at the end.
+        rounds: at most this many.
+        score: one of `importance.SCORES`, by which Gaussians are ranked.
+        beta: exponent of the volume in the paper's score.
+        callbacks: of the training.
+    """
+
+    def __init__(
+        self, state: TrainState, task: Task, first: int, until: int, *, rounds: int,
+        score: str = "loo", beta: float = 0.1, callbacks: Sequence[TrainCallback] = (),
+    ) -> None:
+        self.state, self.task, self.first, self.until = state, task, first, until
+        self.rounds, self.callbacks = rounds, callbacks
+        self._score, self._beta = score, beta
+        self.count_before = len(state.splats)  # the first removal
+        self.removals_done = 0
+
+    def advance(self, until: int, importance: Importance | None = None) -> None:
+        """Trains up to a step; `importance` gets the scores of these steps."""
+        fit(self.state, self.task, until, self.callbacks, importance)
+
+    def score(self, until: int) -> Tensor:
+        """Trains up to a step and returns the score [N] that the last epoch's own passes give.
+
+        Every training view counts once: those that the steps at hand do not reach are rendered.
+        """
+        state, task = self.state, self.task
+        device = state.splats.means.device
+        importance = Importance.of_score(self._score, len(state.splats), device)
+        if not importance.needs_views:
+            self.advance(until)
+        else:
+            epoch = task.schedule.epoch(len(task.train))
+            self.advance(max(state.iteration, until - epoch))
+            unseen = list(range(len(task.train)))
+            if state.iteration < until:
+                state.queue = []  # a new epoch, in which no view comes twice
+                self.advance(until, importance)
+                unseen = state.queue
+            add_views(
+                importance, state.splats, [self._view(i) for i in sorted(unseen)],
+                sh_degree=task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend)
+        return importance.score(
+            self._score, state.splats, beta=self._beta, generator=state.generator)
+
+    def remove(self, score: Tensor, count: int) -> None:
+        """Removes all but the `count` Gaussians of the highest scores."""
+        remove(self.state, survivors(score, count))
+        self.removals_done += 1
+
+    def _view(self, index: int) -> TrainView:
+        """Returns a training view with its camera as it was refined."""
+        view, poses = self.task.train[index], self.state.poses
+        return view if poses is None else replace(view, camera=poses.camera(index, view.camera))
+
+
+def prune_loop(run: PruneRun, target: int) -> None:
+    """Removes all but `target` Gaussians round by round and trains to the end of the run.
+
+    A run that did some of the rounds before goes on with the next one.
+    """
+    n = run.count_before
+    plan = plan_removals(n, min(n, target), run.rounds, run.until - run.first)
+    for removal in plan[run.removals_done:]:
+        run.remove(run.score(run.first + removal.after), removal.count)
+    run.advance(run.until)

@@ -1,4 +1,4 @@
-"""What a run of pruning has on disk: the rounds done so far, and the state of the one under way.
+"""A pruning run on disk: it goes on after a kill, and may search how much can go.
 
 `round-<k>.safetensors` is a state after the k-th removal, `rounds.json` lists the removals. The
 state is written first and the list after it: a kill in between repeats the round before, to the
@@ -23,12 +23,16 @@ from recon_cli.errors import ConfigError
 from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import read_ply
-from recon_cli.train.fit import Task, validation_psnr
+from recon_cli.train.callbacks import TrainLog, seconds_at
+from recon_cli.train.fit import validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import finished_state, saved_state
-from recon_cli.train.pruning import Recovery, remove, rounds_within, scored, survivors
-from recon_cli.train.runner import LOG, Log, load_task, read_config, run_fit, seconds_at
+from recon_cli.train.prune_loop import PruneRun, remaining, rounds_within
+from recon_cli.train.runner import LOG, Segment, run_fit
+from recon_cli.train.schedule import RecoverySchedule
 from recon_cli.train.state import TrainState, save_state
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import load_task, read_config
 from recon_cli.workspace.atomic import read_json, write_bytes
 
 logger = logging.getLogger("recon")
@@ -37,6 +41,10 @@ ROUNDS = "rounds.json"
 GOOD = "good.safetensors"  # the last state whose validation PSNR was good enough
 _END_RECOVERY = 6  # the reference recovers for 5,000 steps after 30,000
 _END_EPOCHS = 6  # three rounds in its first half, each scored by an epoch of its own
+# Share that a round of the search removes at first; halved whenever that was too much, down to the
+# least, which bounds how far from the largest possible ratio the search may end.
+_SEARCH_SHARE = 0.25
+_LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -65,115 +73,36 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """All that the rounds of one run need.
+class PruneSource:
+    """The trained model that is pruned.
 
     Attributes:
         config: options of the stage.
         task: views and the plan of the training run.
-        start: loads the state to be pruned.
-        load: loads a state that was saved in `out`.
-        out: partial folder of the stage.
-        ctx: progress and record.
+        begin: loads the state to be pruned.
         first: steps done before the first removal.
         until: steps done at the end, if the count is known beforehand.
+        rounds: of removal, at most.
         earlier_seconds: of training before that.
     """
 
     config: PruneConfig
     task: Task
-    start: Callable[[], TrainState]
-    load: Callable[[Path], TrainState]
-    out: Path
-    ctx: StageContext
+    begin: Callable[[], TrainState]
     first: int
     until: int
+    rounds: int
     earlier_seconds: float
 
-    @property
-    def rounds(self) -> int:
-        """How many rounds there are."""
-        epoch = self.task.schedule.epoch(len(self.task.train))
-        return self.config.rounds or rounds_within(self.until - self.first, epoch)
-
-    def recovering(self, first: int, until: int) -> Task:
-        """Returns the task with learning rates for a recovery between two steps."""
+    def recovery(self, first: int, until: int) -> Task:
+        """Returns the task with the learning rates of a recovery between two steps."""
         config = dataclasses.replace(self.task.schedule.config, early_stop=False)
-        plan = Recovery(config, first=first, until=until)
-        return dataclasses.replace(self.task, schedule=plan)
-
-    def advance(
-        self, task: Task, number: int, state: TrainState, until: int,
-        importance: Importance | None = None,
-    ) -> None:
-        """Trains a state of round `number` up to a step."""
-        if state.iteration < until:
-            run_fit(
-                state, task, until, self.out, self.ctx, label=f"round {number}", first=self.first,
-                earlier_seconds=self.earlier_seconds, end=max(self.until, until),
-                checkpoint=_name(number), importance=importance)
-
-    def scored(self, task: Task, number: int, state: TrainState, until: int) -> Tensor:
-        """Trains a state of round `number` up to a step and returns its scores [N].
-
-        The seconds of passes that only score go into the log, like those of training.
-        """
-        trained, trained_cpu = 0.0, 0.0
-
-        def advance(state: TrainState, until: int, importance: Importance | None) -> None:
-            nonlocal trained, trained_cpu
-            begin, cpu_begin = time.perf_counter(), time.process_time()
-            self.advance(task, number, state, until, importance)
-            trained += time.perf_counter() - begin
-            trained_cpu += time.process_time() - cpu_begin
-
-        begin, cpu_begin = time.perf_counter(), time.process_time()
-        score = scored(state, task, until, name=self.config.score, beta=self.config.beta,
-                       advance=advance)
-        Log(self.out / LOG, state.iteration, self.earlier_seconds).spend(
-            state.iteration, time.perf_counter() - begin - trained,
-            time.process_time() - cpu_begin - trained_cpu)
-        return score
-
-    def remove(
-        self, number: int, state: TrainState, score: Tensor, count: int, done: list[Round]
-    ) -> None:
-        """Removes all but `count` Gaussians, saves the state and appends the round to `done`."""
-        n, before = len(state.splats), validation_psnr(state, self.task)
-        remove(state, survivors(score, count))
-        save_state(self.out / _name(number + 1), state)
-        done.append(Round(
-            state.iteration, n, len(state.splats), 1 - len(state.splats) / n, before,
-            validation_psnr(state, self.task)))
-        logger.info("round %d removes %d of %d Gaussians", number + 1, n - len(state.splats), n)
-        self.write(done)
-        (self.out / _name(number)).unlink(missing_ok=True)
-
-    def write(self, done: list[Round]) -> None:
-        """Writes the list of rounds, whole or not at all."""
-        rows = [dataclasses.asdict(one) for one in done]
-        write_bytes(self.out / ROUNDS, json.dumps(rows, indent=1).encode())
-
-    def read(self) -> list[Round]:
-        """Returns the list of rounds; empty where the state that it leads to is missing."""
-        path = self.out / ROUNDS
-        rows = read_json(path) if path.exists() else []
-        there = (self.out / _name(len(rows))).exists()
-        return [Round(**row) for row in rows] if there else []
-
-    def clear(self) -> None:
-        """Deletes what only a later run would have needed."""
-        for path in (*self.out.glob(_name("*")), self.out / GOOD):
-            path.unlink(missing_ok=True)
-
-    def state(self, number: int) -> TrainState:
-        """Returns the state in which round `number` is."""
-        path = self.out / _name(number)
-        return self.load(path) if path.exists() else self.start()
+        schedule = RecoverySchedule(config, first=first, until=until)
+        return dataclasses.replace(self.task, schedule=schedule)
 
 
-def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Course:
-    """Returns what the rounds need: the state to be pruned, the views, and the steps there are.
+def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContext) -> PruneSource:
+    """Returns the model to be pruned, its views, and the steps there are.
 
     Raises:
         ConfigError: the middle of a run is asked for that took place elsewhere.
@@ -191,30 +120,154 @@ def course_of(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageCon
     task = load_task(scene, train_config, ctx)
     ctx.notice_idle(train_config.batch_views)
     final = train / "final.safetensors"
-    source = train / "mid.safetensors" if config.at == "mid" else final
-
-    def load(path: Path) -> TrainState:
-        return saved_state(path, task)
+    path = train / "mid.safetensors" if config.at == "mid" else final
 
     def begin() -> TrainState:
-        return finished_state(read_ply(train / "splats.ply"), task) if origin else load(source)
+        if origin:
+            return finished_state(read_ply(train / "splats.ply"), task)
+        return saved_state(path, task)
 
-    start = begin()
+    start, epoch = begin(), task.schedule.epoch(len(task.train))
     steps = config.recovery
     if steps is None:
-        rest = load(final).steps - start.steps if config.at == "mid" else 0
-        steps = _recovery(
-            config, train_config, task.schedule.epoch(len(task.train)), rest)
-    return Course(
-        config, task, begin, load, out, ctx, start.iteration,
-        start.iteration + steps, seconds_at(train / LOG, start.iteration))
+        rest = saved_state(final, task).steps - start.steps if config.at == "mid" else 0
+        steps = _recovery_steps(config, train_config, epoch, rest)
+    return PruneSource(
+        config, task, begin, start.iteration, start.iteration + steps,
+        config.rounds or rounds_within(steps, epoch), seconds_at(train / LOG, start.iteration))
 
 
-def _recovery(config: PruneConfig, train: RunConfig, epoch: int, rest: int) -> int:
+def _recovery_steps(config: PruneConfig, train: RunConfig, epoch: int, rest: int) -> int:
     """Returns how many steps the recovery takes; `rest` are those of training from its middle."""
     if config.at == "mid":  # as many as the unpruned run took, which may have stopped early
         return rest
     return max(train.iterations // _END_RECOVERY, _END_EPOCHS * epoch)
+
+
+class StoredPruneRun(PruneRun):
+    """A pruning run whose rounds and state are kept in a folder; it begins where that left off.
+
+    Args:
+        source: the model to be pruned.
+        out: partial folder of the stage.
+        ctx: progress and record.
+    """
+
+    def __init__(self, source: PruneSource, out: Path, ctx: StageContext) -> None:
+        self.source, self._out, self._ctx = source, out, ctx
+        self.done = self._read_rounds()
+        path = out / _name(len(self.done))
+        super().__init__(
+            saved_state(path, source.task) if path.exists() else source.begin(),
+            source.recovery(source.first, source.until), source.first, source.until,
+            rounds=source.rounds, score=source.config.score, beta=source.config.beta)
+        self.removals_done = len(self.done)
+        if self.done:
+            self.count_before = self.done[0].gaussians_before
+        self._trained = 0.0, 0.0  # wall and CPU seconds of training
+
+    def advance(self, until: int, importance: Importance | None = None) -> None:
+        """Trains up to a step with checkpoints and a log."""
+        begin, cpu_begin = time.perf_counter(), time.process_time()
+        if self.state.iteration < until:
+            number = len(self.done)
+            run_fit(self.state, self.task, until, Segment(
+                self._out, f"round {number}", first=self.first, until=max(self.until, until),
+                earlier_seconds=self.source.earlier_seconds, checkpoint=_name(number)),
+                self._ctx, importance)
+        wall, cpu = self._trained
+        self._trained = (
+            wall + time.perf_counter() - begin, cpu + time.process_time() - cpu_begin)
+
+    def score(self, until: int) -> Tensor:
+        """Trains up to a step and returns the score [N].
+
+        The seconds of passes that only score go into the log, like those of training.
+        """
+        self._trained = 0.0, 0.0
+        begin, cpu_begin = time.perf_counter(), time.process_time()
+        score = super().score(until)
+        TrainLog(self._out / LOG, self.state.iteration, self.source.earlier_seconds).add_idle(
+            self.state.iteration, time.perf_counter() - begin - self._trained[0],
+            time.process_time() - cpu_begin - self._trained[1])
+        return score
+
+    def remove(self, score: Tensor, count: int) -> None:
+        """Ends the round before, removes Gaussians, and saves the state and the list of rounds."""
+        number, n, before = len(self.done), len(self.state.splats), self.end_round()
+        super().remove(score, count)
+        left = len(self.state.splats)
+        save_state(self._out / _name(number + 1), self.state)
+        self.done.append(Round(
+            self.state.iteration, n, left, 1 - left / n, before, self._psnr()))
+        logger.info("round %d removes %d of %d Gaussians", number + 1, n - left, n)
+        self.write_rounds()
+        (self._out / _name(number)).unlink(missing_ok=True)
+
+    def end_round(self) -> float | None:
+        """Returns the validation PSNR in dB, and records it as that of the round under way."""
+        psnr = self._psnr()
+        if self.done and self.done[-1].validation_psnr_db is None:
+            self.done[-1] = dataclasses.replace(self.done[-1], validation_psnr_db=psnr)
+        return psnr
+
+    def accept(self) -> None:
+        """Saves the state as the last good one."""
+        save_state(self._out / GOOD, self.state)
+
+    def take_back(self) -> None:
+        """Returns to the last good state and marks the round as taken back."""
+        self.done[-1] = dataclasses.replace(self.done[-1], kept=False)
+        good = self._out / GOOD
+        self.state = (
+            saved_state(good, self.source.task) if good.exists() else self.source.begin())
+
+    def write_rounds(self) -> None:
+        """Writes the list of rounds, whole or not at all."""
+        rows = [dataclasses.asdict(row) for row in self.done]
+        write_bytes(self._out / ROUNDS, json.dumps(rows, indent=1).encode())
+
+    def clear(self) -> None:
+        """Deletes what only a resumed run would have needed."""
+        for path in (*self._out.glob(_name("*")), self._out / GOOD):
+            path.unlink(missing_ok=True)
+
+    def _psnr(self) -> float | None:
+        return validation_psnr(self.state, self.source.task)
+
+    def _read_rounds(self) -> list[Round]:
+        """Returns the list of rounds; empty where the state that it leads to is missing."""
+        path = self._out / ROUNDS
+        rows = read_json(path) if path.exists() else []
+        return [Round(**row) for row in rows] if (self._out / _name(len(rows))).exists() else []
+
+
+def prune_while_good(run: StoredPruneRun, psnr_before: float, max_drop: float) -> None:
+    """Removes as many as cost at most `max_drop` dB; the run ends with the last good state.
+
+    A round that costs too much is taken back, and a smaller one is tried from the state before.
+    """
+    steps = (run.until - run.first) // run.rounds
+    while True:
+        score = None
+        if run.done:
+            begin = run.done[-1].iteration
+            run.task = run.source.recovery(begin, begin + steps)
+            score = run.score(begin + steps)
+            run.end_round()
+            if psnr_before - (run.done[-1].validation_psnr_db or 0.0) <= max_drop:
+                run.accept()
+            else:
+                run.take_back()
+                score = None
+        share = _SEARCH_SHARE * 0.5 ** sum(not row.kept for row in run.done)
+        count = remaining(len(run.state.splats), share)
+        if share < _LEAST_SHARE or count == len(run.state.splats):
+            break
+        if score is None:
+            run.task = run.source.task
+            score = run.score(run.state.iteration)
+        run.remove(score, count)
 
 
 def _name(number: int | str) -> str:

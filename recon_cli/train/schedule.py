@@ -212,3 +212,34 @@ class Schedule:
     def deletes_large(self, iteration: int) -> bool:
         """Tells whether Gaussians that cover too much are deleted as well."""
         return self.recipe.resets and iteration > self.reset_every
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecoverySchedule(Schedule):
+    """A run of its own, but for its coarse beginning: all learning rates start anew.
+
+    The rates at which training ended let no Gaussian move into the gap that its neighbour left.
+
+    Attributes:
+        first: step at which the recovery begins.
+        until: step at which it ends.
+    """
+
+    first: int
+    until: int
+
+    def share(self, iteration: int) -> float:
+        """Returns how much of the recovery is done after a step, 0 to 1."""
+        return min(1.0, (iteration - self.first) / max(1, self.until - self.first))
+
+    def level(self, iteration: int) -> int:  # noqa: ARG002
+        """Returns 1: images are never reduced."""
+        return 1
+
+    def sh_degree(self, iteration: int) -> int:  # noqa: ARG002
+        """Returns the degree in use, which is the highest."""
+        return self.config.sh_degree
+
+    def gathers(self, iteration: int) -> bool:  # noqa: ARG002
+        """Returns False: nothing grows back."""
+        return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,9 +17,7 @@ from recon_cli.train.gradient import gradient_step
 from recon_cli.train.importance import Importance
 from recon_cli.train.sh import color_spread, needed, reduced, visibility
 from recon_cli.train.state import TrainState
-
-if TYPE_CHECKING:
-    from recon_cli.train.fit import Task
+from recon_cli.train.task import Task
 
 _SKIPPED = 0.02  # share of the run's steps that may come to nothing
 _SKIPPED_FLOOR = 5

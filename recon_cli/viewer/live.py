@@ -17,6 +17,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from recon_cli.context import TrainCallback, TrainReport
 from recon_cli.errors import ReconError
 from recon_cli.flythrough.paths import visible_depths
 from recon_cli.scene.camera import Camera
@@ -37,8 +38,8 @@ _ECHO = "recon-echo"  # a key under which no browser stores anything
 logger = logging.getLogger("recon")
 
 
-class LiveView:
-    """Training callbacks that send the Gaussians to all browsers.
+class LiveView(TrainCallback):
+    """Sends the Gaussians in training to all browsers.
 
     Args:
         server: that browsers connect to.
@@ -58,7 +59,7 @@ class LiveView:
         self._busy = False
         self._closed = False
 
-    def begin(self, label: str, until: int, cameras: Sequence[Camera], splats: Splats) -> None:
+    def on_begin(self, label: str, until: int, cameras: Sequence[Camera], splats: Splats) -> None:
         """Moves all browsers to the first training camera."""
         self._label, self._until, self._psnr_db = label, until, None
         try:
@@ -76,7 +77,7 @@ class LiveView:
             for client in self._server.get_clients().values():
                 move_browser(client, start, up, cameras[0])
 
-    def step(self, iteration: int, splats: Splats) -> None:
+    def on_step(self, iteration: int, splats: Splats) -> None:
         """Sends the Gaussians if an update is due and a browser is connected."""
         start = time.perf_counter()
         if self._busy or start < self._due or not self._server.get_clients():
@@ -86,9 +87,9 @@ class LiveView:
         copy = flat.map(lambda tensor: tensor.detach().cpu().clone())
         self._work.submit(self._send, iteration, copy, start)
 
-    def report(self, iteration: int, validation_psnr_db: float | None) -> None:  # noqa: ARG002
+    def on_report(self, report: TrainReport) -> None:
         """Keeps the PSNR for the next update."""
-        self._psnr_db = validation_psnr_db
+        self._psnr_db = report.validation_psnr_db
 
     def close(self) -> None:
         """Stops sending updates."""

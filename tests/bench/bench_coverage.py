@@ -25,7 +25,7 @@ from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.runner import read_config
+from recon_cli.train.train_data import read_config
 
 CLASSES = (0, 1, 3, 10, 1000)  # views that show a pixel: 0, 1 to 2, 3 to 9, 10 and more
 SLACK = 1.03  # of the depth

@@ -23,7 +23,9 @@ from recon_cli.render import registry
 from recon_cli.stages import train
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate
-from recon_cli.train.runner import gaussians_that_fit, load_task, run_fit
+from recon_cli.train.memory import gaussians_that_fit
+from recon_cli.train.runner import Segment, run_fit
+from recon_cli.train.train_data import load_task
 
 CLOCKS = {"cpu": time.process_time, "wall": time.perf_counter}
 
@@ -48,7 +50,7 @@ def row(workspace: Path, config: TrainConfig, ctx: StageContext, clock: str) -> 
         task = train._with(task, made.config(config))
         state = train._state(task, scene, out / "none")
         begin = now()
-        run_fit(state, task, made.iterations, out, ctx, label="train")
+        run_fit(state, task, made.iterations, Segment(out, "train", made.iterations), ctx)
         took = now() - begin
     asked = config.quality if config.minutes is None else f"{config.minutes:g} min"
     return (f"| {workspace.name} | {asked} | {made.iterations} | {len(state.splats)} | "

@@ -23,7 +23,7 @@ from recon_cli.io.images import fit_camera, read_image
 from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
-from recon_cli.train.runner import read_config
+from recon_cli.train.train_data import read_config
 
 FOCAL, WIDTH, HEIGHT = 300.0, 600, 340  # pixels, with the principal point at the centre
 

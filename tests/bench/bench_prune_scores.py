@@ -7,6 +7,7 @@ Scores change no gradient, so a second run that is told which rows stay takes th
 
 from __future__ import annotations
 
+import dataclasses
 import time
 import zlib  # noqa: F401 - before pycolmap, which brings a zlib of its own
 from pathlib import Path
@@ -16,37 +17,44 @@ import torch
 
 from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.experiments.sweep import advancing
 from recon_cli.render.registry import use_threads
-from recon_cli.train.prune_run import Course, course_of
-from recon_cli.train.pruning import remaining, removals, remove, scored, survivors
+from recon_cli.train.prune_loop import PruneRun, prune_loop, remaining, remove, survivors
+from recon_cli.train.prune_run import PruneSource, load_prune_source
 
 REPEATS = 3
 
 
-def seconds(course: Course, ratio: float, told: list[torch.Tensor] | None) -> tuple[
+class Told(PruneRun):
+    """Removes rows that it was told and scores nothing, or keeps the rows that its scores give."""
+
+    def __init__(self, source: PruneSource, told: list[torch.Tensor] | None) -> None:
+        state, task = source.begin(), source.recovery(source.first, source.until)
+        super().__init__(state, dataclasses.replace(task, validation=[]), source.first,
+                         source.until, rounds=source.rounds)
+        self.told, self.rows = told, list[torch.Tensor]()
+
+    def score(self, until: int) -> torch.Tensor:
+        if self.told is None:
+            return super().score(until)
+        self.advance(max(self.state.iteration, until - len(self.task.train)))
+        self.state.queue = []
+        self.advance(until)
+        return torch.empty(0)
+
+    def remove(self, score: torch.Tensor, count: int) -> None:
+        told = self.told
+        self.rows.append(survivors(score, count) if told is None else told[len(self.rows)])
+        remove(self.state, self.rows[-1])
+
+
+def seconds(source: PruneSource, ratio: float, told: list[torch.Tensor] | None) -> tuple[
     float, list[torch.Tensor], torch.Tensor
 ]:
     """Returns CPU seconds, the rows that stayed in each round, and the means at the end."""
-    state, first, until = course.start(), course.first, course.until
-    task = course.recovering(first, until)
-    advance, kept = advancing(task), []
-    plan = removals(len(state.splats), remaining(len(state.splats), ratio), course.rounds,
-                    until - first)
+    run = Told(source, told)
     begin = time.process_time()
-    for number, removal in enumerate(plan):
-        at = first + removal.after
-        if told is None:
-            score = scored(state, task, at, name=course.config.score, beta=0.1, advance=advance)
-            kept.append(survivors(score, removal.count))
-        else:
-            advance(state, max(state.iteration, at - len(task.train)), None)
-            state.queue = []
-            advance(state, at, None)
-            kept.append(told[number])
-        remove(state, kept[-1])
-    advance(state, until, None)
-    return time.process_time() - begin, kept, state.splats.means.detach()
+    prune_loop(run, remaining(len(run.state.splats), ratio))
+    return time.process_time() - begin, run.rows, run.state.splats.means.detach()
 
 
 @click.command()
@@ -56,18 +64,17 @@ def main(workspace: Path, ratio: float) -> None:
     """Print the least seconds of each way and their ratio; WORKSPACE holds a trained model."""
     use_threads("numba", 1)
     inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm", "train")})
-    course = course_of(
-        PruneConfig(), inputs, workspace, StageContext(backend="numba"))
+    source = load_prune_source(PruneConfig(), inputs, StageContext(backend="numba"))
     with_scores, without = [], []
     for _ in range(REPEATS):
-        spent, rows, means = seconds(course, ratio, None)
+        spent, rows, means = seconds(source, ratio, None)
         with_scores.append(spent)
-        spent, _, same = seconds(course, ratio, rows)
+        spent, _, same = seconds(source, ratio, rows)
         without.append(spent)
         assert torch.equal(means, same)
     a, b = min(with_scores), min(without)
     click.echo(
-        f"{ratio:.0%} in {course.rounds} rounds, {course.until - course.first} steps: "
+        f"{ratio:.0%} in {source.rounds} rounds, {source.until - source.first} steps: "
         f"{a:.2f} s with scores, {b:.2f} s without: {a / b - 1:+.1%}")
 
 

@@ -25,12 +25,13 @@ from recon_cli.evaluation.reference_views import load_reference_views, load_scen
 from recon_cli.experiments.trial import score_as_ply
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
-from recon_cli.train.fit import Task, fit
+from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.plan import first_count
-from recon_cli.train.runner import load_task
 from recon_cli.train.schedule import RECIPES, Recipe, Schedule
 from recon_cli.train.state import TrainState
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import load_task
 
 WARM = 20  # steps that load what is compiled
 SHOWN = 20  # training views that are scored, at most
@@ -75,7 +76,7 @@ def trained(task: Task, scene: Scene) -> TrainState:
     config = task.schedule.config
     state = first_state(
         task, scene.points, scene.colors, most=first_count(config, len(scene.points)))
-    fit(state, task, config.iterations, on_step=lambda _: None, on_report=lambda _: None)
+    fit(state, task, config.iterations)
     return state
 
 

@@ -22,9 +22,9 @@ from recon_cli.render.triton.step_status import StepReport
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import async_trainer
-from recon_cli.train.fit import Task
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, new_state
+from recon_cli.train.task import Task
 
 _ITERATIONS = 30_000
 GATHERING = 15_000  # step after a densification; the next one is 100 steps away

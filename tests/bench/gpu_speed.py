@@ -15,8 +15,8 @@ from torch import Tensor
 from recon_cli.experiments.synthetic_room import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.train import async_trainer
-from recon_cli.train.fit import Task
 from recon_cli.train.state import TrainState
+from recon_cli.train.task import Task
 
 TORCH, GSPLAT = Goal(15, 40), Goal(0.5, 1.2)  # times as fast
 STEP = Goal(8, 3)  # ms

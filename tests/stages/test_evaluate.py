@@ -18,7 +18,7 @@ from recon_cli.evaluation import reference_views
 from recon_cli.evaluation.metrics import psnr, ssim
 from recon_cli.io.images import read_image
 from recon_cli.stages import evaluate
-from recon_cli.train.runner import read_config, write_config
+from recon_cli.train.train_data import read_config, write_config
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
 from recon_cli.stages import export
-from recon_cli.train.runner import write_config
+from recon_cli.train.train_data import write_config
 from recon_cli.workspace.atomic import write_json
 
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])

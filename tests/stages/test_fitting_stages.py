@@ -12,10 +12,11 @@ import torch
 from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, run, without
 
 from recon_cli.config.stages import ExportConfig, PruneConfig, RunConfig
+from recon_cli.context import TrainCallback
 from recon_cli.errors import FormatError, StageError, TrainingError
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.stages import export, prune, train
-from recon_cli.train import prune_run, runner
+from recon_cli.train import callbacks, prune_run, runner
 from recon_cli.train.state import save_state
 
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
@@ -38,7 +39,7 @@ def stopping_after(steps, monkeypatch):
         if state.iteration >= steps:
             raise Killed
 
-    monkeypatch.setattr(runner, "save_state", save_then_die)
+    monkeypatch.setattr(callbacks, "save_state", save_then_die)
 
 
 def test_training_leaves_a_scene_its_states_and_a_log(inputs):
@@ -82,12 +83,13 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
 
     original = runner.fit_together
 
-    def fit_and_press(state, task, until, *, on_step, **others):
-        def step(now):
-            if now.iteration == 10:
+    class Press(TrainCallback):
+        def on_step(self, iteration, splats):  # noqa: ARG002
+            if iteration == 10:
                 os.kill(os.getpid(), signal.SIGINT)
-            on_step(now)
-        original(state, task, until, on_step=step, **others)
+
+    def fit_and_press(state, task, until, callbacks, *others):
+        original(state, task, until, (Press(), *callbacks), *others)
 
     with monkeypatch.context() as patch:
         patch.setattr(runner, "fit_together", fit_and_press)
@@ -186,18 +188,18 @@ def test_a_checkpoint_cut_short_is_refused_with_what_to_type(inputs, tmp_path, m
 
 def test_large_checkpoints_take_no_more_than_a_tenth_of_the_time():
     now = [0.0]
-    pace = runner.Pace(lambda: now[0])
+    throttle = callbacks.CheckpointThrottle(lambda: now[0])
 
     def save(seconds):
-        with pace.saving():
+        with throttle.saving():
             now[0] += seconds
 
-    assert pace.allows()
+    assert throttle.allows()
     save(0.2)  # soon written: as often as is asked for
-    assert pace.allows()
+    assert throttle.allows()
     save(0.5)
-    assert not pace.allows()
+    assert not throttle.allows()
     now[0] += 4.9
-    assert not pace.allows()
+    assert not throttle.allows()
     now[0] += 0.2
-    assert pace.allows()
+    assert throttle.allows()

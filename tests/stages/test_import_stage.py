@@ -20,7 +20,7 @@ from recon_cli.io.splats.registry import FORMATS
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import transformed
 from recon_cli.stages import evaluate, import_scene, prune
-from recon_cli.train.runner import read_config
+from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_json
 
 TURN = np.array([[0.0, -1, 0], [0.6, 0, 0.8], [-0.8, 0, 0.6]])

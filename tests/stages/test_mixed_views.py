@@ -14,7 +14,7 @@ from recon_cli.evaluation import reference_views
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import runner
+from recon_cli.train import memory, train_data
 from recon_cli.train.memory import estimate
 
 CONFIG = RunConfig(
@@ -92,11 +92,11 @@ def test_the_largest_view_decides_the_memory_and_masks_are_counted(tmp_path, mon
         asked.append(values)
         return estimate(**values)
 
-    monkeypatch.setattr(runner, "estimate", recorded)
+    monkeypatch.setattr(memory, "estimate", recorded)
     inputs = make_inputs(tmp_path, TWO[::-1])  # the smaller one comes first
     write_masks(inputs, {"000001.png": np.ones((44, 30), bool)})
     scene = reference_views.load_scene(inputs, validation=0.1)
-    runner.load_task(scene, CONFIG, StageContext())
+    train_data.load_task(scene, CONFIG, StageContext())
     assert (asked[0]["width"], asked[0]["height"], asked[0]["masks"]) == (48, 36, 1)
 
 

@@ -15,8 +15,9 @@ from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import use_threads
 from recon_cli.stages import prune, train
-from recon_cli.train import prune_loop, prune_run, runner
+from recon_cli.train import callbacks, prune_run, runner
 from recon_cli.train.state import save_state
+from recon_cli.workspace.atomic import write_bytes
 
 CONFIG = TrainConfig(
     iterations=120, densify_every=10, max_gaussians=120, sh_rate=0.05, checkpoint_every=3,
@@ -94,10 +95,10 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
                 raise Killed
 
         with monkeypatch.context() as patch:
-            for module in (prune_run, runner, prune_loop):
+            for module in (prune_run, callbacks):
                 patch.setattr(module, "save_state", lambda *a: count_and_die(save_state, *a))
             patch.setattr(
-                prune_run, "write_bytes", lambda *a: count_and_die(runner.write_bytes, *a))
+                prune_run, "write_bytes", lambda *a: count_and_die(write_bytes, *a))
             try:
                 resumed = run(config, inputs, tmp_path / "out")
                 break
@@ -115,10 +116,10 @@ def test_ctrl_c_while_scores_are_gathered_costs_no_byte_either(
 ):
     original = runner.fit_together
 
-    def interrupted(state, task, until, *, importance, **others):
+    def interrupted(state, task, until, callbacks, importance, threads):
         if importance is not None and state.iteration > 125:
             raise KeyboardInterrupt
-        original(state, task, until, importance=importance, **others)
+        original(state, task, until, callbacks, importance, threads)
 
     with monkeypatch.context() as patch:
         patch.setattr(runner, "fit_together", interrupted)

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
+from tiny_task import Hooks
+
 import recon_cli
 from recon_cli.train.distributed.data_parallel import dismiss, fit_together
 from recon_cli.train.distributed.process_group import Processes
@@ -21,10 +23,6 @@ from recon_cli.train.state import save_state
 HERE = Path(__file__).parent
 ROOT = Path(recon_cli.__file__).parents[1]
 PATIENCE = 60  # seconds, for what takes a moment
-
-
-def ignore(_):
-    """Hears of a step or a report."""
 
 
 @dataclass(eq=False)
@@ -36,11 +34,11 @@ class Team:
     folder: Path
     fits: int = 0
 
-    def fit(self, state, task, until, *, on_step=ignore, on_report=ignore, importance=None):
+    def fit(self, state, task, until, *, importance=None, **hooks):
         self.fits += 1
         fit_together(
-            state, dataclasses.replace(task, ranks=self.ranks), until, on_step=on_step,
-            on_report=on_report, importance=importance)
+            state, dataclasses.replace(task, ranks=self.ranks), until, (Hooks(**hooks),),
+            importance)
 
     def others_hold(self, state):
         """Whether all others ended the last fit with the very bytes that `state` is saved as."""

@@ -9,7 +9,7 @@ import pytest
 import torch
 from interpreter import DEVICE
 from scenes import camera_at, random_splats
-from tiny_task import STRATEGIES, same
+from tiny_task import STRATEGIES, Hooks, same
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from recon_cli.context import Ranks
@@ -18,11 +18,12 @@ from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import async_trainer
 from recon_cli.train.exposure import Exposure
-from recon_cli.train.fit import Task, fit
+from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
 from recon_cli.train.stepper import Stepper
+from recon_cli.train.task import Task
 
 triton_step = pytest.importorskip(
     "recon_cli.render.triton.step", reason="triton is not installed")
@@ -56,8 +57,8 @@ def first(backend="triton", config=CONFIG):
     return new_state(splats, config, 1.0, backend=backend)
 
 
-def run(state, task, until=END, *, looks=lambda _: False, on_step=lambda _: None):
-    fit(state, task, until, on_step=on_step, on_report=lambda _: None, looks=looks)
+def run(state, task, until=END, *, looks=lambda _: False, on_step=None):
+    fit(state, task, until, (Hooks(on_step, needs_step=looks),))
 
 
 def held(state):
@@ -81,10 +82,10 @@ def reference(folder):
     """Seven steps that meet the host after the densification, for a checkpoint, and at the end."""
     state, met = first(), []
 
-    def on_step(now):
-        met.append(now.iteration)
-        if now.iteration == CHECKPOINT:
-            save_state(folder / "state.safetensors", now)
+    def on_step(iteration, _splats):
+        met.append(iteration)
+        if iteration == CHECKPOINT:
+            save_state(folder / "state.safetensors", state)
 
     run(state, task_of(), looks=lambda now: now == CHECKPOINT, on_step=on_step)
     assert met == [4, CHECKPOINT, END]

@@ -20,7 +20,7 @@ def with_batches(views, config=CONFIG):
 
 
 def run(state, task, until):
-    fit(state, task, until, on_step=lambda _: None, on_report=lambda _: None)
+    fit(state, task, until)
 
 
 def gradients_after_a_step(backend, views, monkeypatch, queue):

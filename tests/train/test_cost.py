@@ -112,7 +112,7 @@ def test_timing_changes_nothing_of_the_run(tmp_path):
     task = tiny_task()
     calibrated(tmp_path, task=task)
     for state, given in ((timed, task), (plain, tiny_task())):
-        fit(state, given, 30, on_step=lambda _: None, on_report=lambda _: None)
+        fit(state, given, 30)
     assert same(timed, plain)
 
 

@@ -76,21 +76,19 @@ def test_harmonics_that_no_view_needs_go_once_densification_has_ended(tmp_path, 
     config = RunConfig(**{**vars(STRATEGIES["budget"]), "sh_uniform": 1.0})
     whole, part = first_state(config, backend="numba"), first_state(config, backend="numba")
     task = tiny_task(config, backend="numba")
-    quiet = {"on_step": lambda _: None, "on_report": lambda _: None}
-    fit(whole, task, 35, **quiet)
+    fit(whole, task, 35)
     assert len(whole.splats.sh_rest) == len(whole.splats)
-    fit(whole, task, 36, **quiet)
+    fit(whole, task, 36)
     assert len(whole.splats.sh_rest) == 0
-    fit(whole, task, 45, **quiet)
-    fit(part, task, stop, **quiet)
+    fit(whole, task, 45)
+    fit(part, task, stop)
     resumed = saved_and_loaded(part, tmp_path, backend="numba", config=config)
-    fit(resumed, task, 45, **quiet)
+    fit(resumed, task, 45)
     assert same(whole, resumed)
 
 
 def test_harmonics_stay_where_nothing_is_asked():
     config = STRATEGIES["budget"]
     state = first_state(config, backend="numba")
-    fit(state, tiny_task(config, backend="numba"), 45, on_step=lambda _: None,
-        on_report=lambda _: None)
+    fit(state, tiny_task(config, backend="numba"), 45)
     assert len(state.splats.sh_rest) == len(state.splats)

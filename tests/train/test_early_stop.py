@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, tiny_task
+from tiny_task import CONFIG, STRATEGIES, Hooks, first_state, same, saved_and_loaded, tiny_task
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.train import fit as fitting
@@ -62,7 +62,7 @@ def flat(monkeypatch):
 
 def run(state, task, until=60):
     reports = []
-    fit(state, task, until, on_step=lambda _: None, on_report=reports.append)
+    fit(state, task, until, (Hooks(on_report=reports.append),))
     return reports
 
 

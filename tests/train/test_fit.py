@@ -9,6 +9,7 @@ from tiny_task import (
     CONFIG,
     EXTENT,
     STRATEGIES,
+    Hooks,
     first_state,
     same,
     saved_and_loaded,
@@ -45,8 +46,7 @@ def masked_task(backend, device="cpu"):
 
 
 def run(state, task, until, **hooks):
-    fit(state, task, until, on_step=hooks.get("on_step", lambda _: None),
-        on_report=hooks.get("on_report", lambda _: None))
+    fit(state, task, until, (Hooks(**hooks),))
 
 
 @every_run

@@ -10,12 +10,12 @@ from recon_cli.context import Ranks
 from recon_cli.train.distributed.serialize import Fit, packed, unpacked
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import _parts
-from recon_cli.train.pruning import Recovery
+from recon_cli.train.schedule import RecoverySchedule
 
 
 def test_a_fit_is_the_same_after_it_was_handed_over():
     config = dataclasses.replace(CONFIG, batch_views=2, exposure="on")
-    plan = Recovery(config, first=3, until=9)
+    plan = RecoverySchedule(config, first=3, until=9)
     task = dataclasses.replace(tiny_task(config), schedule=plan, camera_error=0.25)
     task.train[2] = dataclasses.replace(task.train[2], mask=np.eye(30, 40) > 0)
     state = first_state(config)

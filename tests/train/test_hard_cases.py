@@ -26,7 +26,7 @@ def trained(candidate, config=PLAIN, **changes):
     """The state after a run on the views of a scene, some of its task's fields changed."""
     task = replace(candidate.task, schedule=Schedule(config), **changes)
     state = first_state(task, candidate.points, candidate.colors, most=1000)
-    fit(state, task, config.iterations, on_step=lambda _: None, on_report=lambda _: None)
+    fit(state, task, config.iterations)
     assert all(torch.isfinite(value).all() for value in state.splats.parameters().values())
     return state
 

@@ -35,8 +35,8 @@ def test_the_others_do_not_hear_of_ctrl_c(tmp_path):
 
 def test_a_process_that_dies_in_a_fit_is_missed(tmp_path):
     with team(2, tmp_path) as found:
-        def kill(now):
-            if now.iteration == 2:
+        def kill(iteration, _splats):
+            if iteration == 2:
                 found.others[0].kill()
                 found.others[0].wait(PATIENCE)
 

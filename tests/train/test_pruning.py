@@ -7,23 +7,24 @@ import pytest
 import torch
 from scenes import camera_at, random_splats
 
-from recon_cli.config.stages import PRUNE_SCORES, RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import Task, fit
-from recon_cli.train.importance import importance_of
-from recon_cli.train.pruning import (
+from recon_cli.train.fit import fit
+from recon_cli.train.importance import SCORES, importance_of
+from recon_cli.train.prune_loop import (
     LAST_ROUND,
-    Recovery,
+    PruneRun,
     Removal,
+    plan_removals,
+    prune_loop,
     remaining,
-    removals,
     remove,
     rounds_within,
-    scored,
     survivors,
 )
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.schedule import RecoverySchedule, Schedule
 from recon_cli.train.state import new_state
+from recon_cli.train.task import Task
 
 CONFIG = RunConfig(iterations=100, max_gaussians=40)
 
@@ -32,7 +33,7 @@ def task_of(count=5):
     rng = np.random.default_rng(0)
     views = [TrainView(camera_at(20 + i, 16), rng.integers(0, 256, (16, 20 + i, 3), np.uint8))
              for i in range(count)]
-    return Task(views, [], Recovery(CONFIG, first=100, until=200), 1.0, "torch",
+    return Task(views, [], RecoverySchedule(CONFIG, first=100, until=200), 1.0, "torch",
                 torch.device("cpu"))
 
 
@@ -42,11 +43,8 @@ def state_of(splats=None):
     return state
 
 
-def fitting(task):
-    def advance(state, until, importance):
-        fit(state, task, until, on_step=lambda _: None, on_report=lambda _: None,
-            importance=importance)
-    return advance
+def run_of(task, state, score="loo", until=200):
+    return PruneRun(state, task, 100, until, rounds=3, score=score)
 
 
 def test_exactly_the_asked_count_stays_even_when_all_scores_are_equal():
@@ -70,13 +68,13 @@ def test_a_ratio_is_the_share_that_goes_and_one_always_stays():
 
 
 def test_rounds_remove_the_same_share_each_and_leave_the_rest_of_the_recovery_in_peace():
-    plan = removals(1000, 125, 3, 300)
+    plan = plan_removals(1000, 125, 3, 300)
     assert plan == (Removal(50, 500), Removal(100, 250), Removal(150, 125))
     assert plan[-1].after == LAST_ROUND * 300
 
 
 def test_one_round_removes_all_at_once():
-    assert removals(1000, 200, 1, 300) == (Removal(0, 200),)
+    assert plan_removals(1000, 200, 1, 300) == (Removal(0, 200),)
 
 
 def test_there_is_a_round_an_epoch_within_bounds():
@@ -86,15 +84,15 @@ def test_there_is_a_round_an_epoch_within_bounds():
 
 
 def test_rounds_that_would_remove_nothing_are_left_out():
-    assert removals(10, 10, 5, 100) == ()
-    plan = removals(10, 8, 5, 100)
+    assert plan_removals(10, 10, 5, 100) == ()
+    plan = plan_removals(10, 8, 5, 100)
     assert [removal.count for removal in plan] == sorted(
         {removal.count for removal in plan}, reverse=True)
     assert plan[-1].count == 8
 
 
 def test_a_recovery_begins_at_the_first_rates_and_ends_at_the_last():
-    run, recovery = Schedule(CONFIG), Recovery(CONFIG, first=100, until=150)
+    run, recovery = Schedule(CONFIG), RecoverySchedule(CONFIG, first=100, until=150)
     assert recovery.means_rate(100) == run.means_rate(0)
     assert recovery.means_rate(150) == pytest.approx(run.means_rate(100))
     assert recovery.rate_factor(101) == 1
@@ -102,7 +100,7 @@ def test_a_recovery_begins_at_the_first_rates_and_ends_at_the_last():
 
 
 def test_a_recovery_looks_at_full_images_with_all_degrees_and_adds_nothing():
-    recovery = Recovery(CONFIG, first=60, until=100)
+    recovery = RecoverySchedule(CONFIG, first=60, until=100)
     for iteration in range(61, 101):
         assert recovery.level(iteration) == 1
         assert recovery.sh_degree(iteration) == 3
@@ -112,7 +110,7 @@ def test_a_recovery_looks_at_full_images_with_all_degrees_and_adds_nothing():
 
 def test_removed_gaussians_are_gone_and_the_others_keep_their_moments():
     task, state = task_of(), state_of()
-    fitting(task)(state, 103, None)
+    fit(state, task, 103)
     means, moment = (state.optimizer.tensors()[name].clone()
                      for name in ("splats.means", "adam.means.exp_avg"))
     rows = torch.tensor([1, 5, 7])
@@ -120,13 +118,13 @@ def test_removed_gaussians_are_gone_and_the_others_keep_their_moments():
     assert torch.equal(state.splats.means, means[rows])
     assert torch.equal(state.optimizer.tensors()["adam.means.exp_avg"], moment[rows])
     assert moment[rows].abs().max() > 0
-    fitting(task)(state, 106, None)  # and training goes on
+    fit(state, task, 106)  # and training goes on
 
 
-@pytest.mark.parametrize("name", PRUNE_SCORES)
+@pytest.mark.parametrize("name", SCORES)
 def test_scoring_takes_exactly_the_steps_that_it_was_given(name):
     task, state = task_of(), state_of()
-    score = scored(state, task, 112, name=name, beta=0.1, advance=fitting(task))
+    score = run_of(task, state, name).score(112)
     assert state.iteration == 112
     assert score.shape == (40,)
     assert (score >= 0).all()
@@ -137,7 +135,7 @@ def test_scoring_takes_exactly_the_steps_that_it_was_given(name):
 def test_every_view_counts_once_however_few_steps_there_are(steps, monkeypatch):
     task, state = task_of(), state_of()
     monkeypatch.setattr(type(state.optimizer), "step", lambda *_, **__: None)  # nothing moves
-    score = scored(state, task, 100 + steps, name="blend_sum", beta=0.1, advance=fitting(task))
+    score = run_of(task, state, "blend_sum").score(100 + steps)
     expected = importance_of(state.splats, task.train, sh_degree=3, backend="torch").blend_sum
     assert torch.allclose(score, expected)
 
@@ -145,6 +143,20 @@ def test_every_view_counts_once_however_few_steps_there_are(steps, monkeypatch):
 def test_scores_come_from_the_last_epoch_and_not_from_steps_before_it(monkeypatch):
     task, state = task_of(), state_of()
     monkeypatch.setattr(type(state.optimizer), "step", lambda *_, **__: None)
-    score = scored(state, task, 113, name="loo", beta=0.1, advance=fitting(task))
+    score = run_of(task, state).score(113)
     expected = importance_of(state.splats, task.train, sh_degree=3, backend="torch").loo
     assert torch.allclose(score, expected)
+
+
+def test_the_loop_removes_in_rounds_and_trains_to_the_end():
+    counts = []
+
+    class Counted(PruneRun):
+        def remove(self, score, count):
+            super().remove(score, count)
+            counts.append((self.state.iteration, len(self.state.splats)))
+
+    task, state = task_of(), state_of()
+    prune_loop(Counted(state, task, 100, 124, rounds=3), 5)
+    assert counts == [(104, 20), (108, 10), (112, 5)]
+    assert state.iteration == 124

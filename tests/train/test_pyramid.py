@@ -7,7 +7,7 @@ from scenes import camera_at, random_splats
 
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.pyramid import Pyramid, reduced
+from recon_cli.train.task import Pyramid, reduced
 
 # A picture that is rendered small and one that is rendered large and averaged differ by what a
 # pixel's blur adds. Measured .03 on soft Gaussians; a camera off by half a pixel gives .09.

@@ -12,7 +12,7 @@ from recon_cli.errors import TrainingError
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import _parts
-from recon_cli.train.pruning import Recovery
+from recon_cli.train.schedule import RecoverySchedule
 
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 every_strategy = pytest.mark.parametrize("name", STRATEGIES)
@@ -36,8 +36,7 @@ def batched(views, config=CONFIG, **changes):
 
 
 def alone(state, task, until, importance=None):
-    fit(state, task, until, on_step=lambda _: None, on_report=lambda _: None,
-        importance=importance)
+    fit(state, task, until, importance=importance)
 
 
 def assert_near(state, other, config, share):
@@ -129,7 +128,7 @@ def test_a_jump_is_taken_by_all(others):
 @two
 def test_scores_of_all_processes_are_added_to_those_that_were_there(others):
     config = batched(2)
-    task = dataclasses.replace(tiny_task(config, backend="numba"), schedule=Recovery(
+    task = dataclasses.replace(tiny_task(config, backend="numba"), schedule=RecoverySchedule(
         config, first=0, until=10))
     found = {}
     for who, run in (("all", others.fit), ("one", alone)):
@@ -150,8 +149,8 @@ def test_what_stops_the_leader_between_two_steps_leaves_the_others_waiting(other
     config = batched(2)
     mine, single = (first_state(config, backend="numba") for _ in range(2))
 
-    def press(now):
-        if now.iteration == 13:
+    def press(iteration, _splats):
+        if iteration == 13:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -181,10 +180,10 @@ def test_processes_that_part_are_stopped(others, densify_every):
     config = batched(2, densify_every=densify_every, max_gaussians=40)
     state = first_state(config)
 
-    def spoil(now):
-        if now.iteration == 3:
+    def spoil(iteration, splats):
+        if iteration == 3:
             with torch.no_grad():
-                now.splats.means[7, 1] *= 1 + 1e-6
+                splats.means[7, 1] *= 1 + 1e-6
 
     with pytest.raises(TrainingError, match="hold different Gaussians"):
         others.fit(state, tiny_task(config), 20, on_step=spoil)

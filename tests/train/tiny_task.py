@@ -4,11 +4,12 @@ import torch
 from scenes import camera_at, random_splats, with_harmonics
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.context import TrainCallback
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import Task
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
+from recon_cli.train.task import Task
 
 CONFIG = RunConfig(
     iterations=60, densify="reference", densify_every=10, densify_gradient=1e-5, max_gaussians=90,
@@ -17,6 +18,24 @@ STRATEGIES = {
     name: RunConfig(iterations=60, densify=name, densify_every=10, max_gaussians=90, sh_rate=0.05)
     for name in ("budget", "mcmc")} | {"reference": CONFIG}
 EXTENT = 1.0
+
+
+class Hooks(TrainCallback):
+    """Calls functions of a test."""
+
+    def __init__(self, on_step=None, on_report=None, needs_step=lambda _: True):
+        self._on_step, self._on_report, self._needs_step = on_step, on_report, needs_step
+
+    def on_step(self, iteration, splats):
+        if self._on_step:
+            self._on_step(iteration, splats)
+
+    def on_report(self, report):
+        if self._on_report:
+            self._on_report(report)
+
+    def needs_step(self, iteration):
+        return self._needs_step(iteration)
 
 
 def tiny_task(config=CONFIG, device="cpu", backend="torch"):

@@ -10,8 +10,8 @@ from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.background import fibonacci_sphere
 from recon_cli.train.feature_trials import Candidate
-from recon_cli.train.fit import Task
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.task import Task
 
 CONFIG = RunConfig(iterations=500, max_gaussians=2000, sh_degree=0, images="original")
 EXTENT = 0.5

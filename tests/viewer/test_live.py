@@ -14,7 +14,7 @@ from tiny_stages import CONFIG, run
 from viewing import complaints, nodes, until
 
 from recon_cli.cli import main
-from recon_cli.context import StageContext
+from recon_cli.context import StageContext, TrainCallback
 from recon_cli.io.ply import read_ply
 from recon_cli.stages import train
 from recon_cli.viewer import live
@@ -25,21 +25,21 @@ from recon_cli.workspace.layout import Workspace
 SHORT = dataclasses.replace(CONFIG, iterations=60)
 
 
-class Spy:
+class Spy(TrainCallback):
     """Remembers what it was told."""
 
     def __init__(self):
         self.begun, self.steps, self.reports = [], [], []
 
-    def begin(self, label, until, cameras, splats):
+    def on_begin(self, label, until, cameras, splats):
         self.begun.append((label, until, len(cameras), len(splats)))
 
-    def step(self, iteration, splats):
+    def on_step(self, iteration, splats):
         self.steps.append((iteration, len(splats)))
         self.last = splats.means.detach().clone()
 
-    def report(self, iteration, validation_psnr_db):
-        self.reports.append((iteration, validation_psnr_db))
+    def on_report(self, report):
+        self.reports.append((report.iteration, report.validation_psnr_db))
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +51,10 @@ def plain(tmp_path_factory):
     return inputs, (folder / "train" / "splats.ply").read_bytes()
 
 
-def test_a_watcher_sees_every_step_and_changes_nothing(plain, tmp_path):
+def test_a_callback_sees_every_step_and_changes_nothing(plain, tmp_path):
     inputs, expected = plain
     spy = Spy()
-    run(train, SHORT, inputs, tmp_path / "train", StageContext(watcher=spy))
+    run(train, SHORT, inputs, tmp_path / "train", StageContext(callbacks=(spy,)))
     assert (tmp_path / "train" / "splats.ply").read_bytes() == expected
     assert [(label, until, cameras) for label, until, cameras, _ in spy.begun] == [
         ("train", 60, 8)]
@@ -72,20 +72,20 @@ def test_a_training_that_is_looked_at_in_a_browser_is_the_same_to_the_byte(
     monkeypatch.setattr(live, "SHARE", 0.9)  # many updates in a short training
     inputs, expected = plain
     with start_server(HOST, None, label="x") as (server, address):
-        watcher = LiveView(server, Workspace(tmp_path))
+        view = LiveView(server, Workspace(tmp_path))
         page.page.set_viewport_size({"width": 320, "height": 240})
         page.page.goto(address)
         page.page.get_by_text("Waiting for the training").wait_for(timeout=60_000)
         until(page, server.get_clients)
         done = elsewhere.submit(
-            run, train, SHORT, inputs, tmp_path / "train", StageContext(watcher=watcher))
+            run, train, SHORT, inputs, tmp_path / "train", StageContext(callbacks=(view,)))
         until(page, done.done)
         done.result()
         page.page.get_by_text("of 60").wait_for(timeout=60_000)
         until(page, lambda: nodes(page, "GaussianSplatsMessage"))
         camera = next(iter(server.get_clients().values())).camera
         until(page, lambda: np.linalg.norm(camera.position) < 2)  # among the training cameras
-        watcher.close()
+        view.close()
         assert not complaints(page)
     assert (tmp_path / "train" / "splats.ply").read_bytes() == expected
 
@@ -156,7 +156,7 @@ def test_whatever_an_update_costs_its_share_of_the_time_is_bounded(clock, second
     view, shown = looked_at(clock, seconds=seconds)
     begin = clock.now
     for iteration in range(20_000):
-        view.step(iteration, splats)
+        view.on_step(iteration, splats)
         clock.now += 0.05
     cost = seconds + 0.25  # the page goes on drawing for as long
     possible = SHARE * (clock.now - begin) / cost
@@ -165,7 +165,7 @@ def test_whatever_an_update_costs_its_share_of_the_time_is_bounded(clock, second
 
 def test_where_nobody_looks_nothing_is_copied(clock):
     view, shown = looked_at(clock, seconds=0.0, browsers=0)
-    view.step(1, None)  # would fail if it were touched
+    view.on_step(1, None)  # would fail if it were touched
     assert not shown
 
 
@@ -176,6 +176,6 @@ def test_a_browser_that_fails_ends_no_training(clock):
         raise RuntimeError("lost")
 
     view._show = fail
-    view.step(1, random_splats(4, seed=0, dtype=torch.float32))
+    view.on_step(1, random_splats(4, seed=0, dtype=torch.float32))
     assert not view._busy
     assert view._due > clock.now

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -13,9 +12,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.train.densify import budget, mcmc, reference
 from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.state import TrainState
-
-if TYPE_CHECKING:
-    from recon_cli.train.fit import Task
+from recon_cli.train.task import Task
 
 _LARGE_SCALE = 0.1  # x extent; larger Gaussians are deleted once opacities were reset
 

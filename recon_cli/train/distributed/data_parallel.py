@@ -7,21 +7,23 @@ and the others wait for the next fit; in the middle of a step nothing can be sai
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import suppress
 
 import torch
 from torch import Tensor
 
-from recon_cli.context import Ranks
+from recon_cli.context import Ranks, TrainCallback, TrainReport
 from recon_cli.errors import LostError, TrainingError
 from recon_cli.render import registry
+from recon_cli.scene.splats import Splats
 from recon_cli.train.cost import EXCHANGE, join_exchange
 from recon_cli.train.distributed.serialize import Fit, hand_out, packed, receive, unpacked
-from recon_cli.train.fit import Report, Task, fit
+from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import TrainState, tensors_of
 from recon_cli.train.stepper import Stepper
+from recon_cli.train.task import Task
 
 _DONE, _FIT = 0, 1  # between fits, and EXCHANGE
 _STOP, _END, _COMPARE = -1, -2, -3  # in a fit
@@ -31,12 +33,9 @@ def fit_together(
     state: TrainState,
     task: Task,
     until: int,
-    *,
-    on_step: Callable[[TrainState], None],
-    on_report: Callable[[Report], None],
+    callbacks: Sequence[TrainCallback] = (),
     importance: Importance | None = None,
     threads: int = 1,
-    looks: Callable[[int], bool] = lambda _: True,
 ) -> None:
     """Runs `state` on like `fit`, with the help of all processes that `task.ranks` leads.
 
@@ -44,11 +43,9 @@ def fit_together(
         state: changed in place.
         task: views and plan.
         until: total number of steps.
-        on_step: as `fit` has it.
-        on_report: as `fit` has it.
+        callbacks: as `fit` has it; several processes call them after every step.
         importance: as `fit` has it; gets the scores of all processes.
         threads: of each process.
-        looks: as `fit` has it; several processes see the state after every step.
 
     Raises:
         TrainingError: as `fit`, or the processes no longer hold the same Gaussians.
@@ -56,50 +53,64 @@ def fit_together(
     """
     ranks = task.ranks
     if ranks.alone or state.iteration >= until:
-        fit(state, task, until, on_step=on_step, on_report=on_report, importance=importance,
-            looks=looks)
+        fit(state, task, until, callbacks, importance)
         return
     arrays = packed(Fit(state, task, importance, threads))
-    between = False  # of two steps: the others wait for a word
-
-    def go_on() -> None:
-        nonlocal between
-        ranks.told(state.iteration)
-        between = False
-
-    def stepped(now: TrainState) -> None:
-        nonlocal between
-        between = True
-        if task.schedule.densifies(now.iteration):
-            _say_and_compare(now, ranks)
-        on_step(now)
-        if now.iteration < until:
-            go_on()
-
-    def reported(report: Report) -> None:
-        nonlocal between
-        between = True
-        _say_and_compare(state, ranks)
-        on_report(report)
-
+    leader = _Leader(state, task, until, callbacks)
     try:
         ranks.told(_FIT)
         hand_out(arrays, ranks)
         ranks.views = task.train
         del arrays
-        go_on()
-        fit(state, task, until, on_step=stepped, on_report=reported, importance=importance)
+        leader.start_step()
+        fit(state, task, until, (leader,), importance)
         ranks.told(_END)
         if importance is not None:
             importance.over(ranks)
     except BaseException as error:
         # what a step raises about the training, it raises in every process
-        alike = between or isinstance(error, TrainingError)
+        alike = leader.between_steps or isinstance(error, TrainingError)
         if alike and not isinstance(error, LostError):
             ranks.told(_STOP)
         else:
             ranks.leave()
         raise
+
+
+class _Leader(TrainCallback):
+    """Calls callbacks while the other processes wait, then has them take the next step."""
+
+    def __init__(
+        self, state: TrainState, task: Task, until: int, callbacks: Sequence[TrainCallback]
+    ) -> None:
+        self._state, self._task, self._until, self._callbacks = state, task, until, callbacks
+        self.between_steps = False  # the others wait for a word
+
+    def start_step(self) -> None:
+        """Has all processes take the next step."""
+        self._task.ranks.told(self._state.iteration)
+        self.between_steps = False
+
+    def on_step(self, iteration: int, splats: Splats) -> None:
+        """Calls the callbacks and starts the next step."""
+        self.between_steps = True
+        if self._task.schedule.densifies(iteration):
+            _say_and_compare(self._state, self._task.ranks)
+        for callback in self._callbacks:
+            callback.on_step(iteration, splats)
+        if iteration < self._until:
+            self.start_step()
+
+    def on_report(self, report: TrainReport) -> None:
+        """Compares the processes and calls the callbacks."""
+        self.between_steps = True
+        _say_and_compare(self._state, self._task.ranks)
+        for callback in self._callbacks:
+            callback.on_report(report)
+
+    def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
+        """Returns True: the others wait after every step."""
+        return True
 
 
 def dismiss(ranks: Ranks) -> None:

@@ -21,12 +21,11 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import Ranks
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import Task
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import saved_state
-from recon_cli.train.pruning import Recovery
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.schedule import RecoverySchedule, Schedule
 from recon_cli.train.state import TrainState, save_state
+from recon_cli.train.task import Task
 
 _LENS = ("width", "height", "fx", "fy", "cx", "cy")
 _STATE = "state.safetensors"
@@ -61,7 +60,7 @@ def packed(fit: Fit) -> dict[str, NDArray[Any]]:
     task, schedule, importance = fit.task, fit.task.schedule, fit.importance
     assert schedule.recipe == Schedule(schedule.config).recipe, "only trials have one of their own"
     views = () if task.ranks.views is task.train else task.train
-    recovery = [schedule.first, schedule.until] if isinstance(schedule, Recovery) else None
+    recovery = [schedule.first, schedule.until] if isinstance(schedule, RecoverySchedule) else None
     said = {
         "config": dataclasses.asdict(schedule.config), "recovery": recovery,
         "extent": task.extent, "backend": task.backend, "device": task.device.type,
@@ -94,7 +93,7 @@ def unpacked(arrays: dict[str, NDArray[Any]], ranks: Ranks) -> Fit:
     schedule = Schedule(config)
     if said["recovery"]:
         first, until = said["recovery"]
-        schedule = Recovery(config, first=first, until=until)
+        schedule = RecoverySchedule(config, first=first, until=until)
     task = Task(
         list(ranks.views), [], schedule, said["extent"], said["backend"],
         torch.device(said["device"]), camera_error=said["camera_error"], ranks=ranks)

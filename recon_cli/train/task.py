@@ -1,14 +1,52 @@
-"""Views at reduced sizes, for the first part of a run."""
+"""What is fitted: the views, at every size that a run asks for, and the plan."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
+import torch
 
+from recon_cli.context import ALONE, Ranks
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.schedule import Schedule
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is fitted and by which plan.
+
+    Attributes:
+        train: views that gradients come from.
+        validation: views that are only looked at.
+        schedule: when things happen.
+        extent: of the scene, world units.
+        backend: name of the rasterizer.
+        device: where the tensors live.
+        jump: (iteration, iteration at which it goes on) of the run that this one branches off;
+            this one does the same.
+        camera_error: how far cameras may be off, in rad; for their refinement.
+        ranks: this process among those that take the steps together.
+    """
+
+    train: list[TrainView]
+    validation: list[TrainView]
+    schedule: Schedule
+    extent: float
+    backend: str
+    device: torch.device
+    jump: tuple[int, int] | None = None
+    camera_error: float | None = None
+    ranks: Ranks = ALONE
+
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """The training views at every size."""
+        return Pyramid(self.train, page_locked=self.device.type == "cuda")
+
 
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 
