@@ -107,8 +107,8 @@ def output_options(plot: str) -> Callable[[Command], Command]:
 @scene_options
 @click.option(
     "--recipes", multiple=True, metavar="NAME,...",
-    help="reference, budget, mcmc, paper, budget-pruned, budget-l1 or budget-degree-1, each with "
-         "options of training if wanted: budget+sh_degree=2.  [default: reference,budget,mcmc]")
+    help="reference, budget, paper, budget-pruned, budget-l1 or budget-degree-1, each with "
+         "options of training if wanted: budget+sh_degree=2.  [default: reference,budget]")
 @click.option(
     "--iterations", type=click.IntRange(min=1), metavar="N",
     help="Steps of every run.  [default: 3000]")
@@ -135,5 +135,5 @@ def train(call: Call, /, scenes: SceneOptions, recipes: tuple[str, ...], **typed
     request = load("recon_cli.experiments.recipe_benchmark.RecipeRequest")
     run = load("recon_cli.experiments.recipe_benchmark.run")
     shared = scenes.fields(call)
-    variants = parse(recipes or ("reference,budget,mcmc",))
+    variants = parse(recipes or ("reference,budget",))
     click.echo(run(request(**shared, **typed, recipes=variants), TqdmProgress()))

@@ -144,8 +144,8 @@ class TrainConfig(StageConfig):
     minutes: float | None = option(
         None, "Time budget.", unit="minutes", minimum=0.01, automatic="none")
     densify: str = option(
-        "budget", "Add Gaussians by error (budget), as 3DGS (reference) or by relocation (mcmc).",
-        choices=("budget", "reference", "mcmc"))
+        "budget", "Add Gaussians where the error is (budget) or as 3DGS does (reference).",
+        choices=("budget", "reference"))
     iterations: int | None = option(
         None, "Optimization steps.", minimum=1, automatic="by --quality")
     batch_views: int = option(
@@ -157,9 +157,6 @@ class TrainConfig(StageConfig):
     sh_degree: int | None = option(
         None, "Degree of the spherical harmonics.", minimum=0, maximum=3,
         automatic="auto, chosen by a short trial")
-    sh_uniform: float = option(
-        0.0, "Gaussians whose colour deviates less over the training views lose their harmonics "
-        "after densification; 0 keeps all.", minimum=0.0, maximum=1.0, expert=True)
     max_gaussians: int | None = option(
         None, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS,
         automatic="auto, by image detail, steps and memory")
@@ -239,7 +236,8 @@ class RunConfig(TrainConfig):
         60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
 
 
-PRUNE_SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
+# Those that beat a random choice, and the paper's; `train.importance` knows more. docs/pruning.md
+PRUNE_SCORES = ("loo", "blend_max", "paper")
 
 
 @dataclass(frozen=True)
@@ -259,9 +257,8 @@ class PruneConfig(StageConfig):
         None, "Pruning rounds, with fine-tuning and new scores in between.", minimum=1,
         automatic="3 to 8, one per epoch in half of --recovery")
     score: str = option(
-        "loo", "Importance score: loo (leave-one-out error), paper (eq. 3 to 5), lightgaussian "
-        "(without clamping), blend_sum, blend_max (blend weights), opacity or random.",
-        choices=PRUNE_SCORES)
+        "loo", "Importance score: loo (leave-one-out error), blend_max (greatest blend weight) or "
+        "paper (eq. 3 to 5).", choices=PRUNE_SCORES)
     beta: float = option(
         0.1, "Volume exponent of the `paper` score (eq. 4).", minimum=0.0, expert=True)
     at: str = option(

@@ -90,7 +90,6 @@ BUDGET_PRUNED = Variant(
     MidPrune(_MID, PruneConfig(at="mid")), tries_degree=True)
 KNOWN: dict[str, Variant] = {variant.name: variant for variant in (
     REFERENCE, PAPER, BUDGET, BUDGET_PRUNED,
-    Variant("mcmc", "mcmc", {"densify": "mcmc"}, tries_degree=True),
     Variant("budget-l1", "budget-l1", {"densify": "budget", "ssim_weight": 0.0}, tries_degree=True),
     Variant("budget-degree-1", "budget-degree-1", {"densify": "budget", "sh_degree": 1}),
 )}

@@ -23,7 +23,7 @@ from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.gradient import DeferredStep, gradient_step
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import TrainState
-from recon_cli.train.stepper import Stepper, control, next_view, skip
+from recon_cli.train.stepper import Stepper, next_view, skip
 from recon_cli.train.task import Task
 
 _FARTHEST = 100  # steps between two meetings, so that Ctrl-C and a progress bar need not wait
@@ -56,8 +56,7 @@ def advancing(
         looks: whether somebody wants to see the state after a step.
     """
     plain = importance is None and state.exposure is None and state.poses is None
-    quiet = not STRATEGIES[task.schedule.config.densify].each_step
-    if task.backend == "triton" and task.ranks.alone and plain and quiet:
+    if task.backend == "triton" and task.ranks.alone and plain:
         return Ahead(state, task, looks).advance
     return Stepper(state, task, importance).step
 
@@ -74,7 +73,7 @@ class Ahead:
     def __init__(self, state: TrainState, task: Task, looks: Callable[[int], bool]) -> None:
         self._state, self._task, self._looks = state, task, looks
         self._compute = cast(DeferredStep, gradient_step(task.backend, task.device))
-        self._variance = STRATEGIES[task.schedule.config.densify].variance
+        self._strategy = STRATEGIES[task.schedule.config.densify]
         self._trail: list[_Before] = []
         self._batch = _Batch(self._compute, task.schedule.config.batch_views)
 
@@ -97,7 +96,7 @@ class Ahead:
             if happened is not None:
                 continue
             if np.isfinite(loss):  # as in `Stepper.step`
-                control(state, task)
+                self._strategy.control(state, task)
             return loss
 
     def _start(self) -> None:
@@ -113,7 +112,7 @@ class Ahead:
                 next_view(state, self._task), schedule.level(iteration))
             statistics = self._compute.start(
                 state.optimizer, view, schedule.sh_degree(iteration),
-                schedule.config.ssim_weight, variance=gathers and self._variance)
+                schedule.config.ssim_weight, variance=gathers and self._strategy.variance)
             self._batch.add(
                 state, statistics if gathers else None, view.camera, moves_sh=moves_sh)
         counted = self._batch.end(state, gathers=gathers, moves_sh=moves_sh)
@@ -125,8 +124,7 @@ class Ahead:
     def _meets(self, iteration: int) -> bool:
         schedule = self._task.schedule
         return (self._looks(iteration) or len(self._trail) >= _FARTHEST
-                or schedule.densifies(iteration) or schedule.resets(iteration)
-                or iteration == schedule.review)
+                or schedule.densifies(iteration) or schedule.resets(iteration))
 
     def _take_back(self, happened: int) -> None:
         """Returns to the state after the first steps of the trail; the others changed nothing."""

@@ -171,12 +171,3 @@ def add_views(
         if output.rgb.requires_grad:
             output.rgb.sum().backward()  # type: ignore[no-untyped-call]
         found.add(output.statistics)
-
-
-def importance_of(
-    splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str
-) -> Importance:
-    """Returns all that a pass over views finds; the arguments are those of `add_views`."""
-    found = Importance.zeros(len(splats), splats.means.device)
-    add_views(found, splats, views, sh_degree=sh_degree, backend=backend)
-    return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -99,23 +98,6 @@ class SplatOptimizer:
         self.gradients = Splats(**{
             name: self._view(name, "gradient") for name in self._buffers}
         ) if self.fused else self.splats
-
-    @property
-    def bytes_per_gaussian(self) -> int:
-        """Memory of values, gradients and moments of one Gaussian that has all of them."""
-        held = sum(math.prod(buffer.shape[1:]) * buffer.element_size()
-                   for roles in self._buffers.values() for buffer in roles.values())
-        return held if self.fused else held // 3 * 4  # autograd holds the gradients
-
-    @torch.no_grad()
-    def regularize(self, weight: float) -> None:
-        """Adds the gradient of weight x (mean opacity + mean scale) (Kheradmand et al. 2024)."""
-        if weight <= 0:
-            return
-        opacities, scales = self.splats.opacities, self.splats.scales
-        for name, slope in (("logit_opacities", opacities * (1 - opacities)),
-                            ("log_scales", scales)):
-            self.gradient(name).add_(slope, alpha=weight / slope.numel())
 
     def gradient(self, name: str) -> Tensor:
         """Returns the gradient of a parameter that the last backward pass left, to be changed."""

@@ -64,8 +64,6 @@ class Recipe:
         means_final: rate of the means at the end, of that at the start; exponential between.
         final_from: share from which all other rates fall.
         final_rate: to which they fall at the end, of their own; exponential.
-        noise: of the means, x their rate (MCMC).
-        regularize: weight of opacities and scales in the loss (MCMC).
     """
 
     densify_from: float
@@ -82,8 +80,6 @@ class Recipe:
     means_final: float = 0.01
     final_from: float = 1.0
     final_rate: float = 1.0
-    noise: float = 0.0
-    regularize: float = 0.0
 
 
 # Kerbl et al. 2023 and INRIA's defaults: 500, 15,000 and 1,000 of 30,000 iterations
@@ -95,13 +91,7 @@ BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
     sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False, means_rate=6.0,
     scales_rate=2.0, sh_rate=2.0, final_from=0.8, final_rate=0.1)
-# Kheradmand et al. 2024 as in gsplat: relocation from 500 of 30,000, noise 5e5, both regularisers
-# .01; it ends with the others, so that a pruned branch is not filled up again
-MCMC = Recipe(
-    densify_from=500 / 30_000, densify_until=0.6, full_at=0.54, levels=BUDGET.levels,
-    sh_at=BUDGET.sh_at, sh_every=4, opacity_decay=1.0, resets=False, final_from=0.8,
-    final_rate=0.1, noise=5e5, regularize=0.01)
-RECIPES = {"reference": REFERENCE, "budget": BUDGET, "mcmc": MCMC}
+RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 
 _REFERENCE = 30_000  # iterations of INRIA's default run
@@ -146,14 +136,6 @@ class Schedule:
     def mid(self) -> int:
         """The iteration whose state is kept for pruning."""
         return max(1, round(self.config.mid * self.config.iterations))
-
-    @property
-    def review(self) -> int:
-        """The step after which Gaussians may lose their harmonics: none is added any more.
-
-        Not after `mid`: a pruned branch must not reorder the Gaussians whose scores it gathers.
-        """
-        return int(self.recipe.densify_until * self.config.iterations)
 
     def level(self, iteration: int) -> int:
         """Returns the factor by which images are reduced in this step."""

@@ -15,13 +15,11 @@ from recon_cli.train.densify import STRATEGIES
 from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.importance import Importance
-from recon_cli.train.sh import color_spread, needed, reduced, visibility
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 
 _SKIPPED = 0.02  # share of the run's steps that may come to nothing
 _SKIPPED_FLOOR = 5
-_COLOR_VIEWS = 30  # from which colours are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +76,7 @@ class Stepper:
             return loss
         if found.seen.any():
             self._move(batch, found, iteration)
-        control(state, task)
+        self._strategy.control(state, task)
         return loss
 
     def _gather(self, batch: list[int], iteration: int) -> _Found:
@@ -150,7 +148,6 @@ class Stepper:
                 state.poses.step(index, found.turn[place], schedule.share(iteration))
             if state.exposure is not None:
                 state.exposure.step(index, found.gain[place], schedule.share(iteration))
-        state.optimizer.regularize(schedule.recipe.regularize)
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
             factor=schedule.rate_factor(iteration))
@@ -161,30 +158,6 @@ def next_view(state: TrainState, task: Task) -> int:
     if not state.queue:
         state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
     return state.queue.pop()
-
-
-def control(state: TrainState, task: Task) -> None:
-    """Adds and deletes Gaussians, and takes harmonics away, where the schedule says so."""
-    STRATEGIES[task.schedule.config.densify].control(state, task)
-    if state.iteration == task.schedule.review:
-        drop_harmonics(state, task)
-
-
-def drop_harmonics(state: TrainState, task: Task) -> None:
-    """Takes the harmonics from Gaussians that look alike from all training views.
-
-    (Papantonakis et al. 2024; `train.sh`.) Over a sample of the views.
-    """
-    threshold = task.schedule.config.sh_uniform
-    if threshold <= 0 or len(state.splats.sh_rest) == 0:
-        return
-    every = max(1, -(-len(task.train) // _COLOR_VIEWS))
-    cameras = [view.camera for view in task.train[::every]]
-    splats = state.splats.map(lambda tensor: tensor.detach())
-    spread = color_spread(splats, cameras, visibility(splats, cameras))
-    few, order = reduced(splats, needed(spread, threshold=threshold), colors=spread.mean)
-    state.optimizer.replace(few, order)
-    state.gathered = Gathered.zeros(len(few), few.means.device)
 
 
 def skip(state: TrainState, task: Task, steps: int = 1) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import TrainingError
+from recon_cli.errors import ConfigError, FormatError, TrainingError
 from recon_cli.evaluation.metrics import leaves_enough
 from recon_cli.evaluation.reference_views import MASK_HINT, notice_hidden
 from recon_cli.io.images import fit_camera, read_masked_image
@@ -86,7 +86,17 @@ def write_config(folder: Path, config: RunConfig) -> None:
 
 
 def read_config(folder: Path) -> RunConfig:
-    """Returns the options that `write_config` wrote."""
-    values = read_json(folder / "config.json")
+    """Returns the options that `write_config` wrote.
+
+    Raises:
+        FormatError: a version before this one wrote a value that is no longer known.
+    """
+    path = folder / "config.json"
+    values = read_json(path)
     names = {item.name for item in dataclasses.fields(RunConfig)}
-    return RunConfig(**{name: value for name, value in values.items() if name in names})
+    try:
+        return RunConfig(**{name: value for name, value in values.items() if name in names})
+    except ConfigError as error:
+        raise FormatError(
+            f"{path} is of another version of recon: {error}",
+            hint="Run `recon train --again`.") from error

@@ -6,9 +6,9 @@ import pytest
 from posed_sets import make_replica
 
 from recon_cli.cli import main
-from recon_cli.config.stages import PRUNE_SCORES
 from recon_cli.evaluation.reference_views import MeanScore
 from recon_cli.experiments.sweep import NONE, SweepTrial, count_trials, table
+from recon_cli.train.importance import SCORES
 
 RATIOS = (0.5, 0.9)
 
@@ -40,7 +40,7 @@ def test_every_score_meets_every_ratio_and_the_controls_stand_beside(swept):
     assert len(found["trials"]) == count_trials(RATIOS)
     for ratio in RATIOS:
         names = [one["score"] for one in found["trials"] if one["ratio"] == ratio]
-        assert names == [*PRUNE_SCORES, NONE]
+        assert names == [*SCORES, NONE]
     assert found["trials"][0]["score"] == NONE  # no prune, equal steps
     assert found["trials"][0]["steps"] == found["recovery_steps"] == 6
 
@@ -81,7 +81,7 @@ def test_the_picture_is_an_svg_that_names_every_score(workspace):
     pytest.importorskip("matplotlib")
     picture = (workspace / "sweep.svg").read_text()
     assert "<svg" in picture
-    for name in PRUNE_SCORES:  # text is drawn as paths, with the words in comments
+    for name in SCORES:  # text is drawn as paths, with the words in comments
         assert f"<!-- {name} -->" in picture
 
 

@@ -136,7 +136,7 @@ def test_pruning_the_finished_run_without_recovery_only_removes(inputs, tmp_path
 
 def test_a_config_of_the_same_ratio_by_chance_keeps_other_gaussians(inputs, tmp_path):
     results = []
-    for score in ("paper", "random"):
+    for score in ("loo", "paper"):
         config = PruneConfig(ratio=0.5, at="end", recovery=0, score=score)
         results.append(run(prune, config, inputs, tmp_path / score))
     assert results[0]["gaussians"] == results[1]["gaussians"]

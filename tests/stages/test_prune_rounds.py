@@ -187,7 +187,7 @@ def test_the_search_ends_within_the_loss_that_it_was_allowed(whole):
 
 
 def test_where_every_removal_costs_too_much_nothing_goes(inputs, tmp_path, caplog):
-    config = PruneConfig(max_psnr_drop=0.0, score="random", recovery=0)
+    config = PruneConfig(max_psnr_drop=0.0, score="paper", recovery=0)
     summary = run(config, inputs, tmp_path / "out")
     assert summary["gaussians"] == summary["gaussians_before"]
     assert not any(one["kept"] for one in summary["rounds"])

@@ -317,5 +317,4 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
     assert chosen(importance=Importance.zeros(COUNT, torch.device("cpu"))) is Stepper
     assert chosen(exposure=True) is Stepper
     assert chosen(batch_views=2) is async_trainer.Ahead
-    assert chosen(densify="mcmc") is Stepper
     assert chosen(ranks=Ranks(0, 2)) is Stepper

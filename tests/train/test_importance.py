@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 import torch
 from scenes import camera_at, joined, one_splat, random_splats
+from tiny_task import importance_of
 
-from recon_cli.config.stages import PRUNE_SCORES, RunConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
-from recon_cli.train.importance import Importance, importance_of, lightgaussian_score, paper_score
+from recon_cli.train.importance import (
+    SCORES,
+    Importance,
+    lightgaussian_score,
+    paper_score,
+)
 from recon_cli.train.optimizer import SplatOptimizer
 
 CPU = torch.device("cpu")
@@ -99,7 +105,7 @@ def test_one_gaussian_alone_has_the_score_that_its_picture_gives():
     assert found.loo.item() == pytest.approx(2 * squares * alpha.square().sum().item())
 
 
-@pytest.mark.parametrize("name", [name for name in PRUNE_SCORES if name != "random"])
+@pytest.mark.parametrize("name", [name for name in SCORES if name != "random"])
 def test_a_view_whose_mask_ignores_all_adds_nothing(name):
     splats, camera = random_splats(30), camera_at(30, 20)
     views = [blank(camera), blank(camera, np.zeros((20, 30), bool))]

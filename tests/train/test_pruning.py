@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 from scenes import camera_at, random_splats
+from tiny_task import importance_of
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit import fit
-from recon_cli.train.importance import SCORES, importance_of
+from recon_cli.train.importance import SCORES
 from recon_cli.train.prune_loop import (
     LAST_ROUND,
     PruneRun,

@@ -63,10 +63,10 @@ def test_rates_do_not_fall_where_the_fall_would_be_too_short_to_settle_anything(
 
 
 @pytest.mark.parametrize("iterations", [1, 7, 35, 55, 1000, 2999])
-def test_harmonics_are_reviewed_after_the_last_densification_and_not_after_the_middle(iterations):
+def test_nothing_is_added_after_the_state_that_pruning_branches_off(iterations):
     plan = Schedule(RunConfig(iterations=iterations, densify_every=1))
     added = [i for i in range(1, iterations + 1) if plan.densifies(i)]
-    assert max(added, default=0) <= plan.review <= plan.mid
+    assert max(added, default=0) <= plan.mid
 
 
 def test_the_target_never_falls_below_what_the_run_began_with():

@@ -7,6 +7,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import TrainCallback
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
 from recon_cli.train.task import Task
@@ -16,7 +17,7 @@ CONFIG = RunConfig(
     sh_rate=0.05)
 STRATEGIES = {
     name: RunConfig(iterations=60, densify=name, densify_every=10, max_gaussians=90, sh_rate=0.05)
-    for name in ("budget", "mcmc")} | {"reference": CONFIG}
+    for name in ("budget",)} | {"reference": CONFIG}
 EXTENT = 1.0
 
 
@@ -67,3 +68,10 @@ def saved_and_loaded(state, folder, device="cpu", backend="torch", config=CONFIG
 def same(a, b):
     return all(torch.equal(value, getattr(b.splats, name))
                for name, value in a.splats.parameters().items())
+
+
+def importance_of(splats, views, *, sh_degree, backend):
+    """All that a pass over views finds."""
+    importance = Importance.zeros(len(splats), splats.means.device)
+    add_views(importance, splats, views, sh_degree=sh_degree, backend=backend)
+    return importance

@@ -9,7 +9,7 @@ import torch
 
 from recon_cli.errors import TrainingError
 from recon_cli.scene.splats import Splats
-from recon_cli.train.densify import budget, mcmc, reference
+from recon_cli.train.densify import budget, reference
 from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
@@ -22,14 +22,12 @@ class Strategy:
     """How the count changes during a run.
 
     Attributes:
-        control: called after each step; adds and deletes Gaussians where the schedule says so.
+        control: called after each step; adds and deletes Gaussians when the schedule says so.
         variance: it needs the variance of the gradient over each Gaussian's pixels.
-        each_step: it changes something after every step, and not only when the schedule says so.
     """
 
     control: Callable[[TrainState, Task], None]
     variance: bool = False
-    each_step: bool = False
 
 
 def replaced(state: TrainState, splats: Splats, source: torch.Tensor) -> None:
@@ -72,19 +70,7 @@ def _budget(state: TrainState, task: Task) -> None:
             state.splats, state.gathered.variance, rule, state.generator))
 
 
-def _mcmc(state: TrainState, task: Task) -> None:
-    """Relocates, adds and shakes."""
-    schedule = task.schedule
-    if schedule.densifies(state.iteration):
-        replaced(state, *mcmc.relocate(
-            state.splats, schedule.target(state.iteration, state.first_count),
-            schedule.config.min_opacity, state.generator))
-    rate = schedule.recipe.noise * schedule.means_rate(state.iteration) * task.extent
-    mcmc.add_noise(state.splats, rate, state.generator)
-
-
 STRATEGIES = {
     "reference": Strategy(_reference),
     "budget": Strategy(_budget, variance=True),
-    "mcmc": Strategy(_mcmc, each_step=True),
 }

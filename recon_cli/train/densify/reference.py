@@ -19,7 +19,6 @@ from recon_cli.train.densify.statistics import Gathered
 _SPLIT = 2  # Gaussians that replace one that is split
 _SHRINK = 1.6  # their scales are divided by this
 _MAX_RADIUS = 20.0  # pixels on the screen
-_MAX_SCALE = 0.1  # x extent
 RESET_OPACITY = 0.01
 
 
