@@ -18,8 +18,8 @@ from torch import Tensor
 
 from recon_cli.render import Statistics
 from recon_cli.scene.camera import Camera
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.densify import STRATEGIES
-from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.gradient import DeferredStep, gradient_step
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import TrainState
@@ -151,7 +151,7 @@ class _Batch:
         """Begins a step."""
         if self._views == 1:
             return
-        self._gathered = Gathered.zeros(len(state.splats), state.splats.means.device)
+        self._gathered = DensificationStats.zeros(len(state.splats), state.splats.means.device)
         self._seen = torch.zeros_like(self._compute.counted)
         self._before = self._compute.status.skipped.clone()
         self._loss.zero_()

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from recon_cli.context import Ranks, TrainCallback
 from recon_cli.scene.splats import TERMS, Splats
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.densify import budget
-from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.fit import fit, report_every, validation_psnr
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.schedule import Schedule
@@ -326,7 +326,7 @@ def join_exchange(ranks: Ranks) -> None:
 def _exchange_ms(ranks: Ranks, count: int, terms: int, device: torch.device) -> float:
     """Returns the median of what a step with so many Gaussians exchanges."""
     gradients = [torch.zeros(count, width, device=device) for width in (*_WIDTHS, 3 * terms)]
-    found, gathered = torch.zeros(11, dtype=torch.float64), Gathered.zeros(count, device)
+    found, gathered = torch.zeros(11, dtype=torch.float64), DensificationStats.zeros(count, device)
     marks = []
     for _ in range(_ROUNDS + _WARM_UP + 1):
         marks.append(time.perf_counter())

@@ -118,9 +118,21 @@ def _megabytes(count: int) -> str:
 
 
 def gaussians_that_fit(scene: Scene, config: RunConfig, ctx: StageContext) -> int:
-    """Returns how many Gaussians memory has room for, before the images are loaded."""
-    one = _memory(scene, config, ctx, gaussians=1)
-    return room(one, _free_bytes(ctx))
+    """Returns how many Gaussians memory has room for, before the images are loaded.
+
+    Raises:
+        TrainingError: fewer than two views are left to train on.
+    """
+    refuse_few_views(scene)
+    return room(_memory(scene, config, ctx, gaussians=1), _free_bytes(ctx))
+
+
+def refuse_few_views(scene: Scene) -> None:
+    """Raises TrainingError unless there are two views to train on."""
+    if len(scene.train) < 2:
+        raise TrainingError(
+            f"{len(scene.train)} views are left to train on; at least 2 are needed.",
+            hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
 
 
 def _memory(

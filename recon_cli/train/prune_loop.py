@@ -16,7 +16,7 @@ from torch import Tensor
 
 from recon_cli.context import TrainCallback
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.densify.statistics import Gathered
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.state import TrainState
@@ -89,7 +89,7 @@ def remove(state: TrainState, rows: Tensor) -> None:
     """Goes on with the Gaussians at `rows` alone; they keep their moments."""
     splats = state.splats.select(rows)
     state.optimizer.replace(splats, rows)
-    state.gathered = Gathered.zeros(len(splats), splats.means.device)
+    state.gathered = DensificationStats.zeros(len(splats), splats.means.device)
 
 
 class PruneRun:

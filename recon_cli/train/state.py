@@ -18,7 +18,7 @@ from torch import Tensor
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import Splats
-from recon_cli.train.densify.statistics import Gathered
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import Poses
@@ -49,7 +49,7 @@ class TrainState:
     """
 
     optimizer: SplatOptimizer
-    gathered: Gathered
+    gathered: DensificationStats
     generator: torch.Generator
     iteration: int = 0
     queue: list[int] = field(default_factory=list)
@@ -86,7 +86,7 @@ def new_state(
         poses: refinement of their cameras, likewise.
     """
     generator = torch.Generator().manual_seed(config.seed)
-    gathered = Gathered.zeros(len(splats), splats.means.device)
+    gathered = DensificationStats.zeros(len(splats), splats.means.device)
     return TrainState(
         SplatOptimizer(splats, config, extent, backend=backend), gathered, generator,
         first_count=len(splats), exposure=exposure, poses=poses)
@@ -141,7 +141,8 @@ def load_state(
         splats = Splats(**_under("splats.", tensors))
         state = TrainState(
             SplatOptimizer(splats, config, extent, backend=backend),
-            Gathered(**_under("gathered.", tensors)), generator, int(scalars["iteration"]),
+            DensificationStats(**_under("gathered.", tensors)), generator,
+            int(scalars["iteration"]),
             [int(i) for i in scalars["queue"]], int(scalars["first_count"]),
             int(scalars["skipped"]), [(int(at), float(psnr)) for at, psnr in scalars["looks"]],
             (int(scalars["jump"][0]), int(scalars["jump"][1])) if scalars["jump"] else None)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from recon_cli.errors import TrainingError
 from recon_cli.render import Statistics
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.densify import STRATEGIES
-from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import TrainState
@@ -86,7 +86,7 @@ class Stepper:
         found, gathers = _Found.nothing(len(batch)), self._task.schedule.gathers(iteration)
         several = len(batch) > 1 or not ranks.alone
         # in a sum of its own, so that who looked at which view changes no bit
-        gathered = state.gathered if not several else Gathered.zeros(
+        gathered = state.gathered if not several else DensificationStats.zeros(
             len(state.splats), self._task.device)
         for place in range(ranks.rank, len(batch), ranks.count):
             view = self._view(batch[place], iteration)

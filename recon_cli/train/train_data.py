@@ -18,7 +18,7 @@ from recon_cli.io.images import fit_camera, read_masked_image
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.memory import check_memory
+from recon_cli.train.memory import check_memory, refuse_few_views
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import read_json, write_bytes
@@ -30,7 +30,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     Raises:
         TrainingError: fewer than two views are left to train on, or memory is short.
     """
-    _refuse_too_few_views(scene)
+    refuse_few_views(scene)
     _refuse_tiny_units(scene)
     check_memory(scene, config, ctx)
     train = load_views(scene.train, config, ctx)
@@ -44,13 +44,6 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     return Task(
         train, load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), camera_error=error)
-
-
-def _refuse_too_few_views(scene: Scene) -> None:
-    if len(scene.train) < 2:
-        raise TrainingError(
-            f"{len(scene.train)} views are left to train on; at least 2 are needed.",
-            hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
 
 
 def _refuse_tiny_units(scene: Scene) -> None:

@@ -18,8 +18,8 @@ def test_a_recipe_may_change_options_of_training() -> None:
     assert (config.iterations, config.seed, config.max_size) == (7, 3, 48)
     assert parse_recipe("paper") is not PAPER
     assert parse_recipe("paper").prune == PAPER.prune
-    assert [one.name for one in parse_recipes(("reference, budget", "mcmc"))] == [
-        "reference", "budget", "mcmc"]
+    assert [one.name for one in parse_recipes(("reference, budget", "paper"))] == [
+        "reference", "budget", "paper"]
 
 
 @pytest.mark.parametrize("text", [

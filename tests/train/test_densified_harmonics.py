@@ -8,8 +8,8 @@ from scenes import random_splats, with_harmonics
 from tiny_task import STRATEGIES, first_state, tiny_task
 
 from recon_cli.scene.splats import with_rows
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.densify import budget, reference
-from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.fit import fit
 
 N, COLORED = 40, 13
@@ -20,7 +20,7 @@ def generator():
 
 
 def by_reference(splats):
-    gathered = Gathered.zeros(N, torch.device("cpu"))
+    gathered = DensificationStats.zeros(N, torch.device("cpu"))
     gathered.pull[::3] = 2.0
     gathered.count[:] = 1
     rule = reference.DensifyRule(1.0, 100.0, 0.05, None, 60)  # all are small: cloned
@@ -54,7 +54,7 @@ def test_children_have_what_their_parents_have_and_those_with_coefficients_come_
 
 def test_halves_of_a_split_have_what_their_parent_has():
     few = with_harmonics(random_splats(N, dtype=torch.float32), 2, COLORED)
-    gathered = Gathered.zeros(N, torch.device("cpu"))
+    gathered = DensificationStats.zeros(N, torch.device("cpu"))
     gathered.pull[:] = 2.0
     gathered.count[:] = 1
     few.logit_opacities[:] = 1.0

@@ -7,8 +7,8 @@ import torch
 from scenes import joined, one_splat
 
 from recon_cli.render import Statistics
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.densify.reference import DensifyRule, densify, lowered_opacities
-from recon_cli.train.densify.statistics import Gathered
 
 RULE = DensifyRule(gradient=1.0, clone_scale=0.1, min_opacity=0.005, large_scale=1.0, most=100)
 
@@ -19,7 +19,7 @@ def splat(scale=0.05, opacity=0.5):
 
 
 def pulled(*means):
-    gathered = Gathered.zeros(len(means), torch.device("cpu"))
+    gathered = DensificationStats.zeros(len(means), torch.device("cpu"))
     gathered.pull[:] = torch.tensor(means)
     gathered.count[:] = 1
     return gathered
@@ -71,7 +71,7 @@ def test_the_pull_is_measured_in_normalised_device_coordinates_over_seen_steps()
     statistics = Statistics.zeros(torch.zeros(2, 3))
     statistics.means2d_grad[0] = torch.tensor([0.3, 0.4])
     statistics.radii[0] = 5.0
-    gathered = Gathered.zeros(2, torch.device("cpu"))
+    gathered = DensificationStats.zeros(2, torch.device("cpu"))
     gathered.add(statistics, 20, 20)
     gathered.add(statistics, 20, 20)
     assert gathered.mean_pull.tolist() == pytest.approx([0.5 * 10, 0.0])

@@ -9,8 +9,8 @@ import torch
 
 from recon_cli.errors import TrainingError
 from recon_cli.scene.splats import Splats
+from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.densify import budget, reference
-from recon_cli.train.densify.statistics import Gathered
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 
@@ -41,7 +41,7 @@ def replaced(state: TrainState, splats: Splats, source: torch.Tensor) -> None:
             f"No Gaussian is left at step {state.iteration}.",
             hint="Lower --min-opacity, or check the cameras with another viewer.")
     state.optimizer.replace(splats, source)
-    state.gathered = Gathered.zeros(len(splats), splats.means.device)
+    state.gathered = DensificationStats.zeros(len(splats), splats.means.device)
 
 
 def _reference(state: TrainState, task: Task) -> None:

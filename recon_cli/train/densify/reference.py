@@ -14,7 +14,7 @@ from torch import Tensor
 
 from recon_cli.render.torch.projection import rotation_matrices
 from recon_cli.scene.splats import Splats, joined
-from recon_cli.train.densify.statistics import Gathered
+from recon_cli.train.densification_stats import DensificationStats
 
 _SPLIT = 2  # Gaussians that replace one that is split
 _SHRINK = 1.6  # their scales are divided by this
@@ -42,7 +42,7 @@ class DensifyRule:
 
 
 def densify(
-    splats: Splats, gathered: Gathered, rule: DensifyRule, generator: torch.Generator
+    splats: Splats, gathered: DensificationStats, rule: DensifyRule, generator: torch.Generator
 ) -> tuple[Splats, Tensor]:
     """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones."""
     opaque = splats.opacities.detach() >= rule.min_opacity
@@ -81,7 +81,7 @@ def _halves(splats: Splats, rows: Tensor, generator: torch.Generator) -> Splats:
     return parent
 
 
-def _not_oversized(splats: Splats, gathered: Gathered, rule: DensifyRule) -> Tensor:
+def _not_oversized(splats: Splats, gathered: DensificationStats, rule: DensifyRule) -> Tensor:
     """Returns a mask of the Gaussians that are not too large on the screen or in the world."""
     if rule.large_scale is None:
         return torch.ones_like(gathered.radius, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""What training steps leave behind for densification, summed over views."""
+"""What training steps record for densification, summed over views."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon_cli.render import Statistics
 
 
 @dataclass(eq=False)
-class Gathered:
+class DensificationStats:
     """How the loss pulled at each Gaussian since the last densification.
 
     Attributes:
@@ -30,9 +30,9 @@ class Gathered:
     variance: Tensor
 
     @staticmethod
-    def zeros(n: int, device: torch.device) -> Gathered:
+    def zeros(n: int, device: torch.device) -> DensificationStats:
         """Returns a record of nothing for n Gaussians."""
-        return Gathered(*(torch.zeros(n, device=device) for _ in range(4)))
+        return DensificationStats(*(torch.zeros(n, device=device) for _ in range(4)))
 
     def add(self, statistics: Statistics, width: int, height: int) -> None:
         """Adds what one backward pass over an image of width x height found."""
@@ -48,11 +48,11 @@ class Gathered:
         ranks.add([self.pull, self.count, self.variance])
         ranks.raise_to_most(self.radius)
 
-    def times(self, factor: Tensor) -> Gathered:
+    def times(self, factor: Tensor) -> DensificationStats:
         """Returns all of it times a factor, a number on the device."""
-        return Gathered(*(value * factor for value in vars(self).values()))
+        return DensificationStats(*(value * factor for value in vars(self).values()))
 
-    def join(self, other: Gathered) -> None:
+    def join(self, other: DensificationStats) -> None:
         """Adds what was found elsewhere."""
         self.pull += other.pull
         self.count += other.count
