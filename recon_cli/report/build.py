@@ -34,6 +34,7 @@ from recon_cli.report.scores import LABELS, build_scores
 from recon_cli.report.stage_status import StageStatus, Statuses, inspect_stages
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
+from recon_cli.workspace.summaries import ExportSummary
 
 FILE = "report.html"
 _SUFFIXES = (".html", ".htm")
@@ -129,6 +130,7 @@ def _template_values(
         "sweep": draw_prune_curve(root, stages), "rounds": draw_rounds(stages["prune"]),
         "sweep_command": f"recon prune --sweep -w {shlex.quote(str(root))}",
         "provenance": read_provenance(stages), "labels": LABELS,
+        "export": stages["export"].read_summary(ExportSummary),
         "longest": max(run.seconds for run in runs),
         "largest": max(run.peak_memory_bytes for run in runs),
         "gain": GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),
