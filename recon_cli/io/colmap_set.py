@@ -38,7 +38,7 @@ def match_names_by_order(
     raise FormatError(
         f"{model_at} lacks images.bin or images.txt, which hold the names of its {len(ids)} "
         "images, and no folder has these images in their order.",
-        hint="Copy that file too; without it poses and images cannot be told to belong together.")
+        hint="Copy that file too; without it poses cannot be matched to images.")
 
 
 def _image_names(folder: Path) -> list[str]:
