@@ -44,17 +44,11 @@ class Gap:
 
 @dataclass(frozen=True)
 class Tags:
-    """How the frames of a file are to be displayed.
+    """How the frames of a file are to be displayed."""
 
-    Attributes:
-        aspect: width of a pixel over its height.
-        transfer: how HDR video codes light, None for SDR.
-        primaries: H.273 code of its primary colours.
-    """
-
-    aspect: Fraction = Fraction(1)
-    transfer: Transfer | None = None
-    primaries: int = UNSPECIFIED
+    aspect: Fraction = Fraction(1)  # width of a pixel over its height
+    transfer: Transfer | None = None  # None for SDR
+    primaries: int = UNSPECIFIED  # H.273 code
 
 
 def tags_of(stream: VideoStream) -> Tags:
@@ -69,17 +63,11 @@ def tags_of(stream: VideoStream) -> Tags:
 
 @dataclass(frozen=True, eq=False)
 class DecodedPicture:
-    """A decoded frame.
+    """A decoded frame."""
 
-    Attributes:
-        frame: as it was decoded, or deinterlaced.
-        tags: how it is displayed.
-        interlaced: whether its two fields were taken at different times.
-    """
-
-    frame: av.VideoFrame
+    frame: av.VideoFrame  # deinterlaced, if it was interlaced
     tags: Tags = Tags()
-    interlaced: bool = False
+    interlaced: bool = False  # its two fields were taken at different times
 
     @property
     def square_size(self) -> tuple[int, int]:

@@ -27,12 +27,8 @@ from recon_cli.scene.camera import Lens
 def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> IngestedSource:
     """Writes the images, masks, poses and points of a data set into ingest's folder `out`.
 
-    Args:
-        config: see `IngestConfig`. From a sequence, frames are chosen evenly; of other sets all
-            images are used unless a number is given. Views that the set holds out are all used.
-        path: the data set.
-        out: frames already in it are kept.
-        ctx: for notices and progress.
+    From a sequence, frames are chosen evenly; of other sets all images are used unless a number is
+    given. Views that the set holds out are all used. Frames already in `out` are kept.
 
     Raises:
         InputError: too few images can be read.

@@ -47,18 +47,11 @@ PLAN = "raw.json"  # how camera RAW was developed, for the next run and for insp
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writes the photos of a folder.
-
-    Attributes:
-        out: ingest's folder.
-        max_size: longest side of a frame.
-        masks: by the file name of the photo.
-        plan: for those that are RAW.
-    """
+    """Writes the photos of a folder into ingest's folder `out`."""
 
     out: Path
-    max_size: int
-    masks: dict[str, Path]
+    max_size: int  # longest side of a frame
+    masks: dict[str, Path]  # by the file name of the photo
     plan: RawPlan
 
     def write(self, photo: Photo, name: str) -> NDArray[np.uint8]:
@@ -88,12 +81,8 @@ def ingest(
 ) -> IngestedSource:
     """Writes photos into ingest's folder `out` and returns them.
 
-    Args:
-        config: see `IngestConfig`.
-        paths: a folder with photos in it or in a subfolder; or photos.
-        out: frames already in it are kept.
-        ctx: for notices and progress.
-        prefix: of the names of the frames.
+    `paths` are a folder with photos in it or in a subfolder, or photos. Frames already in `out` are
+    kept; `prefix` is that of their names.
 
     Raises:
         InputError: too few photos can be read, or show a view of their own; a mask is broken.

@@ -39,18 +39,11 @@ COUNT_SHARE, COUNT_FRAMES = 0.02, 10
 
 @dataclass(frozen=True, eq=False)
 class ScannedVideo:
-    """A video after the first pass.
-
-    Attributes:
-        path: the video.
-        scan: of its F frames.
-        lengths: [F] float64 `path_length` up to each frame, in widths.
-        judgement: which frames may be chosen, and why the others may not.
-    """
+    """A video after the first pass."""
 
     path: Path
     scan: Scan
-    lengths: NDArray[np.float64]
+    lengths: NDArray[np.float64]  # [F], `path_length` up to each frame
     judgement: Judgement
 
 
@@ -102,13 +95,7 @@ def ingest(
 ) -> IngestedSource:
     """Writes `count` frames of a video into ingest's folder `out` and returns them.
 
-    Args:
-        config: see `IngestConfig`.
-        source: of `scan`.
-        count: how many frames to choose, if there are as many.
-        out: frames already in it are kept.
-        ctx: for notices and progress.
-        prefix: of the names of the frames.
+    Frames already in `out` are kept; `prefix` is that of their names.
 
     Raises:
         InputError: too few frames are sharp, or the file has changed.

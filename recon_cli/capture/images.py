@@ -62,22 +62,13 @@ SENSOR_MM = (2.0, 70.0)
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo whose header could be read.
-
-    Attributes:
-        path: its file.
-        width: width in pixels once upright.
-        height: height in pixels once upright.
-        focal_px: focal length in pixels by EXIF, None where unknown.
-        camera: maker and model by EXIF, empty where not given.
-        focal_mm: focal length in mm by EXIF, None where not given.
-    """
+    """A photo whose header could be read; camera and focal lengths are those of EXIF."""
 
     path: Path
-    width: int
+    width: int  # once upright
     height: int
     focal_px: float | None
-    camera: str = ""
+    camera: str = ""  # maker and model
     focal_mm: float | None = None
 
     @property
@@ -307,15 +298,9 @@ def _raw_lens(path: Path, width: int, height: int) -> ExifLens:
 
 @dataclass(frozen=True)
 class ExifLens:
-    """The optics by EXIF.
+    """The optics by EXIF."""
 
-    Attributes:
-        camera: maker and model, empty where not given.
-        focal_mm: focal length in mm, None where not given.
-        focal_px: focal length in pixels, None where unknown.
-    """
-
-    camera: str = ""
+    camera: str = ""  # maker and model
     focal_mm: float | None = None
     focal_px: float | None = None
 

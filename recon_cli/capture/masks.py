@@ -27,17 +27,11 @@ HALF = 128  # from this value on a pixel is white, or opaque
 
 @dataclass(frozen=True)
 class FoundMasks:
-    """The masks of a folder of photos.
+    """The masks of a folder of photos."""
 
-    Attributes:
-        by_photo: path of the mask, by the photo's file name.
-        unused: file names of masks to which no photo belongs.
-        outside: a folder of masks beside the given one, None where there is none.
-    """
-
-    by_photo: dict[str, Path]
-    unused: tuple[str, ...]
-    outside: Path | None = None
+    by_photo: dict[str, Path]  # by the photo's file name
+    unused: tuple[str, ...]  # file names of masks without a photo
+    outside: Path | None = None  # a folder of masks beside the given one
 
 
 def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FoundMasks:
@@ -102,12 +96,6 @@ def opaque(
     alpha: NDArray[np.uint8] | None, name: str, width: int, height: int
 ) -> NDArray[np.uint8] | None:
     """Returns where a picture is at least half opaque, [H, W], 255 or 0; None for everywhere.
-
-    Args:
-        alpha: its opacity, of any size; None where it holds none.
-        name: for the message.
-        width: of the mask.
-        height: of the mask.
 
     Raises:
         InputError: it is transparent everywhere.

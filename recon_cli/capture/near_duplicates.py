@@ -33,13 +33,7 @@ NAMED = 8  # photos that a message lists; all are in the record of the selection
 
 @dataclass(frozen=True, eq=False)
 class PhotoMeasures:
-    """What is measured of one photo, as it is stored.
-
-    Attributes:
-        signature: of `signature`.
-        exposure: of `measure_exposure`.
-        sharpness: of `measure_sharpness`.
-    """
+    """What is measured of one stored photo, by the functions of these names."""
 
     signature: NDArray[np.float32]
     exposure: tuple[float, float, float]
@@ -64,8 +58,7 @@ def choose_photos(
 
     Args:
         folder: its name, for messages.
-        sources: file names of the photos.
-        names: under which they are stored.
+        sources: file names of the photos; `names` are those of their frames.
         measures: of `measure_photo`, None for a photo that cannot be read.
 
     Raises:

@@ -20,15 +20,10 @@ SAME_FOCAL = 0.01
 
 @dataclass(frozen=True)
 class PhotoFolder:
-    """The photos of a folder in natural order (2 before 10), and what is broken.
-
-    Attributes:
-        photos: readable by their header.
-        broken: why each file that is named like a photo could not be read, by file name.
-    """
+    """The photos of a folder in natural order (2 before 10), and what is broken."""
 
     photos: tuple[Photo, ...]
-    broken: dict[str, str]
+    broken: dict[str, str]  # why a file that is named like a photo cannot be read, by file name
 
 
 def list_photos(paths: Iterable[Path]) -> PhotoFolder:
@@ -127,15 +122,10 @@ def names_in_order(stems: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class PhotoGroup:
-    """Photos that share intrinsics.
+    """Photos that share intrinsics."""
 
-    Attributes:
-        name: camera, size and, where two groups share these, focal length; for messages.
-        photos: at least one, in their given order.
-    """
-
-    name: str
-    photos: tuple[Photo, ...]
+    name: str  # camera, size and, where two groups share these, focal length; for messages
+    photos: tuple[Photo, ...]  # at least one, in their given order
 
     @property
     def width(self) -> int:

@@ -44,30 +44,19 @@ CameraSettings = tuple[tuple[float, ...], int]  # multipliers and saturation of 
 
 @dataclass(frozen=True)
 class RawShot:
-    """How one photo is developed.
+    """How one photo is developed."""
 
-    Attributes:
-        multipliers: of red, green, blue and second green.
-        saturation: sensor value that is white, black level included.
-        gain_ev: by how many stops it is brightened after white balance.
-    """
-
-    multipliers: tuple[float, ...]
-    saturation: int
-    gain_ev: float
+    multipliers: tuple[float, ...]  # red, green, blue, second green
+    saturation: int  # sensor value that is white, black level included
+    gain_ev: float  # stops of brightening after white balance
 
 
 @dataclass(frozen=True)
 class RawPlan:
-    """How the RAW photos of a folder are developed.
-
-    Attributes:
-        shots: by the file name of the photo.
-        broken: why a photo cannot be developed, by file name.
-    """
+    """How the RAW photos of a folder are developed, by their file names."""
 
     shots: dict[str, RawShot]
-    broken: dict[str, str]
+    broken: dict[str, str]  # why a photo cannot be developed
 
     def to_json(self) -> dict[str, Any]:
         """Returns JSON values."""
@@ -96,12 +85,7 @@ class _Header:
 
 
 def plan_raw(paths: Sequence[Path], *, step: Callable[[], None] = lambda: None) -> RawPlan:
-    """Returns how to develop RAW photos of one scene so that they match.
-
-    Args:
-        paths: the photos of one folder in the order of taking.
-        step: is called after each photo.
-    """
+    """Returns how to develop RAW photos of one scene, in order, alike; calls `step` per photo."""
     broken: dict[str, str] = {}
     headers = [header for path in paths if (header := _try_read(_read_header, path, broken))]
     common = _by_camera(headers)

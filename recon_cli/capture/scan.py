@@ -32,8 +32,7 @@ class Scan:
     """The measures of F frames in presentation order, which gives a frame its index.
 
     Attributes:
-        width: width of an upright frame in pixels.
-        height: height of an upright frame in pixels.
+        width: of an upright frame in pixels, as is the height.
         declared: frames that the file claims to hold, by its duration where it has no count; 0
             where unknown.
         gaps: packets that gave no frame.
@@ -69,35 +68,24 @@ class Scan:
 
     def to_json(self) -> dict[str, Any]:
         """Returns the scan as JSON values; NaN becomes null."""
-        return {
-            "width": self.width,
-            "height": self.height,
-            "declared": self.declared,
-            "gaps": self.gaps,
-            "sharpness": self.sharpness.tolist(),
-            "motion": [None if np.isnan(step) else step for step in self.motion.tolist()],
-            "exposure": self.exposure.tolist(),
-            "seconds": list(self.seconds),
-            "whole": self.whole.tolist(),
-            "notices": list(self.notices),
-        }
+        values = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(self).items()}
+        motion = [None if np.isnan(step) else step for step in values["motion"]]
+        return {**values, "motion": motion}
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> Scan:
         """Returns the scan that `to_json` wrote."""
-        motion = [np.nan if step is None else step for step in value["motion"]]
-        return cls(
-            width=value["width"],
-            height=value["height"],
-            declared=value["declared"],
-            gaps=value["gaps"],
-            sharpness=np.array(value["sharpness"], np.float64),
-            motion=np.array(motion, np.float64),
-            exposure=np.array(value["exposure"], np.float64).reshape(-1, 3),
-            seconds=tuple(value["seconds"]),
-            whole=np.array(value["whole"], np.bool_),
-            notices=tuple(value["notices"]),
-        )
+        return cls(**{
+            **value,
+            "sharpness": np.array(value["sharpness"], np.float64),
+            "motion": np.array(value["motion"], np.float64),  # null becomes NaN
+            "exposure": np.array(value["exposure"], np.float64).reshape(-1, 3),
+            "seconds": tuple(value["seconds"]),
+            "whole": np.array(value["whole"], np.bool_),
+            "notices": tuple(value["notices"]),
+        })
 
 
 @dataclass(frozen=True)
@@ -116,15 +104,10 @@ class _FrameMeasures:
 
 
 def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
-    """Returns the scan of a video; the same one for any number of threads.
+    """Returns the scan of a video, the same for any number of threads; calls `step` per frame.
 
     A damaged stream is scanned again by one thread: only then are the frames around the damage
     reproducible, here and when they are decoded again (`decode_threads`).
-
-    Args:
-        path: the video.
-        threads: decoder threads.
-        step: called after each frame.
 
     Raises:
         InputError: the file is no video, or no frame of it can be decoded.

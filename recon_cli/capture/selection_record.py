@@ -40,23 +40,14 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class FrameCandidate:
-    """One frame of a capture.
+    """One frame of a capture."""
 
-    Attributes:
-        source: name of the file that it came from.
-        index: its place in that video, or among the photos of that folder.
-        reason: what became of it.
-        sharpness: variance of its Laplacian; None where it could not be read.
-        name: of the stored frame, None where it was not kept.
-        like: index of the kept frame that a duplicate equals, or that is nearest to one too close.
-    """
-
-    source: str
-    index: int
+    source: str  # file name
+    index: int  # in that video, or among the photos of that folder
     reason: Reason
-    sharpness: float | None
-    name: str | None = None
-    like: int | None = None
+    sharpness: float | None  # None where it could not be read
+    name: str | None = None  # of the stored frame, None where it was not kept
+    like: int | None = None  # the kept frame that a duplicate equals, or nearest to one too close
 
 
 def video_candidates(

@@ -124,17 +124,11 @@ def convert_hint(path: Path) -> str:
 
 @dataclass(frozen=True)
 class DeclaredLength:
-    """The length of a video by its container.
+    """The length of a video by its container."""
 
-    Attributes:
-        frames: the container's count, 0 where it keeps none.
-        seconds: duration, 0 where it is not known.
-        rate: frames per second; a rough guess where the rate varies.
-    """
-
-    frames: int
-    seconds: float
-    rate: float
+    frames: int  # 0 where it has no count
+    seconds: float  # 0 where unknown
+    rate: float  # frames per second; a rough guess where the rate varies
 
     def count(self, rate: float) -> int:
         """Returns the number of frames there should be, by the duration where there is no count."""

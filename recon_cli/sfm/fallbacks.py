@@ -42,45 +42,24 @@ SLOWER = 3.0
 
 @dataclass(frozen=True)
 class Fallback:
-    """One way to find a model.
-
-    Attributes:
-        name: for the user.
-        reason: why a capture begins with it.
-        choose_pairs: returns the pairs of images to match first, by file name.
-        find_models: runs the mapper.
-    """
+    """One way to find a model: the pairs of images to match first, and the mapper."""
 
     name: str
-    reason: str
+    reason: str  # why a capture begins with it
     choose_pairs: Callable[[MappingJob], set[matching.Pair]]
     find_models: Callable[[MappingJob, Reporter], list[pycolmap.Reconstruction]]
 
 
 @dataclass(frozen=True)
 class MapperAttempt:
-    """What became of one fallback.
-
-    Attributes:
-        name: of the fallback.
-        reason: why it was tried.
-        seconds: that it took with its matching, 0 where it was skipped.
-        skipped: why it was skipped, empty where it was tried.
-        registered: frames with a camera.
-        shortfall: why that is not good enough, empty where it is.
-        apart: frames that only other models hold, a tuple each.
-        rejected: why frames were taken out of the model, by name.
-        trusted: whether the verdict trusts the model.
-        weak_link: share of the matches that agree across the weakest cut, None where unknown.
-        reprojection_error_px: mean, None without a model.
-    """
+    """What became of one fallback; see also `AttemptSummary` and `ModelCandidate`."""
 
     name: str
     reason: str
     seconds: float = 0.0
     skipped: str = ""
     registered: tuple[str, ...] = ()
-    shortfall: str = "no model was found"
+    shortfall: str = "no model was found"  # why it is not good enough; empty where it is
     apart: tuple[tuple[str, ...], ...] = ()
     rejected: dict[str, str] = dataclasses.field(default_factory=dict)
     trusted: bool = False
@@ -128,13 +107,8 @@ def match_first(job: MappingJob, report: Reporter) -> Result:
 def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result:
     """Writes the best model of all attempts that were needed into out/model.
 
-    Args:
-        job: whose database holds the matches of the first fallback.
-        report: told of phases and counts.
-        deadline: monotonic time in seconds at which the process is ended.
-
-    Returns:
-        What the model holds, and what became of each attempt.
+    The matches of the first fallback are in the database. At `deadline`, in monotonic seconds, the
+    process is ended.
 
     Raises:
         SfmError: too few frames have a camera, they see the points from one place, or the parts of

@@ -30,60 +30,27 @@ Result = dict[str, Any]  # JSON values only
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """Frames that share one camera.
+    """Frames that share one camera."""
 
-    Attributes:
-        names: file names of its frames, sorted.
-        width: of its frames in pixels.
-        height: of its frames in pixels.
-        focal_px: focal length in pixels where a guess is known.
-        lens: intrinsics where they are known.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # sorted
     width: int
     height: int
-    focal_px: float | None = None
-    lens: Lens | None = None
+    focal_px: float | None = None  # a guess
+    lens: Lens | None = None  # known intrinsics
 
 
 @dataclass(frozen=True)
 class MappingJob:
-    """One run of the mapping process.
+    """One run of the mapping process; see `SfmConfig` for the options."""
 
-    Attributes:
-        frames: folder of the original frames; features are found in these.
-        denoised: folder of their denoised twins, under the same names.
-        out: the stage's folder; database, model and undistorted images go there.
-        groups: the frames by camera.
-        masks: folder of masks under the names of the frames (0 where a pixel is ignored), None
-            where no frame has one.
-        poses: file of known poses (see `io.posed`), None where there are none.
-        pose_use: "keep", "refine" or "ignore" them.
-        given_points: the file of poses comes with points.
-        pairs: "auto", "exhaustive", "retrieval" or "sequential".
-        max_features: SIFT keypoints that an image keeps at most.
-        min_registered: share of the frames that must get a camera.
-        accept_weak: accept a model whose parts are weakly connected.
-        gravity: turn the world upright where there is evidence for up.
-        scale_between: two places and their distance in metres (see `sfm.measure`), None where the
-            scale is not known.
-        max_minutes: after which the parent ends the process; a further mapper is tried only where
-            it is expected to end in time.
-        seed: of every random sampling.
-        threads: for features, matching and undistortion.
-        sharpness: of frames by name, where known.
-        times: presentation times in seconds by name, where known.
-    """
-
-    frames: Path
-    denoised: Path
-    out: Path
+    frames: Path  # folder of the original frames; features are found in these
+    denoised: Path  # folder of their denoised twins, under the same names
+    out: Path  # the stage's folder
     groups: tuple[CameraGroup, ...]
-    masks: Path | None
-    poses: Path | None
+    masks: Path | None  # folder of masks under the names of the frames; 0 is ignored
+    poses: Path | None  # file of known poses, see `io.posed`
     pose_use: str
-    given_points: bool
+    given_points: bool  # the file of poses has points
     pairs: str
     max_features: int
     min_registered: float
@@ -93,8 +60,8 @@ class MappingJob:
     max_minutes: float
     seed: int
     threads: int
-    sharpness: Mapping[str, float]
-    times: Mapping[str, float]
+    sharpness: Mapping[str, float]  # by name, where known
+    times: Mapping[str, float]  # presentation times in seconds by name, where known
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -236,17 +203,11 @@ _ERRORS: dict[str, type[ReconError]] = {
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase of the work begins.
+    """A phase of the work begins."""
 
-    Attributes:
-        name: "features", "matches", "mapping" or "undistorted".
-        total: how many units it has.
-        done: how many of them an interrupted run had done.
-    """
-
-    name: str
-    total: int
-    done: int
+    name: str  # "features", "matches", "mapping" or "undistorted"
+    total: int  # units of work
+    done: int  # those that an interrupted run had done
 
 
 @dataclass(frozen=True)

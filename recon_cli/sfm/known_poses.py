@@ -245,15 +245,10 @@ def _centers(viewmats: Poses) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class SpotCheck:
-    """How well sampled pairs of images agree with given poses.
+    """How well sampled pairs of images agree with given poses."""
 
-    Attributes:
-        matches: verified matches of all pairs.
-        share: of them that agree with the poses; None where there are too few to tell.
-    """
-
-    matches: int
-    share: float | None
+    matches: int  # verified, of all pairs
+    share: float | None  # of them that agree with the poses; None where there are too few
 
     @property
     def fits(self) -> bool:
@@ -271,15 +266,12 @@ class SpotCheck:
 def spot_check(
     job: MappingJob, near: Mapping[str, list[str]], viewmats: Mapping[str, NDArray[np.float64]]
 ) -> SpotCheck:
-    """Returns how well sampled pairs of images agree with the poses.
+    """Returns how well sampled pairs of images agree with the poses; every lens is known.
 
     Args:
-        job: whose groups all have a known lens.
+        job: gives the images.
         near: `neighbours` of each image.
         viewmats: [4, 4] world to camera by name.
-
-    Raises:
-        FormatError: a frame cannot be read.
     """
     names = sorted(viewmats)
     places = {names[int((i + 0.5) * len(names) / PLACES)] for i in range(PLACES)}

@@ -32,10 +32,7 @@ def map_incrementally(job: MappingJob, report: Reporter, *, relaxed: bool = Fals
                 ) -> list[pycolmap.Reconstruction]:
     """Returns every model that the incremental mapper finds; they may share images.
 
-    Args:
-        job: whose database holds the matches.
-        report: told of each image that gets a camera.
-        relaxed: begin from pairs, and take images, that show less than COLMAP asks for.
+    `relaxed` lowers the thresholds for the first pair and for further images.
     """
     options = _options(job)
     if relaxed:
@@ -89,9 +86,7 @@ def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) ->
     The mapper keeps it in the middle, because a few images cannot tell it from a shift. All of them
     can: on the fox photos it comes out 2 px from the published value, 16 px off the middle.
 
-    Args:
-        model: changed in place.
-        constant: ids of cameras whose intrinsics stay as they are.
+    The model is changed in place; the intrinsics of the cameras `constant` stay as they are.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True

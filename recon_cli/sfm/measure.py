@@ -29,17 +29,11 @@ _HINT = (
 
 @dataclass(frozen=True)
 class ScaleBetween:
-    """Two places and how far they are apart.
-
-    Attributes:
-        a: a frame's name, "x,y,z" or "FRAME:u,v".
-        b: the same for the other end.
-        metres: above 0.
-    """
+    """Two places, each a frame's name, "x,y,z" or "FRAME:u,v", and their distance."""
 
     a: str
     b: str
-    metres: float
+    metres: float  # above 0
 
 
 @dataclass(frozen=True)
@@ -70,19 +64,12 @@ Place = CameraPlace | PointPlace | PixelPlace
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The scale that follows from a `ScaleBetween`.
-
-    Attributes:
-        request: what was asked for.
-        a: [3] world units.
-        b: [3] world units.
-        scale: metres in one world unit.
-    """
+    """The scale that follows from a `ScaleBetween`."""
 
     request: ScaleBetween
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
-    scale: float
+    a: NDArray[np.float64]  # [3] world units
+    b: NDArray[np.float64]  # [3]
+    scale: float  # metres in one world unit
 
     def to_json(self) -> dict[str, Any]:
         """Returns what was measured as JSON values."""
@@ -93,14 +80,10 @@ class Measurement:
 
 
 def parse_place(text: str, names: Collection[str]) -> Place:
-    """Returns the place that a text names.
-
-    Args:
-        text: a frame's name with or without its ending, "x,y,z" or "FRAME:u,v".
-        names: the frames there are.
+    """Returns the place that a text names: a frame (with or without its suffix), point or pixel.
 
     Raises:
-        ConfigError: it is none of the three, or there is no such frame.
+        ConfigError: it is none of the three, or there is no such frame among `names`.
     """
     if (name := _frame(text, names)) is not None:
         return CameraPlace(name)

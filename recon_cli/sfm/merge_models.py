@@ -36,32 +36,20 @@ MAX_REJECTED = 0.2
 
 @dataclass(frozen=True, eq=False)
 class ModelCandidate:
-    """A model that may become the result.
+    """A model that may become the result."""
 
-    Attributes:
-        model: adjusted.
-        verdict: on it.
-        apart: frames that only other models hold, a tuple each.
-        rejected: why frames were taken out, by name.
-    """
-
-    model: pycolmap.Reconstruction
+    model: pycolmap.Reconstruction  # adjusted
     verdict: Verdict
-    apart: tuple[tuple[str, ...], ...]
-    rejected: Mapping[str, str]
+    apart: tuple[tuple[str, ...], ...]  # frames that only other models hold
+    rejected: Mapping[str, str]  # why frames were taken out, by name
 
 
 @dataclass(frozen=True)
 class SharedPoints:
-    """Points that two models have in common.
+    """Points that two models have in common, in the coordinates of each."""
 
-    Attributes:
-        source: in the one model, [P, 3].
-        target: the same points in the other, [P, 3].
-    """
-
-    source: NDArray[np.float64]
-    target: NDArray[np.float64]
+    source: NDArray[np.float64]  # [P, 3]
+    target: NDArray[np.float64]  # [P, 3]
 
 
 def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> ModelCandidate | None:

@@ -63,33 +63,20 @@ _JSON_KEYS = {"weakest_cut": "weak_link", "aliasing": "fold", "outliers": "astra
 
 @dataclass(frozen=True)
 class Jump:
-    """A step between two images that follow each other.
-
-    Attributes:
-        before: name of the image before the step.
-        after: name of the image after it.
-        ratio: its length over that of the usual step around it; a step across a gap in time is
-            divided over the gap.
-    """
+    """A step between two images that follow each other."""
 
     before: str
     after: str
-    ratio: float
+    ratio: float  # of its length to the usual step around it, gaps in time taken into account
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """How often counts fall between edges.
+    """How many values fall between edges."""
 
-    Attributes:
-        edges: bin k holds the counts from edges[k] up to, but without, edges[k + 1].
-        counts: one less than there are edges.
-        median: of all counts; zero where there are none.
-    """
-
-    edges: tuple[int, ...]
+    edges: tuple[int, ...]  # bin k holds the values from edges[k] up to, but without, edges[k + 1]
     counts: tuple[int, ...]
-    median: float
+    median: float  # of all values; zero without any
 
     @classmethod
     def of(cls, values: NDArray[np.int64]) -> Histogram:
@@ -108,14 +95,11 @@ class Verdict:
     """What was found about a model; images by name.
 
     Attributes:
-        images: how many were given to the mapper.
-        registered: how many have a camera.
+        images: that were given to the mapper.
+        registered: images with a camera.
         model_parts: cameras that see points in common, directly or through others; the largest part
             first. A sound model is one part.
         match_parts: the same of all images and verified matches: what could be mapped together.
-        weakest_cut: the cut whose matches agree least with the poses.
-        aliasing: the groups of cameras that show least of what they should show in common.
-        outliers: cameras that their own matches contradict; they can be dropped.
         unregistered: why each image without a camera has none.
         jumps: steps of the camera that are far too long; empty unless the images are a video.
         keypoints: of each image.
@@ -175,9 +159,8 @@ def examine(
     """Returns what a finished model and the matches that it came from say about it.
 
     Args:
-        model: the reconstruction; it is left as it is.
-        database: COLMAP's database with the features and verified matches of the images; no other
-            program, nor Python's SQLite in this process, may have it open.
+        model: the reconstruction; it is not changed.
+        database: COLMAP's database of the images; Python's SQLite must not have it open.
         names: of all images that were given to the mapper; the database may hold more.
         sharpness: variance of the Laplacian of each image, where known.
         times: seconds of each image in the video, where known.
@@ -294,11 +277,7 @@ def _sides(sides: tuple[Names, Names]) -> str:
 def find_jumps(evidence: MatchEvidence, times: Mapping[str, float | None]) -> tuple[Jump, ...]:
     """Returns the steps that are far too long; none where the images are not known to be a video.
 
-    A video is known by the times of all its cameras, or by names that are all numbers.
-
-    Args:
-        evidence: of the model.
-        times: seconds in the video by name; None or absent where it is not known.
+    A video is known by the times of all its cameras, in seconds, or by names that are all numbers.
     """
     rows = np.flatnonzero(evidence.registered)
     moments = _moments([evidence.names[row] for row in rows], times)
@@ -334,12 +313,7 @@ def _moments(
 def unregistered_reasons(
     evidence: MatchEvidence, sharpness: Mapping[str, float | None]
 ) -> dict[str, str]:
-    """Returns the most likely reason for every image that has no camera.
-
-    Args:
-        evidence: of the model.
-        sharpness: variance of the Laplacian by name; None or absent where it is not known.
-    """
+    """Returns the most likely reason for every image that has no camera."""
     known = [value for value in sharpness.values() if value is not None]
     usual = float(np.median(known)) if known else None
     return {

@@ -65,17 +65,12 @@ class Overlap:
 class VisualAliasing:
     """The two groups of images that show least of what they should show in common.
 
-    Attributes:
-        share: of the cells that should look alike, those that do; None where it cannot be told.
-        reason: why it cannot be told; empty otherwise.
-        sides: names of the images of both groups, the smaller one first.
-        cells: that should look alike.
     """
 
-    share: float | None
-    reason: str
-    sides: tuple[tuple[str, ...], tuple[str, ...]]
-    cells: int
+    share: float | None  # of the cells that should look alike, those that do; None where unknown
+    reason: str  # why it is unknown; empty otherwise
+    sides: tuple[tuple[str, ...], tuple[str, ...]]  # names of the images, the smaller group first
+    cells: int  # that should look alike
 
 
 @dataclass(frozen=True)

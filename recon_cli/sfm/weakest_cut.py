@@ -41,38 +41,29 @@ class WeakestCut:
     """The cut through a model whose matches agree least with the poses.
 
     Attributes:
-        share: of the matches across, those that agree with the poses; None where it cannot be told.
-        reason: why it cannot be told; empty otherwise.
+        share: of the matches across, those that agree with the poses; None where unknown.
+        reason: why it is unknown; empty otherwise.
         sides: names of the images on both sides, the smaller side first.
-        pairs: verified pairs of images across.
-        matches: verified matches across.
-        points: points of the model that images of both sides see, counted for every pair of them.
+        points: of the model that images of both sides see, counted for every pair of them.
         normalised_cut: points across over those of the lighter side, 0 (apart) to 1.
     """
 
     share: float | None
     reason: str
     sides: tuple[tuple[str, ...], tuple[str, ...]]
-    pairs: int
-    matches: int
+    pairs: int  # verified, across
+    matches: int  # verified, across
     points: int
     normalised_cut: float
 
 
 @dataclass(frozen=True)
 class OutlierCamera:
-    """A camera that the image's own matches contradict.
-
-    Attributes:
-        name: of the image.
-        share: of its matches with cameras that are no outliers, those that agree with the poses;
-            zero where there are none.
-        matches: with such cameras.
-    """
+    """A camera that the image's own matches contradict."""
 
     name: str
-    share: float
-    matches: int
+    share: float  # of its matches with cameras that are no outliers, those that agree
+    matches: int  # with such cameras
 
 
 def find_weakest_cut(

@@ -71,7 +71,7 @@ def row(name: str, model: pycolmap.Reconstruction, database: Path, reference: Pa
     cells = [
         name, f"{verdict.registered}/{verdict.images}",
         f"{model.compute_mean_reprojection_error():.2f}", *shares(verdict),
-        str(len(verdict.astray)), "yes" if verdict.trusted else "no", f"{seconds:.2f}"]
+        str(len(verdict.outliers)), "yes" if verdict.trusted else "no", f"{seconds:.2f}"]
     if reference is not None:
         known = centers(reference)
         images = [model.image(i) for i in model.reg_image_ids()]
@@ -84,7 +84,7 @@ def row(name: str, model: pycolmap.Reconstruction, database: Path, reference: Pa
 
 def shares(verdict: Verdict) -> Iterator[str]:
     """The two shares, or a dash where they cannot be told."""
-    for share in (verdict.weak_link.share, verdict.fold.share):
+    for share in (verdict.weakest_cut.share, verdict.aliasing.share):
         yield "-" if share is None else f"{share:.3f}"
 
 
