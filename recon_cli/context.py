@@ -75,7 +75,7 @@ class TrainCallback:
 
 
 @dataclass(eq=False)
-class Ranks:
+class ProcessGroup:
     """This process among those that train together; by itself there is but one.
 
     Attributes:
@@ -113,21 +113,21 @@ class Ranks:
     def add(self, tensors: Sequence[Tensor]) -> None:
         """Replaces tensors by their sums over all processes, the same bits in each."""
 
-    def raise_to_most(self, tensor: Tensor) -> None:
+    def all_reduce_max(self, tensor: Tensor) -> None:
         """Replaces the values of a tensor by the greatest of all processes."""
 
-    def told(self, number: int) -> int:
+    def broadcast_int(self, number: int) -> int:
         """Returns the number that the leader gives; the others' own does not matter."""
         return number
 
-    def spread(self, tensor: Tensor) -> None:
+    def broadcast(self, tensor: Tensor) -> None:
         """Replaces the values of a tensor by those of the leader's."""
 
     def leave(self) -> None:
         """Ends the connection: whoever waits for this process hears that it is gone."""
 
 
-ALONE = Ranks()
+SINGLE_PROCESS = ProcessGroup()
 
 
 Summary = dict[str, Any]  # JSON values only; goes into the manifest
@@ -174,7 +174,7 @@ class StageContext:
     threads: int = 1
     record: Callable[[int, int], None] = _ignore
     callbacks: tuple[TrainCallback, ...] = ()
-    ranks: Ranks = ALONE
+    ranks: ProcessGroup = SINGLE_PROCESS
 
     def notice(self, text: str) -> None:
         """Tells the user something that is no error but must not be missed, in one line.

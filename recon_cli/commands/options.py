@@ -26,7 +26,7 @@ from recon_cli.config.settings import (
     section_of,
 )
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.context import ALONE, Ranks
+from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 
 if TYPE_CHECKING:
     from click.types import OptionHelpExtra
@@ -60,7 +60,7 @@ class Call:
     print_config: bool = False
     settings: Settings = field(default_factory=dict)
     assigned: Settings = field(default_factory=dict)
-    ranks: Ranks = ALONE
+    ranks: ProcessGroup = SINGLE_PROCESS
 
 
 pass_call = click.make_pass_decorator(Call, ensure=True)

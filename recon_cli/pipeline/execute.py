@@ -15,7 +15,7 @@ from recon_cli import machine
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.context import ALONE, Ranks, StageContext, StageInputs, TrainCallback
+from recon_cli.context import SINGLE_PROCESS, ProcessGroup, StageContext, StageInputs, TrainCallback
 from recon_cli.errors import BackendError, ConfigError, ManifestError, ReconError
 from recon_cli.lazy import load
 from recon_cli.pipeline.freshness import WorkspaceCheck
@@ -66,7 +66,7 @@ class Job:
     report: Callable[[Outcome], None] = _ignore
     table: Sequence[Stage] = STAGES
     callbacks: tuple[TrainCallback, ...] = ()
-    ranks: Ranks = ALONE
+    ranks: ProcessGroup = SINGLE_PROCESS
 
     def inspect(self) -> WorkspaceCheck:
         """Returns the checks of the workspace as it is now."""
@@ -186,7 +186,7 @@ def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> S
 
 
 def render_context(
-    compute: ComputeConfig, progress: Progress, ranks: Ranks = ALONE
+    compute: ComputeConfig, progress: Progress, ranks: ProcessGroup = SINGLE_PROCESS
 ) -> StageContext:
     """Returns where to train and render, once the rasterizer is ready.
 
@@ -205,7 +205,7 @@ def render_context(
     return StageContext(progress, device, backend, threads, ranks=ranks)
 
 
-def _resolve_backend(compute: ComputeConfig, ranks: Ranks) -> tuple[str, str]:
+def _resolve_backend(compute: ComputeConfig, ranks: ProcessGroup) -> tuple[str, str]:
     """Returns (backend, device) to train and render with.
 
     Raises:

@@ -44,7 +44,7 @@ class _Before:
     generator: torch.Tensor
 
 
-def advancing(
+def choose_trainer(
     state: TrainState, task: Task, importance: Importance | None, looks: Callable[[int], bool]
 ) -> Callable[[], float]:
     """Returns a function that takes a step or several and returns the loss of the last one.
@@ -57,11 +57,11 @@ def advancing(
     """
     plain = importance is None and state.exposure is None and state.poses is None
     if task.backend == "triton" and task.ranks.alone and plain:
-        return Ahead(state, task, looks).advance
+        return AsyncTrainer(state, task, looks).advance
     return Stepper(state, task, importance).step
 
 
-class Ahead:
+class AsyncTrainer:
     """Takes the steps of one call of `fit.fit` ahead of the device.
 
     Args:
@@ -90,7 +90,7 @@ class Ahead:
                 continue
             loss, skipped, happened = self._batch.close()
             if happened is not None:
-                self._take_back(happened)
+                self._rollback(happened)
             self._trail.clear()
             skip(state, task, skipped)
             if happened is not None:
@@ -126,7 +126,7 @@ class Ahead:
         return (self._looks(iteration) or len(self._trail) >= _FARTHEST
                 or schedule.densifies(iteration) or schedule.resets(iteration))
 
-    def _take_back(self, happened: int) -> None:
+    def _rollback(self, happened: int) -> None:
         """Returns to the state after the first steps of the trail; the others changed nothing."""
         before = self._trail[happened]
         self._state.iteration, self._state.queue = before.iteration, before.queue

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.context import Ranks, TrainCallback
+from recon_cli.context import ProcessGroup, TrainCallback
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.densify import budget
@@ -282,7 +282,7 @@ _WIDTHS = 3, 4, 3, 1, 3  # numbers of a Gaussian, parameter by parameter, higher
 
 
 def with_exchange(
-    cost: CostModel, ranks: Ranks, most: int, sh_degree: int, device: torch.device
+    cost: CostModel, ranks: ProcessGroup, most: int, sh_degree: int, device: torch.device
 ) -> CostModel:
     """Returns the cost of steps that `ranks` take together, from that of one process's share.
 
@@ -306,31 +306,31 @@ def with_exchange(
     return replace(cost, levels=levels, seconds=cost.seconds + time.perf_counter() - begin)
 
 
-def _led(ranks: Ranks, count: int, terms: int, device: torch.device) -> float:
+def _led(ranks: ProcessGroup, count: int, terms: int, device: torch.device) -> float:
     try:
-        ranks.told(EXCHANGE)
+        ranks.broadcast_int(EXCHANGE)
         for number in (count, terms, int(device.type == "cuda")):
-            ranks.told(number)
+            ranks.broadcast_int(number)
         return _exchange_ms(ranks, count, terms, device)
     except BaseException:  # the others are in the middle of it, and hear of nothing else
         ranks.leave()
         raise
 
 
-def join_exchange(ranks: Ranks) -> None:
+def join_exchange(ranks: ProcessGroup) -> None:
     """Takes part in an exchange that the leader times."""
-    count, terms, on_gpu = (ranks.told(0) for _ in range(3))
+    count, terms, on_gpu = (ranks.broadcast_int(0) for _ in range(3))
     _exchange_ms(ranks, count, terms, torch.device("cuda" if on_gpu else "cpu"))
 
 
-def _exchange_ms(ranks: Ranks, count: int, terms: int, device: torch.device) -> float:
+def _exchange_ms(ranks: ProcessGroup, count: int, terms: int, device: torch.device) -> float:
     """Returns the median of what a step with so many Gaussians exchanges."""
     gradients = [torch.zeros(count, width, device=device) for width in (*_WIDTHS, 3 * terms)]
     found, gathered = torch.zeros(11, dtype=torch.float64), DensificationStats.zeros(count, device)
     marks = []
     for _ in range(_ROUNDS + _WARM_UP + 1):
         marks.append(time.perf_counter())
-        ranks.told(0)
+        ranks.broadcast_int(0)
         ranks.add(gradients)
         ranks.add([found])
         gathered.over(ranks)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon_cli.context import Ranks
+from recon_cli.context import ProcessGroup
 from recon_cli.render import Statistics
 
 
@@ -43,10 +43,10 @@ class DensificationStats:
         self.radius = torch.maximum(self.radius, statistics.radii)
         self.variance += statistics.variance
 
-    def over(self, ranks: Ranks) -> None:
+    def over(self, ranks: ProcessGroup) -> None:
         """Takes together what the processes found that train together."""
         ranks.add([self.pull, self.count, self.variance])
-        ranks.raise_to_most(self.radius)
+        ranks.all_reduce_max(self.radius)
 
     def times(self, factor: Tensor) -> DensificationStats:
         """Returns all of it times a factor, a number on the device."""
@@ -60,6 +60,6 @@ class DensificationStats:
         self.variance += other.variance
 
     @property
-    def mean_pull(self) -> Tensor:
+    def mean_grad2d(self) -> Tensor:
         """Mean length per step in which the Gaussian was seen, [N]; 0 where it never was."""
         return self.pull / self.count.clamp_min(1)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.sparse_adam import Rows
+from recon_cli.train.sparse_adam import SparseAdam
 
 # Falling to a tenth as in INRIA 3DGS (exposure_lr_init .01, exposure_lr_final .001), but lower: in
 # 2,000 steps on two phone videos, from gains that were estimated, held-out views gained .72 and
@@ -41,7 +41,7 @@ class Exposure:
         first = np.zeros((images, 3)) if start is None else start
         if first.shape != (images, 3):
             raise ValueError(f"log-gains of shape {first.shape}, needed {(images, 3)}")
-        self._rows = Rows(torch.from_numpy(first - first.mean(axis=0)))
+        self._rows = SparseAdam(torch.from_numpy(first - first.mean(axis=0)))
 
     @property
     def log_gains(self) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ def fit(
     """
     start, cpu_start = time.perf_counter(), time.process_time()
     every = report_every(task.schedule)
-    advance = async_trainer.advancing(state, task, importance, lambda i: (
+    advance = async_trainer.choose_trainer(state, task, importance, lambda i: (
         i == until or i % every == 0 or any(callback.needs_step(i) for callback in callbacks)))
     while state.iteration < until:
         loss = advance()

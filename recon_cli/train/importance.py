@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon_cli.context import Ranks
+from recon_cli.context import ProcessGroup
 from recon_cli.render import Statistics, render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -77,11 +77,11 @@ class Importance:
         if self.leaves_out:
             self.loo += statistics.loo
 
-    def over(self, ranks: Ranks) -> None:
+    def over(self, ranks: ProcessGroup) -> None:
         """Takes together what the processes found that train together."""
         views = torch.tensor([self.views])
         ranks.add([views, self.hits, self.blend_sum, self.loo])
-        ranks.raise_to_most(self.blend_max)
+        ranks.all_reduce_max(self.blend_max)
         self.views = int(views)
 
     def score(

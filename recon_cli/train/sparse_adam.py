@@ -12,7 +12,7 @@ _EPSILON = 1e-15  # as for the splats: the gradient of a mean over all pixels is
 _ROLES = ("value", "exp_avg", "exp_avg_sq", "count")
 
 
-class Rows:
+class SparseAdam:
     """Adam (Kingma and Ba 2015, algorithm 1) that counts the steps of each row on its own.
 
     A row that was stepped for the first time moves by its rate, however late that is. On the CPU

@@ -171,5 +171,5 @@ def skip(state: TrainState, task: Task, steps: int = 1) -> None:
     if state.skipped > most:
         raise TrainingError(
             f"The loss is not finite at step {state.iteration}, as at {state.skipped - 1} steps "
-            f"before it; {most} are borne with.",
+            f"before it; at most {most} are allowed.",
             hint="Lower the learning rates, or run `recon train --again` with another --seed.")

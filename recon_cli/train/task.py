@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from recon_cli.context import ALONE, Ranks
+from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
 
@@ -40,7 +40,7 @@ class Task:
     device: torch.device
     jump: tuple[int, int] | None = None
     camera_error: float | None = None
-    ranks: Ranks = ALONE
+    ranks: ProcessGroup = SINGLE_PROCESS
 
     @cached_property
     def pyramid(self) -> Pyramid:

@@ -132,7 +132,7 @@ def waiting(figures: Figures, size: SceneSize) -> None:
     state, task = training(size, figures.device, still=True)
     for start in (GATHERING, AFTER):
         state.iteration = start
-        steps = async_trainer.Ahead(state, task, lambda _: False)
+        steps = async_trainer.AsyncTrainer(state, task, lambda _: False)
         steps._start()  # compiles
         torch.cuda.synchronize()
         found = f"{_FREE} steps from {start:,} on, recordings among them"

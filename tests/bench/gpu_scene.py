@@ -78,7 +78,7 @@ def stretch(
     state: TrainState, task: Task, start: int, steps: int
 ) -> Callable[[], None]:
     """Returns what takes the steps after `start`, as `recon train` takes them, and waits."""
-    advance = async_trainer.advancing(state, task, None, lambda now: now == start + steps)
+    advance = async_trainer.choose_trainer(state, task, None, lambda now: now == start + steps)
 
     def take() -> None:
         state.iteration = start

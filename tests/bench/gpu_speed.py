@@ -149,7 +149,7 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH)
 def _started(state: TrainState, task: Task) -> float:
     """Returns the milliseconds in which the host starts a step that was recorded before."""
     state.iteration = GATHERING
-    trainer = async_trainer.Ahead(state, task, lambda _: False)
+    trainer = async_trainer.AsyncTrainer(state, task, lambda _: False)
     for _ in range(_RECORDED):
         trainer._start()
     torch.cuda.synchronize()

@@ -6,7 +6,7 @@ import sys
 import torch
 from safetensors.torch import save_file
 
-from recon_cli.train.distributed.process_group import Processes
+from recon_cli.train.distributed.process_group import TorchProcessGroup
 
 
 def numbers(rank):
@@ -18,7 +18,7 @@ def numbers(rank):
 
 
 if __name__ == "__main__":
-    ranks = Processes.join()
+    ranks = TorchProcessGroup.join()
     tensors = numbers(ranks.rank)
     ranks.add(tensors)
     save_file({str(i): tensor for i, tensor in enumerate(tensors)},

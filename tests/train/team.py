@@ -17,7 +17,7 @@ from tiny_task import Hooks
 
 import recon_cli
 from recon_cli.train.distributed.data_parallel import dismiss, fit_together
-from recon_cli.train.distributed.process_group import Processes
+from recon_cli.train.distributed.process_group import TorchProcessGroup
 from recon_cli.train.state import save_state
 
 HERE = Path(__file__).parent
@@ -29,7 +29,7 @@ PATIENCE = 60  # seconds, for what takes a moment
 class Team:
     """The leader's end, and the others as processes."""
 
-    ranks: Processes
+    ranks: TorchProcessGroup
     others: list[subprocess.Popen]
     folder: Path
     fits: int = 0
@@ -83,7 +83,7 @@ def team(count, folder, script="follower.py"):
     others = [started(rank) for rank in range(1, count)]
     try:
         with mock.patch.dict(os.environ, place(0)):
-            ranks = Processes.join()
+            ranks = TorchProcessGroup.join()
         try:
             yield Team(ranks, others, folder)
         finally:

@@ -12,7 +12,7 @@ from scenes import camera_at, random_splats
 from tiny_task import STRATEGIES, Hooks, same
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from recon_cli.context import Ranks
+from recon_cli.context import ProcessGroup
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
@@ -295,7 +295,7 @@ def test_steps_of_several_views_go_ahead_to_the_same_bits(monkeypatch):
 def test_a_step_never_waits_for_the_device(views):
     config = dataclasses.replace(CONFIG, batch_views=views)
     state, task = first(config=config), task_of(config=config)
-    steps = async_trainer.Ahead(state, task, lambda _: False)
+    steps = async_trainer.AsyncTrainer(state, task, lambda _: False)
     steps._start()
     with NoWaiting():
         steps._start()
@@ -309,12 +309,12 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
         state, task = first(backend, config), task_of(backend, config)
         state.exposure = Exposure(3) if exposure else None
         task = dataclasses.replace(task, ranks=ranks) if ranks else task
-        found = async_trainer.advancing(state, task, importance, lambda _: False)
+        found = async_trainer.choose_trainer(state, task, importance, lambda _: False)
         return type(found.__self__)
 
-    assert chosen() is async_trainer.Ahead
+    assert chosen() is async_trainer.AsyncTrainer
     assert chosen("numba") is Stepper
     assert chosen(importance=Importance.zeros(COUNT, torch.device("cpu"))) is Stepper
     assert chosen(exposure=True) is Stepper
-    assert chosen(batch_views=2) is async_trainer.Ahead
-    assert chosen(ranks=Ranks(0, 2)) is Stepper
+    assert chosen(batch_views=2) is async_trainer.AsyncTrainer
+    assert chosen(ranks=ProcessGroup(0, 2)) is Stepper

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from tiny_task import CONFIG, first_state, same, tiny_task
 
-from recon_cli.context import Ranks
-from recon_cli.train.distributed.serialize import Fit, packed, unpacked
+from recon_cli.context import ProcessGroup
+from recon_cli.train.distributed.serialize import Fit, pack_fit, unpack_fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import _parts
 from recon_cli.train.schedule import RecoverySchedule
@@ -21,12 +21,12 @@ def test_a_fit_is_the_same_after_it_was_handed_over():
     state = first_state(config)
     state.exposure, state.poses = _parts(task, None)
     found = Importance.of_score("paper", 40, torch.device("cpu"))
-    ranks = Ranks(1, 2)
-    first = unpacked(packed(Fit(state, task, found, 3)), ranks)
-    known = dataclasses.replace(task, ranks=Ranks(0, 2, views=task.train))
-    second = packed(Fit(state, known, None, 3))
+    ranks = ProcessGroup(1, 2)
+    first = unpack_fit(pack_fit(Fit(state, task, found, 3)), ranks)
+    known = dataclasses.replace(task, ranks=ProcessGroup(0, 2, views=task.train))
+    second = pack_fit(Fit(state, known, None, 3))
     assert not [name for name in second if name.startswith("image")]
-    for one in (first, unpacked(second, ranks)):
+    for one in (first, unpack_fit(second, ranks)):
         assert one.task.schedule == plan
         assert (one.task.camera_error, one.task.extent, one.threads) == (0.25, 1.0, 3)
         assert same(one.state, state)

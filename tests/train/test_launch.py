@@ -16,7 +16,7 @@ from recon_cli import cli
 from recon_cli.cli import main
 from recon_cli.commands.options import Call
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.context import ALONE, Ranks, StageContext
+from recon_cli.context import SINGLE_PROCESS, ProcessGroup, StageContext
 from recon_cli.errors import BackendError
 from recon_cli.io.ply import read_ply
 from recon_cli.pipeline import execute
@@ -122,14 +122,14 @@ def test_verbs_that_do_not_train_run_once_and_the_others_end_well(tmp_path):
     (["--batch-views", "2"], 3, 6), ([], 3, 3), ([], 1, 1), (["--batch-views", "2"], 1, 2)])
 def test_the_views_of_a_step_are_those_of_all_processes(tmp_path, capsys, typed, count, views):
     words = ["train", "-w", str(tmp_path), "--print-config", *typed]
-    cli.cli.main(words, standalone_mode=False, obj=Call(ranks=Ranks(0, count)))
+    cli.cli.main(words, standalone_mode=False, obj=Call(ranks=ProcessGroup(0, count)))
     assert f"\nbatch_views = {views}\n" in capsys.readouterr().out
 
 
 def test_a_file_says_how_many_views_a_step_has_whoever_computes(tmp_path, capsys):
     (tmp_path / "recon.toml").write_text("[train]\nbatch_views = 4\n")
     words = ["train", "-w", str(tmp_path), "--print-config"]
-    cli.cli.main(words, standalone_mode=False, obj=Call(ranks=Ranks(0, 3)))
+    cli.cli.main(words, standalone_mode=False, obj=Call(ranks=ProcessGroup(0, 3)))
     assert "\nbatch_views = 4\n" in capsys.readouterr().out
 
 
@@ -139,7 +139,7 @@ def test_who_was_not_started_by_torchrun_is_alone(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert not launch.follows()
     with launch.leading() as ranks:
-        assert ranks is ALONE
+        assert ranks is SINGLE_PROCESS
 
 
 def test_one_process_by_torchrun_is_alone_too(monkeypatch):
@@ -147,7 +147,7 @@ def test_one_process_by_torchrun_is_alone_too(monkeypatch):
         monkeypatch.setenv(name, value)
     assert not launch.follows()
     with launch.leading() as ranks:
-        assert ranks is ALONE
+        assert ranks is SINGLE_PROCESS
 
 
 def test_processes_share_the_cores_of_their_machine(monkeypatch):
@@ -155,20 +155,21 @@ def test_processes_share_the_cores_of_their_machine(monkeypatch):
     monkeypatch.setattr(registry, "use_threads", lambda *_: None)
     for local, typed, threads in ((2, None, 3), (9, None, 1), (2, 5, 5), (1, None, 7)):
         ctx = execute.render_context(
-            ComputeConfig("cpu", "torch", typed), NullProgress(), Ranks(0, 9, local))
+            ComputeConfig("cpu", "torch", typed), NullProgress(), ProcessGroup(0, 9, local))
         assert ctx.threads == threads
 
 
 @pytest.mark.parametrize(("count", "notices"), [(4, 1), (3, 0), (1, 0)])
 def test_processes_that_no_view_is_left_for_are_told_of(count, notices, caplog):
     with caplog.at_level("WARNING", logger="recon"):
-        StageContext(ranks=Ranks(0, count)).notice_idle(3)
+        StageContext(ranks=ProcessGroup(0, count)).notice_idle(3)
     assert [record.getMessage() for record in caplog.records] == notices * [
         "1 of the 4 processes have nothing to do: a step takes --batch-views 3"]
 
 
 def test_a_process_without_a_gpu_is_named_before_anything_is_done(monkeypatch):
     monkeypatch.setattr(registry, "resolve", lambda *_: ("triton", "cuda"))
+    group = ProcessGroup(0, 3, 3, lacks_gpu=True)
     with pytest.raises(BackendError, match="3 processes were started") as raised:
-        execute.render_context(ComputeConfig(), NullProgress(), Ranks(0, 3, 3, lacks_gpu=True))
+        execute.render_context(ComputeConfig(), NullProgress(), group)
     assert "--nproc-per-node gpu" in raised.value.hint

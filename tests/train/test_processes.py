@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from team import PATIENCE, team
 from tiny_task import first_state, tiny_task
 
-from recon_cli.context import ALONE
+from recon_cli.context import SINGLE_PROCESS
 from recon_cli.errors import LostError
 from recon_cli.train.cost import CostModel, LevelCost, with_exchange
 
@@ -74,7 +74,7 @@ def test_what_a_step_exchanges_is_part_of_its_cost(tmp_path):
     assert added[0] == pytest.approx(added[1])
     assert sum(added[0]) > 0
     assert together.seconds > cost.seconds
-    assert with_exchange(cost, ALONE, 60_000, 1, cpu) is cost
+    assert with_exchange(cost, SINGLE_PROCESS, 60_000, 1, cpu) is cost
 
 
 def test_an_exchange_that_is_interrupted_lets_the_others_go(tmp_path, monkeypatch):

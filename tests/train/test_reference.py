@@ -74,7 +74,7 @@ def test_the_pull_is_measured_in_normalised_device_coordinates_over_seen_steps()
     gathered = DensificationStats.zeros(2, torch.device("cpu"))
     gathered.add(statistics, 20, 20)
     gathered.add(statistics, 20, 20)
-    assert gathered.mean_pull.tolist() == pytest.approx([0.5 * 10, 0.0])
+    assert gathered.mean_grad2d.tolist() == pytest.approx([0.5 * 10, 0.0])
     assert gathered.radius.tolist() == [5.0, 0.0]
 
 

@@ -47,7 +47,7 @@ def densify(
     """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones."""
     opaque = splats.opacities.detach() >= rule.min_opacity
     kept = opaque & _not_oversized(splats, gathered, rule)
-    selected = opaque & _hardest_pulled(gathered.mean_pull, rule, len(splats))
+    selected = opaque & _hardest_pulled(gathered.mean_grad2d, rule, len(splats))
     small = splats.scales.detach().amax(1) <= rule.clone_scale
     clones = torch.nonzero(selected & small & kept)[:, 0]
     splits = torch.nonzero(selected & ~small)[:, 0]

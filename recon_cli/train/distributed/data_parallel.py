@@ -13,12 +13,18 @@ from contextlib import suppress
 import torch
 from torch import Tensor
 
-from recon_cli.context import Ranks, TrainCallback, TrainReport
+from recon_cli.context import ProcessGroup, TrainCallback, TrainReport
 from recon_cli.errors import LostError, TrainingError
 from recon_cli.render import registry
 from recon_cli.scene.splats import Splats
 from recon_cli.train.cost import EXCHANGE, join_exchange
-from recon_cli.train.distributed.serialize import Fit, hand_out, packed, receive, unpacked
+from recon_cli.train.distributed.serialize import (
+    Fit,
+    pack_fit,
+    receive_arrays,
+    send_arrays,
+    unpack_fit,
+)
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import TrainState, tensors_of
@@ -55,23 +61,23 @@ def fit_together(
     if ranks.alone or state.iteration >= until:
         fit(state, task, until, callbacks, importance)
         return
-    arrays = packed(Fit(state, task, importance, threads))
+    arrays = pack_fit(Fit(state, task, importance, threads))
     leader = _Leader(state, task, until, callbacks)
     try:
-        ranks.told(_FIT)
-        hand_out(arrays, ranks)
+        ranks.broadcast_int(_FIT)
+        send_arrays(arrays, ranks)
         ranks.views = task.train
         del arrays
         leader.start_step()
         fit(state, task, until, (leader,), importance)
-        ranks.told(_END)
+        ranks.broadcast_int(_END)
         if importance is not None:
             importance.over(ranks)
     except BaseException as error:
         # what a step raises about the training, it raises in every process
         alike = leader.between_steps or isinstance(error, TrainingError)
         if alike and not isinstance(error, LostError):
-            ranks.told(_STOP)
+            ranks.broadcast_int(_STOP)
         else:
             ranks.leave()
         raise
@@ -88,7 +94,7 @@ class _Leader(TrainCallback):
 
     def start_step(self) -> None:
         """Has all processes take the next step."""
-        self._task.ranks.told(self._state.iteration)
+        self._task.ranks.broadcast_int(self._state.iteration)
         self.between_steps = False
 
     def on_step(self, iteration: int, splats: Splats) -> None:
@@ -113,25 +119,25 @@ class _Leader(TrainCallback):
         return True
 
 
-def dismiss(ranks: Ranks) -> None:
+def dismiss(ranks: ProcessGroup) -> None:
     """Tells the other processes that there is nothing more to do, and leaves them."""
     with suppress(LostError):  # who is gone need not be told
-        ranks.told(_DONE)
+        ranks.broadcast_int(_DONE)
     ranks.leave()
 
 
-def follow(ranks: Ranks) -> None:
+def follow(ranks: ProcessGroup) -> None:
     """Takes part in what the leader begins until it says that it is done.
 
     Raises:
         LostError: the leader is gone.
     """
     ready: set[str] = set()
-    while (word := ranks.told(_DONE)) != _DONE:
+    while (word := ranks.broadcast_int(_DONE)) != _DONE:
         if word == EXCHANGE:
             join_exchange(ranks)
             continue
-        given = unpacked(receive(ranks), ranks)
+        given = unpack_fit(receive_arrays(ranks), ranks)
         if given.task.backend not in ready:
             registry.use_threads(given.task.backend, given.threads)
             registry.prepare(given.task.backend, lambda: None)
@@ -145,7 +151,7 @@ def _take_part(given: Fit) -> None:
     """Takes the steps that the leader takes."""
     state, ranks = given.state, given.task.ranks
     stepper = Stepper(state, given.task, given.importance)
-    while (word := ranks.told(_STOP)) not in (_STOP, _END):
+    while (word := ranks.broadcast_int(_STOP)) not in (_STOP, _END):
         try:
             if word == _COMPARE:
                 _compare(state, ranks)
@@ -155,23 +161,23 @@ def _take_part(given: Fit) -> None:
         except LostError:
             raise
         except TrainingError:
-            if ranks.told(_STOP) != _STOP:  # the leader met nothing of the kind
+            if ranks.broadcast_int(_STOP) != _STOP:  # the leader met nothing of the kind
                 raise
             return
     if word == _END and given.importance is not None:
         given.importance.over(ranks)
 
 
-def _say_and_compare(state: TrainState, ranks: Ranks) -> None:
-    ranks.told(_COMPARE)
+def _say_and_compare(state: TrainState, ranks: ProcessGroup) -> None:
+    ranks.broadcast_int(_COMPARE)
     _compare(state, ranks)
 
 
-def _compare(state: TrainState, ranks: Ranks) -> None:
+def _compare(state: TrainState, ranks: ProcessGroup) -> None:
     """Raises TrainingError, in every process, unless all hold the same state."""
     digests = torch.tensor([_digest(tensor) for tensor in tensors_of(state).values()])
     most = torch.stack([digests, ~digests])
-    ranks.raise_to_most(most)
+    ranks.all_reduce_max(most)
     if not torch.equal(most[0], ~most[1]):
         raise TrainingError(
             f"The processes hold different Gaussians after step {state.iteration}.",

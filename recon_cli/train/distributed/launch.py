@@ -11,7 +11,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from recon_cli.context import ALONE, Ranks
+from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 from recon_cli.errors import LostError
 
 # RANK and WORLD_SIZE alone are set by other programs as well, for purposes of their own.
@@ -30,22 +30,22 @@ def _are_several() -> bool:
 
 
 @contextmanager
-def leading() -> Iterator[Ranks]:
+def leading() -> Iterator[ProcessGroup]:
     """Yields the processes that this one leads, and lets them go in the end.
 
     Raises:
         BackendError: they cannot be connected.
     """
     if not _are_several():
-        yield ALONE
+        yield SINGLE_PROCESS
         return
     # to be seen where they never all come: under somebody else's torchrun
     logger.info("one of %s processes that torchrun started: waiting for the others",
                 os.environ["WORLD_SIZE"])
     from recon_cli.train.distributed.data_parallel import dismiss
-    from recon_cli.train.distributed.process_group import Processes
+    from recon_cli.train.distributed.process_group import TorchProcessGroup
 
-    ranks = Processes.join()
+    ranks = TorchProcessGroup.join()
     del os.environ[_MARK]  # what this process starts itself is alone
     try:
         yield ranks
@@ -65,10 +65,10 @@ def follow() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logger.setLevel(logging.WARNING)
     from recon_cli.train.distributed.data_parallel import follow
-    from recon_cli.train.distributed.process_group import Processes
+    from recon_cli.train.distributed.process_group import TorchProcessGroup
 
     try:
-        follow(Processes.join())
+        follow(TorchProcessGroup.join())
     except LostError as error:
         return error.exit_code
     return 0

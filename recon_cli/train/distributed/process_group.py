@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from recon_cli.context import Ranks
+from recon_cli.context import ProcessGroup
 from recon_cli.errors import BackendError, LostError
 
 # The others wait while the leader maps a capture, which takes hours; a process that is gone is
@@ -25,14 +25,14 @@ _SMALL = 1 << 16  # numbers; sending fewer costs about as much as sending one
 
 
 @dataclass(eq=False)
-class Processes(Ranks):
+class TorchProcessGroup(ProcessGroup):
     """This process among those that torchrun started; all must call the same methods in turn.
 
     Any method raises LostError where another process is gone.
     """
 
     @staticmethod
-    def join() -> Processes:
+    def join() -> TorchProcessGroup:
         """Returns this process once all are there, by what torchrun put in the environment.
 
         Raises:
@@ -51,10 +51,10 @@ class Processes(Ranks):
                 f"The processes cannot be connected: {error}.",
                 hint="Start them with torchrun, and name the network with GLOO_SOCKET_IFNAME where "
                 "there are several.") from error
-        found = Processes(
+        found = TorchProcessGroup(
             dist.get_rank(), dist.get_world_size(), int(os.environ["LOCAL_WORLD_SIZE"]))
         seen = torch.tensor([own < gpus, own >= gpus], dtype=torch.int64)
-        found.raise_to_most(seen)
+        found.all_reduce_max(seen)
         found.lacks_gpu = bool(seen.all())
         return found
 
@@ -75,18 +75,18 @@ class Processes(Ranks):
                 tensor.copy_(flat[: tensor.numel()].view_as(tensor))
                 flat = flat[tensor.numel() :]
 
-    def raise_to_most(self, tensor: Tensor) -> None:
+    def all_reduce_max(self, tensor: Tensor) -> None:
         """Replaces the values of a tensor by the greatest of all processes."""
         with _connected():
             dist.all_reduce(tensor, dist.ReduceOp.MAX)
 
-    def told(self, number: int) -> int:
+    def broadcast_int(self, number: int) -> int:
         """Returns the number that the leader gives; the others' own does not matter."""
         word = torch.tensor([number], dtype=torch.int64)
-        self.spread(word)
+        self.broadcast(word)
         return int(word)
 
-    def spread(self, tensor: Tensor) -> None:
+    def broadcast(self, tensor: Tensor) -> None:
         """Replaces the values of a tensor by those of the leader's."""
         with _connected():
             dist.broadcast(tensor, 0)

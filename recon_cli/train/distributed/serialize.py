@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.context import Ranks
+from recon_cli.context import ProcessGroup
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.importance import Importance
@@ -48,7 +48,7 @@ class Fit:
     threads: int
 
 
-def packed(fit: Fit) -> dict[str, NDArray[Any]]:
+def pack_fit(fit: Fit) -> dict[str, NDArray[Any]]:
     """Returns arrays that say all about a fit; the first one is JSON.
 
     Views that all processes hold already are left out.
@@ -81,7 +81,7 @@ def packed(fit: Fit) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def unpacked(arrays: dict[str, NDArray[Any]], ranks: Ranks) -> Fit:
+def unpack_fit(arrays: dict[str, NDArray[Any]], ranks: ProcessGroup) -> Fit:
     """Returns the fit that `packed` took apart, for the process that `ranks` is."""
     said = json.loads(arrays["said"].tobytes())
     if said["cameras"]:
@@ -107,21 +107,21 @@ def unpacked(arrays: dict[str, NDArray[Any]], ranks: Ranks) -> Fit:
     return Fit(state, task, importance, said["threads"])
 
 
-def hand_out(arrays: dict[str, NDArray[Any]], ranks: Ranks) -> None:
-    """Sends arrays to all other processes, which `receive` them."""
+def send_arrays(arrays: dict[str, NDArray[Any]], ranks: ProcessGroup) -> None:
+    """Sends arrays to all other processes, which call `receive_arrays`."""
     listed = [[name, str(array.dtype), array.shape] for name, array in arrays.items()]
     names = np.frombuffer(json.dumps(listed).encode(), np.uint8).copy()
-    ranks.told(len(names))
+    ranks.broadcast_int(len(names))
     for array in (names, *arrays.values()):
-        ranks.spread(torch.from_numpy(np.ascontiguousarray(array)))
+        ranks.broadcast(torch.from_numpy(np.ascontiguousarray(array)))
 
 
-def receive(ranks: Ranks) -> dict[str, NDArray[Any]]:
-    """Returns the arrays that the leader hands out."""
-    names = np.zeros(ranks.told(0), np.uint8)
-    ranks.spread(torch.from_numpy(names))
+def receive_arrays(ranks: ProcessGroup) -> dict[str, NDArray[Any]]:
+    """Returns the arrays that the leader sends."""
+    names = np.zeros(ranks.broadcast_int(0), np.uint8)
+    ranks.broadcast(torch.from_numpy(names))
     arrays = {
         name: np.zeros(shape, dtype) for name, dtype, shape in json.loads(names.tobytes())}
     for array in arrays.values():
-        ranks.spread(torch.from_numpy(array))
+        ranks.broadcast(torch.from_numpy(array))
     return arrays
