@@ -1,4 +1,4 @@
-"""What every rasterizer promises. docs/rasterizer says it with the equations.
+"""The contract of every rasterizer; its equations are in docs/rasterizer.
 
 A backend is a function of the type `Renderer`. It culls tightly (a Gaussian meets a pixel where
 q <= 2 ln(255 o)), clamps alpha at .99, composites front to back in order of depth (ties in order
@@ -31,7 +31,7 @@ NEAR = 0.05  # world units; COLMAP's scenes measure about ten units across
 
 @dataclass(frozen=True)
 class Approximation:
-    """Where a picture may be cheaper than exact. The defaults are the contract.
+    """Where an image may be cheaper than exact. The defaults are the contract.
 
     Attributes:
         alpha_min: fragments below this alpha are dropped.
@@ -103,7 +103,7 @@ class Statistics:
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:
-    """An image and what came with it.
+    """The images of a view and their statistics.
 
     Attributes:
         rgb: [H, W, 3] colour over the background, not clamped.

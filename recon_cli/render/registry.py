@@ -194,7 +194,7 @@ def render(
         backend: a name from `available_backends`.
         scores: also gather hits, blend_sum and blend_max, and loo in the backward pass.
         mask: [H, W] bool, the pixels over which the scores are taken; None takes all. It changes
-            neither the picture nor a gradient.
+            neither the image nor a gradient.
 
     Returns:
         The image, alpha, depth and statistics; see `RenderOutput`.

@@ -127,11 +127,11 @@ def triton_candidate() -> Candidate:
         splats: Splats, camera: Camera, target: TargetImage, options: StepOptions
     ) -> StepResult:
         gradients, moved = splats.map(torch.zeros_like), splats.map(torch.clone)
-        step, taken = PhotometricStep(splats.means.device), 0
-        while taken < _REPEATS:
+        step, steps = PhotometricStep(splats.means.device), 0
+        while steps < _REPEATS:
             step(splats, gradients, camera, target, options)
             report = step.close()
-            taken += report.stopped is None  # else there is room for it now
+            steps += report.stopped is None  # else there is room for it now
         adam(*_adam_groups(moved, gradients), counted=step.counted, betas=_BETAS,
              taken=torch.zeros(1, dtype=torch.int64, device=splats.means.device), epsilon=_EPSILON)
         return StepResult(report.loss, gradients, moved)
@@ -171,10 +171,11 @@ def check(
     try:
         for label, splats, camera in _scenes(count, width, height):
             splats = splats.map(lambda tensor: tensor.to(device))
-            for what, error in _compare(candidate, splats, camera):
-                errors[f"{what}, {label} scene"] = error if math.isfinite(error) else _NOT_FINITE
-        wrong = [f"{what}: error {error:.3g} times what is allowed"
-                 for what, error in errors.items() if error > 1]
+            for quantity, error in _compare(candidate, splats, camera):
+                errors[f"{quantity}, {label} scene"] = (
+                    error if math.isfinite(error) else _NOT_FINITE)
+        wrong = [f"{quantity}: error {error:.3g} times what is allowed"
+                 for quantity, error in errors.items() if error > 1]
         failure = "; ".join(wrong[:3]) + (f"; {len(wrong) - 3} more" if len(wrong) > 3 else "")
     except Exception as error:  # compilers and drivers raise many types
         failure = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

@@ -176,7 +176,7 @@ class _DeviceStep:
                 break
         if gain is not None:
             self.log_gain_gradient = self._compute.log_gain_gradient.cpu().numpy()
-        return report.loss, statistics if report.seen else None
+        return report.loss, statistics if report.instances else None
 
 
 class _AutogradStep:

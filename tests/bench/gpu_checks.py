@@ -79,7 +79,7 @@ class _Again:
     def __init__(self, calls: list[int]) -> None:
         self._calls = calls
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Has no memory to give back."""
 
     def __call__(self, work: Callable[[], None]) -> Callable[[], None]:

@@ -198,7 +198,7 @@ def staged(
                       torch.zeros(3, device=device), 3, backend="triton", scores=True).statistics
     tiles = last_of.shape[0]
     counts = Counts(
-        size.gaussians, int((seen.radii > 0).sum()), account.seen, tiles,
+        size.gaussians, int((seen.radii > 0).sum()), account.instances, tiles,
         size.width * size.height, int(last_of.amax(1).sum()) * _AREA)
     medians = {name: middle(times) for name, times in found.items()}
     return medians, middle(wholes), counts, int(seen.hits.sum())

@@ -16,7 +16,6 @@ from recon_cli.render.numba.simd_functions import (
     absolute,
     bits,
     broadcast,
-    copy,
     count_bits,
     exp2,
     fetch_add,
@@ -342,7 +341,7 @@ def memory_probe(x, raw, at, out):
     store(out, 1, load(x, at))
     store(out, 1 + LANES, load_bytes(raw, at))
     store(out, 1 + 2 * LANES, broadcast(x, at))
-    copy(x, at, out, 1 + 3 * LANES)
+    store(out, 1 + 3 * LANES, load(x, at))
 
 
 @pytest.mark.parametrize("at", [0, 1, 5, 16])

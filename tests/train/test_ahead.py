@@ -140,7 +140,7 @@ def test_recorded_launches_give_the_same_bits(reference, monkeypatch):
     class Recorder:
         pools = 0
 
-        def begin_anew(self):
+        def reset(self):
             self.pools += 1
 
         def __call__(self, work):

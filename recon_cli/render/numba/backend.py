@@ -1,6 +1,6 @@
 """The numba backend behind the contract: float32 on the CPU, differentiable by autograd.
 
-Its kernels are loaded from the cache, or compiled with a progress to look at, before the first use.
+Its kernels are loaded from the cache, or compiled under a progress bar, before the first use.
 """
 
 from __future__ import annotations

@@ -35,19 +35,8 @@ from recon_cli.render.numba.compositing import (
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute,
-    broadcast,
-    exp2,
-    fetch_add,
-    fill,
-    fma,
-    lane_numbers,
-    largest,
-    load,
-    minimum,
-    select,
-    store,
-    totals,
+    absolute, broadcast, exp2, fetch_add, fill, fma, lane_numbers, largest, load, minimum, select,
+    store, totals
 )
 from recon_cli.render.numba.soa import (
     BATCH,

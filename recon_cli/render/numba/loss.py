@@ -1,4 +1,4 @@
-"""L1 and D-SSIM with their gradient, in two sweeps over the rows of an image.
+"""L1 and D-SSIM with their gradient, in two passes over the rows of an image.
 
     L = (1 - w) mean |x - y| + w (1 - mean SSIM(x, y))            (Kerbl et al. 2023, eq. 7)
     SSIM = a1 a2 / (b1 b2),  a1 = 2 mx my + C1,  a2 = 2 cov + C2,
@@ -18,17 +18,7 @@ from numpy.typing import NDArray
 from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute,
-    broadcast,
-    fetch_add,
-    fill,
-    fma,
-    lane_numbers,
-    load,
-    load_bytes,
-    select,
-    store,
-    total,
+    absolute, broadcast, fetch_add, fill, fma, lane_numbers, load, load_bytes, select, store, total
 )
 from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, pool
 

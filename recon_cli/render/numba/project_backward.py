@@ -13,64 +13,13 @@ from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.projection import C0, direction_gradient, write_basis
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    copy,
-    exp2,
-    fetch_add,
-    fill,
-    fma,
-    load,
-    maximum,
-    minimum,
-    select,
-    square_root,
-    store,
-    transpose,
+    exp2, fetch_add, fill, fma, load, maximum, minimum, select, square_root, store, transpose
 )
 from recon_cli.render.numba.soa import (
-    ABS_X,
-    ABS_Y,
-    BLOCK,
-    BLUE,
-    COUNT,
-    GRAD_BLUE,
-    GRAD_DEPTH,
-    GRAD_GREEN,
-    GRAD_RED,
-    GREEN,
-    LEAVE_ONE_OUT,
-    LOG2_E,
-    P_BASIS,
-    P_DX,
-    P_DY,
-    P_DZ,
-    P_LOGIT,
-    P_REST,
-    P_S0,
-    P_S1,
-    P_S2,
-    P_X,
-    P_Y,
-    P_Z,
-    PROJECTION_FLOATS,
-    RECORD,
-    RED,
-    S_SQUARED,
-    S_U,
-    S_UU,
-    S_UV,
-    S_V,
-    S_VV,
-    SLOT,
-    SQUARE,
-    U_X,
-    U_Y,
-    V_Y,
-    S,
-    gather,
-    image_axes,
-    planes_to_rows,
-    terms_of_group,
-    unit_quaternion,
+    ABS_X, ABS_Y, BLOCK, BLUE, COUNT, GRAD_BLUE, GRAD_DEPTH, GRAD_GREEN, GRAD_RED, GREEN,
+    LEAVE_ONE_OUT, LOG2_E, P_BASIS, P_DX, P_DY, P_DZ, P_LOGIT, P_REST, P_S0, P_S1, P_S2, P_X, P_Y,
+    P_Z, PROJECTION_FLOATS, RECORD, RED, S_SQUARED, S_U, S_UU, S_UV, S_V, S_VV, SLOT, SQUARE, U_X,
+    U_Y, V_Y, S, gather, image_axes, planes_to_rows, terms_of_group, unit_quaternion
 )
 
 _F = np.float32
@@ -88,9 +37,9 @@ GRADIENT_FLOATS = (_PULL + 15) * LANES
 
 @kernel
 def project_backward(counter, ids, block_starts, slot_start, sums, depths, means, quats, log_scales,
-              logits, sh_dc, sh_rest, stride, terms, view, records, g_means, g_quats,
-              g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad, absolute_grad, variance,
-              loo, scratch):
+                     logits, sh_dc, sh_rest, stride, terms, view, records, g_means, g_quats,
+                     g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad, absolute_grad,
+                     variance, loo, scratch):
     """Writes the gradients of all Gaussians, zero for those that were not seen."""
     n = len(logits)
     blocks = len(block_starts) - 1
@@ -128,7 +77,7 @@ def project_backward(counter, ids, block_starts, slot_start, sums, depths, means
                 transpose(scratch, SQUARE * LANES, scratch, (_SUMS + plane) * LANES)
                 for k in range(LANES):
                     j = first + min(k, count - 1)
-                    copy(records, j * RECORD + plane, scratch, (SQUARE + k) * LANES)
+                    store(scratch, (SQUARE + k) * LANES, load(records, j * RECORD + plane))
                 transpose(scratch, SQUARE * LANES, scratch, (_RECORD + plane) * LANES)
             colour_gradient(scratch, used)
             shape_gradient(scratch, view)

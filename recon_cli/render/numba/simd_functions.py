@@ -373,35 +373,14 @@ def transpose(_typing: Any, source: Any, at: Any, target: Any, to: Any) -> Any:
                 (i - step + LANES if i & step else i) for i in range(LANES)])
             high = ir.Constant(INTS, [
                 (i + LANES if i & step else i + step) for i in range(LANES)])
-            rows = _exchange(builder, rows, step, low, high)
+            for k in range(LANES):
+                if not k & step:
+                    a, b = rows[k], rows[k + step]
+                    rows[k] = builder.shuffle_vector(a, b, low)
+                    rows[k + step] = builder.shuffle_vector(a, b, high)
             step *= 2
         for k in range(LANES):
             builder.store(rows[k], row(end, k), align=4)
-        return context.get_dummy_value()
-
-    return types.void(source, at, target, to), emit
-
-
-def _exchange(builder: Any, rows: list[Any], step: int, low: Any, high: Any) -> list[Any]:
-    result = list(rows)
-    for k in range(LANES):
-        if not k & step:
-            a, b = rows[k], rows[k + step]
-            result[k] = builder.shuffle_vector(a, b, low)
-            result[k + step] = builder.shuffle_vector(a, b, high)
-    return result
-
-
-@intrinsic
-def copy(_typing: Any, source: Any, at: Any, target: Any, to: Any) -> Any:
-    """Copies LANES numbers from source[at] to target[to]."""
-    if not (_flat(source, types.float32, at) and _flat(target, types.float32, to)):
-        return None
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        begin = _as(builder, _address(context, builder, sig, args), VECTOR)
-        end = _as(builder, _address(context, builder, sig, args, 2), VECTOR)
-        builder.store(builder.load(begin, align=4, typ=VECTOR), end, align=4)
         return context.get_dummy_value()
 
     return types.void(source, at, target, to), emit

@@ -1,7 +1,9 @@
-"""Rows of higher SH coefficients in memory, and planes of them in scratch.
+"""The layouts that kernels share: records, slots, and structures of arrays of LANES Gaussians.
 
-Rows are `stride` numbers long, 9, 24 or 45, and only the first Gaussians have one; none of these is
-a multiple of LANES. Nothing is read or written behind the last row.
+In scratch each quantity of a group of LANES Gaussians is a plane, one vector. Raw parameters are
+gathered into planes; rows of higher SH coefficients are transposed both ways. Rows are `stride`
+numbers long, 9, 24 or 45, and only the first Gaussians have one; none of these is a multiple of
+LANES. Nothing is read or written behind the last row.
 """
 
 from __future__ import annotations
@@ -14,21 +16,13 @@ import numpy as np
 from recon_cli.render.numba.kernel import inlined
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute,
-    copy,
-    fill,
-    load,
-    maximum,
-    minimum,
-    select,
-    square_root,
-    store,
-    transpose,
+    absolute, fill, load, maximum, minimum, select, square_root, store, transpose
 )
 
 TILE_WIDTH = LANES  # one vector is one row of pixels of a tile
 TILE_HEIGHT = 16
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+
 RECORD = 16  # floats a Gaussian
 MEAN_X, MEAN_Y = 0, 1  # pixels
 U_X, U_Y, V_Y = 2, 3, 4
@@ -41,15 +35,19 @@ EXTENT_X, EXTENT_Y = 10, 11
 SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
 # What float32 drops of the mean: at 640 pixels it is 3e-5, and decides who reaches alpha = 1/255.
 MEAN_X_LOW, MEAN_Y_LOW = 14, 15
+
 FAR = 1e9  # pixels; the half of an ellipse that only its box cuts
 BATCH = 32  # instances of a tile that are prepared at a time
+
 # What the backward pass sums over the pixels of an instance, one slot of 16 numbers for each;
 # s = alpha dL/dalpha.
 SLOT = 16
 (GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_DEPTH, S, S_U, S_V, S_UU, S_UV, S_VV,
  ABS_X, ABS_Y, S_SQUARED, COUNT, LEAVE_ONE_OUT) = range(15)
+
 LOG2_E = math.log2(math.e)
 LOG2_ALPHA_MAX = math.log2(0.99)
+
 BLOCK = 1024  # Gaussians that a thread takes at a time
 _F = np.float32
 
@@ -183,7 +181,7 @@ def rows_to_planes(sh_rest, stride, ids, first, count, terms, scratch, plane, sp
         for k in range(LANES):
             row = stride * np.int64(ids[first + min(k, count - 1)])
             if row < len(sh_rest):
-                copy(sh_rest, row + at, scratch, (spare + k) * LANES)
+                store(scratch, (spare + k) * LANES, load(sh_rest, row + at))
             else:
                 store(scratch, (spare + k) * LANES, fill(0.0))
         transpose(scratch, spare * LANES, scratch, (plane + at) * LANES)
@@ -205,4 +203,4 @@ def planes_to_rows(scratch, plane, spare, terms, ids, first, count, slot_start, 
         for k in range(count):
             row = stride * np.int64(ids[first + k])
             if row < len(sh_rest) and slot_start[first + k + 1] > slot_start[first + k]:
-                copy(scratch, (spare + k) * LANES, sh_rest, row + at)
+                store(sh_rest, row + at, load(scratch, (spare + k) * LANES))

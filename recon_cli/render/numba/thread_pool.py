@@ -36,7 +36,7 @@ class ThreadPool:
 
     Attributes:
         threads: how many run a kernel; torch's number of threads if None.
-        observer: told the name of each kernel and the seconds that it took; None for nobody.
+        observer: called with the name of each kernel and the seconds that it took.
     """
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class ThreadPool:
         with self._lock:
             self._prepare(count)
 
-            ended: list[BaseException | None] = []  # what went wrong in each other thread
+            ended: list[BaseException | None] = []  # the failure of each other thread
 
             def call(number: int) -> None:
                 own = (self._scratch[number],) if scratch else ()
@@ -91,8 +91,8 @@ class ThreadPool:
     def _wait(self, ended: list[BaseException | None], count: int) -> BaseException | None:
         """Waits until `count` threads have ended; returns the Ctrl-C that came meanwhile.
 
-        Ctrl-C has to wait as well: no thread may still write when the arrays are handed on. What
-        counts is the list; a message on the queue only wakes, for an interrupt may lose one.
+        Ctrl-C has to wait as well: no thread may still write when the caller goes on. The list
+        decides; a message on the queue only wakes, because an interrupt may lose one.
         """
         interrupt: BaseException | None = None
         while len(ended) < count:
@@ -121,7 +121,7 @@ def _work(inbox: SimpleQueue[Callable[[], None]], wake: SimpleQueue[None]) -> No
 
 
 def _failure_of(call: Callable[[int], None], number: int) -> BaseException | None:
-    """Returns what a call raises: it belongs into the thread that waits."""
+    """Returns what a call raises, to be raised in the thread that waits."""
     try:
         call(number)
     except BaseException as error:

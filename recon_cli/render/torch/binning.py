@@ -22,34 +22,25 @@ _SLACK = 1e-3  # in q; a tile is kept when rounding leaves the test in doubt
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """E instances, known by two orders: by tile (to composite) and by Gaussian (to reduce).
-
-    Attributes:
-        tiles_x: tiles in a row.
-        tiles_y: tiles in a column.
-        gaussians: [E] int64, by tile and depth: row in the projection.
-        slots: [E] int64, by tile and depth: position in the order by Gaussian.
-        counts: [tiles_y * tiles_x] int64, instances of each tile.
-        per_gaussian: [M] int64, instances of each Gaussian.
-    """
+    """E instances, in two orders: by tile (to composite) and by Gaussian (to reduce)."""
 
     tiles_x: int
     tiles_y: int
-    gaussians: Tensor
-    slots: Tensor
-    counts: Tensor
-    per_gaussian: Tensor
+    gaussians: Tensor  # [E] int64, by tile and depth: row in the projection
+    slots: Tensor  # [E] int64, by tile and depth: position in the order by Gaussian
+    counts: Tensor  # [tiles_y * tiles_x] int64, instances of each tile
+    per_gaussian: Tensor  # [M] int64, instances of each Gaussian
 
 
 def bin_to_tiles(projection: Projection, width: int, height: int) -> Instances:
     """Returns the instances of all projected Gaussians for an image of width x height pixels."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    found = [_instances(projection, rows, boxes, tiles_x)
+    pairs = [_instances(projection, rows, boxes, tiles_x)
              for rows, boxes in _candidate_chunks(projection, tiles_x, tiles_y)]
     device = projection.means2d.device
     empty = torch.zeros(0, dtype=torch.int64, device=device)
-    gaussians = torch.cat([pair[0] for pair in found]) if found else empty
-    tiles = torch.cat([pair[1] for pair in found]) if found else empty
+    gaussians = torch.cat([pair[0] for pair in pairs]) if pairs else empty
+    tiles = torch.cat([pair[1] for pair in pairs]) if pairs else empty
     # The projection is sorted by depth, so a stable sort by tile leaves each tile in depth order.
     slots = torch.sort(tiles.to(torch.int32), stable=True).indices
     return Instances(

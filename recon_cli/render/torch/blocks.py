@@ -27,19 +27,12 @@ _PAIRS = {"cpu": 1 << 18, "cuda": 1 << 25}  # pairs a block: the second-level ca
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What the blocks read, one row a Gaussian; the last row is empty and pads short lists.
+    """What the blocks read, one row a Gaussian; the last row is empty and pads short lists."""
 
-    Attributes:
-        means2d: [M+1, 2] float64 centres, so that offsets from a far centre keep their digits.
-        whitening: [M+1, 3] float64 factors (l11, l12, l22) of the inverse covariance.
-        log_opacities: [M+1]; -inf in the last row, whose alpha is therefore 0.
-        channels: [M+1, 5] r, g, b, depth, one.
-    """
-
-    means2d: Tensor
-    whitening: Tensor
-    log_opacities: Tensor
-    channels: Tensor
+    means2d: Tensor  # [M+1, 2] float64 centres, so that offsets from a far centre keep their digits
+    whitening: Tensor  # [M+1, 3] float64 factors (l11, l12, l22) of the inverse covariance
+    log_opacities: Tensor  # [M+1]; -inf in the last row, whose alpha is therefore 0
+    channels: Tensor  # [M+1, 5] r, g, b, depth, one
 
 
 class Scratch:
@@ -56,27 +49,20 @@ class Scratch:
     def take(self, name: str, shape: tuple[int, ...]) -> Tensor:
         """Returns the buffer of that name as an uninitialised tensor of `shape`."""
         size = math.prod(shape)
-        held = self._buffers.get(name)
-        if held is None or held.numel() < size:
-            held = self._buffers[name] = self._like.new_empty(max(size, DEPTH * PIXELS))
-        return held[:size].view(shape)
+        buffer = self._buffers.get(name)
+        if buffer is None or buffer.numel() < size:
+            buffer = self._buffers[name] = self._like.new_empty(max(size, DEPTH * PIXELS))
+        return buffer[:size].view(shape)
 
 
 @dataclass(eq=False)
 class Block:
-    """A run of instances of some tiles.
+    """A run of instances of some tiles."""
 
-    Attributes:
-        tiles: [n] tile indices.
-        positions: [n, K] instance in tile order; E (one past the end) where a list is shorter.
-        rows: [n, K] row in the table.
-        before: [n, 256] transmittance in front of the block, kept for the backward pass.
-    """
-
-    tiles: Tensor
-    positions: Tensor
-    rows: Tensor
-    before: Tensor
+    tiles: Tensor  # [n] tile indices
+    positions: Tensor  # [n, K] instance in tile order; E (one past the end) where a list is shorter
+    rows: Tensor  # [n, K] row in the table
+    before: Tensor  # [n, 256] transmittance in front of the block, kept for the backward pass
 
 
 def build_table(
@@ -90,36 +76,30 @@ def build_table(
     _, b, c = cov2d.double().unbind(-1)
     det = det.double()
     whitening = torch.stack([(c / det).sqrt(), -b / (c * det).sqrt(), c.rsqrt()], dim=-1)
-    one = torch.ones_like(log_o)[:, None]
+    ones = torch.ones_like(log_o)[:, None]
     return Table(
         torch.nn.functional.pad(means2d.double(), (0, 0, 0, 1)),
         torch.nn.functional.pad(whitening, (0, 0, 0, 1)),
         torch.nn.functional.pad(log_o, (0, 1), value=-torch.inf),
-        torch.nn.functional.pad(torch.cat([channels, one], dim=-1), (0, 0, 0, 1)),
+        torch.nn.functional.pad(torch.cat([channels, ones], dim=-1), (0, 0, 0, 1)),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class TileLists:
-    """The instances of every tile in a form that blocks are cut from.
+class InstanceLists:
+    """The instances of every tile in a form that blocks are cut from."""
 
-    Attributes:
-        counts: [tiles] instances of each tile.
-        first: [tiles] position of the first one.
-        gaussians: [E+1] row in the table by position; the last one is the empty row.
-    """
-
-    counts: Tensor
-    first: Tensor
-    gaussians: Tensor
+    counts: Tensor  # [tiles] instances of each tile
+    first: Tensor  # [tiles] position of the first one
+    gaussians: Tensor  # [E+1] row in the table by position; the last one is the empty row
 
     @staticmethod
-    def of(instances: Instances) -> TileLists:
+    def of(instances: Instances) -> InstanceLists:
         """Returns the lists of some instances."""
         empty_row = len(instances.per_gaussian)
         gaussians = torch.nn.functional.pad(instances.gaussians, (0, 1), value=empty_row)
         first = torch.cumsum(instances.counts, 0) - instances.counts
-        return TileLists(instances.counts, first, gaussians)
+        return InstanceLists(instances.counts, first, gaussians)
 
     def groups(self) -> list[Tensor]:
         """Returns the tiles that have instances, in groups of similar length, longest first."""
@@ -210,7 +190,7 @@ def composite(
     return odds, after, torch.threshold_(live, _below(TRANSMITTANCE_MIN, alpha.dtype), 0.0)
 
 
-def whitened_moments(moments: Tensor, affine: Tensor) -> Tensor:
+def whiten_moments(moments: Tensor, affine: Tensor) -> Tensor:
     """Returns the sums [n, K, 6] of s times u, v, u^2, uv, v^2, 1, with s = alpha dL/dalpha.
 
     `moments` are the sums of s times 1, x, y, x^2, xy, y^2 at offsets from the tile's centre.
@@ -255,7 +235,7 @@ def gradients_of(
     return torch.stack([l11 * u, l12 * u + l22 * v], dim=-1), pull * scales, e * p + f * q
 
 
-def spread_of(
+def sum_magnitudes(
     slope: Tensor, weights: Tensor, affine: Tensor, monomials: Tensor, scratch: Scratch
 ) -> Tensor:
     """Returns [n, K, 4]: sum |s y| along x and y, sum s^2, and the number of fragments.

@@ -17,6 +17,9 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 
+# largest entry; smaller ones lose digits in float32 (denormal: 1e-38)
+_QUATERNION_MIN = 1e-30
+
 
 def colors_from_sh(
     offsets: Tensor,  # [V, 3] from the camera's centre to the Gaussians
@@ -37,37 +40,24 @@ def colors_from_sh(
     return colors.clamp_min(0)
 
 
-_QUATERNION_MIN = 1e-30  # largest entry; what is smaller loses digits in float32 (denormal: 1e-38)
-
-
 @dataclass(frozen=True, eq=False)
 class Projection:
     """M projected Gaussians, in order of depth.
 
-    Attributes:
-        ids: [M] int64 row of each in the splats.
-        means2d: [M, 2] projected centres in pixels.
-        directions: [M, 2, 3] J W R, the own axes at scale one on the image; times the scales they
-            are V, and the covariance is V V^T + 0.3 I.
-        log_scales: [M, 3].
-        cov2d: [M, 3] its entries (a, b, c) as [[a, b], [b, c]], pixels^2; carries no gradient.
-        det: [M] its determinant, computed without cancellation; carries no gradient.
-        opacities: [M] in (0, 1).
-        colors: [M, 3] seen from this camera, at least 0.
-        depths: [M] z in camera coordinates, world units.
-        broken: Gaussians that were culled because a value is not finite.
+    `directions` are J W R, the Gaussian's own axes at scale one on the image; times the scales they
+    are V, and the covariance is V V^T + 0.3 I. It and its determinant carry no gradient.
     """
 
-    ids: Tensor
-    means2d: Tensor
-    directions: Tensor
-    log_scales: Tensor
-    cov2d: Tensor
-    det: Tensor
-    opacities: Tensor
-    colors: Tensor
-    depths: Tensor
-    broken: int
+    ids: Tensor  # [M] int64, row of each in the splats
+    means2d: Tensor  # [M, 2] pixels
+    directions: Tensor  # [M, 2, 3]
+    log_scales: Tensor  # [M, 3]
+    cov2d: Tensor  # [M, 3] entries (a, b, c) of [[a, b], [b, c]], pixels^2
+    det: Tensor  # [M]
+    opacities: Tensor  # [M] in (0, 1)
+    colors: Tensor  # [M, 3] seen from this camera, at least 0
+    depths: Tensor  # [M] z in camera coordinates, world units
+    broken: int  # Gaussians that were culled because a value is not finite
 
 
 def project(splats: Splats, camera: Camera, sh_degree: int) -> Projection:
@@ -117,8 +107,9 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     rotation does not depend on the length.
     """
     largest = quats.detach().abs().amax(-1, keepdim=True)
-    given = largest > _QUATERNION_MIN
-    quats = torch.where(given, quats / largest.where(given, 1.0), quats.new_tensor([1.0, 0, 0, 0]))
+    nonzero = largest > _QUATERNION_MIN
+    unrotated = quats.new_tensor([1.0, 0, 0, 0])
+    quats = torch.where(nonzero, quats / largest.where(nonzero, 1.0), unrotated)
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     return torch.stack([
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -133,7 +124,7 @@ def _rotation(splats: Splats, camera: Camera) -> Tensor:
 
 
 def _finite(splats: Splats, sh_degree: int) -> Tensor:
-    """Returns a mask [N]: every value that a picture of this degree uses is finite."""
+    """Returns a mask [N]: every value that an image of this degree uses is finite."""
     used = splats.parameters() | {"sh_rest": splats.sh_rest[:, : (sh_degree + 1) ** 2 - 1]}
     finite = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
     for tensor in used.values():
@@ -160,7 +151,7 @@ def _project_rows(
     means2d = torch.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], dim=-1)
 
     # The linearisation blows up at grazing angles: hold x/z and y/z within the image widened by
-    # 15% on each side (INRIA 3DGS). clamp has zero gradient where it holds.
+    # 15% on each side (INRIA 3DGS). clamp has zero gradient there.
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
     u = u.clamp(-camera.cx / camera.fx - margin_x,
                 (camera.width - camera.cx) / camera.fx + margin_x)

@@ -1,12 +1,13 @@
 """The torch backend: a vectorized tile rasterizer for any device, in float32 or float64.
 
-Tiles are taken in groups of similar length and composited in blocks; see `torch_blocks`. The
+Tiles are taken in groups of similar length and composited in blocks; see `blocks`. The
 backward pass walks the blocks back to front and evaluates them again, so that memory does not
 grow with the pairs.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,15 +20,15 @@ from recon_cli.render.torch.blocks import (
     DEPTH,
     PIXELS,
     Block,
+    InstanceLists,
     Scratch,
-    TileLists,
     alphas,
     build_table,
     composite,
     gradients_of,
     pixel_monomials,
-    spread_of,
-    whitened_moments,
+    sum_magnitudes,
+    whiten_moments,
     whitening_of,
 )
 from recon_cli.render.torch.projection import Projection, project
@@ -52,10 +53,22 @@ def render(
     log_opacities = torch.nn.functional.logsigmoid(splats.logit_opacities[projection.ids])
     channels = torch.cat([projection.colors, projection.depths[:, None]], dim=-1)
     rgb, depth, alpha = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        _View(projection, instances, (camera.height, camera.width), statistics, scores, mask),
         projection.means2d, projection.directions, projection.log_scales, log_opacities, channels,
-        background, projection, instances, (camera.height, camera.width), statistics, scores,
-        mask)
+        background)
     return RenderOutput(rgb, alpha, depth, statistics)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What compositing reads beside the tensors that have gradients."""
+
+    projection: Projection
+    instances: Instances
+    size: tuple[int, int]  # height, width
+    statistics: Statistics
+    scores: bool
+    mask: Tensor | None  # [H, W]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -63,21 +76,20 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor, directions: Tensor, log_scales: Tensor, log_opacities: Tensor,
-        channels: Tensor, background: Tensor, projection: Projection, instances: Instances,
-        size: tuple[int, int], statistics: Statistics, scores: bool, mask: Tensor | None,
+        ctx: Any, view: _View, means2d: Tensor, directions: Tensor, log_scales: Tensor,
+        log_opacities: Tensor, channels: Tensor, background: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
+        projection, instances, size = view.projection, view.instances, view.size
         table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
         image = means2d.new_zeros(len(instances.counts), PIXELS, CHANNELS)
         # a pixel beyond the image is stopped from the start: it counts in no statistic
         transmittance = _to_tiles(means2d.new_ones(*size, 1), instances)[..., 0]
         monomials, scratch = pixel_monomials(means2d)[:3], Scratch(means2d)
         counting = None
-        if scores and mask is not None:
-            counting = _to_tiles(mask.to(means2d)[..., None], instances)[..., 0]
-        tally = _Tally(instances, means2d, counting) if scores else None
-        lists = TileLists.of(instances)
+        if view.scores and view.mask is not None:
+            counting = _to_tiles(view.mask.to(means2d)[..., None], instances)[..., 0]
+        tally = _Tally(instances, means2d, counting) if view.scores else None
+        lists = InstanceLists.of(instances)
 
         def composite_group(tiles: Tensor) -> list[Block]:
             blocks = []
@@ -95,10 +107,10 @@ class _Rasterize(torch.autograd.Function):
 
         groups = [composite_group(tiles) for tiles in lists.groups()]
         if tally:
-            tally.write(projection.ids, statistics)
+            tally.write(projection.ids, view.statistics)
         ctx.save_for_backward(
             means2d, directions, log_scales, log_opacities, channels, background, image)
-        ctx.rest = projection, instances, statistics, scores, counting, groups
+        ctx.rest = view, counting, groups
         left = 1 - image[..., 4:]
         rgb = _to_image(image[..., :3] + left * background, instances, size)
         depth = _to_image(image[..., 3:4], instances, size)[..., 0]
@@ -110,7 +122,8 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         means2d, directions, log_scales, log_opacities, channels, background, image = (
             ctx.saved_tensors)
-        projection, instances, statistics, scores, counting, groups = ctx.rest
+        view, counting, groups = ctx.rest
+        projection, instances, statistics = view.projection, view.instances, view.statistics
         table = build_table(means2d, projection.cov2d, projection.det, log_opacities, channels)
         monomials, scratch = pixel_monomials(means2d), Scratch(means2d)
         grads = torch.cat([grad_rgb, grad_depth[..., None], grad_alpha[..., None]], dim=-1)
@@ -120,9 +133,9 @@ class _Rasterize(torch.autograd.Function):
         # What is not covered shows the background: fold it into the channel of ones.
         grads[..., 4] -= grads[..., :3] @ background
         behind = means2d.new_zeros(len(instances.counts), PIXELS)  # sum of w (g . f) behind
-        composited = left * background if scores else None  # colour behind, not divided by T
+        composited = left * background if view.scores else None  # colour behind, not divided by T
         features = means2d.new_zeros(len(instances.gaussians) + 1, CHANNELS + 6)
-        scored = means2d.new_zeros(len(instances.gaussians) + 1, 5) if scores else None
+        scored = means2d.new_zeros(len(instances.gaussians) + 1, 5) if view.scores else None
         upper = means2d.new_ones(DEPTH, DEPTH).triu(1)
 
         def descend_group(blocks: list[Block]) -> None:
@@ -149,10 +162,10 @@ class _Rasterize(torch.autograd.Function):
                 slope = later.sub_(shade).mul_(unclamped.div_(1 + unclamped))  # alpha dL/dalpha
                 features[block.positions, :CHANNELS] = odds.mul_(live) @ grad
                 moments = slope.view(n * k, PIXELS) @ monomials.T
-                features[block.positions, CHANNELS:] = whitened_moments(
+                features[block.positions, CHANNELS:] = whiten_moments(
                     moments.view(n, k, 6), affine).to(means2d.dtype)
                 if scored is not None:
-                    scored[block.positions, :4] = spread_of(
+                    scored[block.positions, :4] = sum_magnitudes(
                         slope, odds, affine, monomials[:3], scratch)
 
         for blocks in groups:
@@ -163,8 +176,7 @@ class _Rasterize(torch.autograd.Function):
         shape = [gradient.to(means2d.dtype) for gradient in gradients_of(
             per_gaussian[:, 5:10], table.whitening[:-1], directions, log_scales)]
         statistics.means2d_grad[projection.ids] = shape[0]
-        return (*shape, per_gaussian[:, 10], per_gaussian[:, :4], grad_background,
-                None, None, None, None, None, None)
+        return None, *shape, per_gaussian[:, 10], per_gaussian[:, :4], grad_background
 
 
 def _leave_one_out(
@@ -192,7 +204,7 @@ def _leave_one_out(
 def _write_scores(
     scored: Tensor, per_gaussian: Tensor, ids: Tensor, statistics: Statistics
 ) -> None:
-    """Writes the statistics of the backward pass from the sums [M, 5] of `spread_of` and loo."""
+    """Writes the statistics of the backward pass: sums [M, 5] of `sum_magnitudes`, and loo."""
     statistics.absolute_grad[ids] = scored[:, :2]
     squares, count = scored[:, 2].double(), scored[:, 3].double().clamp_min(1)
     variance = squares - per_gaussian[:, 10].double().square() / count

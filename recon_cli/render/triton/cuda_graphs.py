@@ -1,6 +1,6 @@
-"""Recorded launches: what is started again and again in the same sizes is started as one.
+"""CUDA graphs: work that is started repeatedly in the same sizes is recorded and replayed.
 
-A recording holds every size and address of its first time. What differs from step to step must
+A recording holds every size and address of the first time. What differs from step to step must
 therefore lie in memory that the work reads.
 """
 
@@ -12,20 +12,22 @@ from typing import Protocol
 
 import torch
 
-logger = logging.getLogger("recon")
-_BEFORE = 2  # times that work is done as it is: kernels are compiled, and few steps need no more
+_BEFORE = 2  # times that work is run unrecorded: kernels are compiled, and few steps need no more
 _MOST = 8  # recordings that are kept at a time
+
+logger = logging.getLogger("recon")
+
 Work = Callable[[], None]
 
 
 class Recorder(Protocol):
     """Turns work into work that does the same to the same memory."""
 
-    def begin_anew(self) -> None:
-        """Gives back the memory of all recordings, which nobody has any more."""
+    def reset(self) -> None:
+        """Frees the memory of all recordings, which are no longer referenced."""
 
     def __call__(self, work: Work) -> Work:
-        """Returns what repeats the work, which it does not do.
+        """Returns a function that replays the work; does not run it.
 
         Raises:
             RuntimeError: the work cannot be recorded.
@@ -36,7 +38,7 @@ class Graphs:
     """Records work that comes up again.
 
     Args:
-        recorder: None does all work as it is.
+        recorder: None runs all work unrecorded.
     """
 
     def __init__(self, recorder: Recorder | None) -> None:
@@ -46,11 +48,11 @@ class Graphs:
 
     @staticmethod
     def of(device: torch.device) -> Graphs:
-        """Returns what suits a device: CUDA graphs, or nothing."""
+        """Returns CUDA graphs on a CUDA device, and no recording elsewhere."""
         return Graphs(_CudaGraphs(device) if device.type == "cuda" else None)
 
     def run(self, key: Hashable, work: Work) -> None:
-        """Does the work, by its recording once there is one.
+        """Runs the work, by its recording once there is one.
 
         Args:
             key: of all sizes and addresses; equal keys mean the same launches.
@@ -80,7 +82,7 @@ class Graphs:
         self._times.clear()
         if self._recorded and self._recorder is not None:
             self._recorded.clear()
-            self._recorder.begin_anew()
+            self._recorder.reset()
 
 
 class _CudaGraphs:
@@ -91,7 +93,7 @@ class _CudaGraphs:
         self._stream = torch.cuda.Stream(device)
         self._pool = torch.cuda.graph_pool_handle()
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Takes another pool: torch refuses one whose graphs are all gone."""
         self._pool = torch.cuda.graph_pool_handle()
         torch.cuda.empty_cache()  # or the old one's blocks would stay until memory runs out

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-STEPS, STOPPED, NEEDED, SKIPPED, SEEN, LOSS = (tl.constexpr(place) for place in range(6))
+STEPS, STOPPED, NEEDED, SKIPPED, INSTANCES, LOSS = (tl.constexpr(place) for place in range(6))
 _FIRST = (0.0, -1.0, 0.0, 0.0, 0.0, 0.0)
 _BLOCK = 256
 INFINITE = tl.constexpr(float("inf"))
@@ -48,7 +48,7 @@ def record_kernel(ends, count, room, loss, fits, status, counted):
     tl.store(status + NEEDED, tl.maximum(tl.load(status + NEEDED), total.to(tl.float64)))
     skipped = tl.load(status + SKIPPED)
     tl.store(status + SKIPPED, tl.where(going & (finite == 0), skipped + 1.0, skipped))
-    tl.store(status + SEEN, total.to(tl.float64))
+    tl.store(status + INSTANCES, total.to(tl.float64))
     tl.store(status + LOSS, value)
     tl.store(counted, (going & finite & (total > 0)).to(tl.int32))
 
@@ -62,14 +62,14 @@ class StepReport:
             after it changed nothing. None where all were taken.
         needed: most instances of a step.
         skipped: steps whose loss was not finite; they changed nothing.
-        seen: instances of the last step.
+        instances: of the last step.
         loss: of the last step.
     """
 
     stopped: int | None
     needed: int
     skipped: int
-    seen: int
+    instances: int
     loss: float
 
 
@@ -97,10 +97,11 @@ class StepStatus:
 
     def close(self) -> StepReport:
         """Waits for the device, returns what it recorded, and resets it."""
-        _, stopped, needed, skipped, seen, loss = self.numbers.tolist()
+        _, stopped, needed, skipped, instances, loss = self.numbers.tolist()
         self.numbers.copy_(self._first)
         return StepReport(
-            None if stopped < 0 else int(stopped), int(needed), int(skipped), int(seen), loss)
+            None if stopped < 0 else int(stopped), int(needed), int(skipped), int(instances),
+            loss)
 
 
 def admit_step(ends: Tensor, room: int, status: StepStatus, fits: Tensor) -> Tensor:
