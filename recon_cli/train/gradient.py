@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon_cli.lazy import load
 from recon_cli.render import Statistics, render
 from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.scene.camera import Camera
@@ -18,6 +19,8 @@ from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import camera_gradient
 
 if TYPE_CHECKING:
+    from recon_cli.render.numba.step import PhotometricStep as NumbaStep
+    from recon_cli.render.triton.step import PhotometricStep as TritonStep
     from recon_cli.render.triton.step_status import StepReport, StepStatus
 
 
@@ -90,9 +93,7 @@ class _FusedStep:
     """The numba backend's own loss and gradients, in buffers that are used again."""
 
     def __init__(self) -> None:
-        from recon_cli.render.numba.step import PhotometricStep
-
-        self._compute = PhotometricStep()
+        self._compute: NumbaStep = load("recon_cli.render.numba.step.PhotometricStep")()
 
     @property
     def log_gain_gradient(self) -> NDArray[np.float64]:
@@ -103,9 +104,9 @@ class _FusedStep:
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
     ) -> NDArray[np.float64]:
         """Returns the gradient [6] of a turn and a move of the camera."""
-        from recon_cli.render.numba.step import camera_gradient as numba_camera_gradient
-
-        return numba_camera_gradient(optimizer.splats, optimizer.gradients, camera, sh_degree)
+        gradient: NDArray[np.float64] = load("recon_cli.render.numba.step.camera_gradient")(
+            optimizer.splats, optimizer.gradients, camera, sh_degree)
+        return gradient
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
@@ -124,9 +125,7 @@ class _DeviceStep:
     """The triton backend's own loss and gradients; nothing but `close` waits for the device."""
 
     def __init__(self, device: torch.device) -> None:
-        from recon_cli.render.triton.step import PhotometricStep
-
-        self._compute = PhotometricStep(device)
+        self._compute: TritonStep = load("recon_cli.render.triton.step.PhotometricStep")(device)
         self.log_gain_gradient = np.zeros(3)
 
     @property

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.lazy import load
 from recon_cli.scene.splats import Splats, with_terms
 from recon_cli.train.schedule import RECIPES
 
@@ -164,16 +165,14 @@ class SplatOptimizer:
         self._rates["means"] = means_rate * self._extent / factor
         names = self._moved(sh_rest=sh_rest)
         if self._backend == "triton":
-            from recon_cli.render.triton.optimizer import step as triton_step
-
-            triton_step(*self._groups(names), taken=self._taken, counted=counted, betas=_BETAS,
-                        epsilon=_EPSILON)
+            load("recon_cli.render.triton.optimizer.step")(
+                *self._groups(names), taken=self._taken, counted=counted, betas=_BETAS,
+                epsilon=_EPSILON)
             return
         self._taken += 1
         if self.fused:
-            from recon_cli.render.numba.optimizer import step as numba_step
-
-            numba_step(*self._groups(names), count=self.count, betas=_BETAS, epsilon=_EPSILON)
+            load("recon_cli.render.numba.optimizer.step")(
+                *self._groups(names), count=self.count, betas=_BETAS, epsilon=_EPSILON)
         else:
             self._step_torch(names)
 

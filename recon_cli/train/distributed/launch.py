@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 from recon_cli.errors import LostError
+from recon_cli.lazy import load
 
 # RANK and WORLD_SIZE alone are set by other programs as well, for purposes of their own.
 _MARK = "TORCHELASTIC_RUN_ID"
@@ -42,15 +43,12 @@ def leading() -> Iterator[ProcessGroup]:
     # to be seen where they never all come: under somebody else's torchrun
     logger.info("one of %s processes that torchrun started: waiting for the others",
                 os.environ["WORLD_SIZE"])
-    from recon_cli.train.distributed.data_parallel import dismiss
-    from recon_cli.train.distributed.process_group import TorchProcessGroup
-
-    ranks = TorchProcessGroup.join()
+    ranks = load("recon_cli.train.distributed.process_group.TorchProcessGroup").join()
     del os.environ[_MARK]  # what this process starts itself is alone
     try:
         yield ranks
     finally:
-        dismiss(ranks)
+        load("recon_cli.train.distributed.data_parallel.dismiss")(ranks)
 
 
 def follow() -> int:
@@ -64,11 +62,9 @@ def follow() -> int:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logger.setLevel(logging.WARNING)
-    from recon_cli.train.distributed.data_parallel import follow
-    from recon_cli.train.distributed.process_group import TorchProcessGroup
-
+    processes = load("recon_cli.train.distributed.process_group.TorchProcessGroup")
     try:
-        follow(TorchProcessGroup.join())
+        load("recon_cli.train.distributed.data_parallel.follow")(processes.join())
     except LostError as error:
         return error.exit_code
     return 0
