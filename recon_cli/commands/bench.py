@@ -45,7 +45,7 @@ from recon_cli.progress import TqdmProgress
     "--compare", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
     help="Print the ratio of each figure of an earlier --json FILE to this run's.  "
          "[default: none]")
-@options.verbosity()
+@options.verbosity
 @pass_call
 @click.pass_context
 def bench(ctx: click.Context, call: Call, /, outputs: OutputFiles, **typed: Any) -> None:

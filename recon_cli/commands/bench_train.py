@@ -70,7 +70,7 @@ def scene_options(function: Command) -> Command:
 def compute_options(function: Command) -> Command:
     """Adds --set, device, backend, threads and -v."""
     for decorator in (
-        options.verbosity(), options.of(ComputeConfig),
+        options.verbosity, options.of(ComputeConfig),
         options.assignments("ingest.frames=200"),
     ):
         function = decorator(function)

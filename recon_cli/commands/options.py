@@ -160,6 +160,19 @@ def _store(name: str) -> Callable[[click.Context, click.Parameter, Any], None]:
     return store
 
 
+def _switch(flag: str, help: str, *short: str) -> Decorator:
+    """Returns a decorator that adds a flag, stored under its own name in `Call`."""
+    name = flag[2:].replace("-", "_")
+    return click.option(
+        *short, flag, name, is_flag=True, expose_value=False, callback=_store(name),
+        help=f"{help}  [default: off]")
+
+
+verbosity = _switch("--verbose", "Show details and tracebacks.", "-v")
+again = _switch("--again", "Run even if up to date.")
+print_config = _switch("--print-config", "Print options as TOML and exit.")
+
+
 def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPACE") -> Decorator:
     """Returns a decorator that adds -w, --config and -v.
 
@@ -176,53 +189,7 @@ def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPAC
             "--config", "config_file", type=click.Path(dir_okay=False, path_type=Path),
             expose_value=False, callback=_store("config_file"),
             help="TOML file with options.  [default: none]"),
-        verbosity(),
-    ])
-
-
-def verbosity() -> Decorator:
-    """Returns a decorator that adds -v."""
-    return click.option(
-        "-v", "--verbose", is_flag=True, expose_value=False, callback=_store("verbose"),
-        help="Show details and tracebacks.  [default: off]")
-
-
-def again() -> Decorator:
-    """Returns a decorator that adds --again."""
-    return click.option(
-        "--again", is_flag=True, expose_value=False, callback=_store("again"),
-        help="Run even if up to date.  [default: off]")
-
-
-def print_config() -> Decorator:
-    """Returns a decorator that adds --print-config."""
-    return click.option(
-        "--print-config", is_flag=True, expose_value=False, callback=_store("print_config"),
-        help="Print options as TOML and exit.  [default: off]")
-
-
-def sweep() -> Decorator:
-    """Returns a decorator that adds --sweep and --ratios."""
-    def parse(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[float, ...]:
-        try:
-            ratios = tuple(sorted({float(word) for word in text.split(",")}))
-        except ValueError:
-            ratios = ()
-        if not ratios or not 0 < ratios[0] <= ratios[-1] < 1:
-            raise click.BadParameter(
-                f"{text!r} is no list of shares between 0 and 1, such as 0.5,0.8.",
-                param=parameter)
-        return ratios
-
-    return _stack([
-        click.option(
-            "--sweep", is_flag=True,
-            help="Print what every score costs at every ratio on the validation views, with "
-                 "controls, write sweep.json and sweep.svg into the workspace, and exit.  "
-                 "[default: off]"),
-        click.option(
-            "--ratios", default="0.5,0.66,0.8,0.9", metavar="X,X,...", callback=parse,
-            show_default=True, help="With --sweep: fractions to remove."),
+        verbosity,
     ])
 
 
@@ -249,7 +216,7 @@ def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
         renders: the stage needs a rasterizer, so that device and backend can be chosen.
     """
     compute: Decorator = of(ComputeConfig, only=() if renders else ("threads",))
-    return _stack([of(config), compute, again(), print_config(), common()])
+    return _stack([of(config), compute, again, print_config, common()])
 
 
 def of(

@@ -53,7 +53,7 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 @click.option(
     "--compare", is_flag=True,
     help="Print what each filter would gain and lose on this capture, write compare.json into the "
-         "workspace, and stop.  [default: off]")
+         "workspace, and exit.  [default: off]")
 @options.stage(DenoiseConfig)
 @pass_call
 def denoise(call: Call, compare: bool) -> None:
@@ -115,8 +115,27 @@ def import_scene(call: Call, file: Path | None) -> None:
         call, IMPORT.verb, [IMPORT.name], sources=() if file is None else (file,), table=table)
 
 
+def _parse_ratios(
+    _ctx: click.Context, parameter: click.Parameter, text: str
+) -> tuple[float, ...]:
+    try:
+        ratios = tuple(sorted({float(word) for word in text.split(",")}))
+    except ValueError:
+        ratios = ()
+    if not ratios or not 0 < ratios[0] <= ratios[-1] < 1:
+        raise click.BadParameter(
+            f"{text!r} is no list of fractions between 0 and 1, such as 0.5,0.8.", param=parameter)
+    return ratios
+
+
 @verb("prune")
-@options.sweep()
+@click.option(
+    "--sweep", is_flag=True,
+    help="Print what every score costs at every ratio on the validation views, with controls, "
+         "write sweep.json and sweep.svg into the workspace, and exit.  [default: off]")
+@click.option(
+    "--ratios", default="0.5,0.66,0.8,0.9", metavar="X,X,...", callback=_parse_ratios,
+    show_default=True, help="With --sweep: fractions to remove.")
 @options.stage(PruneConfig, renders=True)
 @pass_call
 def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
@@ -175,8 +194,8 @@ def export(call: Call) -> None:
     help="Also prune in mid-training.  [default: on]")
 @options.assignments()
 @options.of(ComputeConfig)
-@options.again()
-@options.print_config()
+@options.again
+@options.print_config
 @options.common()
 @pass_call
 def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
@@ -191,7 +210,7 @@ def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
 @verb("demo")
 @options.assignments()
 @options.of(ComputeConfig)
-@options.again()
+@options.again
 @options.common(workspace="demo", envvar=None)
 @pass_call
 def demo(call: Call) -> None:
