@@ -150,11 +150,11 @@ def test_nothing_to_train_on_is_an_error(inputs, tmp_path):
 
 def test_export_hands_out_the_pruned_model_where_there_is_one(inputs, tmp_path):
     summary = run(export, ExportConfig(), inputs, tmp_path / "a")
-    assert summary["model"] == "pruned"
+    assert summary.model == "pruned"
     assert (tmp_path / "a" / "splats.ply").read_bytes() == (
         inputs.folders["prune"] / "splats.ply").read_bytes()
     summary = run(export, ExportConfig(model="base"), inputs, tmp_path / "b")
-    assert summary["gaussians"] == len(read_ply(inputs.folders["train"] / "splats.ply"))
+    assert summary.gaussians == len(read_ply(inputs.folders["train"] / "splats.ply"))
 
 
 def test_export_of_a_pruned_model_that_is_not_there_names_the_command(inputs, tmp_path):
