@@ -7,7 +7,8 @@ size of the picture.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -69,11 +70,29 @@ def check_encoding(encoding: VideoEncoding) -> None:
     _configure(context, encoding)
     context.time_base = 1 / encoding.rate
     try:
-        context.open()
+        with _restore_scheduling():
+            context.open()
     except av.error.FFmpegError as error:
         raise ConfigError(
             f"{encoder} cannot encode a video of {encoding.width}x{encoding.height} pixels at "
             f"{encoding.fps:g} fps.", hint="Give another --size, --fps or --codec.") from error
+
+
+@contextmanager
+def _restore_scheduling() -> Iterator[None]:
+    """Restores the scheduling of this thread at the end.
+
+    SVT-AV1 gives the thread that opens it real-time priority where the user is root, as in a
+    container, and leaves it so: what spins on that thread later would starve all others for good.
+    """
+    if not hasattr(os, "sched_getscheduler"):  # Linux alone has it
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
 
 
 def _configure(context: VideoCodecContext, encoding: VideoEncoding) -> None:
@@ -94,7 +113,7 @@ def encode_video(
     Args:
         pictures: RGB or gray files, in order.
         path: of the .mp4.
-        encoding: that `refuse_what_cannot_be_encoded` let pass.
+        encoding: that `check_encoding` accepted.
         threads: of the encoder.
         on_frame: called after each picture.
 
@@ -102,7 +121,7 @@ def encode_video(
         OSError: the file cannot be written.
         FormatError: a picture cannot be read.
     """
-    with replacing(path) as temporary, av.open(
+    with _restore_scheduling(), replacing(path) as temporary, av.open(
             str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream(encoding.encoder(), rate=encoding.rate)
         assert isinstance(stream, VideoStream)

@@ -1,5 +1,7 @@
 """Videos by PyAV, read back by PyAV."""
 
+import os
+
 import av
 import numpy as np
 import pytest
@@ -41,6 +43,16 @@ def test_a_video_holds_every_picture_at_its_size_and_pace(pictures, tmp_path, co
     for frame, path in zip(frames, pictures, strict=True):
         error = frame.to_ndarray(format="rgb24").astype(int) - read_image(path, 64, 48)
         assert np.abs(error).mean() < 3  # the colours of two by two pixels are one
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="Linux alone tells it")
+@pytest.mark.parametrize("codec", ["h264", "av1"])
+def test_an_encoder_leaves_the_scheduling_of_the_thread_as_it_was(pictures, tmp_path, codec):
+    before = os.sched_getscheduler(0)
+    check_encoding(VideoEncoding(codec, 12, 64, 48, 25.0))
+    assert os.sched_getscheduler(0) == before
+    make(pictures, tmp_path / "a.mp4", codec)
+    assert os.sched_getscheduler(0) == before
 
 
 def test_colours_are_stored_as_bt709_and_said_to_be(tmp_path):
