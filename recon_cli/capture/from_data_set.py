@@ -15,12 +15,12 @@ from recon_cli.capture.masks import opaque, read_mask, write_mask
 from recon_cli.capture.photos import MIN_FRAMES, names_in_order
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
-from recon_cli.io import frames as store
+from recon_cli.io import records as store
 from recon_cli.io.depth_points import points_from_depth
-from recon_cli.io.frames import Frame, Group, KnownPoses
 from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.io.layouts import describe, read_posed
 from recon_cli.io.posed import PosedImage, PosedSet
+from recon_cli.io.records import Frame, Group, KnownPoses
 from recon_cli.scene.camera import Lens
 
 

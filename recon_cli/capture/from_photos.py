@@ -37,9 +37,9 @@ from recon_cli.capture.raw import RawPlan, develop, plan_raw
 from recon_cli.capture.selection_record import FrameCandidate, Reason
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
-from recon_cli.io import frames as store
-from recon_cli.io.frames import Frame, Group
+from recon_cli.io import records as store
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
+from recon_cli.io.records import Frame, Group
 from recon_cli.workspace import atomic
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection

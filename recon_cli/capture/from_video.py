@@ -27,9 +27,9 @@ from recon_cli.capture.scan import Scan, decode_threads, scan_video
 from recon_cli.capture.video import declared_length, frames_at
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
-from recon_cli.io import frames as store
-from recon_cli.io.frames import Frame, Group
+from recon_cli.io import records as store
 from recon_cli.io.images import fit_image, fit_size, write_png
+from recon_cli.io.records import Frame, Group
 from recon_cli.workspace import atomic
 
 # A count by the duration may be off by this much, as a share or in frames (sound that ends a little

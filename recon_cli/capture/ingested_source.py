@@ -9,7 +9,7 @@ from typing import Protocol
 
 from recon_cli.capture.contact_sheet import SHEET, ContactSheet
 from recon_cli.capture.selection_record import CHOICE, FrameCandidate, write_choice
-from recon_cli.io.frames import Frame, Group, KnownPoses
+from recon_cli.io.records import Frame, Group, KnownPoses
 from recon_cli.progress import Progress
 
 

@@ -18,8 +18,7 @@ from recon_cli.lazy import load
 def _outputs(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[str, ...]:
     asked = text.split(",")
     if not set(asked) <= set(OUTPUTS):
-        raise click.BadParameter(
-            f"{text!r} is no list of {', '.join(OUTPUTS)}.", param=parameter)
+        raise click.BadParameter(f"{text!r} is no list of {', '.join(OUTPUTS)}.", param=parameter)
     return tuple(output for output in OUTPUTS if output in asked)
 
 

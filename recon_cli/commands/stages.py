@@ -31,8 +31,7 @@ SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune while training goes on
 FORMS = ("text", "markdown", "csv", "latex", "json")
 
-_inputs = click.argument(
-    "inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))
+_inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))
 
 
 @verb("ingest")
@@ -92,8 +91,7 @@ def train(call: Call, with_prune: bool, with_view: bool) -> None:
     with show_training(call) if with_view and not call.print_config else nullcontext() as live:
         callbacks = () if live is None else (live,)
         if with_prune:
-            run_stages(
-                call, "train --prune", ["train", "prune"], forced=MID, callbacks=callbacks)
+            run_stages(call, "train --prune", ["train", "prune"], forced=MID, callbacks=callbacks)
         else:
             run_stages(call, "train", ["train"], callbacks=callbacks)
 
@@ -115,9 +113,7 @@ def import_scene(call: Call, file: Path | None) -> None:
         call, IMPORT.verb, [IMPORT.name], sources=() if file is None else (file,), table=table)
 
 
-def _parse_ratios(
-    _ctx: click.Context, parameter: click.Parameter, text: str
-) -> tuple[float, ...]:
+def _parse_ratios(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[float, ...]:
     try:
         ratios = tuple(sorted({float(word) for word in text.split(",")}))
     except ValueError:

@@ -21,8 +21,7 @@ class IngestConfig(StageConfig):
     frames: int | None = option(
         None, "Number of frames to choose from videos and posed sequences.", unit="frames",
         minimum=3, automatic="by camera motion, up to --max-frames")
-    max_frames: int = option(
-        100, "Upper limit of the automatic number.", unit="frames", minimum=3)
+    max_frames: int = option(100, "Upper limit of the automatic number.", unit="frames", minimum=3)
     max_size: int = option(1920, "Longest side of a stored frame.", unit="pixels", minimum=64)
     holdout: str = option(
         "every:8", "Held-out test views: every:N (each Nth by name), segment:A:B (from share A to "
@@ -103,8 +102,7 @@ class SfmConfig(StageConfig):
         "it; off keeps the axes of the mapper.", choices=("auto", "off"))
     scale_between: tuple[str, str, float] | None = option(
         None, SCALE_BETWEEN, metavar="A B METRES", automatic="arbitrary scale")
-    max_minutes: float = option(
-        20.0, "Time limit.", unit="minutes", minimum=0.01, hashed=False)
+    max_minutes: float = option(20.0, "Time limit.", unit="minutes", minimum=0.01, hashed=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,8 +158,7 @@ class TrainConfig(StageConfig):
     max_gaussians: int | None = option(
         None, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS,
         automatic="auto, by image detail, steps and memory")
-    early_stop: bool = option(
-        True, "Skip to the final phase once validation PSNR stops improving.")
+    early_stop: bool = option(True, "Skip to the final phase once validation PSNR stops improving.")
     images: str = option(
         "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
         choices=("auto", "denoised", "original"))
@@ -181,8 +178,7 @@ class TrainConfig(StageConfig):
     means_rate: float = option(
         1.6e-4, "Initial learning rate of the means, times the scene extent (and 6 with budget); "
         "decays to a hundredth.", minimum=0.0, expert=True)
-    quats_rate: float = option(
-        1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)
+    quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)
     scales_rate: float = option(
         5e-3, "Learning rate of the log-scales; doubled with budget.", minimum=0.0, expert=True)
     opacities_rate: float = option(
@@ -232,8 +228,7 @@ class RunConfig(TrainConfig):
     iterations: int = option(3000, "Optimization steps.", minimum=1)
     max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)
     sh_degree: int = option(3, "Degree of the spherical harmonics.", minimum=0, maximum=3)
-    max_gaussians: int = option(
-        60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
+    max_gaussians: int = option(60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
 
 
 # Those that beat a random choice, and the paper's; `train.importance` knows more. docs/pruning.md

@@ -31,8 +31,8 @@ from recon_cli.evaluation.metrics import (
 )
 from recon_cli.evaluation.scores import ViewScore
 from recon_cli.io.colmap import read_scene
-from recon_cli.io.frames import read_frame_list
 from recon_cli.io.images import fit_camera, read_masked_image, to_uint8
+from recon_cli.io.records import read_frame_list
 from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View

@@ -12,7 +12,7 @@ from recon_cli.config.stages import ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
-from recon_cli.io.import_record import ImportRecord, has_views
+from recon_cli.io.records import ImportRecord, has_views
 from recon_cli.scene.gravity import camera_up, turn_onto
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.measure import Measurement, ScaleBetween, measure

@@ -23,9 +23,8 @@ from recon_cli.export.reduce import crop, fit_to_size, measure_change
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.colmap import write_colmap
-from recon_cli.io.frames import read_frame_list
-from recon_cli.io.import_record import ImportRecord, has_views
 from recon_cli.io.ply import write_points
+from recon_cli.io.records import ImportRecord, has_views, read_frame_list
 from recon_cli.io.splats.glb import nearest_axes, write_glb
 from recon_cli.io.splats.html import write_html
 from recon_cli.io.splats.registry import FORMATS
@@ -172,8 +171,7 @@ class Exporter:
         importance = Importance.of_score(_SCORE, len(on_device), on_device.means.device)
         add_views(importance, on_device, self._load_training_views(),
                   sh_degree=on_device.sh_degree, backend=self._ctx.backend)
-        return importance.score(
-            _SCORE, on_device, beta=0.0, generator=torch.Generator()).cpu()
+        return importance.score(_SCORE, on_device, beta=0.0, generator=torch.Generator()).cpu()
 
     def _load_training_views(self) -> list[TrainView]:
         """Returns the training views with their cameras in the world of the files."""

@@ -121,6 +121,5 @@ def align_to_views(
 def _flat_psnr(view: ReferenceView) -> float:
     """Returns the PSNR of an image in the view's mean colour."""
     pixels = view.image.reshape(-1, 3) if view.mask is None else view.image[view.mask]
-    flat = np.broadcast_to(
-        (pixels.mean(axis=0) / 255).astype(np.float32), view.image.shape)
+    flat = np.broadcast_to((pixels.mean(axis=0) / 255).astype(np.float32), view.image.shape)
     return psnr(flat, view.image, view.mask)

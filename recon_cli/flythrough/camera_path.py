@@ -107,8 +107,7 @@ def _read_frame(entry: Any, where: str) -> tuple[NDArray[np.float64], float]:
         raise FormatError(f"{where} is not a JSON object.", hint=_HINT)
     if "camera_to_world" not in entry:
         raise FormatError(f"{where} has no camera_to_world.", hint=_HINT)
-    viewmat = viewmat_from_pose(
-        entry["camera_to_world"], f"{where} camera_to_world", opengl=True)
+    viewmat = viewmat_from_pose(entry["camera_to_world"], f"{where} camera_to_world", opengl=True)
     fov = _read_number(entry, "fov", where)
     if not _FOV_DEG[0] <= fov <= _FOV_DEG[1]:
         raise FormatError(

@@ -137,9 +137,7 @@ def _horizontal(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def find_look_at(
-    cameras: list[Camera], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def find_look_at(cameras: list[Camera], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the point [3] that cameras look at, by the points in the middle of their pictures.
 
     Each camera looks at the point on its axis at the median depth of those points; the result is

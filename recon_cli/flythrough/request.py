@@ -120,8 +120,7 @@ class RenderRequest:
     def _check_video(self) -> None:
         codec = self.codec or CODECS[0]
         if self.crf is not None and not 0 <= self.crf <= _CRF_LIMITS[codec]:
-            raise ConfigError(
-                f"--crf is {self.crf}; {codec} accepts 0 to {_CRF_LIMITS[codec]}.")
+            raise ConfigError(f"--crf is {self.crf}; {codec} accepts 0 to {_CRF_LIMITS[codec]}.")
         if not self.video:
             for name in ("codec", "crf"):
                 if getattr(self, name) is not None:

@@ -13,8 +13,8 @@ from recon_cli.context import StageInputs
 from recon_cli.errors import StageError
 from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.export.synthetic_cameras import synthetic_scene
-from recon_cli.io.import_record import NEEDS_VIEWS_HINT, ImportRecord
 from recon_cli.io.ply import read_ply
+from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.freshness import WorkspaceCheck

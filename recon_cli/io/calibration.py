@@ -50,6 +50,23 @@ def viewmat_from_pose(value: Any, where: str, *, opengl: bool = False) -> NDArra
     return _OPENGL @ viewmat if opengl else viewmat
 
 
+def pose_from_viewmat(viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns [4, 4] camera to world with OpenGL axes: the inverse of `viewmat_from_pose`."""
+    pose = np.eye(4)
+    pose[:3, :3] = viewmat[:3, :3].T
+    pose[:3, 3] = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    return pose @ _OPENGL
+
+
+def rotation_matrix(quat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the [3, 3] rotation of a unit quaternion wxyz."""
+    w, x, y, z = quat
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+
+
 def _matrix(value: Any, where: str) -> NDArray[np.float64]:
     """Returns a finite [4, 4] matrix whose last row is 0 0 0 1."""
     try:
@@ -85,13 +102,8 @@ def _numbers(values: NDArray[np.float64]) -> str:
     return " ".join(f"{value:.4g}" for value in values)
 
 
-def make_lens(
-    model: str, width: float, height: float, params: Sequence[float], where: str
-) -> Lens:
-    """Returns the intrinsics of a file, checked for plausibility.
-
-    Raises:
-        FormatError: the model is unknown, or a number is missing, not finite or out of range.
+def make_lens(model: str, width: float, height: float, params: Sequence[float], where: str) -> Lens:
+    """Returns the intrinsics of a file; FormatError if they are unknown, incomplete or implausible.
     """
     if model not in MODELS:
         raise FormatError(
@@ -111,27 +123,18 @@ def make_lens(
 
 
 def lens_from_matrix(
-    matrix: NDArray[np.float64], width: int, height: int, where: str, *, first_center: float
+    matrix: NDArray[np.float64], width: int, height: int, where: str
 ) -> Lens:
     """Returns the PINHOLE intrinsics of a [3, 3] or [4, 4] matrix K.
 
-    Args:
-        matrix: fx 0 cx, 0 fy cy, 0 0 1 in its upper left.
-        width: image width in pixels.
-        height: image height in pixels.
-        where: the matrix, for messages.
-        first_center: where the file's convention puts the centre of the first pixel, 0 or 0.5;
-            ours is 0.5.
-
-    Raises:
-        FormatError: the matrix is skewed, or its numbers cannot be those of a camera.
+    In K the centre of the first pixel is at 0, here at 0.5. FormatError if K is skewed or no
+    camera's.
     """
-    shift = 0.5 - first_center
     if matrix.shape[0] < 3 or matrix.shape[1] < 3 or not np.isfinite(matrix).all():
         raise FormatError(f"{where} is no finite 3x3 or 4x4 matrix.")
     if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]) or abs(matrix[2, 2] - 1) > ORTHONORMAL:
         raise FormatError(f"{where} is no matrix of intrinsics without skew.")
-    params = (matrix[0, 0], matrix[1, 1], matrix[0, 2] + shift, matrix[1, 2] + shift)
+    params = (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
     return make_lens("PINHOLE", width, height, params, where)
 
 
@@ -146,14 +149,9 @@ def undistort_pixels(
     lens: Lens,
     pixels: NDArray[np.float64],  # [M, 2]
 ) -> NDArray[np.float64]:
-    """Returns [M, 2] x/z and y/z of the rays through pixels, without distortion.
+    """Returns [M, 2] x/z and y/z of the rays through pixels x, y, without distortion.
 
-    Args:
-        lens: intrinsics of every model but THIN_PRISM_FISHEYE.
-        pixels: x and y; the centre of the first pixel lies at 0.5.
-
-    Raises:
-        ValueError: the lens is a THIN_PRISM_FISHEYE, which OpenCV does not have either.
+    ValueError for a THIN_PRISM_FISHEYE, which OpenCV does not have either.
     """
     focals, _ = MODELS[lens.model]
     focal = np.array([lens.params[0], lens.params[focals - 1]])
@@ -173,11 +171,9 @@ def undistort_pixels(
 
 
 def _undo(distorted: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverts k1 k2 p1 p2 k3 k4 k5 k6 by the fixed point that cv2.undistortPoints iterates.
-
-    Not by OpenCV, whose versions 4 and 5 set the number of steps by different calls, and whose
-    default of five leaves 0.04 pixels at the corners of a lens with k1 = -0.28.
-    """
+    """Inverts k1 k2 p1 p2 k3 k4 k5 k6 by the fixed point that cv2.undistortPoints iterates."""
+    # Not OpenCV, whose default of five steps leaves 0.04 pixels at the corners for k1 = -0.28, and
+    # whose versions 4 and 5 set their number differently.
     k1, k2, p1, p2, k3, k4, k5, k6 = k
     undone = distorted.copy()
     for _ in range(_STEPS):

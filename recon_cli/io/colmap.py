@@ -1,6 +1,7 @@
 """COLMAP models of undistorted views: checked binary readers, and a writer by pycolmap.
 
-Binary files are parsed here, so that a damaged one is an error that names the file and the fault.
+Binary files are parsed here, so that a missing or damaged one is a FormatError that names the file
+and the fault.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from recon_cli.errors import FormatError, InputError
+from recon_cli.io.calibration import rotation_matrix
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View, split_views
 
@@ -55,55 +57,46 @@ def read_scene(
         denoised: folder of the denoised frames; None for the denoised/ beside images/.
 
     Raises:
-        FormatError: the model is missing, damaged, empty or not of pinhole cameras, or an image is
-            missing or it or its mask is not of its camera's size.
+        FormatError: the model is missing, damaged, empty or not of pinhole cameras, or an image or
+            its mask is missing or not of its camera's size.
     """
-    cameras = read_cameras(undistorted / "sparse" / "cameras.bin")
+    sparse = undistorted / "sparse"
     twins = undistorted / "denoised" if denoised is None else denoised
     views = []
-    for name, camera_id, viewmat in read_images(undistorted / "sparse" / "images.bin"):
-        if camera_id not in cameras:
-            raise model_error(
-                undistorted / "sparse", f"{name} has the unknown camera {camera_id}", _HINT)
-        inner = cameras[camera_id]
-        camera = Camera(
-            inner.width, inner.height, inner.fx, inner.fy, inner.cx, inner.cy, viewmat)
+    for name, inner, viewmat in _read_views(sparse):
+        camera = Camera(inner.width, inner.height, inner.fx, inner.fy, inner.cx, inner.cy, viewmat)
         mask = undistorted / "masks" / name
         view = View(name, camera, undistorted / "images" / name, twins / name,
                     mask if mask.exists() else None)
         for path in filter(None, (view.original, view.denoised, view.mask)):
             _check_size(path, camera)
         views.append(view)
-    points, colors = read_points(undistorted / "sparse" / "points3D.bin")
+    points, colors = read_points(sparse / "points3D.bin")
     train, chosen, test = split_views(views, held_out, validation=validation)
     if not views or not len(points):
-        raise model_error(
-            undistorted / "sparse", f"{len(views)} views and {len(points)} points", _HINT)
+        raise model_error(sparse, f"{len(views)} views and {len(points)} points", _HINT)
     missing = sorted(held_out - {view.name for view in views})
-    error = mean_point_error(undistorted / "sparse" / "points3D.bin")
+    error = mean_point_error(sparse / "points3D.bin")
     return Scene(train, chosen, test, tuple(missing), points, colors, error)
 
 
 def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
-    """Returns the camera of each view of an undistorted model, by name.
+    """Returns the camera of each view of an undistorted model, by name."""
+    return {name: pinhole for name, pinhole, _ in _read_views(sparse)}
 
-    Raises:
-        FormatError: the model is missing or damaged, or not of pinhole cameras.
-    """
+
+def _read_views(sparse: Path) -> list[tuple[str, Pinhole, NDArray[np.float64]]]:
+    """Returns the name, camera and [4, 4] world to camera of each view."""
     cameras = read_cameras(sparse / "cameras.bin")
-    views = read_images(sparse / "images.bin")
-    missing = [name for name, camera_id, _ in views if camera_id not in cameras]
-    if missing:
-        raise model_error(sparse, f"{missing[0]} has an unknown camera", _HINT)
-    return {name: cameras[camera_id] for name, camera_id, _ in views}
+    images = read_images(sparse / "images.bin")
+    for name, camera_id, _ in images:
+        if camera_id not in cameras:
+            raise model_error(sparse, f"{name} has the unknown camera {camera_id}", _HINT)
+    return [(name, cameras[camera_id], viewmat) for name, camera_id, viewmat in images]
 
 
 def read_cameras(path: Path) -> dict[int, Pinhole]:
-    """Returns the cameras of a cameras.bin by id.
-
-    Raises:
-        FormatError: the file is missing or damaged, or holds a camera that is no pinhole.
-    """
+    """Returns the cameras of a cameras.bin by id; FormatError unless all are pinholes."""
     reader = Reader(path, _HINT)
     cameras = {}
     for _ in range(reader.count(minimum=24)):
@@ -118,14 +111,8 @@ def read_cameras(path: Path) -> dict[int, Pinhole]:
     return cameras
 
 
-def read_images(
-    path: Path, *, hint: str = _HINT
-) -> list[tuple[str, int, NDArray[np.float64]]]:
-    """Returns (name, camera id, [4, 4] world to camera) of each image of an images.bin.
-
-    Raises:
-        FormatError: the file is missing or damaged.
-    """
+def read_images(path: Path, *, hint: str = _HINT) -> list[tuple[str, int, NDArray[np.float64]]]:
+    """Returns (name, camera id, [4, 4] world to camera) of each image of an images.bin."""
     reader = Reader(path, hint)
     images = []
     for _ in range(reader.count(minimum=73)):
@@ -140,21 +127,9 @@ def read_images(
     return images
 
 
-def read_points(
-    path: Path, *, hint: str = _HINT
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.bin, sorted by point id.
-
-    Raises:
-        FormatError: the file is missing or damaged.
-    """
-    reader = Reader(path, hint)
-    rows = []
-    for _ in range(reader.count(minimum=51)):
-        rows.append(reader.take("<Q3d3Bd")[:7])
-        reader.skip(8 * reader.count(minimum=8))  # image id and observation of each in the track
-    reader.end()
-    rows.sort()
+def read_points(path: Path, *, hint: str = _HINT) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.bin, sorted by point id."""
+    rows = sorted(row[:7] for row in _read_point_rows(path, hint))
     positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(positions).all():
         raise model_error(path, "a point that is not finite", hint)
@@ -165,17 +140,20 @@ def mean_point_error(path: Path) -> float | None:
     """Returns the mean reprojection error of a points3D.bin in pixels of its images.
 
     None if no point has any, as points from depth maps.
-
-    Raises:
-        FormatError: the file is missing or damaged.
     """
-    reader = Reader(path, _HINT)
-    errors = []
+    errors = [float(row[7]) for row in _read_point_rows(path, _HINT) if row[7] > 0]
+    return float(np.mean(errors)) if errors else None
+
+
+def _read_point_rows(path: Path, hint: str) -> list[tuple[Any, ...]]:
+    """Returns id, position, colour and error of each point."""
+    reader = Reader(path, hint)
+    rows = []
     for _ in range(reader.count(minimum=51)):
-        errors.append(float(reader.take("<Q3d3Bd")[7]))
-        reader.skip(8 * reader.count(minimum=8))
-    known = [error for error in errors if error > 0]
-    return float(np.mean(known)) if known else None
+        rows.append(reader.take("<Q3d3Bd"))
+        reader.skip(8 * reader.count(minimum=8))  # image id and observation of each in the track
+    reader.end()
+    return rows
 
 
 def _check_size(path: Path, camera: Camera) -> None:
@@ -197,18 +175,11 @@ def write_colmap(
     points: NDArray[np.float64],  # [P, 3]
     colors: NDArray[np.uint8],  # [P, 3]
 ) -> None:
-    """Writes a model of pinhole cameras, whole or not at all.
+    """Writes a model of pinhole cameras into a new or empty folder, whole or not at all.
 
-    Views with the same intrinsics share a camera. No observations are written.
-
-    Args:
-        folder: of the model, such as sparse/0; new or empty.
-        views: name of each image below the images' folder, and its camera.
-        points: in world units.
-        colors: RGB.
-
-    Raises:
-        InputError: there are no views, or the folder holds something.
+    Views are names below the folder of images, with their cameras; those with the same intrinsics
+    share a camera. No observations are written. InputError if there are no views, or the folder
+    holds something.
     """
     if not views:
         raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
@@ -289,23 +260,14 @@ class Reader:
             raise model_error(self._path, f"{rest} bytes too many", self._hint)
 
 
-def quat_to_matrix(quat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the [3, 3] rotation of a quaternion, wxyz, of any length but zero."""
-    quat = quat / np.abs(quat).max()  # so that squares stay finite
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])
-
-
 def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
     """Returns [4, 4] of a quaternion wxyz and a translation; None if they are no pose."""
     if not np.isfinite(pose).all() or not any(pose[:4]):
         return None
+    quat = np.array(pose[:4])
+    quat = quat / np.abs(quat).max()  # so that squares stay finite
     matrix = np.eye(4)
-    matrix[:3, :3] = quat_to_matrix(np.array(pose[:4]))
+    matrix[:3, :3] = rotation_matrix(quat / np.linalg.norm(quat))
     matrix[:3, 3] = pose[4:]
     return matrix
 

@@ -1,9 +1,9 @@
 """Whole COLMAP models of any camera model, binary or text, with or without rigs and frames.
 
-Newer models have rigs and frames beside their images,
-but images.bin and images.txt still hold the composed pose of each image (pycolmap 4.2), so rigs and
-frames are read only if the images file itself is missing. Observations and tracks are skipped. The
-layouts are those of COLMAP's src/colmap/scene/reconstruction_io; errors in text name the line.
+Newer models have rigs and frames beside their images, but images.bin and images.txt still hold the
+composed pose of each image (pycolmap 4.2), so rigs and frames are read only if the images file is
+missing. Observations and tracks are skipped. The layouts are those of COLMAP's
+src/colmap/scene/reconstruction_io; errors in text name the line.
 """
 
 from __future__ import annotations
@@ -47,11 +47,10 @@ class Model:
 
     lenses: dict[int, Lens]  # intrinsics by camera id
     images: list[NamedImage]  # in the order of the file
-    # (camera id, [4, 4] world to camera) by image id, if the file with the names is missing; else
-    # empty
+    # camera id and world to camera by image id; empty unless the file with the names is missing
     unnamed: dict[int, tuple[int, Pose]]
-    points: NDArray[np.float64]  # [P, 3] float64 sparse points
-    colors: NDArray[np.uint8]  # [P, 3] uint8 their RGB colours
+    points: NDArray[np.float64]  # [P, 3] sparse points
+    colors: NDArray[np.uint8]  # [P, 3] RGB of the points
 
 
 def model_suffix(folder: Path) -> str | None:
@@ -64,11 +63,7 @@ def model_suffix(folder: Path) -> str | None:
 
 
 def read_model(folder: Path) -> Model:
-    """Returns the model in a folder; the binary one if it has both forms.
-
-    Raises:
-        FormatError: the folder holds no model, or a damaged one.
-    """
+    """Returns the model in a folder, the binary one if it has both forms."""
     suffix = model_suffix(folder)
     if suffix is None:
         raise FormatError(f"{folder} holds no COLMAP model.", hint=_HINT)
@@ -89,8 +84,7 @@ def read_model(folder: Path) -> Model:
         raise model_error(folder, "no image has a pose", _HINT)
     if not points.is_file():
         return Model(lenses, named, unnamed, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    positions, colors = (
-        read_points(points, hint=_HINT) if binary else read_points_text(points))
+    positions, colors = (read_points(points, hint=_HINT) if binary else read_points_text(points))
     return Model(lenses, named, unnamed, positions, colors)
 
 
@@ -123,8 +117,7 @@ def _read_lenses(path: Path) -> dict[int, Lens]:
         camera_id, model, width, height = reader.take("<IiQQ")
         name = _IDS[model] if 0 <= model < len(_IDS) else str(model)
         params = reader.take(f"<{MODELS[name][1]}d") if name in MODELS else ()
-        lenses[camera_id] = make_lens(
-            name, width, height, params, f"{path}, camera {camera_id},")
+        lenses[camera_id] = make_lens(name, width, height, params, f"{path}, camera {camera_id},")
     reader.end()
     return lenses
 
@@ -201,11 +194,7 @@ def _read_images_text(path: Path) -> list[NamedImage]:
 
 
 def read_points_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.txt, sorted by point id.
-
-    Raises:
-        FormatError: the file is missing or a line is malformed.
-    """
+    """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.txt, sorted by point id."""
     rows = []
     for where, words in _rows(path, max_words=8):
         row = _numbers(words[:7], where, 7)

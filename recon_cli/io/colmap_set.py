@@ -22,14 +22,10 @@ _POINTS = 5000  # of the model, evenly spread; a view shows about a tenth of the
 _BETTER = 0.9
 
 
-def match_names_by_order(
+def _match_names_by_order(
     model: Model, candidates: Iterable[Path], model_at: Path
 ) -> tuple[list[NamedImage], Path]:
-    """Returns (name, camera id, world to camera) of each image, and the folder of the images.
-
-    Raises:
-        FormatError: the images are not as many as the poses, or their colours speak against it.
-    """
+    """Returns (name, camera id, world to camera) of each image, and the folder of the images."""
     ids = list(model.unnamed)
     for place in candidates:
         names = _image_names(place)
@@ -119,9 +115,7 @@ def lacks_cameras(folder: Path) -> bool:
 def read_colmap(folder: Path) -> PosedSet:
     """Returns a COLMAP model with its images.
 
-    Raises:
-        InputError: none of its images is there.
-        FormatError: the model is damaged, or an image is of another size than its camera.
+    InputError if no image exists; FormatError if the model is damaged or does not fit the images.
     """
     place = _find_model(folder)
     if place is None:
@@ -132,31 +126,24 @@ def read_colmap(folder: Path) -> PosedSet:
     if model.images:
         named, images, notices = _locate_images(model, candidates, folder)
     else:
-        named, images = match_names_by_order(model, candidates, model_at)
+        named, images = _match_names_by_order(model, candidates, model_at)
         notices = (f"the model lacks the names of its {len(named)} images; they were taken in the "
                    "order of the files, and their colours agree with it",)
     listed = []
     for name, camera, viewmat in sorted(named, key=lambda image: image[0]):
+        image = ListedImage(name, images / name, model.lenses[camera], viewmat)
         mask = folder / "masks" / f"{name}.png"  # as COLMAP's --ImageReader.mask_path names them
-        listed.append(ListedImage(
-            name, images / name, model.lenses[camera], viewmat,
-            mask=mask if is_file(mask) else None))
+        listed.append(replace(image, mask=mask) if is_file(mask) else image)
     posed = find_images("colmap", listed, model_at)
-    has_points = len(model.points) > 0
-    return replace(
-        posed, points=model.points if has_points else None,
-        colors=model.colors if has_points else None,
-        notices=(*notices, *_other_models(model_at), *posed.notices))
+    if len(model.points):
+        posed = replace(posed, points=model.points, colors=model.colors)
+    return replace(posed, notices=(*notices, *_other_models(model_at), *posed.notices))
 
 
 def _find_model(folder: Path) -> tuple[str, tuple[str, ...]] | None:
-    for place, images in _PLACES:
-        if model_suffix(folder / place) is None:
-            continue
-        if place == "undistorted/sparse" and not (folder / images[0]).is_dir():
-            continue
-        return place, images
-    return None
+    return next(((place, images) for place, images in _PLACES
+                 if model_suffix(folder / place) is not None
+                 and (place != "undistorted/sparse" or (folder / images[0]).is_dir())), None)
 
 
 def _list_reduced_folders(folder: Path) -> list[Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -24,21 +23,14 @@ _HALVINGS = 24  # of the interval of voxel sizes; the count then changes by less
 def points_from_depth(
     posed: PosedSet, *, max_points: int = MAX_POINTS
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Returns points [P, 3] in the world of the set, and their RGB colours [P, 3].
+    """Returns points [P, 3] in the world of the set, and their RGB colours [P, 3]; deterministic.
 
     Held-out images are not used: neither their depth nor their colours may be known before the
-    score. The same set gives the same points.
-
-    Args:
-        posed: a set in which some images have depth.
-        max_points: greatest number of points.
-
-    Raises:
-        InputError: no image that may be used has depth at any pixel.
-        FormatError: an image or its depth cannot be read.
+    score. InputError if no image that may be used has depth, FormatError if one cannot be read.
     """
     images = [image for image in posed.images if image.depth is not None and not image.held_out]
-    images = _spread(images)
+    count = min(len(images), MAX_FRAMES)
+    images = [images[int((at + 0.5) * len(images) / count)] for at in range(count)]
     pixels = sum(posed.lenses[image.lens].width * posed.lenses[image.lens].height
                  for image in images)
     step = max(1, math.ceil(math.sqrt(pixels / (_SAMPLES * max_points))))
@@ -51,11 +43,6 @@ def points_from_depth(
     colors = np.concatenate([color for _, color in clouds])
     rows = _thin(points, max_points)
     return points[rows], colors[rows]
-
-
-def _spread(images: Sequence[PosedImage]) -> list[PosedImage]:
-    count = min(len(images), MAX_FRAMES)
-    return [images[int((at + 0.5) * len(images) / count)] for at in range(count)]
 
 
 def _unproject(

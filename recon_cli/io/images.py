@@ -1,4 +1,4 @@
-"""Reading, writing and resizing of images and masks.
+"""Reading, writing and resizing of images and masks; a file that is none is a FormatError.
 
 There is one way to reduce an image, because the choice of filter alone can move a score.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.frames import AGAIN
+from recon_cli.io.records import AGAIN
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.atomic import write_bytes
 
@@ -31,14 +31,8 @@ def fit_camera(camera: Camera, max_size: int) -> Camera:
 
 
 def read_image(path: Path, width: int, height: int) -> NDArray[np.uint8]:
-    """Returns an image as [height, width, 3] RGB, reduced by area where it is larger.
-
-    Raises:
-        FormatError: the file is missing or no image.
-    """
-    data = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if data is None:
-        raise FormatError(f"{path} cannot be read as an image.", hint="Run `recon sfm --again`.")
+    """Returns an image as [height, width, 3] RGB, reduced by area where it is larger."""
+    data = _read(path, cv2.IMREAD_COLOR, "an image")
     if data.shape[:2] != (height, width):
         data = cv2.resize(data, (width, height), interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(data[:, :, ::-1], dtype=np.uint8)
@@ -49,13 +43,8 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
 
     A pixel of the reduced mask counts only if all pixels that it covers do, so that the same pixel
     of the image holds nothing to be ignored.
-
-    Raises:
-        FormatError: the file is missing or no image.
     """
-    data = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if data is None:
-        raise FormatError(f"{path} cannot be read as a mask.", hint="Run `recon sfm --again`.")
+    data = _read(path, cv2.IMREAD_GRAYSCALE, "a mask")
     ignored = (data < _COUNTS).astype(np.float32)
     if data.shape != (height, width):
         # zeros alone average to exactly 0; the mean of bytes would round a sliver away
@@ -63,15 +52,18 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     return np.asarray(ignored == 0)
 
 
+def _read(path: Path, flags: int, kind: str) -> NDArray[np.uint8]:
+    data: NDArray[np.uint8] | None = cv2.imread(str(path), flags)
+    if data is None:
+        raise FormatError(f"{path} cannot be read as {kind}.", hint="Run `recon sfm --again`.")
+    return data
+
+
 def fill_masked(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Returns an image [H, W, 3] whose ignored pixels have the mean colour of those that count.
 
     SSIM compares windows, so a pixel that counts depends on its neighbours under the mask. Their
     content must not matter, and black would be an edge stronger than all contrast around it.
-
-    Args:
-        image: [H, W, 3].
-        mask: [H, W], True where a pixel counts.
     """
     result = image.copy()
     result[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else 0
@@ -84,9 +76,6 @@ def read_masked_image(
     """Returns an image [height, width, 3], filled under its mask, and the mask [height, width].
 
     The mask is None where every pixel counts.
-
-    Raises:
-        FormatError: a file is missing or no image.
     """
     image = read_image(path, width, height)
     if mask is None:
@@ -110,11 +99,7 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
 
 
 def read_png(path: Path) -> NDArray[np.uint8]:
-    """Returns the pixels of a frame, RGB, [H, W, 3].
-
-    Raises:
-        FormatError: the file is no image.
-    """
+    """Returns the pixels of a frame, RGB, [H, W, 3]."""
     # Not cv2.imread, which cannot open every path on Windows.
     data = np.frombuffer(path.read_bytes(), np.uint8)
     bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None

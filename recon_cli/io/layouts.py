@@ -9,8 +9,7 @@ from pathlib import Path
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_set import is_colmap, lacks_cameras, read_colmap
 from recon_cli.io.posed import PosedSet
-from recon_cli.io.replica import is_replica, lacks_trajectory, read_replica
-from recon_cli.io.scannet import is_scannet, read_scannet
+from recon_cli.io.rgbd import is_replica, is_scannet, lacks_trajectory, read_replica, read_scannet
 from recon_cli.io.transforms import is_transforms, read_transforms
 
 
@@ -41,8 +40,7 @@ LAYOUTS: tuple[Layout, ...] = (
 
 def recognise(path: Path) -> str | None:
     """Returns the name of the layout that a path has, None where it has no known one."""
-    layout = _find(path)
-    return None if layout is None else layout.name
+    return next((row.name for row in LAYOUTS if row.fits(path)), None)
 
 
 def refuse_incomplete(path: Path) -> None:
@@ -68,11 +66,9 @@ def refuse_incomplete(path: Path) -> None:
 def read_posed(path: Path) -> PosedSet:
     """Returns the data set with poses at a path.
 
-    Raises:
-        InputError: the path has no known layout, or none of its images exists.
-        FormatError: a file of the data set is missing or damaged.
+    InputError if its layout is unknown or no image exists; FormatError if a file is damaged.
     """
-    layout = _find(path)
+    layout = next((row for row in LAYOUTS if row.fits(path)), None)
     if layout is None:
         known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
         raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
@@ -102,10 +98,6 @@ def describe(posed: PosedSet) -> str:
     if posed.missing:
         parts.append(f"{_count(len(posed.missing), 'image')} missing")
     return f"{words}: {', '.join(parts)}"
-
-
-def _find(path: Path) -> Layout | None:
-    return next((row for row in LAYOUTS if row.fits(path)), None)
 
 
 def _count(number: int, noun: str) -> str:

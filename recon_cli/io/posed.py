@@ -30,9 +30,8 @@ _MAX_DEPTH = float(np.finfo(np.float32).max)
 class DepthFile:
     """Reads the z-depth of an image from its file.
 
-    Depth of another size than the image is looked up at the nearest pixel along the same ray:
-    interpolation over an edge would give the depth of nothing. The rays are compared without
-    distortion.
+    Depth of another size than the image is looked up at the nearest pixel along the same ray,
+    because interpolation over an edge would give the depth of nothing. Distortion is left out.
     """
 
     path: Path  # the file
@@ -43,8 +42,7 @@ class DepthFile:
     def __call__(self) -> NDArray[np.float32]:
         """Returns [H, W] z-depth at the size of the image, in world units, 0 where unknown.
 
-        Raises:
-            FormatError: the file is missing, damaged or no depth.
+        FormatError if the file is missing, damaged or no depth.
         """
         values = _read_depth(self.path).astype(np.float64) * self.unit
         depth = np.where((values > 0) & (values < _MAX_DEPTH), values, 0).astype(np.float32)
@@ -114,14 +112,14 @@ class ListedImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image whose camera is known; the fields are those of `ListedImage`."""
+    """An image whose file exists; the other fields are those of `ListedImage`."""
 
     name: str
     path: Path
     lens: int  # index into the lenses of the set, which are of the size of the files
     viewmat: NDArray[np.float64]
     held_out: bool = False
-    depth: DepthFile | None = None  # reads z-depth, [H, W] float32 in world units, 0 where unknown
+    depth: DepthFile | None = None
     mask: Path | None = None
 
 
@@ -136,9 +134,8 @@ class PosedSet:
     metric: bool = False  # its unit is the metre
     sequence: bool = False  # its images are frames of one walk, in order
     splits: bool = False  # it says itself which images are held out
-    # [P, 3] float64 sparse points in its world, None if it has none
-    points: NDArray[np.float64] | None = None
-    colors: NDArray[np.uint8] | None = None  # [P, 3] uint8 their RGB colours, None with them
+    points: NDArray[np.float64] | None = None  # [P, 3] sparse points in its world, if it has any
+    colors: NDArray[np.uint8] | None = None  # [P, 3] RGB of the points
     notices: tuple[str, ...] = ()  # what the user should know about how it was read
 
 
@@ -156,8 +153,8 @@ def find_images(
         missing: names of further images that it lists, known to be missing.
 
     Raises:
-        FormatError: two images have one name, or one is of another size than its lens without all
-            others being so by the same factor.
+        FormatError: two images have one name, or the sizes of files and lenses differ by more than
+            one common factor.
         InputError: no image exists.
     """
     names = [*(item.name for item in listed), *missing]
@@ -177,8 +174,9 @@ def find_images(
     lenses: dict[Lens, int] = {}
     images = []
     for item, size in zip(existing, sizes, strict=True):
-        lens = item.lens if size == (item.lens.width, item.lens.height) else (
-            item.lens.resized(*size))
+        lens = item.lens
+        if size != (lens.width, lens.height):
+            lens = lens.resized(*size)
         images.append(PosedImage(
             item.name, item.path, lenses.setdefault(lens, len(lenses)), item.viewmat,
             item.held_out, item.depth and replace(item.depth, lens=lens), item.mask))
@@ -210,11 +208,7 @@ def _check_sizes(items: Sequence[ListedImage], sizes: Sequence[tuple[int, int]])
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Returns (width, height) of an image from its header.
-
-    Raises:
-        FormatError: the file is no image.
-    """
+    """Returns (width, height) of an image from its header; FormatError if it is none."""
     try:
         with warnings.catch_warnings():
             # Pillow warns from 89 megapixels and refuses from twice that.
@@ -238,15 +232,9 @@ def resolve_inside(folder: Path, name: object, where: str) -> Path:
     """Returns folder/name for a relative name that stays in the folder.
 
     A data set may come from anywhere, so it may not name files elsewhere on the disk, not even
-    images. Links below the folder are its owner's and are followed.
-
-    Args:
-        folder: the folder of the data set.
-        name: a path as the data set writes it, with either kind of slash.
-        where: the entry, for messages.
-
-    Raises:
-        FormatError: the name is no text, absolute, or leads out of the folder.
+    images. Links below the folder are its owner's and are followed. `name` is what the data set
+    writes, with either kind of slash, and `where` the entry for messages: FormatError if the name
+    is no text, absolute, or leads out of the folder.
     """
     if not isinstance(name, str) or not name.strip() or "\0" in name:
         raise FormatError(f"{where} has no file name.")

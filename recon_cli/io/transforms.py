@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.calibration import make_lens, viewmat_from_pose
-from recon_cli.io.ply_table import read_ply_points
+from recon_cli.io.calibration import make_lens, pose_from_viewmat, viewmat_from_pose
+from recon_cli.io.ply import read_ply_points
 from recon_cli.io.posed import (
     SUFFIXES,
     DepthFile,
@@ -36,12 +36,9 @@ from recon_cli.workspace.atomic import read_json, write_json
 
 _FISHEYE = ("OPENCV_FISHEYE",)
 # They share one meaning of k1, k2, p1, p2, and leave at zero what they do not have.
-_PERSPECTIVE = (
-    "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV",
-)
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # COLMAP's order in FULL_OPENCV
 _LARGEST = sys.float_info.max
-_OPENGL = np.diag([1.0, -1, -1, 1])  # from OpenGL's camera axes to OpenCV's
 _FILE = "transforms.json"
 _PARTS = ("train", "val", "test")
 _DEPTH_UNIT = 1e-3  # nerfstudio's default: depth in millimetres
@@ -51,13 +48,9 @@ _HINT = "Export it again from the program that it came from."
 def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
     """Returns the lens of a frame.
 
-    Args:
-        entry: the keys of the frame over those of the file.
-        size: (width, height) of the image in pixels, for where w and h are not given.
-        where: what a message calls the frame.
-
-    Raises:
-        FormatError: no focal length is given, the camera model is unknown, or a number is not one.
+    `entry` has the keys of the frame over those of the file; `size` is (width, height) of the
+    image, for where w and h are not given. FormatError if the focal length is missing, the camera
+    model is unknown, or a number is not one.
     """
     width = read_number(entry, "w", where) or float(size[0])
     height = read_number(entry, "h", where) or float(size[1])
@@ -116,11 +109,7 @@ def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float,
 
 
 def read_number(entry: Mapping[str, Any], key: str, where: str) -> float | None:
-    """Returns the number under a key, None where there is none.
-
-    Raises:
-        FormatError: what is there is no number that is finite.
-    """
+    """Returns the finite number under a key, None where there is none; else FormatError."""
     value = entry.get(key)
     if value is None:
         return None
@@ -157,11 +146,9 @@ def read_transforms(path: Path) -> PosedSet:
     """Returns the frames of a transforms.json, or of transforms_train/val/test.json.
 
     If the set names test views, these are held out and its validation views are left out, as the
-    literature scores it; if it names validation views alone, those are held out.
-
-    Raises:
-        InputError: no image is there.
-        FormatError: the file is no JSON, or a frame lacks a rigid pose, a lens or a file name.
+    literature scores it; if it names validation views alone, those are held out. InputError if no
+    image exists; FormatError if a file is damaged, or a frame lacks a rigid pose, a lens or a file
+    name.
     """
     frames: list[_Frame] = []
     for file, part in _files(path):
@@ -211,8 +198,7 @@ def _read_frames(file: Path, part: str | None) -> list[_Frame]:
         text = entry.get("file_path")
         path = _with_suffix(resolve_inside(file.parent, text, f"{file}, frame {at},"))
         own = part if parts is None else parts.get(_plain(text), "")
-        frames.append(_Frame(
-            {**common, **entry}, f"{file}, frame {text},", file.parent, path, own))
+        frames.append(_Frame({**common, **entry}, f"{file}, frame {text},", file.parent, path, own))
     return frames
 
 
@@ -296,11 +282,7 @@ def _list_frame(frame: _Frame, name: str, held_out: str) -> ListedImage:
 
 
 def _beside(frame: _Frame, key: str) -> Path | None:
-    """Returns the file of depth or mask that a frame names.
-
-    Raises:
-        FormatError: it is named, but not there.
-    """
+    """Returns the file of depth or mask that a frame names, which must exist."""
     if frame.entry.get(key) is None:
         return None
     path = resolve_inside(frame.folder, frame.entry[key], f"{frame.where} {key}")
@@ -375,7 +357,8 @@ def write_transforms(
         value |= {"train_filenames": [name for name in names if name not in held_out],
                   "val_filenames": test, "test_filenames": test}
     value["frames"] = [
-        {"file_path": name, **({} if shared else intrinsics), "transform_matrix": _pose(camera)}
+        {"file_path": name, **({} if shared else intrinsics),
+         "transform_matrix": pose_from_viewmat(camera.viewmat).tolist()}
         for (name, camera), intrinsics in zip(views, inner, strict=True)]
     write_json(path, value)
 
@@ -383,12 +366,3 @@ def write_transforms(
 def _intrinsics(camera: Camera) -> dict[str, float]:
     return {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
             "w": camera.width, "h": camera.height}
-
-
-def _pose(camera: Camera) -> list[list[float]]:
-    """Returns camera to world with OpenGL axes, [4, 4]."""
-    pose = np.eye(4)
-    pose[:3, :3] = camera.viewmat[:3, :3].T
-    pose[:3, 3] = camera.center
-    rows: list[list[float]] = (pose @ _OPENGL).tolist()
-    return rows

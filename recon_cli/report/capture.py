@@ -12,8 +12,8 @@ from markupsafe import Markup
 from recon_cli.config.stages import TrainConfig
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap import read_scene
-from recon_cli.io.frames import FOLDER, Frame, read_frame_list
 from recon_cli.io.images import fit_image, read_png
+from recon_cli.io.records import FOLDER, Frame, read_frame_list
 from recon_cli.report import floor_plan
 from recon_cli.report.chart import draw_mark, legend_item
 from recon_cli.report.gallery import data_uri, encode_sheet

@@ -15,7 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap import Pinhole
-from recon_cli.io.frames import read_poses
+from recon_cli.io.records import read_poses
 from recon_cli.scene.gravity import Gravity, find_gravity, upright_axes
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.job import MappingJob, Result, fresh_folder, publish

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from recon_cli.errors import SfmError
-from recon_cli.io.frames import KnownPoses, read_poses
+from recon_cli.io.records import KnownPoses, read_poses
 from recon_cli.sfm import checks, database, mapper, matching
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish

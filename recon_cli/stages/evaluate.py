@@ -42,8 +42,8 @@ from recon_cli.evaluation.reference_views import (
 )
 from recon_cli.evaluation.scores import ModelScore, csv_table, model_table, paper_table, view_table
 from recon_cli.io.images import to_uint8, write_png
-from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import read_ply
+from recon_cli.io.records import ImportRecord
 from recon_cli.scene.scene import Scene
 from recon_cli.train.callbacks import seconds_at
 from recon_cli.train.runner import LOG

@@ -15,8 +15,8 @@ from recon_cli.errors import StageError
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame
 from recon_cli.export.exporter import Exporter
 from recon_cli.export.verify import verify_ply
-from recon_cli.io.import_record import NEEDS_VIEWS_HINT, ImportRecord, has_views
 from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
 from recon_cli.scene.splats import transformed
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import ExportSummary

@@ -14,8 +14,8 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, InputError
 from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.export.import_alignment import Alignment, align_to_views, read_world
-from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import write_ply
+from recon_cli.io.records import ImportRecord
 from recon_cli.io.splats.registry import format_of
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.train.train_data import write_config

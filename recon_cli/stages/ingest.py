@@ -15,9 +15,9 @@ from recon_cli.capture.ingested_source import IngestedSource, merge_sources
 from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import InputError
-from recon_cli.io import frames as store
-from recon_cli.io.frames import FrameList
+from recon_cli.io import records as store
 from recon_cli.io.layouts import recognise, refuse_incomplete
+from recon_cli.io.records import FrameList
 from recon_cli.workspace.summaries import IngestSummary
 
 MIN_TRAINED = 2  # one view holds no depth

@@ -13,8 +13,8 @@ from typing import Any
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError
-from recon_cli.io import frames as store
-from recon_cli.io.frames import POSES, FrameList, read_poses
+from recon_cli.io import records as store
+from recon_cli.io.records import POSES, FrameList, read_poses
 from recon_cli.sfm import process
 from recon_cli.sfm.checks import list_names
 from recon_cli.sfm.job import CameraGroup, MappingJob, StepLog

@@ -21,8 +21,8 @@ from recon_cli.config.stages import PruneConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.io.import_record import ImportRecord
 from recon_cli.io.ply import read_ply
+from recon_cli.io.records import ImportRecord
 from recon_cli.train.callbacks import TrainLog, seconds_at
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.importance import Importance

@@ -104,8 +104,7 @@ def load_file(path: Path) -> ViewerContent:
     splats = read_splats(path)
     models = {path.name: pack_splats(splats)}
     if not len(models[path.name].splats):
-        raise FormatError(
-            f"{path} holds no Gaussian that can be drawn.", hint="Give another file.")
+        raise FormatError(f"{path} holds no Gaussian that can be drawn.", hint="Give another file.")
     box = box_around(splats)
     low, high = np.array(box.low), np.array(box.high)
     middle, corner = (low + high) / 2, low + 0.8 * (high - low)

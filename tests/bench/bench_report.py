@@ -21,8 +21,8 @@ import click
 import cv2
 
 from recon_cli.evaluation.tables import Table
-from recon_cli.io.frames import FOLDER
 from recon_cli.io.images import read_png, write_png
+from recon_cli.io.records import FOLDER
 from recon_cli.pipeline.execute import Job
 from recon_cli.report.build import write_report
 from recon_cli.report.gallery import MAX_FILE_BYTES, build_gallery

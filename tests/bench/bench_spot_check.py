@@ -14,7 +14,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.io.frames import FOLDER, POSES, read_frame_list, read_poses
+from recon_cli.io.records import FOLDER, POSES, read_frame_list, read_poses
 from recon_cli.sfm import known_poses
 from recon_cli.sfm import known_poses as spot_check
 from recon_cli.sfm.job import CameraGroup, MappingJob

@@ -67,15 +67,13 @@ def test_what_is_no_pose_is_refused(value, said):
 
 def test_a_matrix_with_pixel_centres_at_whole_numbers_is_moved_by_half_a_pixel():
     K = np.array([[300.0, 0, 299.5], [0, 310, 169.5], [0, 0, 1]])
-    assert lens_from_matrix(K, 600, 340, "K", first_center=0).params == (300, 310, 300, 170)
-    assert lens_from_matrix(K, 600, 340, "K", first_center=0.5).params == (300, 310, 299.5, 169.5)
+    assert lens_from_matrix(K, 600, 340, "K").params == (300, 310, 300, 170)
 
 
 def test_a_skewed_matrix_is_refused():
     with pytest.raises(FormatError, match="skew"):
         lens_from_matrix(
-            np.array([[300.0, 9, 299.5], [0, 310, 169.5], [0, 0, 1]]), 600, 340, "K",
-            first_center=0)
+            np.array([[300.0, 9, 299.5], [0, 310, 169.5], [0, 0, 1]]), 600, 340, "K")
 
 
 @pytest.mark.parametrize(("model", "size", "params", "said"), [

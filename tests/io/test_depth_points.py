@@ -7,7 +7,7 @@ from PIL import Image
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.depth_points import points_from_depth
-from recon_cli.io.replica import read_replica
+from recon_cli.io.rgbd import read_replica
 from recon_cli.scene.camera import Lens
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from recon_cli.errors import FormatError
-from recon_cli.io.ply_table import read_ply_points
+from recon_cli.io.ply import read_ply_points
 
 POINTS = np.array([[1.5, -2, 3], [4, 5, 6]])
 COLORS = np.array([[255, 0, 7], [1, 2, 3]])

@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 
 from recon_cli.errors import InputError
-from recon_cli.io.ply import write_points
-from recon_cli.io.ply_table import read_ply_points
+from recon_cli.io.ply import read_ply_points, write_points
 from recon_cli.scene.splats import SH_C0
 
 SPLATS = {

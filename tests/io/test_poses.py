@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from recon_cli.errors import FormatError
-from recon_cli.io.frames import POINTS, POSES, KnownPoses, read_poses
+from recon_cli.io.records import POINTS, POSES, KnownPoses, read_poses
 
 POSE = np.array([[0, -1, 0, 0.1], [1, 0, 0, 1 / 3], [0, 0, 1, 2], [0, 0, 0, 1.0]])
 

@@ -5,7 +5,7 @@ import posed_sets
 import pytest
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.replica import is_replica, read_replica
+from recon_cli.io.rgbd import is_replica, read_replica
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ import posed_sets
 import pytest
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.scannet import read_scannet
+from recon_cli.io.rgbd import read_scannet
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import numpy as np
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.io.frames import Frame, FrameList, Group
 from recon_cli.io.images import write_png
+from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.stages import sfm
 
 

@@ -16,8 +16,7 @@ from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.export import exporter
 from recon_cli.io.colmap import read_images
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.ply_table import read_ply_points
+from recon_cli.io.ply import read_ply, read_ply_points, write_ply
 from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
 from recon_cli.stages import export
 

@@ -18,8 +18,7 @@ from recon_cli.config.stages import ExportConfig, RunConfig, read_matrix
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.ply_table import read_ply_points
+from recon_cli.io.ply import read_ply, read_ply_points, write_ply
 from recon_cli.io.splats.registry import read_splats
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera

@@ -9,7 +9,7 @@ from facts import assert_facts
 from sfm_inputs import run, texture, write_inputs
 
 from recon_cli.errors import SfmError
-from recon_cli.io.frames import Frame, FrameList, Group
+from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.sfm.verdict import find_jumps
 from recon_cli.stages import sfm
 

@@ -10,24 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
+from recon_cli.io.splats.values import Floats
+
 BOOK = 256  # values of a byte
 _SAMPLE = 1 << 16  # numbers or rows that centres are fitted to; more change nothing
 _PAIRS = 1 << 26  # of rows and centres that are compared at a time: 256 MB
 _BOOK_ROUNDS = 20
 _ROUNDS = 10
-Floats = NDArray[np.float32]
 _Float = TypeVar("_Float", np.float32, np.float64)
 
 
 def fit_codebook(values: Floats, rng: np.random.Generator) -> Floats:
-    """Returns 256 ascending numbers that represent `values`.
+    """Returns 256 ascending numbers that represent at least one value.
 
     Lloyd's algorithm from 128 quantiles and 128 even steps, which cover the tails where quantiles
-    leave gaps.
-
-    Args:
-        values: of any shape, at least one.
-        rng: draws a sample if there are many values.
+    leave gaps; `rng` draws a sample if there are many values.
     """
     flat = values.ravel().astype(np.float64)  # whose squares neither underflow nor overflow
     ends = (float(flat.min()), float(flat.max()))
@@ -50,14 +47,10 @@ def fit_palette(
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Returns at most `size` representative rows [P, D] and the index of that of each row [M].
 
-    Two levels of k-means: about sqrt(size) groups first, then each group by itself, with a share
-    of the palette in proportion to its squared error. One level would compare every row with every
-    entry, which takes minutes for a million rows.
-
-    Args:
-        rows: [M, D], M at least 1. Duplicates count once.
-        size: entries wanted, at least 1.
-        rng: draws the rows that the search starts from.
+    Two levels of k-means: about sqrt(size) groups first, then each group by itself, with a share of
+    the palette in proportion to its squared error. One level would compare every row with every
+    entry, which takes minutes for a million rows. Duplicate rows count once; `rng` draws the rows
+    that the search starts from.
     """
     rows, copies = np.unique(rows, axis=0, return_inverse=True)
     peak = max(float(np.abs(rows).max()), float(np.finfo(np.float32).tiny))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.ply_table import Element, read_header, read_tables
+from recon_cli.io.ply import Element, format_header, read_header, read_tables
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
@@ -26,7 +26,7 @@ from recon_cli.io.splats.values import (
     morton_order,
     refuse_above,
     splats_from_arrays,
-    validate_splats,
+    to_arrays,
 )
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.workspace.atomic import replacing
@@ -49,16 +49,12 @@ def write_compressed_ply(path: Path, splats: Splats) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
 
     Log scales below -20 become -20, coefficients are clipped to -4 to 4, and none stays 0.
-
-    Raises:
-        FormatError: there are no Gaussians, one is too large, or a parameter is not finite.
+    FormatError if there are no Gaussians, one is too large, or a parameter is not finite.
     """
-    values = validate_splats(path, splats)
-    order = morton_order(values.means.numpy())
-    means, log_scales, quats, logits, sh_dc, sh_rest = (
-        value.numpy()[order] for value in (
-            values.means, values.log_scales, values.quats, values.logit_opacities, values.sh_dc,
-            values.sh_rest))
+    values = to_arrays(splats, path.name)
+    order = morton_order(values["means"])
+    means, log_scales, quats, logits, sh_dc, sh_rest = (values[name][order] for name in (
+        "means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest"))
     refuse_above(path, log_scales, _SCALE_RANGE)
     parts = [means, np.maximum(log_scales, -_SCALE_RANGE),
              (SH_C0 * sh_dc.astype(np.float64) + 0.5).astype(np.float32)]
@@ -76,12 +72,10 @@ def write_compressed_ply(path: Path, splats: Splats) -> None:
 
 
 def _header(n: int, terms: int) -> bytes:
-    rest = [f"property uchar f_rest_{i}" for i in range(3 * terms)]
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-n // _CHUNK)}",
-             *(f"property float {name}" for name in _BOUNDS), f"element vertex {n}",
-             *(f"property uint {name}" for name in _PACKED),
-             *([f"element sh {n}", *rest] if terms else []), "end_header", ""]
-    return "\n".join(lines).encode("ascii")
+    rest = [f"uchar f_rest_{i}" for i in range(3 * terms)]
+    return format_header({
+        "chunk": (-(-n // _CHUNK), [f"float {name}" for name in _BOUNDS]),
+        "vertex": (n, [f"uint {name}" for name in _PACKED]), **({"sh": (n, rest)} if rest else {})})
 
 
 def _bound_chunks(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
@@ -126,10 +120,8 @@ def _harmonic_bytes(sh_rest: Floats) -> Bytes:
 def read_compressed_ply(path: Path) -> Splats:
     """Returns the Gaussians of a compressed .ply in the file's order and degree.
 
-    Older files without bounds of colours are supported.
-
-    Raises:
-        FormatError: the file is missing, damaged, or another kind of .ply.
+    Older files without bounds of colours are supported. FormatError if the file is missing,
+    damaged, or another kind of .ply.
     """
     header = read_header(path)
     kinds = {each.name: _property_types(each) for each in header.elements}
@@ -168,7 +160,7 @@ def _has(kinds: dict[str, str], names: list[str], kind: str) -> bool:
 def _split_bits(
     words: Words, bits: tuple[int, ...], shifts: tuple[int, ...]
 ) -> NDArray[np.float64]:
-    """Returns [N, 3] shares of words [N]: the inverse of `_joined`."""
+    """Returns [N, 3] shares of words [N]: the inverse of `_join_bits`."""
     most = (1 << np.array(bits, np.uint32)) - 1
     return (words[:, None] >> np.array(shifts, np.uint32) & most) / most
 

@@ -27,13 +27,14 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
+from recon_cli.io.calibration import rotation_matrix
 from recon_cli.io.splats.values import (
+    UntrustedFile,
     logit,
     normalize_quats,
-    parse_json_object,
     sigmoid,
+    splats_from_arrays,
     to_arrays,
-    trim_zero_rows,
 )
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined, transformed
@@ -62,22 +63,14 @@ _JSON_LIMIT = 1 << 22  # bytes; a scene needs a thousandth of it
 _LARGEST = (1 << 32) - 1  # bytes: the header's length has 32 bits
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_HINT = "Write or copy the file again."
 
 
 def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -> None:
     """Writes `splats` to `path`, whole or not at all, in their order.
 
-    Quaternions are normalized. An opacity nearer to 1 than float32 can represent becomes 1.
-
-    Args:
-        path: of the .glb.
-        splats: at least one Gaussian.
-        axes: [3, 3] rotation from the scene's axes to x right, y up, z back.
-
-    Raises:
-        InputError: there are no Gaussians, a value is not finite or a scale beyond float32, or
-            the file would exceed 4 GiB.
+    Quaternions are normalized. An opacity nearer to 1 than float32 can represent becomes 1. `axes`
+    is the [3, 3] rotation from the scene's axes to x right, y up, z back. FormatError if there are
+    no Gaussians or a value is not finite; InputError if a scale exceeds float32, or the file 4 GiB.
     """
     table = to_arrays(transformed(splats, Similarity(rotation=axes)), ".glb")
     with np.errstate(over="ignore"):
@@ -141,11 +134,7 @@ def _describe(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def pack_glb(value: dict[str, Any], data: bytes) -> bytes:
-    """Returns the bytes of a .glb with this JSON and this binary chunk.
-
-    Raises:
-        InputError: they are more than a .glb can hold.
-    """
+    """Returns the bytes of a .glb with this JSON and this binary chunk; InputError beyond 4 GiB."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
@@ -257,18 +246,14 @@ def _read_primitive(
     }
     if {len(column) for column in (*table.values(), *rest)} != {len(means)}:
         raise container.error("attributes of different lengths")
-    table["sh_rest"] = trim_zero_rows(
-        np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3)))
-    return Splats(**{name: torch.from_numpy(value.astype(np.float32))
-                     for name, value in table.items()})
+    table["sh_rest"] = np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3))
+    return splats_from_arrays(container.path, table)
 
 
 def walk_meshes(container: Container) -> Iterator[tuple[dict[str, Any], Similarity]]:
     """Yields the meshes of the default scene, each with its similarity to the world.
 
-    Raises:
-        FormatError: nodes are missing, form a cycle, or stretch, shear or mirror a mesh, after
-            which its Gaussians would be none.
+    FormatError if nodes are missing, form a cycle, or stretch, shear or mirror a mesh.
     """
     scene = container.entry("scenes", container.json.get("scene", 0))
     pending = [(node, np.eye(4)) for node in _indices(container, scene, "nodes")]
@@ -283,7 +268,12 @@ def walk_meshes(container: Container) -> Iterator[tuple[dict[str, Any], Similari
             matrix = parent @ _matrix(container, node)
         pending += [(child, matrix) for child in _indices(container, node, "children")]
         if "mesh" in node:
-            yield container.entry("meshes", node["mesh"]), _similarity(container, matrix)
+            try:
+                similarity = Similarity.from_matrix(matrix)
+            except ValueError as error:
+                raise container.error(
+                    "a node that stretches, shears or mirrors its Gaussians") from error
+            yield container.entry("meshes", node["mesh"]), similarity
 
 
 def _indices(container: Container, entry: dict[str, Any], name: str) -> list[int]:
@@ -297,13 +287,10 @@ def _matrix(container: Container, node: dict[str, Any]) -> NDArray[np.float64]:
     """Returns the matrix [4, 4] of a node, given as a matrix or as its three parts."""
     if "matrix" in node:
         return _numbers(container, node, "matrix", np.eye(4).ravel()).reshape(4, 4).T
-    x, y, z, w = _numbers(container, node, "rotation", np.array([0.0, 0, 0, 1]))
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    quat = _numbers(container, node, "rotation", np.array([0.0, 0, 0, 1]))
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation * _numbers(container, node, "scale", np.ones(3))
+    scale = _numbers(container, node, "scale", np.ones(3))
+    matrix[:3, :3] = rotation_matrix(quat[[3, 0, 1, 2]]) * scale
     matrix[:3, 3] = _numbers(container, node, "translation", np.zeros(3))
     return matrix
 
@@ -311,45 +298,19 @@ def _matrix(container: Container, node: dict[str, Any]) -> NDArray[np.float64]:
 def _numbers(
     container: Container, node: dict[str, Any], name: str, default: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    value = node.get(name)
-    if value is None:
+    if node.get(name) is None:
         return default
-    largest = float(np.finfo(np.float32).max)
-    if not isinstance(value, list) or len(value) != len(default) or not all(
-            type(item) in (int, float) and abs(item) <= largest for item in value):
-        raise container.error(f"{name} = {value!r:.40}; needed are {len(default)} numbers")
-    return np.array(value, np.float64)
+    return container.numbers(node, name, len(default), len(default))
 
 
-def _similarity(container: Container, matrix: NDArray[np.float64]) -> Similarity:
-    try:
-        return Similarity.from_matrix(matrix)
-    except ValueError as error:
-        raise container.error(
-            "a node that stretches, shears or mirrors its Gaussians") from error
-
-
-class Container:
-    """An open .glb.
-
-    Attributes:
-        json: its JSON object.
-        size: bytes of its binary chunk.
-
-    Raises:
-        FormatError: from every method, if the file does not hold what it promises.
-    """
+class Container(UntrustedFile):
+    """An open .glb; every method raises FormatError if the file does not hold what it promises."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEADER.size + _CHUNK.size)
-                if len(head) < _HEADER.size + _CHUNK.size or not head.startswith(_MAGIC):
-                    raise FormatError(f"{path} is no .glb.")
-                data = head + file.read()
-        except OSError as error:
-            raise FormatError(f"{path} cannot be read: {error}.") from error
+        super().__init__(path, _MAGIC, ".glb")
+        data = self.data
+        if len(data) < _HEADER.size + _CHUNK.size:
+            raise FormatError(f"{path} is no .glb.")
         _, version, length = _HEADER.unpack_from(data)
         if version != _VERSION:
             raise self.error(f"version {version} of the container; version 2 can be read")
@@ -363,12 +324,8 @@ class Container:
             kind, self._bytes, _ = self._chunk(data, at)
             if kind != _BIN:
                 raise self.error(f"a second chunk {kind!r}, needed is BIN")
-        self.size = len(self._bytes)
-        self.json = self._parse(text)
-
-    def error(self, content: str) -> FormatError:
-        """Returns the error for this file holding `content`."""
-        return FormatError(f"{self._path} holds {content}.", hint=_HINT)
+        self.size = len(self._bytes)  # of the binary chunk
+        self.json = self.json_object(bytes(text))
 
     def entry(self, group: str, index: object) -> dict[str, Any]:
         """Returns an entry of nodes, meshes, accessors and so on."""
@@ -391,9 +348,9 @@ class Container:
             raise self.error(
                 f"an accessor of {entry.get('type')!r:.40} and {component!r:.40}, not of {kind}")
         item, width = np.dtype(_COMPONENTS[component]), _WIDTHS[kind]
-        count = self._whole(entry, "count", 1)
+        count = self.whole(entry, "count", 1, _LARGEST)
         part, stride = self._view(entry.get("bufferView"), item.itemsize * width)
-        start = self._whole(entry, "byteOffset", 0, default=0)
+        start = self.whole(entry, "byteOffset", 0, _LARGEST, default=0)
         if start + stride * (count - 1) + item.itemsize * width > len(part):
             raise self.error(f"an accessor of {count} values that end after their buffer")
         table = np.ndarray((count, width), item, part, start, (stride, item.itemsize))
@@ -411,20 +368,12 @@ class Container:
         buffer = self.entry("buffers", view.get("buffer"))
         if view["buffer"] != 0 or "uri" in buffer:
             raise self.error("values in another file, or in none")
-        start = self._whole(view, "byteOffset", 0, default=0)
-        length = self._whole(view, "byteLength", 1)
-        stride = self._whole(view, "byteStride", least, default=least)
+        start = self.whole(view, "byteOffset", 0, _LARGEST, default=0)
+        length = self.whole(view, "byteLength", 1, _LARGEST)
+        stride = self.whole(view, "byteStride", least, _LARGEST, default=least)
         if start + length > self.size:
             raise self.error(f"a view of {length} bytes that ends after the {self.size} there")
         return self._bytes[start:start + length], stride
-
-    def _whole(
-        self, part: dict[str, Any], name: str, least: int, *, default: int | None = None
-    ) -> int:
-        value = part.get(name, default)
-        if type(value) is not int or not least <= value <= _LARGEST:
-            raise self.error(f"{name} = {value!r:.40}; needed is at least {least}")
-        return value
 
     def _chunk(self, data: bytes, at: int) -> tuple[bytes, memoryview, int]:
         """Returns the type and the bytes of a chunk, and the offset of the next."""
@@ -435,9 +384,3 @@ class Container:
         if start + length > len(data):
             raise self.error(f"a chunk of {length} bytes that ends after the file")
         return kind, memoryview(data)[start:start + length], start + length
-
-    def _parse(self, text: memoryview) -> dict[str, Any]:
-        try:
-            return parse_json_object(bytes(text))
-        except ValueError as error:
-            raise self.error(f"JSON that cannot be read: {error}") from error

@@ -13,7 +13,6 @@ import html
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -31,6 +30,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.workspace.atomic import write_bytes
 
 View = tuple[str, Camera]
+Z_UP: NDArray[np.float64] = np.array([0.0, 0, 1])
 
 # Files in `web/` by the module name that others import; "recon:" marks relative imports.
 MODULES = {
@@ -48,24 +48,16 @@ _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is
 _DEFAULT_LENS = (1200, 900, 1000.0)  # width, height and focal length in pixels
 
 
-@dataclass(frozen=True, eq=False)
-class Extent:
-    """Middle [3] and radius of most of a scene."""
-
-    middle: NDArray[np.float64]
-    reach: float
-
-
-def measure_extent(means: NDArray[np.floating[Any]]) -> Extent:
-    """Returns the extent of centres [N, 3], robust to outliers."""
+def measure_extent(means: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], float]:
+    """Returns the middle [3] and the radius of most of the centres [N, 3]."""
     middle = np.median(means.astype(np.float64), axis=0)
     reach = float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK))
-    return Extent(middle, reach or 1.0)
+    return middle, reach or 1.0
 
 
 def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
     """Returns a camera in front of the scene and a little above it, looking at its middle."""
-    scene = measure_extent(splats.means.detach().cpu().numpy())
+    middle, reach = measure_extent(splats.means.detach().cpu().numpy())
     back = np.array([0.0, -1, 0]) if abs(up[1]) < 0.5 else np.array([0.0, 0, np.sign(up[1])])
     back -= (back @ up) * up
     offset = 2.5 * back / np.linalg.norm(back) + 0.5 * up
@@ -74,7 +66,7 @@ def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (scene.middle + scene.reach * offset)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (middle + reach * offset)
     width, height, focal = _DEFAULT_LENS
     return "", Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
 
@@ -93,7 +85,7 @@ def build_page(
 def _views(views: Sequence[View], splats: Splats, up: NDArray[np.float64]) -> str:
     """Returns the element with the extent of the scene and the cameras."""
     means = splats.means.detach().cpu().double().numpy()
-    scene = measure_extent(means)
+    middle, reach = measure_extent(means)
     sample = means[::-(-len(means) // _DISTANCE_SAMPLES)]
     lenses: dict[tuple[float, ...], int] = {}
     entries = []
@@ -102,10 +94,10 @@ def _views(views: Sequence[View], splats: Splats, up: NDArray[np.float64]) -> st
         pose = np.hstack([camera.viewmat[:3, :3].T, camera.center[:, None]])
         entries.append({
             "name": name, "lens": lenses.setdefault(lens, len(lenses)),
-            "pose": pose.ravel().tolist(), "distance": _distance(sample, camera) or scene.reach})
+            "pose": pose.ravel().tolist(), "distance": _distance(sample, camera) or reach})
     names = ("fx", "fy", "cx", "cy", "width", "height")
     value = {
-        "up": up.tolist(), "middle": scene.middle.tolist(), "reach": scene.reach,
+        "up": up.tolist(), "middle": middle.tolist(), "reach": reach,
         "lenses": [dict(zip(names, lens, strict=True)) for lens in lenses], "views": entries}
     # No name can close the element.
     text = json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
@@ -133,8 +125,6 @@ def _text(name: str) -> str:
     return (files("recon_cli.io.splats") / "web" / name).read_text(encoding="utf-8")
 
 
-Z_UP: NDArray[np.float64] = np.array([0.0, 0, 1])
-
 _OPENED = re.compile(rb'<script id="scene" type="application/octet-stream" '
                      rb'data-format="([a-z]{1,9})" data-bytes="([0-9]{1,12})">')
 _CLOSED = b"</script>"
@@ -146,7 +136,8 @@ def write_html(
 ) -> None:
     """Writes a page that shows `splats`, whole or not at all.
 
-    Values are quantized as by `write_spz`, but coefficients to 1/128.
+    Values are quantized as by `write_spz`, but coefficients to 1/128; the errors are those of
+    `spz_bytes`.
 
     Args:
         path: of the .html.
@@ -155,10 +146,6 @@ def write_html(
         up: [3] unit vector.
         views: names and cameras that a visitor can step through, first the one that the page
             opens at; without any it opens in front of the scene.
-
-    Raises:
-        FormatError: there are no Gaussians, one is too large or too far away, or a parameter is
-            not finite.
     """
     packed = spz_bytes(path, splats, harmonic_step=1)  # beside the scripts size hardly counts
     scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '
@@ -169,8 +156,7 @@ def write_html(
 def read_html(path: Path) -> Splats:
     """Returns the Gaussians embedded in a page of `write_html`; none of its scripts is run.
 
-    Raises:
-        FormatError: the file is missing or damaged, or no page of that kind.
+    FormatError if the file is missing or damaged, or no page of that kind.
     """
     data = read_contents(path)
     matches = list(_OPENED.finditer(data))

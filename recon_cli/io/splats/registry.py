@@ -39,11 +39,7 @@ FORMATS: dict[str, SplatFormat] = {row.name: row for row in (
 
 
 def format_of(path: Path) -> SplatFormat:
-    """Returns the format of a file by the end of its name.
-
-    Raises:
-        FormatError: the name ends in none.
-    """
+    """Returns the format of a file by the end of its name; FormatError if that is none."""
     for name, row in FORMATS.items():
         if path.name.lower().endswith(f".{name}"):
             return row
@@ -53,10 +49,7 @@ def format_of(path: Path) -> SplatFormat:
 
 
 def read_splats(path: Path) -> Splats:
-    """Returns the Gaussians of a file in any of FORMATS, on the CPU.
-
-    Raises:
-        FormatError: its format is not known, or the file is damaged.
+    """Returns the Gaussians of a file in any of FORMATS, on the CPU; FormatError if it is damaged.
     """
     row = format_of(path)
     try:

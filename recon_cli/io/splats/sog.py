@@ -15,12 +15,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon_cli.io.splats.codebooks import fit_codebook, fit_palette, nearest_entries
@@ -28,11 +26,13 @@ from recon_cli.io.splats.sog_archive import Archive, Meta, pack_archive, read_me
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
+    decode_smallest_three,
     encode_smallest_three,
     logit,
+    morton_codes,
     sigmoid,
+    splats_from_arrays,
     to_arrays,
-    trim_zero_rows,
 )
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.workspace.atomic import write_bytes
@@ -53,21 +53,14 @@ def write_sog(path: Path, splats: Splats, *, seed: int = 0) -> None:
     """Writes `splats` to `path`, whole or not at all; the same seed gives the same bytes.
 
     Gaussians are sorted in Morton order, those that have coefficients first. Quaternions are
-    normalized, and opacities are rounded to 255ths.
-
-    Args:
-        path: of the .sog.
-        splats: at least one Gaussian.
-        seed: of the k-means that find codebooks and palette.
-
-    Raises:
-        InputError: there are no Gaussians, or a value is not finite.
+    normalized, and opacities are rounded to 255ths. `seed` is of the k-means that finds codebooks
+    and palette. FormatError if there are no Gaussians, or a value is not finite.
     """
     rng = np.random.default_rng(seed)
     table = to_arrays(splats, ".sog")
     low, high, places = pack_means(table["means"])
     plain = np.arange(len(splats)) >= len(splats.sh_rest)
-    order = np.lexsort((morton_codes(places), plain))
+    order = np.lexsort((morton_codes(places.astype(np.uint64)), plain))
     table, places = {name: value[order] for name, value in table.items()}, places[order]
     scales, sh0 = fit_codebook(table["log_scales"], rng), fit_codebook(table["sh_dc"], rng)
     opacities = np.rint(sigmoid(table["logit_opacities"]) * 255).astype(np.uint8)
@@ -88,14 +81,8 @@ def write_sog(path: Path, splats: Splats, *, seed: int = 0) -> None:
     }
     images = {name: _image(row) for name, row in rows.items()}
     if table["sh_rest"].size:
-        packed = pack_harmonics(table["sh_rest"], len(splats.sh_rest), rng)
-        labels = packed.labels
-        meta["shN"] = {
-            "count": packed.count, "bands": packed.degree, "codebook": _json(packed.codebook),
-            "files": ["shN_centroids.webp", "shN_labels.webp"]}
-        images["shN_centroids.webp"] = packed.entries
-        images["shN_labels.webp"] = _image(np.column_stack([
-            labels & 255, labels >> 8, np.zeros_like(labels)]).astype(np.uint8))
+        meta["shN"], palette = pack_harmonics(table["sh_rest"], len(splats.sh_rest), rng)
+        images |= palette
     write_bytes(path, pack_archive(meta, images))
 
 
@@ -115,10 +102,8 @@ def _json(book: Floats) -> list[float]:
 def read_sog(path: Path) -> Splats:
     """Returns the Gaussians of a .sog as float32 tensors, in the file's order.
 
-    Those behind the last one that has a coefficient other than zero are of degree 0.
-
-    Raises:
-        FormatError: the file is missing, damaged, of version 1, or does not hold what it promises.
+    Those behind the last one that has a coefficient other than zero are of degree 0. FormatError if
+    the file is missing, damaged, of version 1, or does not hold what it promises.
     """
     archive = Archive(path)
     meta = read_meta(archive)
@@ -129,22 +114,20 @@ def read_sog(path: Path) -> Splats:
     def rows(name: str) -> Bytes:
         return archive.pixels(name, meta.count, size=size).reshape(-1, 4)[: meta.count]
 
-    means = unpack_means(
-        first.reshape(-1, 4)[: meta.count, :3], rows(meta.means[1])[:, :3], meta.low, meta.high)
-    if not np.isfinite(means).all():
-        raise archive.error("positions that overflow float32")
-    quats = unpack_quats(rows(meta.quats_file))
-    if quats is None:
+    low_bytes, high_bytes = first.reshape(-1, 4)[: meta.count, :3], rows(meta.means[1])[:, :3]
+    quats = rows(meta.quats_file)
+    if (quats[:, 3] < _TAG).any():
         raise archive.error("quaternions without their greatest component")
     sh0 = rows(meta.sh0_file)
-    values = {
-        "means": means, "quats": quats,
+    return splats_from_arrays(path, {
+        "means": unpack_means(low_bytes, high_bytes, meta.low, meta.high),
+        "quats": decode_smallest_three(
+            quats[:, 3].astype(np.int64) - _TAG, (quats[:, :3] / 255 * 2 - 1) / _ROOT2),
         "log_scales": _look_up(rows(meta.scales_file)[:, :3], meta.scales, archive),
         "logit_opacities": logit(sh0[:, 3] / 255, _LEAST_OPACITY),
         "sh_dc": _look_up(sh0[:, :3], meta.sh0, archive),
         "sh_rest": _read_harmonics(archive, meta, rows),
-    }
-    return Splats(**{name: torch.from_numpy(value.copy()) for name, value in values.items()})
+    })
 
 
 def _look_up(indices: Bytes, book: Floats, archive: Archive) -> Floats:
@@ -165,9 +148,8 @@ def _read_harmonics(archive: Archive, meta: Meta, rows: Callable[[str], Bytes]) 
     labels = parts[:, 0] + 256 * parts[:, 1].astype(np.int64)
     if labels.max() >= harmonics.count:
         raise archive.error(f"the label {labels.max()} of a palette of {harmonics.count}")
-    _look_up(entries, harmonics.codebook, archive)
-    return trim_zero_rows(unpack_harmonics(
-        Palette(harmonics.count, harmonics.degree, harmonics.codebook, entries, labels)))
+    coefficients = _look_up(entries, harmonics.codebook, archive)
+    return np.asarray(coefficients.reshape(-1, TERMS[harmonics.degree], 3)[labels])
 
 
 def pack_means(means: Floats) -> tuple[Doubles, Doubles, NDArray[np.int64]]:
@@ -187,15 +169,6 @@ def unpack_means(low_bytes: Bytes, high_bytes: Bytes, low: Doubles, high: Double
         return np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
 
 
-def morton_codes(places: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Returns the Z-order [N] of 16-bit positions [N, 3]: their bits interleaved."""
-    codes = np.zeros(len(places), np.int64)
-    for bit in range(16):
-        for axis in range(3):
-            codes |= (places[:, axis] >> bit & 1) << (3 * bit + axis)
-    return codes
-
-
 def pack_quats(quats: Floats) -> Bytes:
     """Returns unit quaternions [N, 4] as the three smaller components and a tag [N, 4]."""
     greatest, others = encode_smallest_three(quats)
@@ -203,34 +176,13 @@ def pack_quats(quats: Floats) -> Bytes:
     return np.column_stack([steps, _TAG + greatest]).astype(np.uint8)
 
 
-def unpack_quats(packed: Bytes) -> Floats | None:
-    """Returns quaternions [N, 4] wxyz; None if a tag is invalid."""
-    if (packed[:, 3] < _TAG).any():
-        return None
-    others = (packed[:, :3] / 255 * 2 - 1) / _ROOT2
-    greatest = np.sqrt(np.maximum(0, 1 - (others ** 2).sum(axis=1)))
-    is_greatest = np.arange(4) == (packed[:, 3] - _TAG)[:, None]
-    quats = np.empty((len(packed), 4))
-    quats[is_greatest] = greatest
-    quats[~is_greatest] = others.ravel()
-    return quats.astype(np.float32)
+def pack_harmonics(
+    sh_rest: Floats, colored: int, rng: np.random.Generator
+) -> tuple[dict[str, Any], dict[str, Bytes]]:
+    """Returns the entry of meta.json and the images of coefficients [N, T, 3].
 
-
-@dataclass(frozen=True, eq=False)
-class Palette:
-    """Coefficients as pixels."""
-
-    count: int  # entries
-    degree: int  # 1 to 3
-    codebook: Floats  # [256] ascending
-    entries: Bytes  # [ceil(count / 64), 64 T, 3] the image of the entries
-    labels: NDArray[np.int64]  # [N] an entry for each Gaussian
-
-
-def pack_harmonics(sh_rest: Floats, colored: int, rng: np.random.Generator) -> Palette:
-    """Returns the palette of coefficients [N, T, 3], of which the first `colored` have any.
-
-    The others share an entry of zeros, and the codebook holds 0 for it.
+    The first `colored` Gaussians have any; the others share an entry of zeros, and the codebook
+    holds 0 for it.
     """
     n, terms = sh_rest.shape[:2]
     size = min(_MAX_ENTRIES, -(-colored // _SHARE))
@@ -246,11 +198,7 @@ def pack_harmonics(sh_rest: Floats, colored: int, rng: np.random.Generator) -> P
     lines = -(-len(entries) // ROW)
     filled = np.pad(entries, ((0, lines * ROW - len(entries)), (0, 0)))
     pixels = nearest_entries(filled, book).reshape(lines, ROW * terms, 3)
-    return Palette(len(entries), TERMS.index(terms), book, pixels, labels)
-
-
-def unpack_harmonics(harmonics: Palette) -> Floats:
-    """Returns coefficients [N, T, 3]."""
-    terms = TERMS[harmonics.degree]
-    entries = harmonics.codebook[harmonics.entries].reshape(-1, terms, 3)
-    return np.asarray(entries[harmonics.labels])
+    rows = np.column_stack([labels & 255, labels >> 8, np.zeros_like(labels)]).astype(np.uint8)
+    names = ["shN_centroids.webp", "shN_labels.webp"]
+    return {"count": len(entries), "bands": TERMS.index(terms), "codebook": _json(book),
+            "files": names}, dict(zip(names, (pixels, _image(rows)), strict=True))

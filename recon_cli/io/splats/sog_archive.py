@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.errors import FormatError
-from recon_cli.io.splats.codebooks import BOOK, Floats
-from recon_cli.io.splats.values import parse_json_object
+from recon_cli.io.splats.codebooks import BOOK
+from recon_cli.io.splats.values import Floats, UntrustedFile
 
 META = "meta.json"
 _META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
@@ -29,34 +28,23 @@ _SMALL = 1 << 20  # Gaussians or pixels that are always accepted: a few hundred 
 _START, _ENTRY = b"PK\x03\x04", b"PK\x01\x02"  # of the file, and of each entry of its directory
 _ENTRIES = 64  # a .sog has eight
 _HEADER = 1 << 16  # bytes of an image beside its pixels
-_HINT = "Write or copy the file again."
 _DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip can hold: the same scene, the same bytes
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others cannot be stopped at a bound
 _MAX_ENTRIES = 65536  # of a palette: labels are 16 bits
 _MAX_COUNT = 16383 * 16383  # pixels of the largest WebP
 
 
-class Archive:
-    """An open .sog.
-
-    Raises:
-        FormatError: from every method, if the file does not hold what it promises.
-    """
+class Archive(UntrustedFile):
+    """An open .sog; every method raises FormatError if the file does not hold what it promises."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        super().__init__(path, _START, ".sog")
+        if self.data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
+            raise self.error(f"more than {_ENTRIES} entries: no .sog")
         try:
-            with path.open("rb") as file:
-                if file.read(len(_START)) != _START:
-                    raise FormatError(f"{path} is no .sog.")
-                self._data = _START + file.read()
-            if self._data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
-                raise self.error(f"more than {_ENTRIES} entries: no .sog")
-            self._zip = zipfile.ZipFile(io.BytesIO(self._data))
-        except OSError as error:
-            raise FormatError(f"{path} cannot be read: {error}.") from error
-        except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-            raise FormatError(f"{path} is no .sog: {error}.", hint=_HINT) from error
+            self._zip = zipfile.ZipFile(io.BytesIO(self.data))
+        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+            raise self.error(f"a zip that is no .sog: {error}") from error
         self._entries = {entry.filename: entry for entry in self._zip.infolist()}
         if len(self._entries) < len(self._zip.infolist()):
             raise self.error("two entries of one name")
@@ -64,35 +52,24 @@ class Archive:
             if _escapes(name):
                 raise self.error(f"the entry {name!r:.80}, which leaves the archive")
 
-    def error(self, content: str) -> FormatError:
-        """Returns the error for this file holding `content`."""
-        return FormatError(f"{self._path} holds {content}.", hint=_HINT)
-
     def meta(self) -> dict[str, Any]:
         """Returns the object in meta.json."""
-        text = self._read(META, _META_LIMIT)
-        try:
-            return parse_json_object(text)
-        except ValueError as error:
-            raise self.error(f"a {META} that cannot be read: {error}") from error
+        return self.json_object(self._read(META, _META_LIMIT))
 
     def check_count(self, count: int) -> None:
         """Raises FormatError for more Gaussians than a file of this size is likely to hold.
 
         They take about 16 bytes each; images of one colour take none, however large they are.
         """
-        if count > _SMALL + len(self._data):
-            raise self.error(f"{count} Gaussians in {len(self._data)} bytes, as it claims")
+        if count > _SMALL + len(self.data):
+            raise self.error(f"{count} Gaussians in {len(self.data)} bytes, as it claims")
 
     def pixels(
         self, name: str, count: int, *, size: tuple[int, int] | None = None
     ) -> NDArray[np.uint8]:
-        """Returns the pixels [H, W, 4] of an image.
+        """Returns the pixels [H, W, 4] of an image of at least `count` pixels, and not many more.
 
-        Args:
-            name: of its entry.
-            count: least number of its pixels, which may be only a few more.
-            size: (width, height) that it must have; None for any.
+        `size` is the (width, height) that it must have; None for any.
         """
         most = max(4 * count, _SMALL)
         data = self._read(name, 4 * most + _HEADER)
@@ -141,11 +118,9 @@ class Archive:
 
 
 def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
-    """Returns the bytes of a .sog; the same arguments give the same bytes.
+    """Returns the bytes of a .sog with images [H, W, 3] or [H, W, 4] by name.
 
-    Args:
-        meta: becomes meta.json.
-        images: [H, W, 3] or [H, W, 4] by name.
+    The same arguments give the same bytes.
     """
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
@@ -210,21 +185,17 @@ class Meta:
 
 
 def read_meta(archive: Archive) -> Meta:
-    """Returns the checked meta.json of an archive.
-
-    Raises:
-        FormatError: it is missing or not of the format.
-    """
+    """Returns the checked meta.json of an archive."""
     value = archive.meta()
     if "version" not in value and isinstance(value.get("means"), dict):
         raise archive.error("version 1 of the format, which is not supported")
-    if _whole(value, "version", 0, sys.maxsize, archive) != 2:
+    if archive.whole(value, "version", 0, sys.maxsize) != 2:
         raise archive.error(f"version {value['version']} of the format; version 2 can be read")
     means, scales, quats, sh0 = (
         _part(value, name, archive) for name in ("means", "scales", "quats", "sh0"))
     return Meta(
-        count=_whole(value, "count", 1, _MAX_COUNT, archive),
-        low=_numbers(means, "mins", 3, 3, archive), high=_numbers(means, "maxs", 3, 3, archive),
+        count=archive.whole(value, "count", 1, _MAX_COUNT),
+        low=archive.numbers(means, "mins", 3, 3), high=archive.numbers(means, "maxs", 3, 3),
         means=_files(means, 2, archive),
         scales=_book(scales, archive), scales_file=_files(scales, 1, archive)[0],
         quats_file=_files(quats, 1, archive)[0],
@@ -237,7 +208,7 @@ def _harmonics(value: dict[str, Any], archive: Archive) -> Harmonics | None:
         return None
     part = _part(value, "shN", archive)
     return Harmonics(
-        _whole(part, "count", 1, _MAX_ENTRIES, archive), _whole(part, "bands", 1, 3, archive),
+        archive.whole(part, "count", 1, _MAX_ENTRIES), archive.whole(part, "bands", 1, 3),
         _book(part, archive), _files(part, 2, archive))
 
 
@@ -248,27 +219,8 @@ def _part(value: dict[str, Any], name: str, archive: Archive) -> dict[str, Any]:
     return part
 
 
-def _whole(part: dict[str, Any], name: str, low: int, high: int, archive: Archive) -> int:
-    value = part.get(name)
-    if type(value) is not int or not low <= value <= high:
-        raise archive.error(f"{name} = {value!r:.40}; needed is {low} to {high}")
-    return value
-
-
 def _book(part: dict[str, Any], archive: Archive) -> Floats:
-    return _numbers(part, "codebook", 1, BOOK, archive).astype(np.float32)
-
-
-def _numbers(
-    part: dict[str, Any], name: str, least: int, most: int, archive: Archive
-) -> NDArray[np.float64]:
-    """Returns finite numbers that fit into float32."""
-    value = part.get(name)
-    largest = float(np.finfo(np.float32).max)
-    if not isinstance(value, list) or not least <= len(value) <= most or not all(
-            type(item) in (int, float) and abs(item) <= largest for item in value):
-        raise archive.error(f"{name} = {value!r:.40}; needed are {most} finite numbers")
-    return np.array(value, np.float64)
+    return archive.numbers(part, "codebook", 1, BOOK).astype(np.float32)
 
 
 def _files(part: dict[str, Any], count: int, archive: Archive) -> tuple[str, ...]:

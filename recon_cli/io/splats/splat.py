@@ -11,18 +11,16 @@ import os
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.values import (
-    Floats,
     decode_opacities,
     encode_opacities,
     refuse_above,
     refuse_not_finite,
     round_to_bytes,
     splats_from_arrays,
-    validate_splats,
+    to_arrays,
 )
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.workspace.atomic import write_bytes
@@ -37,35 +35,27 @@ _OTHER_FORMATS = (b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b\x08\0", b"PK\x03\x04")
 def write_splat(path: Path, splats: Splats) -> None:
     """Writes `splats` to `path`, whole or not at all, in descending order of opacity x volume.
 
-    Harmonics of degrees 1 and up are dropped, and colours are clipped to 0 to 1.
-
-    Raises:
-        FormatError: there are no Gaussians, one is too large, or a parameter is not finite.
+    Harmonics of degrees 1 and up are dropped, and colours are clipped to 0 to 1. FormatError if
+    there are no Gaussians, one is too large, or a parameter is not finite.
     """
-    values = validate_splats(path, splats)
-    log_scales = values.log_scales.numpy()
+    values = to_arrays(splats, path.name)
+    log_scales, logits = values["log_scales"], values["logit_opacities"]
     refuse_above(path, log_scales, _LARGEST)
-    logits = values.logit_opacities.numpy()
     rows = np.empty(len(splats), _ROW)
-    rows["means"] = values.means.numpy()
+    rows["means"] = values["means"]
     rows["scales"] = np.maximum(np.exp(log_scales), _LEAST)
-    rows["rgba"][:, :3] = round_to_bytes(255 * (SH_C0 * values.sh_dc.numpy() + 0.5))
+    rows["rgba"][:, :3] = round_to_bytes(255 * (SH_C0 * values["sh_dc"] + 0.5))
     rows["rgba"][:, 3] = encode_opacities(logits)
-    rows["quats"] = round_to_bytes(values.quats.numpy() * 128 + 128)
-    write_bytes(path, rows[_by_importance(logits, log_scales)].tobytes())
-
-
-def _by_importance(logits: Floats, log_scales: Floats) -> NDArray[np.int64]:
-    """Returns rows by falling opacity x volume; logarithms, because products overflow."""
+    rows["quats"] = round_to_bytes(values["quats"] * 128 + 128)
+    # The logarithm of opacity x volume, whose products overflow.
     importance = log_scales.sum(axis=1, dtype=np.float64) - np.logaddexp(0, -logits)
-    return np.argsort(-importance, kind="stable")
+    write_bytes(path, rows[np.argsort(-importance, kind="stable")].tobytes())
 
 
 def read_splat(path: Path) -> Splats:
     """Returns the Gaussians of a .splat, of degree 0, in the file's order.
 
-    Raises:
-        FormatError: the file is missing, empty or truncated, or holds values that no Gaussian has.
+    FormatError if the file is missing, empty, truncated, or holds values that no Gaussian has.
     """
     try:
         with path.open("rb") as file:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 import zstandard
 from numpy.typing import NDArray
 
@@ -36,7 +37,7 @@ from recon_cli.io.splats.values import (
     refuse_above,
     round_to_bytes,
     splats_from_arrays,
-    validate_splats,
+    to_arrays,
 )
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.workspace.atomic import write_bytes
@@ -68,12 +69,7 @@ _ZSTD_LEVEL = 12  # that of Niantic's program
 
 
 def write_spz(path: Path, splats: Splats, *, version: int = 3) -> None:
-    """Writes `splats` to `path`, whole or not at all; see `spz_bytes`.
-
-    Raises:
-        FormatError: there are no Gaussians, one is too large or too far away, or a parameter is
-            not finite.
-    """
+    """Writes `splats` to `path`, whole or not at all; see `spz_bytes`."""
     write_bytes(path, spz_bytes(path, splats, version=version))
 
 
@@ -83,8 +79,8 @@ def spz_bytes(
     """Returns the bytes of an SPZ file of `splats`.
 
     Log scales below -10 become -10, coefficients outside -1 to 127/128 and dc outside -3.33 to 3.33
-    are clipped. Positions get the 12 fractional bits of Niantic's program, fewer in a scene that
-    is wider than 2048 units, and never fewer than 8. Harmonics are in steps of 1/64 unless given.
+    are clipped. Positions get the 12 fractional bits of Niantic's program, fewer in a scene that is
+    wider than 2048 units, and never fewer than 8.
 
     Args:
         path: of the file, for messages.
@@ -99,9 +95,10 @@ def spz_bytes(
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is none of {VERSIONS}")
-    values = flip_yz(validate_splats(path, splats))
-    means, quats, log_scales = (
-        value.numpy() for value in (values.means, values.quats, values.log_scales))
+    values = flip_yz(Splats(**{
+        name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()}))
+    means, quats = values.means.numpy(), values.quats.numpy()
+    log_scales = values.log_scales.numpy()
     refuse_above(path, log_scales, _LARGEST_SCALE)
     bits = _fractional_bits(path, means)
     return pack(SpzHeader(version, len(splats), values.sh_degree, bits), [
@@ -118,9 +115,8 @@ def spz_bytes(
 def read_spz(path: Path) -> Splats:
     """Returns the Gaussians of an SPZ file of version 2, 3 or 4, in the file's order and degree.
 
-    Raises:
-        FormatError: the file is missing, damaged, of another format or version, or promises more
-            than it holds.
+    FormatError if the file is missing, damaged, of another format or version, or promises more than
+    it holds.
     """
     return spz_splats(path, read_contents(path))
 
@@ -302,9 +298,7 @@ def _without_extensions(path: Path, body: bytes, header: SpzHeader, flags: int) 
     return body[:size]
 
 
-def _unpack_streams(
-    path: Path, data: bytes, header: SpzHeader, flags: int, streams: int
-) -> bytes:
+def _unpack_streams(path: Path, data: bytes, header: SpzHeader, flags: int, streams: int) -> bytes:
     promised = [size for size in header.sizes if size]
     begin = _HEAD.size + _MORE.size
     if len(data) < begin:

@@ -18,6 +18,9 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import Splats, with_rows
 
 _BITS = 21  # per axis; three make a word of 63
+_LARGEST = float(np.finfo(np.float32).max)
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -29,28 +32,20 @@ def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
     low, high = exact.min(axis=0), exact.max(axis=0)
     width = np.where(high > low, high - low, 1)
     cells = ((exact - low) / width * ((1 << _BITS) - 1)).astype(np.uint64)
-    x, y, z = (_spread(cells[:, axis]) for axis in range(3))
-    return np.argsort(x | y << np.uint64(1) | z << np.uint64(2), kind="stable")
+    return np.argsort(morton_codes(cells), kind="stable")
 
 
-def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Returns numbers of 21 bits with two zeros between adjacent bits."""
+def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Returns the Z-order [N] of cells [N, 3] of at most 21 bits: their bits interleaved."""
     for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
                         (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):
-        values = (values | values << np.uint64(shift)) & np.uint64(mask)
-    return values
-
-
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
+        cells = (cells | cells << np.uint64(shift)) & np.uint64(mask)
+    x, y, z = cells.T
+    return np.asarray(x | y << np.uint64(1) | z << np.uint64(2))
 
 
 def read_contents(path: Path) -> bytes:
-    """Returns the bytes of a file.
-
-    Raises:
-        FormatError: it cannot be read.
-    """
+    """Returns the bytes of a file; FormatError if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(os.fstat(file.fileno()).st_size)  # a device has no end
@@ -58,47 +53,66 @@ def read_contents(path: Path) -> bytes:
         raise FormatError(f"{path} cannot be read: {error}.") from error
 
 
-def parse_json_object(text: bytes) -> dict[str, Any]:
-    """Returns a JSON object from an untrusted file.
+class UntrustedFile:
+    """The bytes of a file that begins with `start`, and checks of the JSON in it.
 
-    Raises:
-        ValueError: the text is no JSON object, holds NaN, or is nested too deeply.
+    Every method raises FormatError if the file does not hold what it promises.
     """
-    try:
-        value = json.loads(text, parse_constant=_refuse_constant)
-    except RecursionError as error:
-        raise ValueError("it is nested too deeply") from error
-    if not isinstance(value, dict):
-        raise ValueError("it is no object")
-    return value
 
+    def __init__(self, path: Path, start: bytes, kind: str) -> None:
+        self.path = path
+        try:
+            with path.open("rb") as file:
+                if file.read(len(start)) != start:
+                    raise FormatError(f"{path} is no {kind}.")
+                self.data = start + file.read()
+        except OSError as error:
+            raise FormatError(f"{path} cannot be read: {error}.") from error
 
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number of JSON")
+    def error(self, content: str) -> FormatError:
+        """Returns the error for this file holding `content`."""
+        return FormatError(f"{self.path} holds {content}.", hint="Write or copy the file again.")
 
+    def json_object(self, text: bytes) -> dict[str, Any]:
+        """Returns a JSON object without NaN that is not nested too deeply."""
+        def refuse_constant(name: str) -> float:
+            raise ValueError(f"{name} is no number of JSON")
 
-def validate_splats(path: Path, splats: Splats) -> Splats:
-    """Returns the Gaussians normalized and checked for writing: `to_arrays` as tensors.
+        try:
+            value = json.loads(text, parse_constant=refuse_constant)
+        except (ValueError, RecursionError) as error:
+            raise self.error(f"JSON that cannot be read: {error}") from error
+        if not isinstance(value, dict):
+            raise self.error("JSON that cannot be read: it is no object")
+        return value
 
-    Raises:
-        FormatError: there are no Gaussians, or a parameter is not finite.
-    """
-    return Splats(**{
-        name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()})
+    def whole(
+        self, part: Mapping[str, Any], name: str, least: int, most: int,
+        *, default: int | None = None,
+    ) -> int:
+        """Returns a whole number from `least` to `most` in an object of the JSON."""
+        value = part.get(name, default)
+        if type(value) is not int or not least <= value <= most:
+            raise self.error(f"{name} = {value!r:.40}; needed is {least} to {most}")
+        return value
+
+    def numbers(
+        self, part: Mapping[str, Any], name: str, least: int, most: int
+    ) -> NDArray[np.float64]:
+        """Returns a list of `least` to `most` finite numbers that fit into float32."""
+        value = part.get(name)
+        if not isinstance(value, list) or not least <= len(value) <= most or not all(
+                type(item) in (int, float) and abs(item) <= _LARGEST for item in value):
+            raise self.error(f"{name} = {value!r:.40}; needed are {most} finite numbers")
+        return np.array(value, np.float64)
 
 
 def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
     """Returns the values of a file as float32 tensors, in the file's order.
 
-    Those behind the last one that has a coefficient other than zero are of degree 0.
-
-    Args:
-        path: for the message.
-        values: the parameters by their names in `Splats`, with coefficients of all N Gaussians,
-            of any type.
-
-    Raises:
-        FormatError: a value is not finite.
+    `values` are the parameters by their names in `Splats`, of any type. Gaussians behind the last
+    one that has a coefficient other than zero are of degree 0. FormatError if a value is not
+    finite.
     """
     with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
@@ -149,7 +163,9 @@ def encode_smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     return largest, signed[_others(largest)].reshape(-1, 3)
 
 
-def decode_smallest_three(largest: NDArray[np.int64], others: Floats) -> Floats:
+def decode_smallest_three(
+    largest: NDArray[np.int64], others: NDArray[np.floating[Any]]
+) -> Floats:
     """Returns quaternions [N, 4]: the inverse of `encode_smallest_three`."""
     quats = np.empty((len(others), 4), np.float32)
     quats[_others(largest)] = others.ravel()
@@ -183,14 +199,8 @@ def to_arrays(splats: Splats, kind: str) -> dict[str, NDArray[np.float32]]:
     """Returns the raw parameters as float32 arrays by name, `sh_rest` for all N Gaussians.
 
     Quaternions are normalized; zeros, which mean no rotation, become 1 0 0 0. If no Gaussian has
-    coefficients, `sh_rest` is [N, 0, 3].
-
-    Args:
-        splats: raw parameters on any device.
-        kind: name of the file or format for messages, such as ".sog".
-
-    Raises:
-        FormatError: there are no Gaussians, or a value is not finite.
+    coefficients, `sh_rest` is [N, 0, 3]. `kind` names the file or format in messages: FormatError
+    if there are no Gaussians, or a value is not finite.
     """
     if not len(splats):
         raise FormatError(f"There are no Gaussians to write; a {kind} needs at least one.")

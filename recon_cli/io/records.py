@@ -1,7 +1,8 @@
-"""The records of ingest: frames.json, and poses.json with points.safetensors of a posed data set.
+"""Records that stages leave for others, besides their summaries.
 
-A masked frame has a mask of its name in masks/: 8-bit gray, 255 where a pixel counts, 0 where
-features, training and scores ignore it.
+Ingest writes frames.json, and poses.json with points.safetensors of a data set with poses; import
+writes import.json beside the scene. A masked frame has a mask of its name in masks/: 8-bit gray,
+255 where a pixel counts, 0 where features, training and scores ignore it.
 """
 
 from __future__ import annotations
@@ -20,11 +21,15 @@ from safetensors.numpy import load_file, save_file
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace import atomic
+from recon_cli.workspace.summaries import JsonRecord
 
 FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = "Delete the folder of ingest in the workspace and run recon ingest again."
 _RERUN = "Run `recon ingest --again`."
 POSES, POINTS = "poses.json", "points.safetensors"
+_IMPORT = "import.json"
+NEEDS_VIEWS_HINT = (
+    "Run `recon ingest CAPTURE` and `recon sfm` in this workspace, then `recon import` again.")
 
 
 @dataclass(frozen=True)
@@ -45,11 +50,10 @@ class Group:
     """Frames that share intrinsics: of one camera with one setting of its lens."""
 
     name: str  # of their source, for messages
-    width: int  # of the stored frames in pixels
-    height: int  # of the stored frames in pixels
-    focal_px: float | None = None  # focal length of the stored frames from EXIF, None if unknown
-    # known intrinsics of the stored frames, None if they are to be estimated
-    lens: Lens | None = None
+    width: int  # of the stored frames in pixels, as all below
+    height: int
+    focal_px: float | None = None  # focal length from EXIF, None if unknown
+    lens: Lens | None = None  # known intrinsics, None if they are to be estimated
 
 
 @dataclass(frozen=True)
@@ -67,19 +71,14 @@ class FrameList:
 
 
 def read_frame_list(stage: Path) -> FrameList:
-    """Returns the list of frames in ingest's folder.
-
-    Raises:
-        FormatError: it is missing or not what `FrameList.write` wrote.
-    """
+    """Returns the list of frames in ingest's folder; FormatError if it is missing or damaged."""
     value = atomic.read_json(stage / LIST)
     try:
         frames = tuple(Frame(**frame) for frame in value.pop("frames"))
         groups = tuple(_group(group) for group in value.pop("groups"))
         return FrameList(**value, groups=groups, frames=frames)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise FormatError(
-            f"{stage / LIST} is no list of frames.", hint=AGAIN) from error
+        raise FormatError(f"{stage / LIST} is no list of frames.", hint=AGAIN) from error
 
 
 def _group(value: dict[str, Any]) -> Group:
@@ -98,7 +97,7 @@ class KnownPoses:
     metric: bool  # the world's unit is the metre
     # [P, 3] float64 initial points in the same world, None without points
     points: NDArray[np.float64] | None = None
-    colors: NDArray[np.uint8] | None = None  # [P, 3] uint8 their RGB colours, None with them
+    colors: NDArray[np.uint8] | None = None  # [P, 3] uint8 RGB of the points
 
     def write(self, stage: Path) -> None:
         """Writes both files into ingest's folder."""
@@ -112,11 +111,7 @@ class KnownPoses:
 
 
 def read_poses(path: Path) -> KnownPoses:
-    """Returns what `KnownPoses.write` wrote; `path` is that of poses.json.
-
-    Raises:
-        FormatError: a file is missing or not what was written.
-    """
+    """Returns what `KnownPoses.write` wrote to poses.json; FormatError if a file is damaged."""
     value = atomic.read_json(path)
     try:
         viewmats = {
@@ -133,10 +128,8 @@ def read_poses(path: Path) -> KnownPoses:
 def choose_held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:
     """Returns which of all frames are held out for the score.
 
-    Args:
-        names: of all frames.
-        holdout: (kind, a, b) of `config.fields.parse_holdout`: each a-th by name from the first on,
-            the share a to b of the names in order, or none.
+    `holdout` is (kind, a, b) of `config.stages.parse_holdout`: each a-th by name from the first on,
+    the share a to b of the names in order, or none.
     """
     ordered = sorted(names)
     kind, a, b = holdout
@@ -153,3 +146,45 @@ def prepare_frames_folder(stage: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     atomic.clear_leftovers(stage)
     return folder
+
+
+@dataclass(frozen=True)
+class ImportRecord(JsonRecord):
+    """What is known about an imported scene."""
+
+    file: str  # name of the file that it was read from
+    format: str  # of the file, by its name in `io.splats.registry`
+    sha256: str  # of the file
+    gaussians: int  # count
+    sh_degree: int  # of the colours
+    z_up: bool  # up is z in the file; else it is -y. Given or assumed, never measured
+    views: bool  # it was compared with views of this workspace
+    doubt: str = ""  # why it may not be in their frame, as a sentence; empty if it fits
+
+    def write(self, folder: Path) -> None:
+        """Writes it into the folder of the scene."""
+        atomic.write_json(folder / _IMPORT, self.to_json())
+
+    def warnings(self) -> list[str]:
+        """Returns the caveats of every score of this scene."""
+        return [*([self.doubt] if self.doubt else []),
+                f"the scene was imported from {self.file}: whoever trained it may have trained on "
+                "the held-out views too"]
+
+    @staticmethod
+    def read(folder: Path) -> ImportRecord | None:
+        """Returns the record of the scene in a folder; None if it was trained here.
+
+        FormatError if the file is damaged, ManifestError if it is of another version.
+        """
+        path = folder / _IMPORT
+        return ImportRecord.from_json(atomic.read_json(path)) if path.exists() else None
+
+
+def has_views(folders: Mapping[str, Path]) -> bool:
+    """Returns whether the scene was trained on, or compared with, views of the workspace.
+
+    `folders` are the finished ones of train and perhaps sfm, by stage name.
+    """
+    record = ImportRecord.read(folders["train"])
+    return (record is None or record.views) and "sfm" in folders

@@ -7,7 +7,8 @@ from media import texture
 
 from recon_cli.config.stages import parse_holdout
 from recon_cli.errors import FormatError
-from recon_cli.io.frames import (
+from recon_cli.io.images import fit_image, read_png, write_png
+from recon_cli.io.records import (
     Frame,
     FrameList,
     Group,
@@ -15,7 +16,6 @@ from recon_cli.io.frames import (
     prepare_frames_folder,
     read_frame_list,
 )
-from recon_cli.io.images import fit_image, read_png, write_png
 from recon_cli.scene.camera import Lens
 
 NAMES = [f"{index:06d}.png" for index in range(20)]
