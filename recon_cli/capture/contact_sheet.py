@@ -96,8 +96,7 @@ class ContactSheet:
         head = _wrap(self._heading(held_out), max(columns * width, 4 * width))
         top = GAP + sum(LINE for _ in head) + GAP
         rows = math.ceil(len(self._shown) / columns)
-        canvas = Image.new(
-            "RGB", (max(columns, 4) * width + GAP, top + rows * height + GAP), PAPER)
+        canvas = Image.new("RGB", (max(columns, 4) * width + GAP, top + rows * height + GAP), PAPER)
         draw = ImageDraw.Draw(canvas)
         for line, words in enumerate(head):
             _write_words(draw, words, GAP, GAP + line * LINE)
@@ -116,8 +115,7 @@ class ContactSheet:
         draw.rectangle((x, y, right - 1, bottom - 1), COLOURS[kind])
         thumb = self._thumbs.get(candidate.index)
         if thumb is None:
-            draw.rectangle(
-                (x + BORDER, y + BORDER, right - BORDER - 1, bottom - BORDER - 1), PAPER)
+            draw.rectangle((x + BORDER, y + BORDER, right - BORDER - 1, bottom - BORDER - 1), PAPER)
         else:
             canvas.paste(thumb, (x + BORDER, y + BORDER))
         font, width = ImageFont.load_default(TEXT), self._layout.cell[0] - GAP
@@ -187,8 +185,7 @@ def _layout(width: int, height: int) -> _Layout:
     width, height = max(width, height // MOST_OBLONG), max(height, width // MOST_OBLONG)
     scale = math.sqrt(THUMB_PIXELS / (width * height))
     thumb = max(8, round(width * scale)), max(8, round(height * scale))
-    cell = (
-        max(CELL_WIDTH, thumb[0] + 2 * BORDER) + GAP, thumb[1] + 2 * BORDER + 2 * LINE + GAP)
+    cell = max(CELL_WIDTH, thumb[0] + 2 * BORDER) + GAP, thumb[1] + 2 * BORDER + 2 * LINE + GAP
     columns = max(1, (MAX_WIDTH - GAP) // cell[0])
     # The heading takes part of the budget: some lines of the full width.
     pixels = MAX_PIXELS - (columns * cell[0] + GAP) * (8 * LINE + 3 * GAP)
@@ -244,9 +241,7 @@ def _write_words(
         x += font.getlength(text) + LINE
 
 
-def _shorten(
-    text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float
-) -> str:
+def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:
     """Returns a text shortened to fit a width."""
     if font.getlength(text) <= width:
         return text

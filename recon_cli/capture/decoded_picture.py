@@ -27,8 +27,7 @@ SD_WIDTH, SD_HEIGHT = 1280, 576
 # Without these, swscale cuts off where it should round, and repeats colours of half resolution
 # instead of interpolating them. Against the frames that a rendered video was made from: 1.0 of 255
 # too dark and 38.4 dB; with these 0.1 too bright and 39.0 dB, at 1.6 times the cost.
-ROUNDED = (
-    Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT)
+ROUNDED = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 # H.273, table 3: the transfer characteristics of HDR.
 TRANSFERS = {16: Transfer.PQ, 18: Transfer.HLG}
 # One frame per frame, not per field: the rows of the first field stay as recorded.

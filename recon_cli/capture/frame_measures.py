@@ -69,8 +69,7 @@ class MotionMeter:
 
     def _drop_anchor(self, small: NDArray[np.uint8]) -> None:
         self._anchor = small
-        self._corners = cv2.goodFeaturesToTrack(
-            small, MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING)
+        self._corners = cv2.goodFeaturesToTrack(small, MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING)
         self._reached = 0.0
 
     def _displacement(self, small: NDArray[np.uint8]) -> float:

@@ -197,8 +197,7 @@ def _without_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) -
     Such a view could be trained on and held out at once.
     """
     stems = {Path(name).stem for name in plan.shots}
-    twins = [photo.path.name for photo in photos
-             if not photo.is_raw and photo.path.stem in stems]
+    twins = [photo.path.name for photo in photos if not photo.is_raw and photo.path.stem in stems]
     if twins:
         ctx.notice(
             f"{len(twins)} photos are left out because there is camera RAW of the same name, "
@@ -246,9 +245,7 @@ def _frame_groups(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> 
     return tuple(frame_groups)
 
 
-def _frames(
-    groups: Sequence[PhotoGroup], names: dict[Photo, str], out: Path
-) -> tuple[Frame, ...]:
+def _frames(groups: Sequence[PhotoGroup], names: dict[Photo, str], out: Path) -> tuple[Frame, ...]:
     """Returns the frames sorted by name, each with its group and whether it has a mask."""
     frames = [
         Frame(names[photo], None, photo.path.name, None, held_out=False, group=index,

@@ -88,9 +88,7 @@ def _tile_noise(tile: NDArray[np.uint8]) -> float:
 class Filter(Protocol):
     """Removes noise of a level in 1/255 from a frame [H, W, 3]."""
 
-    def __call__(
-        self, rgb: NDArray[np.uint8], noise: float, strength: float
-    ) -> NDArray[np.uint8]:
+    def __call__(self, rgb: NDArray[np.uint8], noise: float, strength: float) -> NDArray[np.uint8]:
         """Returns the filtered frame."""
 
 
@@ -109,8 +107,7 @@ def bilateral(
         noise: its standard deviation in 1/255.
         strength: range sigma as a multiple of the noise.
     """
-    return np.asarray(
-        cv2.bilateralFilter(rgb, DIAMETER, strength * noise, SIGMA_SPACE), np.uint8)
+    return np.asarray(cv2.bilateralFilter(rgb, DIAMETER, strength * noise, SIGMA_SPACE), np.uint8)
 
 
 def joint(

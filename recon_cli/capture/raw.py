@@ -176,8 +176,7 @@ def _by_camera(headers: Sequence[_Header]) -> dict[tuple[object, ...], CameraSet
         nominal = min(header.white_level for header in own)
         highest = max(header.highest for header in own)
         real = SATURATES_ABOVE * nominal < highest < nominal
-        common[camera] = (
-            warmth[(len(own) - 1) // 2].multipliers, highest if real else nominal)
+        common[camera] = warmth[(len(own) - 1) // 2].multipliers, highest if real else nominal
     return common
 
 
@@ -209,8 +208,7 @@ def _white(measures: Sequence[RawMeasures], ev: NDArray[np.float64]) -> float:
     """Returns the radiance that becomes white, where saturation of the median photo has 1."""
     radiance = np.concatenate([
         view.brightest * 2.0 ** -own for view, own in zip(measures, ev, strict=True)])
-    bright, floor = np.quantile(
-        radiance, [1 - BLOWN_SHARE, 1 - SACRIFICED_SHARE], method="lower")
+    bright, floor = np.quantile(radiance, [1 - BLOWN_SHARE, 1 - SACRIFICED_SHARE], method="lower")
     white = min(1.0, max(float(bright), 1 / MOST_BRIGHTENED))
     clips = [
         2.0 ** -own for view, own in zip(measures, ev, strict=True)

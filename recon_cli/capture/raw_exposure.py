@@ -196,8 +196,7 @@ def _visible(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Returns a gray picture whose contrast does not depend on the exposure, [h, w]."""
     gray = linear.mean(axis=2)
     bright = max(float(np.percentile(gray, 99)), 1e-6)
-    return np.asarray(
-        np.round(255 * np.clip(gray / bright, 0, 1) ** (1 / 2.2)).astype(np.uint8))
+    return np.asarray(np.round(255 * np.clip(gray / bright, 0, 1) ** (1 / 2.2)).astype(np.uint8))
 
 
 def _levels(

@@ -56,8 +56,7 @@ class Transfer(Enum):
 def pq_light(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the display light in cd/m2 of a PQ signal in [0, 1]; BT.2100, table 4."""
     root = signal ** (1 / PQ_M2)
-    return np.asarray(
-        1e4 * (np.maximum(root - PQ_C1, 0) / (PQ_C2 - PQ_C3 * root)) ** (1 / PQ_M1))
+    return np.asarray(1e4 * (np.maximum(root - PQ_C1, 0) / (PQ_C2 - PQ_C3 * root)) ** (1 / PQ_M1))
 
 
 def pq_signal(light: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -149,9 +149,7 @@ def _upright_frame(
     return gravity_found, axes.similarity, axis, axes.walls.strength
 
 
-def _evidence(
-    gravity: Gravity, axis: str, strength: float | None, source: str
-) -> WorldEvidence:
+def _evidence(gravity: Gravity, axis: str, strength: float | None, source: str) -> WorldEvidence:
     cameras, floor = gravity.cameras, gravity.floor
     tilt = None
     if cameras is not None and floor is not None:

@@ -179,9 +179,7 @@ def _misfit(share: float, least: float) -> SfmError:
         "--poses ignore.")
 
 
-def _refine(
-    job: MappingJob, model: pycolmap.Reconstruction, known: KnownPoses
-) -> dict[str, float]:
+def _refine(job: MappingJob, model: pycolmap.Reconstruction, known: KnownPoses) -> dict[str, float]:
     """Adjusts poses and points in place, aligns them with the given poses, returns the movement."""
     before = model.compute_mean_reprojection_error()
     fixed = set(model.cameras) - _uncalibrated(job)
@@ -238,8 +236,7 @@ def _viewmats(model: pycolmap.Reconstruction, names: Collection[str]) -> Poses:
 
 
 def _centers(viewmats: Poses) -> NDArray[np.float64]:
-    centers: NDArray[np.float64] = -np.einsum(
-        "fji,fj->fi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centers: NDArray[np.float64] = -np.einsum("fji,fj->fi", viewmats[:, :3, :3], viewmats[:, :3, 3])
     return centers
 
 

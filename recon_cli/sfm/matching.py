@@ -142,8 +142,7 @@ def sequential_pairs(names: Sequence[str]) -> set[Pair]:
     ordered = sorted(names)
     near = range(1, SEQUENTIAL_OVERLAP + 1)
     far = (2**power for power in range(SEQUENTIAL_OVERLAP))
-    return {
-        pair for step in {*near, *far} for pair in zip(ordered, ordered[step:], strict=False)}
+    return {pair for step in {*near, *far} for pair in zip(ordered, ordered[step:], strict=False)}
 
 
 def similar_pairs(

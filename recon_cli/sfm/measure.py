@@ -165,8 +165,7 @@ def _locate(
         return np.asarray(-viewmat[:3, :3].T @ viewmat[:3, 3])
     pinhole = pinholes[place.name]
     depth = _depth_at(place, points @ viewmat[:3, :3].T + viewmat[:3, 3], pinhole)
-    ray = np.array([
-        (place.u - pinhole.cx) / pinhole.fx, (place.v - pinhole.cy) / pinhole.fy, 1.0])
+    ray = np.array([(place.u - pinhole.cx) / pinhole.fx, (place.v - pinhole.cy) / pinhole.fy, 1.0])
     return np.asarray(viewmat[:3, :3].T @ (depth * ray - viewmat[:3, 3]))
 
 

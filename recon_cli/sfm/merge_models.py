@@ -87,8 +87,7 @@ def _drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCand
 
 
 def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> Verdict:
-    return verdict.examine(
-        model, job.database, job.names, sharpness=job.sharpness, times=job.times)
+    return verdict.examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
 
 
 def _no_worse(together: ModelCandidate, alone: ModelCandidate) -> bool:

@@ -122,12 +122,7 @@ _LOG_TAIL = 64 * 1024  # bytes
 _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
 
 
-def run_job(
-    job: MappingJob,
-    *,
-    progress: Progress,
-    record: Callable[[int, int], None],
-) -> None:
+def run_job(job: MappingJob, *, progress: Progress, record: Callable[[int, int], None]) -> None:
     """Runs a job in a process of its own; its results are in the step log.
 
     Args:

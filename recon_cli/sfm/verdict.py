@@ -297,9 +297,7 @@ def find_jumps(evidence: MatchEvidence, times: Mapping[str, float | None]) -> tu
     return tuple(jumps)
 
 
-def _moments(
-    names: Sequence[str], times: Mapping[str, float | None]
-) -> NDArray[np.float64] | None:
+def _moments(names: Sequence[str], times: Mapping[str, float | None]) -> NDArray[np.float64] | None:
     """Returns when each image was taken, in any unit, [F]; None where that is not known."""
     seconds = [times.get(name) for name in names]
     if all(second is not None for second in seconds):

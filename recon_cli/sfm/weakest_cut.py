@@ -181,9 +181,7 @@ def _cut(evidence: MatchEvidence, links: _Links, side: Cut, inliers: Cut) -> Wea
     )
 
 
-def _outliers(
-    evidence: MatchEvidence, links: _Links, inliers: Cut
-) -> tuple[OutlierCamera, ...]:
+def _outliers(evidence: MatchEvidence, links: _Links, inliers: Cut) -> tuple[OutlierCamera, ...]:
     outliers = []
     for index in np.flatnonzero(evidence.registered & ~inliers):
         matches = links.matches[index, inliers].sum()

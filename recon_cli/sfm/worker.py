@@ -20,14 +20,7 @@ from typing import BinaryIO
 import filelock
 
 from recon_cli.errors import ReconError, WorkspaceError
-from recon_cli.sfm import (
-    align_world,
-    database,
-    fallbacks,
-    known_poses,
-    matching,
-    undistort,
-)
+from recon_cli.sfm import align_world, database, fallbacks, known_poses, matching, undistort
 from recon_cli.sfm.job import LOCK, MappingJob, Reporter, Result, StepLog
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
