@@ -5,6 +5,8 @@ Programming mistakes stay ValueError or AssertionError and leave the CLI with ex
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class ReconError(Exception):
     """A failure that the user can act on.
@@ -76,3 +78,9 @@ class ManifestError(WorkspaceError):
 
 class FormatError(InputError):
     """A file does not hold what its format promises."""
+
+
+def list_names(names: Sequence[str], most: int = 5) -> str:
+    """Returns the first names and the number of the others."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

@@ -15,7 +15,7 @@ from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.io.records import ImportRecord, has_views
 from recon_cli.scene.gravity import camera_up, turn_onto
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.measure import Measurement, ScaleBetween, measure
+from recon_cli.sfm.align_world import Measurement, ScaleBetween, measure
 from recon_cli.workspace.summaries import WorldSummary
 
 _UP = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}

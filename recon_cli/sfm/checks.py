@@ -8,40 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
-import pycolmap
-
-from recon_cli.errors import SfmError
-
-# Shift of the principal point as a share of the longer side. Measured: 0 to 0.025 in rooms, walks
-# and photos of ten and more frames, 0.032 with three; 0.114 in a walk that was torn in two places,
-# 0.97 of whose matches agreed with the cameras.
-MAX_SHIFT = 0.06
-
-
-def describe_shifted_centres(model: pycolmap.Reconstruction, database: Path) -> list[str]:
-    """Returns a sentence for each camera of a model whose principal point moved too far.
-
-    Args:
-        model: the reconstruction.
-        database: holds its cameras before mapping, under the same ids.
-    """
-    with pycolmap.Database.open(database) as opened:
-        initial = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-    shifts = {number: _shift(camera, initial[number])
-              for number, camera in sorted(model.cameras.items()) if number in initial}
-    return [
-        f"The principal point of camera {number} moved by {shift:.0%} of the image's longer side, "
-        f"at most {MAX_SHIFT:.0%} is usual: parts of the model may be displaced against each other."
-        for number, shift in shifts.items() if shift > MAX_SHIFT]
-
-
-def _shift(camera: pycolmap.Camera, initial: pycolmap.Camera) -> float:
-    off = math.hypot(camera.principal_point_x - initial.principal_point_x,
-                     camera.principal_point_y - initial.principal_point_y)
-    return off / float(max(camera.width, camera.height))
-
+from recon_cli.errors import SfmError, list_names
 
 MIN_FRAMES = 3
 # COLMAP accepts a pair of images from 15 inliers on.
@@ -113,9 +81,3 @@ def check_parallax(median_angle_deg: float) -> None:
             f"The camera did not move enough: half of the points are seen at angles below "
             f"{median_angle_deg:.1f} degrees, but {MIN_ANGLE_DEG:g} are needed.",
             hint=_MOVE)
-
-
-def list_names(names: Sequence[str], most: int = 5) -> str:
-    """Returns the first names and the number of the others."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

@@ -25,29 +25,18 @@ MAX_ERROR = 4.0
 
 @dataclass(frozen=True)
 class MatchEvidence:
-    """Verified matches, and how many of them a model confirms; images are indices into names.
+    """Verified matches, and how many of them a model confirms; images are indices into names."""
 
-    Attributes:
-        names: of all N images that were given to the mapper.
-        registered: which images have a camera, [N] bool.
-        centers: camera centres, [N, 3] in the model's units; NaN without a camera.
-        keypoints: features found in each image, [N].
-        seen: which points of the model each image sees, [N, M] bool.
-        tried: pairs that were matched, successfully or not, [N, N] bool, symmetric.
-        pairs: verified pairs of images, [P, 2], first < second, sorted.
-        matches: verified matches of each pair, [P].
-        agreeing: those within MAX_ERROR of the epipolar lines that the poses give, [P]; zero where
-            one of the two has no camera.
-    """
-
-    names: tuple[str, ...]
-    registered: NDArray[np.bool_]
-    centers: NDArray[np.float64]
-    keypoints: NDArray[np.int64]
-    seen: NDArray[np.bool_]
-    tried: NDArray[np.bool_]
-    pairs: NDArray[np.int64]
-    matches: NDArray[np.int64]
+    names: tuple[str, ...]  # of all N images that were given to the mapper
+    registered: NDArray[np.bool_]  # [N], images that have a camera
+    centers: NDArray[np.float64]  # [N, 3] of the cameras, in the model's units; NaN without one
+    keypoints: NDArray[np.int64]  # [N], features found in each image
+    visible: NDArray[np.bool_]  # [N, M], which points of the model each image sees
+    tried: NDArray[np.bool_]  # [N, N], symmetric: pairs that were matched, successfully or not
+    pairs: NDArray[np.int64]  # [P, 2], verified pairs of images, first < second, sorted
+    matches: NDArray[np.int64]  # [P], verified matches of each pair
+    # [P], those within MAX_ERROR of the epipolar lines that the poses give; zero where one of the
+    # two has no camera.
     agreeing: NDArray[np.int64]
 
     @property
@@ -58,12 +47,12 @@ class MatchEvidence:
     @cached_property
     def points(self) -> NDArray[np.int64]:
         """Points of the model that each image sees, [N]."""
-        return np.asarray(self.seen.sum(axis=1), np.int64)
+        return np.asarray(self.visible.sum(axis=1), np.int64)
 
     @cached_property
     def shared(self) -> NDArray[np.int64]:
         """Points that two images both see, [N, N], zero on the diagonal."""
-        visible = self.seen.astype(np.float32)  # exact up to 16 million, and many times faster
+        visible = self.visible.astype(np.float32)  # exact up to 16 million, and many times faster
         shared = np.asarray(visible @ visible.T, np.int64)
         np.fill_diagonal(shared, 0)
         return shared
@@ -89,18 +78,21 @@ def gather_evidence(
         if len(ids) != len(names):
             raise ValueError(f"{database} holds {len(ids)} of {len(names)} images")
         keypoints = {ids[i]: opened.read_keypoints(i)[:, :2].astype(np.float64) for i in ids}
-        tried = _matched_pairs(opened, ids)
-        pairs, matches = _verified_pairs(opened, ids)
+        tried = _read_matched_pairs(opened, ids)
+        pairs, matches = _read_verified_pairs(opened, ids)
     centers = np.full((len(names), 3), np.nan)
     for index, image in placed.items():
         centers[index] = image.projection_center()
+    rows = {image.image_id: index for index, image in placed.items()}
+    visible = np.zeros((len(names), model.num_points3D()), np.bool_)
+    for column, (_, point) in enumerate(sorted(model.points3D.items())):
+        visible[[rows[element.image_id] for element in point.track.elements], column] = True
     return MatchEvidence(
         names=tuple(names),
         registered=np.isin(np.arange(len(names)), list(placed)),
         centers=centers,
         keypoints=np.array([len(keypoints[index]) for index in range(len(names))], np.int64),
-        seen=_seen_points(
-            model, {image.image_id: index for index, image in placed.items()}, len(names)),
+        visible=visible,
         tried=tried,
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
@@ -108,7 +100,7 @@ def gather_evidence(
     )
 
 
-def _matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
+def _read_matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
     """Returns which pairs were matched, [N, N]."""
     tried = np.zeros((len(ids), len(ids)), np.bool_)
     for first, second in combinations(ids, 2):
@@ -118,7 +110,7 @@ def _matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray
     return tried
 
 
-def _verified_pairs(
+def _read_verified_pairs(
     opened: pycolmap.Database, ids: Mapping[int, int]
 ) -> tuple[list[tuple[int, int]], list[NDArray[np.uint32]]]:
     """Returns the verified pairs, sorted, and which keypoints of each match, [M, 2]."""
@@ -134,16 +126,6 @@ def _verified_pairs(
             inliers[ids[second], ids[first]] = rows[:, ::-1]
     order = sorted(inliers)
     return order, [inliers[pair] for pair in order]
-
-
-def _seen_points(
-    model: pycolmap.Reconstruction, rows: Mapping[int, int], count: int
-) -> NDArray[np.bool_]:
-    """Returns which points each image sees, [count, M], the points in the order of their ids."""
-    visible = np.zeros((count, model.num_points3D()), np.bool_)
-    for column, (_, point) in enumerate(sorted(model.points3D.items())):
-        visible[[rows[element.image_id] for element in point.track.elements], column] = True
-    return visible
 
 
 def _count_agreeing(

@@ -14,9 +14,8 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import pycolmap
 
@@ -27,7 +26,7 @@ from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.verdict import check_weak_link, examine
 from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace import atomic
-from recon_cli.workspace.summaries import AttemptSummary
+from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 # Exhaustive matching grows with the square: 4950 pairs of 100 images are about a minute on two
 # cores at 600x340 and still the whole graph, so that a walk around a room closes.
@@ -51,7 +50,7 @@ class Fallback:
 
 
 @dataclass(frozen=True)
-class MapperAttempt:
+class MapperAttempt(JsonRecord):
     """What became of one fallback; see also `AttemptSummary` and `ModelCandidate`."""
 
     name: str
@@ -61,7 +60,7 @@ class MapperAttempt:
     registered: tuple[str, ...] = ()
     shortfall: str = "no model was found"  # why it is not good enough; empty where it is
     apart: tuple[tuple[str, ...], ...] = ()
-    rejected: dict[str, str] = dataclasses.field(default_factory=dict)
+    rejected: Mapping[str, str] = dataclasses.field(default_factory=dict)
     trusted: bool = False
     weak_link: float | None = None
     reprojection_error_px: float | None = None
@@ -89,8 +88,9 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         _incremental("retrieval", f"{count} frames are too many to match all pairs at once"), every)
     return (
         *begin,
-        Fallback("relaxed", "", _no_pairs, lambda *to: mapper.map_incrementally(*to, relaxed=True)),
-        Fallback("global", "", _no_pairs, mapper.map_globally))
+        Fallback("relaxed", "", lambda _: set(),
+                 lambda *to: mapper.map_incrementally(*to, relaxed=True)),
+        Fallback("global", "", lambda _: set(), mapper.map_globally))
 
 
 def match_first(job: MappingJob, report: Reporter) -> Result:
@@ -120,10 +120,10 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
     for fallback in list_fallbacks(job):
         recorded = log.result(fallback.name)
         if recorded:
-            attempt = _read(recorded)
+            attempt = MapperAttempt.from_json(recorded)
         else:
-            attempt = _attempt(job, fallback, reason, attempts, report, deadline)
-            log.finish(fallback.name, dataclasses.asdict(attempt), job.attempts / fallback.name)
+            attempt = _try_fallback(job, fallback, reason, attempts, report, deadline)
+            log.finish(fallback.name, attempt.to_json(), job.attempts / fallback.name)
         attempts.append(attempt)
         if not attempt.skipped:
             reason = attempt.shortfall
@@ -133,16 +133,15 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
 
 
 def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
-    """Returns the frames that a model could hold.
+    """Returns the frames with features that a model could hold.
 
-    Those are the frames with features and, once all pairs are matched, only those that matches
-    connect to it, directly or through others.
+    Once all pairs are matched, these are only those that matches connect to it, directly or not.
     """
     counts = database.keypoint_counts(job.database)
     textured = {name for name, count in counts.items() if count >= checks.MIN_KEYPOINTS}
     if database.progress(job.database, "matches") < len(counts) * (len(counts) - 1) // 2:
         return textured
-    held = set(mapper.registered_names(candidate.model))
+    held = set(mapper.list_registered(candidate.model))
     connected = max(candidate.verdict.match_parts, key=lambda part: len(held.intersection(part)))
     return textured.intersection(connected)
 
@@ -177,11 +176,11 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     return max((attempt for attempt in attempts if attempt.registered), key=quality, default=None)
 
 
-def _attempt(
+def _try_fallback(
     job: MappingJob, fallback: Fallback, reason: str, before: Sequence[MapperAttempt],
     report: Reporter, deadline: float,
 ) -> MapperAttempt:
-    """Tries a fallback and writes its model into its folder."""
+    """Writes the model of a fallback into its folder and returns what became of it."""
     folder = fresh_folder(job.attempts / fallback.name)
     start = time.monotonic()
     wanted = fallback.choose_pairs(job) if before else set()  # those of the first are matched
@@ -195,17 +194,13 @@ def _attempt(
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
         return MapperAttempt(fallback.name, reason, seconds)
-    _write(candidate.model, folder / "model")
+    (folder / "model").mkdir()
+    candidate.model.write(folder / "model")
     return MapperAttempt(
-        fallback.name, reason, seconds, "", tuple(mapper.registered_names(candidate.model)),
-        shortfall(candidate, reachable(job, candidate)), candidate.apart, dict(candidate.rejected),
+        fallback.name, reason, seconds, "", tuple(mapper.list_registered(candidate.model)),
+        shortfall(candidate, reachable(job, candidate)), candidate.apart, candidate.rejected,
         candidate.verdict.trusted, candidate.verdict.weakest_cut.share,
         candidate.model.compute_mean_reprojection_error())
-
-
-def _write(model: pycolmap.Reconstruction, folder: Path) -> None:
-    folder.mkdir()
-    model.write(folder)
 
 
 def _estimate_seconds(job: MappingJob, count: int, before: Sequence[MapperAttempt]) -> float:
@@ -247,18 +242,8 @@ def _describe(attempts: Sequence[MapperAttempt]) -> str:
     return f"Cameras by mapper: {', '.join(counts)}."
 
 
-def _read(value: Result) -> MapperAttempt:
-    return MapperAttempt(**{
-        **value, "registered": tuple(value["registered"]),
-        "apart": tuple(map(tuple, value["apart"]))})
-
-
 def _incremental(pairs: str, reason: str) -> Fallback:
     return Fallback(pairs, reason, _PAIRS[pairs], mapper.map_incrementally)
-
-
-def _no_pairs(_job: MappingJob) -> set[matching.Pair]:
-    return set()
 
 
 def _near_or_similar(job: MappingJob) -> set[matching.Pair]:

@@ -105,8 +105,7 @@ class MappingJob:
         """Writes the job for the mapping process."""
         atomic.write_json(path, {
             name: str(value) if isinstance(value, Path) else value
-            for name, value in dataclasses.asdict(self).items()
-        })
+            for name, value in dataclasses.asdict(self).items()})
 
     @classmethod
     def read(cls, path: Path) -> MappingJob:
@@ -114,28 +113,18 @@ class MappingJob:
         value: dict[str, Any] = atomic.read_json(path)
         for name in ("frames", "denoised", "out", "masks", "poses"):
             value[name] = None if value[name] is None else Path(value[name])
+        for group in value["groups"]:
+            if (lens := group["lens"]) is not None:
+                group["lens"] = Lens(**{**lens, "params": tuple(lens["params"])})
+        value["groups"] = tuple(
+            CameraGroup(**{**group, "names": tuple(group["names"])}) for group in value["groups"])
         scale = value["scale_between"]
-        return cls(**{
-            **value, "groups": tuple(map(_group, value["groups"])),
-            "scale_between": None if scale is None else tuple(scale)})
-
-
-def _group(value: dict[str, Any]) -> CameraGroup:
-    lens = value["lens"]
-    return CameraGroup(**{
-        **value, "names": tuple(value["names"]), "lens": None if lens is None else _lens(lens)})
-
-
-def _lens(value: dict[str, Any]) -> Lens:
-    return Lens(**{**value, "params": tuple(value["params"])})
+        value["scale_between"] = None if scale is None else tuple(scale)
+        return cls(**value)
 
 
 class StepLog:
-    """The finished steps in a folder; every change reaches the disk at once.
-
-    Args:
-        out: the stage's folder, or one in it.
-    """
+    """The finished steps in the stage's folder, or in one in it; written after every change."""
 
     def __init__(self, out: Path) -> None:
         self._out = out
@@ -160,8 +149,7 @@ class StepLog:
         """Records a step as finished, with its result and the files in the `folder` it wrote."""
         files = {
             path.relative_to(self._out).as_posix(): path.stat().st_size
-            for path in (() if folder is None else _files(folder))
-        }
+            for path in (() if folder is None else _files(folder))}
         self._steps[step] = {"result": result, "files": files}
         atomic.write_json(self._out / LOG_FILE, self._steps)
 
@@ -197,8 +185,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 _ERRORS: dict[str, type[ReconError]] = {
-    kind.__name__: kind for kind in (SfmError, ConfigError, FormatError, WorkspaceError)
-}
+    kind.__name__: kind for kind in (SfmError, ConfigError, FormatError, WorkspaceError)}
 
 
 @dataclass(frozen=True)
@@ -210,21 +197,8 @@ class Phase:
     done: int  # those that an interrupted run had done
 
 
-@dataclass(frozen=True)
-class Done:
-    """So many units of the current phase are done, counted from its beginning."""
-
-    count: int
-
-
-@dataclass(frozen=True)
-class Failed:
-    """The process gives up with an error that the parent raises."""
-
-    error: ReconError | OSError
-
-
-Event = Phase | Done | Failed
+# A number is that of the finished units of the current phase; an error ends the process.
+Event = Phase | int | ReconError | OSError
 
 
 class Reporter:
@@ -260,7 +234,7 @@ def parse(line: bytes) -> Event:
     if "phase" in value:
         return Phase(value["phase"], value["total"], value["done"])
     if "count" in value:
-        return Done(value["count"])
+        return int(value["count"])
     if "errno" in value:
-        return Failed(OSError(value["errno"], value["text"], value["file"]))
-    return Failed(_ERRORS[value["error"]](value["message"], hint=value["hint"]))
+        return OSError(value["errno"], value["text"], value["file"])
+    return _ERRORS[value["error"]](value["message"], hint=value["hint"])

@@ -23,7 +23,7 @@ from recon_cli.io.records import KnownPoses, read_poses
 from recon_cli.sfm import checks, database, mapper, matching
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish
-from recon_cli.sfm.merge_models import posed_model
+from recon_cli.sfm.merge_models import build_posed_model
 from recon_cli.sfm.verdict import check_weak_link, examine
 from recon_cli.workspace import atomic
 
@@ -49,28 +49,24 @@ Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
 
 def match_known(job: MappingJob, report: Reporter) -> Result:
     """Matches neighbours in the order of names, and cameras that stand and look alike."""
-    poses = _poses(job).viewmats
+    poses = _read_poses(job).viewmats
     matching.match_pairs(job, near_pairs(poses) | matching.sequential_pairs(list(poses)), report)
     return matching.count_matches(job)
 
 
-def near_pairs(viewmats: Mapping[str, NDArray[np.float64]]) -> set[matching.Pair]:
-    """Returns each image paired with the nearest that look in about the same direction.
-
-    Args:
-        viewmats: [4, 4] world to camera by name.
-    """
+def near_pairs(
+    viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera by name
+) -> set[matching.Pair]:
+    """Returns each image paired with the nearest that look in about the same direction."""
     return {
         (min(name, other), max(name, other))
         for name, others in neighbours(viewmats).items() for other in others[:NEAREST]}
 
 
-def neighbours(viewmats: Mapping[str, NDArray[np.float64]]) -> dict[str, list[str]]:
-    """Returns for each image those that look in about the same direction, nearest first.
-
-    Args:
-        viewmats: [4, 4] world to camera by name.
-    """
+def neighbours(
+    viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera by name
+) -> dict[str, list[str]]:
+    """Returns for each image those that look in about the same direction, nearest first."""
     names = sorted(viewmats)
     matrices = np.stack([viewmats[name] for name in names])
     axes, nearest = matrices[:, 2, :3], {}
@@ -89,18 +85,19 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
     Raises:
         SfmError: too few frames have a pose, or the poses do not fit the images.
     """
-    known = _poses(job)
+    known = _read_poses(job)
     checks.check_registered(job.names, list(known.viewmats), 0.0)
     report.phase("mapping", len(job.names))
     movement: dict[str, float] = {}
     if "features" not in job.steps:
-        model, verdict = _given_model(job, known), None
-        check = spot_check(job, neighbours(known.viewmats), known.viewmats)
+        model, verdict = _build_given_model(job, known), None
+        check = spot_check(job, known.viewmats)
         if not check.fits:
             raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
         lines = check.lines()
     else:
-        model = _triangulate(job, known)
+        posed = build_posed_model(job.database, None, _rigid(known.viewmats, known.viewmats))
+        model = mapper.triangulate(job, posed, refine_intrinsics=bool(_uncalibrated_cameras(job)))
         if job.pose_use == "refine":
             movement = _refine(job, model, known)
         _check_fit(job, model)
@@ -120,7 +117,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         "poses": {"use": job.pose_use, "metric": known.metric, **movement}}
 
 
-def _poses(job: MappingJob) -> KnownPoses:
+def _read_poses(job: MappingJob) -> KnownPoses:
     """Returns the poses of the job's frames."""
     assert job.poses is not None
     known, names = read_poses(job.poses), set(job.names)
@@ -128,7 +125,7 @@ def _poses(job: MappingJob) -> KnownPoses:
     return KnownPoses(viewmats, known.metric, known.points, known.colors)
 
 
-def _given_model(job: MappingJob, known: KnownPoses) -> pycolmap.Reconstruction:
+def _build_given_model(job: MappingJob, known: KnownPoses) -> pycolmap.Reconstruction:
     """Returns the given cameras and points; no image says which points it sees."""
     model, number = pycolmap.Reconstruction(), 0
     for camera, group in enumerate(job.groups, start=1):
@@ -148,12 +145,6 @@ def _given_model(job: MappingJob, known: KnownPoses) -> pycolmap.Reconstruction:
     for point, color in zip(known.points, known.colors, strict=True):
         model.add_point3D(point, pycolmap.Track(), color)
     return model
-
-
-def _triangulate(job: MappingJob, known: KnownPoses) -> pycolmap.Reconstruction:
-    """Returns the given cameras with the points that the matches give."""
-    posed = posed_model(job.database, None, _rigid(known.viewmats, known.viewmats))
-    return mapper.triangulate(job, posed, refine_intrinsics=bool(_uncalibrated(job)))
 
 
 def _rigid(
@@ -182,14 +173,14 @@ def _misfit(share: float, least: float) -> SfmError:
 def _refine(job: MappingJob, model: pycolmap.Reconstruction, known: KnownPoses) -> dict[str, float]:
     """Adjusts poses and points in place, aligns them with the given poses, returns the movement."""
     before = model.compute_mean_reprojection_error()
-    fixed = set(model.cameras) - _uncalibrated(job)
+    fixed = set(model.cameras) - _uncalibrated_cameras(job)
     for _ in range(2):  # the first one drops points that the given poses had spoilt
         mapper.adjust(model, constant=fixed)
-    names = mapper.registered_names(model)
-    given = np.stack([known.viewmats[name] for name in names])
-    model.transform(align_to_given(_viewmats(model, names), given))
+    names = mapper.list_registered(model)
+    original = np.stack([known.viewmats[name] for name in names])
+    model.transform(align_to_given(_viewmats(model, names), original))
     model.update_point_3d_errors()
-    movement = measure_movement(_viewmats(model, names), given)
+    movement = measure_movement(_viewmats(model, names), original)
     return {**movement, "reprojection_error_px_before": before}
 
 
@@ -223,7 +214,7 @@ def measure_movement(refined: Poses, given: Poses) -> dict[str, float]:
         "turned_max_deg": float(np.degrees(turns.max()))}
 
 
-def _uncalibrated(job: MappingJob) -> set[int]:
+def _uncalibrated_cameras(job: MappingJob) -> set[int]:
     """Returns the ids of the cameras whose intrinsics are not known."""
     return {camera for camera, group in enumerate(job.groups, start=1) if group.lens is None}
 
@@ -261,40 +252,31 @@ class SpotCheck:
 
 
 def spot_check(
-    job: MappingJob, near: Mapping[str, list[str]], viewmats: Mapping[str, NDArray[np.float64]]
+    job: MappingJob,
+    viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera by name
 ) -> SpotCheck:
-    """Returns how well sampled pairs of images agree with the poses; every lens is known.
-
-    Args:
-        job: gives the images.
-        near: `neighbours` of each image.
-        viewmats: [4, 4] world to camera by name.
-    """
-    names = sorted(viewmats)
+    """Returns how well sampled pairs of images agree with the poses; every lens is known."""
+    names, near = sorted(viewmats), neighbours(viewmats)
     places = {names[int((i + 0.5) * len(names) / PLACES)] for i in range(PLACES)}
     wanted = {
         (min(name, other), max(name, other)) for name in places
         for other in (near[name][k] for k in NEIGHBOURS if k < len(near[name]))}
-    sample = _part(job, sorted({name for pair in wanted for name in pair}))
+    sampled = {name for pair in wanted for name in pair}
+    groups = tuple(
+        replace(group, names=chosen) for group in job.groups
+        if (chosen := tuple(name for name in group.names if name in sampled)))
+    sample = replace(
+        job, out=fresh_folder(job.attempts / "check"), groups=groups, max_features=FEATURES)
     silent = Reporter(io.BytesIO())
     matching.create_database(sample)
     try:
         matching.extract_features(sample, silent)
         matching.match_pairs(sample, wanted, silent)
         evidence = gather_evidence(
-            posed_model(sample.database, None, _rigid(viewmats, sample.names)),
+            build_posed_model(sample.database, None, _rigid(viewmats, sample.names)),
             sample.database, sample.names)
         matches, agreeing = int(evidence.matches.sum()), int(evidence.agreeing.sum())
     except SfmError:  # hardly any texture
         matches, agreeing = 0, 0
     shutil.rmtree(sample.out)
     return SpotCheck(matches, agreeing / matches if matches >= MIN_MATCHES else None)
-
-
-def _part(job: MappingJob, names: list[str]) -> MappingJob:
-    """Returns a job over some of the images, in a folder of its own."""
-    groups = tuple(
-        replace(group, names=chosen) for group in job.groups
-        if (chosen := tuple(name for name in group.names if name in names)))
-    return replace(
-        job, out=fresh_folder(job.attempts / "check"), groups=groups, max_features=FEATURES)

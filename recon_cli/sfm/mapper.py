@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
+from collections import Counter
 from collections.abc import Collection
 
 import numpy as np
@@ -25,11 +26,12 @@ MIN_IMAGES_PRINCIPAL = 10
 # COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
 MAX_ERROR, MIN_ANGLE = 4.0, 1.5
 # Where COLMAP writes models that are read from memory, and finds the one that it continues.
-FOUND, BEGUN = "found.partial", "begun.partial"
+MODELS, START = "found.partial", "begun.partial"
 
 
-def map_incrementally(job: MappingJob, report: Reporter, *, relaxed: bool = False
-                ) -> list[pycolmap.Reconstruction]:
+def map_incrementally(
+    job: MappingJob, report: Reporter, *, relaxed: bool = False
+) -> list[pycolmap.Reconstruction]:
     """Returns every model that the incremental mapper finds; they may share images.
 
     `relaxed` lowers the thresholds for the first pair and for further images.
@@ -40,22 +42,22 @@ def map_incrementally(job: MappingJob, report: Reporter, *, relaxed: bool = Fals
     images = itertools.count(3)  # the first call comes with the third image of a model
     report.phase("mapping", len(job.names))
     models = pycolmap.incremental_mapping(
-        job.database, job.frames, fresh_folder(job.attempts / FOUND), options,
+        job.database, job.frames, fresh_folder(job.attempts / MODELS), options,
         next_image_callback=lambda: report.done(min(next(images), len(job.names))))
-    shutil.rmtree(job.attempts / FOUND)
+    shutil.rmtree(job.attempts / MODELS)
     return list(models.values())
 
 
 def extend_model(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Returns a model with the images that the mapper can add to it, adjusted as a whole."""
-    begun, options = fresh_folder(job.attempts / BEGUN), _options(job)
-    model.write(begun)
+    start, options = fresh_folder(job.attempts / START), _options(job)
+    model.write(start)
     options.multiple_models = False
     models = pycolmap.incremental_mapping(
-        job.database, job.frames, fresh_folder(job.attempts / FOUND), options, input_path=begun)
-    shutil.rmtree(begun)
-    shutil.rmtree(job.attempts / FOUND)
-    return max(models.values(), key=_size, default=model)
+        job.database, job.frames, fresh_folder(job.attempts / MODELS), options, input_path=start)
+    shutil.rmtree(start)
+    shutil.rmtree(job.attempts / MODELS)
+    return max(models.values(), key=model_size, default=model)
 
 
 def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
@@ -74,8 +76,8 @@ def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruct
         calibration.random_seed = job.seed
         pycolmap.calibrate_view_graph(copy, calibration)
     models = pycolmap.global_mapping(
-        copy, job.frames, fresh_folder(job.attempts / FOUND), _global_options(job))
-    shutil.rmtree(job.attempts / FOUND)
+        copy, job.frames, fresh_folder(job.attempts / MODELS), _global_options(job))
+    shutil.rmtree(job.attempts / MODELS)
     database.remove(copy)
     return list(models.values())
 
@@ -107,17 +109,17 @@ def triangulate(
 ) -> pycolmap.Reconstruction:
     """Returns a model of the same poses with the points that the matches give."""
     triangulated = pycolmap.triangulate_points(
-        model, job.database, job.frames, fresh_folder(job.attempts / FOUND), True, _options(job),
+        model, job.database, job.frames, fresh_folder(job.attempts / MODELS), True, _options(job),
         refine_intrinsics)
-    shutil.rmtree(job.attempts / FOUND)
+    shutil.rmtree(job.attempts / MODELS)
     return triangulated
 
 
 def describe_model(model: pycolmap.Reconstruction) -> Result:
-    """Returns what a model holds, for the stage's summary; None for figures without tracks."""
+    """Returns the contents of a model for the stage's summary; None for figures without tracks."""
     tracks = model.compute_num_observations() > 0
     return {
-        "registered": registered_names(model),
+        "registered": list_registered(model),
         "points": model.num_points3D(),
         "mean_track_length": model.compute_mean_track_length() if tracks else None,
         "reprojection_error_px": model.compute_mean_reprojection_error() if tracks else None,
@@ -126,14 +128,9 @@ def describe_model(model: pycolmap.Reconstruction) -> Result:
     }
 
 
-def registered_names(model: pycolmap.Reconstruction) -> list[str]:
+def list_registered(model: pycolmap.Reconstruction) -> list[str]:
     """Returns the names of the images that have a camera, sorted."""
     return sorted(model.image(i).name for i in model.reg_image_ids())
-
-
-def largest_first(models: Collection[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """Returns models by the number of their images, then of their points."""
-    return sorted(models, key=_size, reverse=True)
 
 
 def triangulation_angles(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
@@ -147,7 +144,8 @@ def triangulation_angles(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     return np.degrees(angles)
 
 
-def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+def model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    """Returns the number of images that have a camera, and of points."""
     return model.num_reg_images(), model.num_points3D()
 
 
@@ -189,12 +187,10 @@ def _global_options(job: MappingJob) -> pycolmap.GlobalPipelineOptions:
 
 def _rare_cameras(model: pycolmap.Reconstruction) -> set[int]:
     """Returns the cameras with few images, where there are several."""
-    counts = dict.fromkeys(model.cameras, 0)
-    for image in model.reg_image_ids():
-        counts[model.image(image).camera_id] += 1
-    if len(counts) == 1:
+    if len(model.cameras) == 1:
         return set()
-    return {camera for camera, count in counts.items() if count < MIN_IMAGES_PRINCIPAL}
+    counts = Counter(model.image(image).camera_id for image in model.reg_image_ids())
+    return {camera for camera in model.cameras if counts[camera] < MIN_IMAGES_PRINCIPAL}
 
 
 def _adjust_some(

@@ -14,23 +14,18 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, list_names
 from recon_cli.sfm import checks, database
-from recon_cli.sfm.checks import list_names
 from recon_cli.sfm.database import scales
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, Result
 
 CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
 # COLMAP's default. With the powers of two an image also meets those 16, 32, ... 512 further on.
 SEQUENTIAL_OVERLAP = 10
-
-
 # COLMAP tries 10000 samples before it gives up on a pair, and most of its time goes to pairs that
 # show nothing in common. 2000 took a third off the verification of five captures; of their 5700
 # verified pairs 8 got lost, all with few matches, and every model kept its images.
 MAX_TRIALS = 2000
-
-
 # Share of the verified matches above which pairs at some distance show whether there is depth.
 MIN_SHARE = 0.01
 # Similar images per image beside its neighbours. Of all pairs that are no neighbours and have 50 or
@@ -58,14 +53,13 @@ def extract_features(job: MappingJob, report: Reporter) -> Result:
     report.phase("features", len(job.names), done=database.progress(job.database, "features"))
     for group in job.groups:
         masked = [name for name in group.names if job.masks and (job.masks / name).exists()]
+        rest = sorted(set(group.names).difference(masked))
         # COLMAP takes no image that has no mask where it is given a folder of masks.
-        for names, masks in (
-            (masked, job.masks), (sorted(set(group.names).difference(masked)), None)
-        ):
+        for names, masks in ((masked, job.masks), (rest, None)):
             if names:  # an empty list would mean all
                 pycolmap.extract_features(
                     job.database, job.frames, names, pycolmap.CameraMode.SINGLE,
-                    _reader(group, masks), _extraction(job), pycolmap.Device.cpu)
+                    _reader_options(group, masks), _extraction_options(job), pycolmap.Device.cpu)
     database.keep_coarsest(job.database, job.max_features)
     counts = database.keypoint_counts(job.database)
     _check_readable(job, counts)
@@ -89,7 +83,7 @@ def create_database(job: MappingJob) -> None:
     for group in job.groups:
         pycolmap.import_images(
             temporary, job.frames, pycolmap.CameraMode.SINGLE, list(group.names),
-            _reader(group))
+            _reader_options(group))
     with pycolmap.Database.open(temporary) as opened:
         names = {image.name for image in opened.read_all_images()}
     _check_readable(job, names)
@@ -105,7 +99,7 @@ def _check_readable(job: MappingJob, readable: Collection[str]) -> None:
             hint="Run `recon ingest --again`.")
 
 
-def _reader(group: CameraGroup, masks: Path | None = None) -> pycolmap.ImageReaderOptions:
+def _reader_options(group: CameraGroup, masks: Path | None = None) -> pycolmap.ImageReaderOptions:
     options = pycolmap.ImageReaderOptions()
     options.camera_model = CAMERA_MODEL
     if masks is not None:
@@ -119,7 +113,7 @@ def _reader(group: CameraGroup, masks: Path | None = None) -> pycolmap.ImageRead
     return options
 
 
-def _extraction(job: MappingJob) -> pycolmap.FeatureExtractionOptions:
+def _extraction_options(job: MappingJob) -> pycolmap.FeatureExtractionOptions:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = job.threads
     # No hard cap, hence `keep_coarsest`: COLMAP stops after the scale at which the count is
@@ -153,20 +147,15 @@ def similar_pairs(
     nearest: int = NEAREST,
     besides: Collection[Pair] = (),
 ) -> set[Pair]:
-    """Returns each image paired with those that look most like it.
+    """Returns each image of `names` paired with the `nearest` ones that look most like it.
 
-    Args:
-        database: with the features of all images.
-        names: of the images to pair.
-        seed: of the sample of descriptors.
-        nearest: images that each one is paired with.
-        besides: known pairs, which are left out; the next ones take their place.
+    The known pairs `besides` are left out; the next ones take their place.
     """
     ordered = sorted(names)
     row = {name: index for index, name in enumerate(ordered)}
     features = _features(database, ordered)
-    described = _describe(features, _visual_words(features, np.random.default_rng(seed)))
-    similarity = described @ described.T
+    vectors = _describe(features, _visual_words(features, np.random.default_rng(seed)))
+    similarity = vectors @ vectors.T
     known = np.array([(row[name], row[other]) for name, other in besides], int).reshape(-1, 2)
     known = np.concatenate([known, known[:, ::-1], np.repeat(np.arange(len(row))[:, None], 2, 1)])
     similarity[known[:, 0], known[:, 1]] = -np.inf
@@ -194,8 +183,8 @@ def _visual_words(
     features: Sequence[NDArray[np.float32]], generator: np.random.Generator
 ) -> NDArray[np.float32]:
     """Returns the centres that k-means finds, [W, 128]."""
-    every = np.concatenate(features)
-    sample = every[generator.permutation(len(every))[:SAMPLE]]
+    descriptors = np.concatenate(features)
+    sample = descriptors[generator.permutation(len(descriptors))[:SAMPLE]]
     words = sample[:WORDS].copy()
     for _ in range(ROUNDS):
         nearest = _nearest(sample, words)
@@ -221,12 +210,12 @@ def _describe(
     outweigh the rest ("intra-normalisation", Arandjelovic and Zisserman, CVPR 2013). The mean of
     all images is subtracted.
     """
-    described = np.zeros((len(features), *words.shape), np.float32)
-    for row, descriptors in zip(described, features, strict=True):
+    vectors = np.zeros((len(features), *words.shape), np.float32)
+    for row, descriptors in zip(vectors, features, strict=True):
         nearest = _nearest(descriptors, words)
         np.add.at(row, nearest, descriptors - words[nearest])
-    described = _unit(_unit(described).reshape(len(features), -1))
-    return _unit(described - described.mean(axis=0))
+    vectors = _unit(_unit(vectors).reshape(len(features), -1))
+    return _unit(vectors - vectors.mean(axis=0))
 
 
 def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -242,11 +231,15 @@ def match_pairs(job: MappingJob, pairs: Iterable[Pair], report: Reporter) -> Non
     job.attempts.mkdir(exist_ok=True)
     listed.write_text("".join(
         f"{name} {other}\n" for name, other in sorted(wanted - there)), encoding="utf-8")
-    options = pycolmap.ImportedPairingOptions()
-    options.match_list_path = listed
     if wanted - there:
+        pairing, matching = pycolmap.ImportedPairingOptions(), pycolmap.FeatureMatchingOptions()
+        pairing.match_list_path = listed
+        matching.num_threads = job.threads
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = job.seed
+        verification.ransac.max_num_trials = MAX_TRIALS
         pycolmap.match_image_pairs(
-            job.database, _matching(job), options, _verification(job), pycolmap.Device.cpu)
+            job.database, matching, pairing, verification, pycolmap.Device.cpu)
     listed.unlink()
 
 
@@ -270,16 +263,3 @@ def check_motion(job: MappingJob) -> None:
     large = [counts for counts in groups if counts[1] >= MIN_SHARE * total]
     deepest = min(large, key=lambda counts: counts[2] / counts[1], default=(0, 0, 0))
     checks.check_motion(*deepest)
-
-
-def _matching(job: MappingJob) -> pycolmap.FeatureMatchingOptions:
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = job.threads
-    return options
-
-
-def _verification(job: MappingJob) -> pycolmap.TwoViewGeometryOptions:
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = job.seed
-    options.ransac.max_num_trials = MAX_TRIALS
-    return options

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from recon_cli.sfm import mapper, verdict
 from recon_cli.sfm.checks import MIN_FRAMES
 from recon_cli.sfm.job import MappingJob
-from recon_cli.sfm.verdict import Verdict
+from recon_cli.sfm.verdict import ModelVerdict
 
 # COLMAP's thresholds for the pose of an image (abs_pose_min_num_inliers, _min_inlier_ratio): a
 # model is placed by its points just as an image is.
@@ -39,17 +39,9 @@ class ModelCandidate:
     """A model that may become the result."""
 
     model: pycolmap.Reconstruction  # adjusted
-    verdict: Verdict
+    verdict: ModelVerdict
     apart: tuple[tuple[str, ...], ...]  # frames that only other models hold
     rejected: Mapping[str, str]  # why frames were taken out, by name
-
-
-@dataclass(frozen=True)
-class SharedPoints:
-    """Points that two models have in common, in the coordinates of each."""
-
-    source: NDArray[np.float64]  # [P, 3]
-    target: NDArray[np.float64]  # [P, 3]
 
 
 def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> ModelCandidate | None:
@@ -59,16 +51,17 @@ def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> Mo
     """
     if not models:
         return None
-    largest, *others = mapper.largest_first(models)
+    largest, *others = sorted(models, key=mapper.model_size, reverse=True)
     mapper.adjust(largest)
     best = _drop_outliers(job, largest)
     for other in others:
         joined = merge(job, best.model, other)
         if joined is None:
             continue
-        together = _drop_outliers(job, joined)
-        if _no_worse(together, best):
-            best = together
+        merged = _drop_outliers(job, joined)
+        larger = merged.model.num_reg_images() > best.model.num_reg_images()
+        if larger and (merged.verdict.trusted or not best.verdict.trusted):
+            best = merged
     return ModelCandidate(best.model, best.verdict, _apart(best, others), best.rejected)
 
 
@@ -86,24 +79,17 @@ def _drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCand
     return ModelCandidate(model, _examine(job, model), (), wrong)
 
 
-def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> Verdict:
+def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> ModelVerdict:
     return verdict.examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
-
-
-def _no_worse(together: ModelCandidate, alone: ModelCandidate) -> bool:
-    """Returns whether a merged model holds more images and is trusted as much."""
-    if together.model.num_reg_images() <= alone.model.num_reg_images():
-        return False
-    return together.verdict.trusted or not alone.verdict.trusted
 
 
 def _apart(
     chosen: ModelCandidate, others: Sequence[pycolmap.Reconstruction]
 ) -> tuple[tuple[str, ...], ...]:
     """Returns the frames of other models that no model before them holds, three or more."""
-    held, parts = {*mapper.registered_names(chosen.model), *chosen.rejected}, []
+    held, parts = {*mapper.list_registered(chosen.model), *chosen.rejected}, []
     for other in others:
-        new = sorted(set(mapper.registered_names(other)) - held)
+        new = sorted(set(mapper.list_registered(other)) - held)
         held.update(new)
         if len(new) >= MIN_FRAMES:
             parts.append(tuple(new))
@@ -118,33 +104,37 @@ def merge(
     None if `other` brings fewer than three further images or shares too few points with `base`.
     Whether the result can be trusted is for the caller to judge.
     """
-    new = set(mapper.registered_names(other)) - set(mapper.registered_names(base))
+    new = set(mapper.list_registered(other)) - set(mapper.list_registered(base))
     if len(new) < MIN_FRAMES:
         return None
-    motion = similarity(find_shared_points(job.database, other, base), base, seed=job.seed)
+    motion = similarity(*find_shared_points(job.database, other, base), base, seed=job.seed)
     if motion is None:
         return None
     poses = {image.name: image.cam_from_world() for image in _images(base)}
     for image in _images(other):
         if image.name in new:
             poses[image.name] = motion.transform_camera_world(image.cam_from_world())
-    joined = mapper.triangulate(job, posed_model(job.database, base, poses))
+    joined = mapper.triangulate(job, build_posed_model(job.database, base, poses))
     mapper.adjust(joined)
     return mapper.extend_model(job, joined)
 
 
 def similarity(
-    shared: SharedPoints, base: pycolmap.Reconstruction, *, seed: int
+    source: NDArray[np.float64],  # [P, 3]
+    target: NDArray[np.float64],  # [P, 3]
+    base: pycolmap.Reconstruction,
+    *,
+    seed: int,
 ) -> pycolmap.Sim3d | None:
-    """Returns the similarity from one model to the other, None where too few points agree."""
-    if len(shared.source) < MIN_INLIERS:
+    """Returns the similarity from points to those of `base`, None where too few agree."""
+    if len(source) < MIN_INLIERS:
         return None
     options = pycolmap.RANSACOptions()
     options.max_error = MAX_ERROR * _depth(base)
     options.max_num_trials = MAX_TRIALS
     options.random_seed = seed
-    estimate = pycolmap.estimate_sim3d_robust(shared.source, shared.target, options)
-    enough = max(MIN_INLIERS, MIN_INLIER_SHARE * len(shared.source))
+    estimate = pycolmap.estimate_sim3d_robust(source, target, options)
+    enough = max(MIN_INLIERS, MIN_INLIER_SHARE * len(source))
     if estimate is None or estimate["num_inliers"] < enough:
         return None
     motion: pycolmap.Sim3d = estimate["tgt_from_src"]
@@ -153,8 +143,8 @@ def similarity(
 
 def find_shared_points(
     database: Path, source: pycolmap.Reconstruction, target: pycolmap.Reconstruction
-) -> SharedPoints:
-    """Returns the points of two models that the same or matching keypoints show."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # [P, 3], [P, 3]
+    """Returns the points that the same or matching keypoints show, in both models."""
     ours, theirs = _points_of_keypoints(source), _points_of_keypoints(target)
     same = {
         (ours[name][row], theirs[name][row])
@@ -168,21 +158,17 @@ def find_shared_points(
             same |= _pair_points(ours.get(first), theirs.get(second), rows)
             same |= _pair_points(ours.get(second), theirs.get(first), rows[:, ::-1])
     ordered = sorted(same)
-    return SharedPoints(
-        np.array([source.point3D(point).xyz for point, _ in ordered]).reshape(-1, 3),
-        np.array([target.point3D(point).xyz for _, point in ordered]).reshape(-1, 3))
+    return (np.array([source.point3D(point).xyz for point, _ in ordered]).reshape(-1, 3),
+            np.array([target.point3D(point).xyz for _, point in ordered]).reshape(-1, 3))
 
 
-def posed_model(
+def build_posed_model(
     database: Path, cameras: pycolmap.Reconstruction | None, poses: Mapping[str, pycolmap.Rigid3d]
 ) -> pycolmap.Reconstruction:
-    """Returns a model without points: the images of a database with these poses.
+    """Returns a model without points: images of a database with poses, world to camera by name.
 
-    Args:
-        database: gives the images and their keypoints.
-        cameras: gives the intrinsics, under the ids that they have in the database; None takes
-            those of the database.
-        poses: world to camera by name of image.
+    The intrinsics are those of `cameras`, under the ids that they have in the database; None takes
+    those of the database.
     """
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:

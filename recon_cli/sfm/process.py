@@ -17,10 +17,10 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from recon_cli.errors import SfmError
+from recon_cli.errors import ReconError, SfmError
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
-from recon_cli.sfm.job import LOCK, Done, Event, Failed, MappingJob, Phase, parse
+from recon_cli.sfm.job import LOCK, Event, MappingJob, Phase, parse
 
 _DOING = {
     "features": ("finding features", "frame"),
@@ -29,27 +29,25 @@ _DOING = {
     "undistorted": ("undistorting frames", "frame"),
 }
 _STEP = {"mapping": "model"}  # the step that a phase belongs to, where the names differ
+LOG = "log.txt"
+POLL_SECONDS = 0.25
+_LOG_TAIL = 64 * 1024  # bytes
+_GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
 
 
 class Monitor:
-    """Shows one bar a phase and records what would survive a crash.
+    """Shows one bar a phase, and calls `record` with (done, total) of what would survive a crash.
 
-    Args:
-        job: what the process does.
-        progress: opens the bars.
-        record: called with (done, total); each step counts as many units as there are frames.
+    Each step counts as many units as there are frames.
     """
 
     def __init__(
         self, job: MappingJob, progress: Progress, record: Callable[[int, int], None]
     ) -> None:
-        self._job = job
-        self._progress = progress
-        self._record = record
+        self._job, self._progress, self._record = job, progress, record
         self._phase: Phase | None = None
-        self._count = 0
-        self._durable = 0
         self._bar: Bar | None = None
+        self._count = self._durable = 0
         self._open = ExitStack()
 
     def __enter__(self) -> Monitor:
@@ -66,34 +64,23 @@ class Monitor:
         text, unit = _DOING[self._phase.name]
         return f"{text} ({self._count} of {self._phase.total} {unit}s done)"
 
-    def show(self, event: Event | None) -> None:
+    def show(self, event: Phase | int | None) -> None:
         """Shows an event, or the progress on the disk when there is none."""
         if isinstance(event, Phase):
-            self._begin(event)
-        elif isinstance(event, Done):
-            self._reach(event.count)
-        else:
-            self._reach(self._count_on_disk())
+            self._open.close()
+            text, unit = _DOING[event.name]
+            self._phase, self._count = event, event.done
+            self._bar = self._open.enter_context(
+                self._progress.bar(text, event.total, unit=unit, done=event.done))
+            self._record_durable(event)
+        elif self._phase is not None and self._bar is not None:
+            count = self._count_on_disk(self._phase) if event is None else event
+            if count > self._count:
+                self._bar.advance(count - self._count)
+                self._count = count
+                self._record_durable(self._phase)
 
-    def _begin(self, phase: Phase) -> None:
-        self._open.close()
-        text, unit = _DOING[phase.name]
-        self._phase, self._count = phase, phase.done
-        self._bar = self._open.enter_context(
-            self._progress.bar(text, phase.total, unit=unit, done=phase.done))
-        self._record_durable()
-
-    def _reach(self, count: int) -> None:
-        if self._bar is not None and count > self._count:
-            self._bar.advance(count - self._count)
-            self._count = count
-            self._record_durable()
-
-    def _count_on_disk(self) -> int:
-        """Returns how many results of the current phase are on the disk."""
-        phase = self._phase
-        if phase is None:
-            return 0
+    def _count_on_disk(self, phase: Phase) -> int:
         if phase.name in ("features", "matches"):
             return database.progress(self._job.database, phase.name)
         if phase.name == "undistorted":
@@ -104,31 +91,19 @@ class Monitor:
             return min(files, phase.total)  # masks lie there twice for a moment
         return 0
 
-    def _record_durable(self) -> None:
+    def _record_durable(self, phase: Phase) -> None:
         """Records finished steps, and images or pairs in the database."""
-        assert self._phase is not None
         frames, steps = len(self._job.names), self._job.steps
-        step = steps.index(_STEP.get(self._phase.name, self._phase.name))
-        durable = self._phase.name in ("features", "matches")
-        share = min(1.0, self._count / max(1, self._phase.total)) if durable else 0.0
+        step = steps.index(_STEP.get(phase.name, phase.name))
+        durable = phase.name in ("features", "matches")
+        share = min(1.0, self._count / max(1, phase.total)) if durable else 0.0
         # A further attempt matches again, which does not undo earlier progress.
         self._durable = max(self._durable, round((step + share) * frames))
         self._record(self._durable, len(steps) * frames)
 
 
-LOG = "log.txt"
-POLL_SECONDS = 0.25
-_LOG_TAIL = 64 * 1024  # bytes
-_GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
-
-
 def run_job(job: MappingJob, *, progress: Progress, record: Callable[[int, int], None]) -> None:
-    """Runs a job in a process of its own; its results are in the step log.
-
-    Args:
-        job: what to do, and after how many minutes the process is killed.
-        progress: for a bar a phase.
-        record: called with (done, total) of what would survive a crash.
+    """Runs a job in a process of its own; its results are in the step log. See also `Monitor`.
 
     Raises:
         SfmError: there is no model to trust, the time is up, or the process died.
@@ -143,8 +118,8 @@ def run_job(job: MappingJob, *, progress: Progress, record: Callable[[int, int],
     try:
         with _start(job, file) as child, Monitor(job, progress, record) as monitor:
             for event in _events(child):
-                if isinstance(event, Failed):
-                    raise event.error
+                if isinstance(event, (ReconError, OSError)):
+                    raise event
                 if time.monotonic() > deadline:
                     raise _timeout_error(max_minutes, monitor)
                 monitor.show(event)
@@ -215,7 +190,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> SfmError:
             "(recon ingest --frames N).")
     return SfmError(
         f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
-        f"{gist(log)}", hint=hint)
+        f"{last_error(log)}", hint=hint)
 
 
 def _signal_name(number: int) -> str:
@@ -225,16 +200,14 @@ def _signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def gist(log: Path) -> str:
+def last_error(log: Path) -> str:
     """Returns the last line of a log that reports an error, else its last line."""
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _LOG_TAIL))
         text = file.read().decode(errors="replace")
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line and not line.startswith("@")]  # native stack frames
-    telling = [
+    errors = [
         line for line in lines
-        if line.startswith(("E2", "F2")) or re.search(r"\b\w*Error\b|\*\*\* SIG|Fatal", line)
-    ]
-    last = (telling or lines or ["nothing."])[-1]
-    return _GLOG.sub("", last)
+        if line.startswith(("E2", "F2")) or re.search(r"\b\w*Error\b|\*\*\* SIG|Fatal", line)]
+    return _GLOG.sub("", (errors or lines or ["nothing."])[-1])

@@ -1,7 +1,8 @@
-"""Frames without lens distortion: originals and denoised twins, through the same pinhole camera.
+"""The model in the world frame, and its frames without lens distortion.
 
-COLMAP scales the camera so that no pixel of the result lies outside the frame (blank_pixels = 0):
-there are no black borders that a model would learn.
+Originals and denoised twins get the same pinhole camera. COLMAP scales it so that no pixel of the
+result lies outside the frame (blank_pixels = 0): there are no black borders that a model would
+learn.
 """
 
 from __future__ import annotations
@@ -15,10 +16,62 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
+from recon_cli.io.colmap import Pinhole
+from recon_cli.io.records import read_poses
+from recon_cli.scene.similarity import Similarity
+from recon_cli.sfm.align_world import ScaleBetween, world_transform
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder, publish
+from recon_cli.workspace import atomic
+from recon_cli.workspace.summaries import WorldSummary
 
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
+
+
+def place_model(job: MappingJob) -> Result:
+    """Writes the mapper's model, moved into the world frame, into out/sparse.
+
+    The axes of a data set with poses are left as they are: others build on them. Returns a
+    `WorldSummary` as JSON values.
+
+    Raises:
+        ConfigError: a place of --scale-between is unknown.
+    """
+    model = pycolmap.Reconstruction(job.model)
+    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    world = world_transform(
+        np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
+        {name: _viewmat(image) for name, image in images.items()},
+        gravity=job.gravity and not job.known_poses,
+        scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
+        metric=job.known_poses and job.poses is not None and read_poses(job.poses).metric,
+        pinholes={name: _pinhole(image.camera) for name, image in images.items()})
+    move_model(model, world.similarity)
+    folder = fresh_folder(job.out / "sparse.partial")
+    model.write(folder)
+    publish(folder, job.out / "sparse")
+    summary = world.summary().to_json()
+    atomic.write_json(job.out / WorldSummary.FILE, summary)
+    return summary
+
+
+def move_model(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+    """Moves cameras and points of `model`; each observation keeps its reprojection error."""
+    model.transform(pycolmap.Sim3d(
+        similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
+
+
+def _viewmat(image: pycolmap.Image) -> NDArray[np.float64]:
+    viewmat = np.eye(4)
+    viewmat[:3] = image.cam_from_world().matrix()
+    return viewmat
+
+
+def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+    """Returns the camera of the undistorted image, to whose pixels --scale-between may point."""
+    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    return Pinhole(flat.width, flat.height, *flat.params)
 
 
 def undistort(job: MappingJob, report: Reporter) -> Result:
@@ -49,8 +102,7 @@ def _write_twins(job: MappingJob, names: Sequence[str], work: Path) -> None:
     """Writes the denoised twins; those of unchanged frames are copies, byte by byte."""
     changed = [
         name for name in names
-        if not filecmp.cmp(job.frames / name, job.denoised / name, shallow=False)
-    ]
+        if not filecmp.cmp(job.frames / name, job.denoised / name, shallow=False)]
     twins = work / TWINS
     twins.mkdir()
     if changed:  # an empty list would mean all

@@ -48,11 +48,10 @@ def across(matrix: Weights, cut: Cut) -> float:
     return float(matrix[np.ix_(cut, ~cut)].sum())
 
 
-def normalised_cut(matrix: Weights, cut: Cut) -> float:
+def conductance(matrix: Weights, cut: Cut) -> float:
     """Returns the weight across over all weight of the lighter side, 0 (apart) to 1.
 
-    This is the conductance of the cut: at least half of Shi and Malik's normalised cut (2000), at
-    most all of it.
+    It lies between half of Shi and Malik's normalised cut (2000) and all of it.
     """
     volume = float(min(matrix[cut].sum(), matrix[~cut].sum()))
     return across(matrix, cut) / volume if volume > 0 else 0.0
@@ -74,7 +73,7 @@ def loose_orders(matrix: Weights) -> Iterator[Order]:
     yield from _orders(matrix, np.diag(matrix.sum(axis=1)))
 
 
-def disputed_orders(part: Weights, whole: Weights) -> Iterator[Order]:
+def disagreement_orders(part: Weights, whole: Weights) -> Iterator[Order]:
     """Yields orders in which a cut leaves a small share of the weight across: part over whole.
 
     With the Laplacians L of both graphs and x = 1 on one side of a cut and 0 on the other, that
@@ -83,10 +82,7 @@ def disputed_orders(part: Weights, whole: Weights) -> Iterator[Order]:
     yield from _orders(part, _laplacian(whole))
 
 
-def _orders(
-    matrix: Weights,
-    scale: NDArray[np.float64],  # [N, N]
-) -> Iterator[Order]:
+def _orders(matrix: Weights, scale: NDArray[np.float64]) -> Iterator[Order]:  # scale: [N, N]
     count = len(matrix)
     if count < 2:
         return

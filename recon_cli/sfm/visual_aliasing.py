@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
-from recon_cli.sfm.view_graph import Cut, Weights
+from recon_cli.sfm.view_graph import Weights
 
 # A point is expected in an image that sees it from nearly the same direction and distance as
 # another: SIFT finds it again there, while at 20 degrees one in six is lost (Lowe 2004, fig. 9).
@@ -50,22 +50,15 @@ MIN_SIDE = 0.1
 
 @dataclass(frozen=True)
 class Overlap:
-    """Cells in which two images should show the same points; symmetric, [N, N] over all images.
-
-    Attributes:
-        expected: cells that should show the same.
-        confirmed: those of them with at least one point that both images see.
-    """
+    """Cells in which two images should show the same points; symmetric, [N, N] over all images."""
 
     expected: Weights
-    confirmed: Weights
+    confirmed: Weights  # those of them with at least one point that both images see
 
 
 @dataclass(frozen=True)
 class VisualAliasing:
-    """The two groups of images that show least of what they should show in common.
-
-    """
+    """The two groups of images that show least of what they should show in common."""
 
     share: float | None  # of the cells that should look alike, those that do; None where unknown
     reason: str  # why it is unknown; empty otherwise
@@ -84,10 +77,7 @@ class _Samples:
 
 
 def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> Overlap:
-    """Returns where the images of a model should show the same, and whether they do.
-
-    Pairs that were never matched are zero.
-    """
+    """Returns where images of a model should show the same; pairs never matched are zero."""
     count = len(evidence.names)
     row = {name: index for index, name in enumerate(evidence.names)}
     images = {row[model.image(i).name]: model.image(i) for i in model.reg_image_ids()}
@@ -99,7 +89,7 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
     for other, frame in frames.items():
         likely = _likely(samples, positions, frame, evidence.centers[other], other)
         should = _cells(samples, likely, count)
-        does = should & _cells(samples, likely & evidence.seen[other][samples.point], count, 1)
+        does = should & _cells(samples, likely & evidence.visible[other][samples.point], count, 1)
         expected[:, other], confirmed[:, other] = should.sum(axis=1), does.sum(axis=1)
     share = expected / np.maximum(cells.sum(axis=1), 1)[:, None]
     mutual = (np.minimum(share, share.T) >= MIN_SHARE) & evidence.tried
@@ -122,13 +112,15 @@ def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
     inner = np.ix_(rows, rows)
     expected, confirmed = overlap.expected[inner], overlap.confirmed[inner]
     cut, share = None, np.inf
+    head = np.arange(1, len(rows))
+    even = np.minimum(head, len(rows) - head) > MIN_SIDE * len(rows)  # enough images on both sides
     for order in (
-        *view_graph.disputed_orders(confirmed, expected), *view_graph.loose_orders(expected),
+        *view_graph.disagreement_orders(confirmed, expected), *view_graph.loose_orders(expected),
         *view_graph.loose_orders(evidence.shared[inner].astype(np.float64)),
     ):
         cells = view_graph.sweep(expected, order)
         shares = np.where(
-            (cells >= MIN_CELLS) & _even(len(rows)),
+            (cells >= MIN_CELLS) & even,
             view_graph.sweep(confirmed, order) / np.maximum(cells, 1), np.inf)
         if shares.min() < share:
             cut, share = order[:int(shares.argmin()) + 1], float(shares.min())
@@ -140,12 +132,6 @@ def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
     first, second = sorted(
         (tuple(evidence.names[row] for row in rows[part]) for part in (side, ~side)), key=len)
     return VisualAliasing(share, "", (first, second), int(view_graph.across(expected, side)))
-
-
-def _even(count: int) -> Cut:
-    """Returns which cuts of a sweep leave enough images on both sides, [count - 1]."""
-    head = np.arange(1, count)
-    return np.asarray(np.minimum(head, count - head) > MIN_SIDE * count)
 
 
 def _in_frame(
@@ -176,7 +162,7 @@ def _sample(
 ) -> _Samples:
     image, point, cell = [], [], []
     for index, frame in frames.items():
-        inside = np.flatnonzero(evidence.seen[index] & ~np.isnan(frame[:, 0]))
+        inside = np.flatnonzero(evidence.visible[index] & ~np.isnan(frame[:, 0]))
         some = inside[np.linspace(0, len(inside) - 1, min(MAX_POINTS, len(inside))).astype(int)]
         column, line = (frame[some] * GRID).astype(np.int64).T
         image.append(np.full(len(some), index))

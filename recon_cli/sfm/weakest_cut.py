@@ -12,7 +12,6 @@ model do not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
-from recon_cli.sfm.view_graph import Cut, Order, Weights
+from recon_cli.sfm.view_graph import Cut, Weights
 from recon_cli.sfm.visual_aliasing import Overlap, is_confirmed
 
 # Least share measured in each model: 0.73 to 0.99 where no camera was off by 1% of the extent;
@@ -38,23 +37,15 @@ MAX_OUTLIERS = 0.1
 
 @dataclass(frozen=True)
 class WeakestCut:
-    """The cut through a model whose matches agree least with the poses.
+    """The cut through a model whose matches agree least with the poses."""
 
-    Attributes:
-        share: of the matches across, those that agree with the poses; None where unknown.
-        reason: why it is unknown; empty otherwise.
-        sides: names of the images on both sides, the smaller side first.
-        points: of the model that images of both sides see, counted for every pair of them.
-        normalised_cut: points across over those of the lighter side, 0 (apart) to 1.
-    """
-
-    share: float | None
-    reason: str
-    sides: tuple[tuple[str, ...], tuple[str, ...]]
+    share: float | None  # of the matches across, those that agree with the poses; None if unknown
+    reason: str  # why it is unknown; empty otherwise
+    sides: tuple[tuple[str, ...], tuple[str, ...]]  # names of the images, the smaller side first
     pairs: int  # verified, across
     matches: int  # verified, across
-    points: int
-    normalised_cut: float
+    points: int  # of the model that images of both sides see, counted for every pair of them
+    normalised_cut: float  # points across over those of the lighter side, 0 (apart) to 1
 
 
 @dataclass(frozen=True)
@@ -104,9 +95,7 @@ class _Links:
         return cls(
             view_graph.weights(count, pairs, evidence.matches[placed]),
             view_graph.weights(count, pairs, evidence.agreeing[placed]),
-            evidence.shared.astype(np.float64),
-            overlap.expected,
-            overlap.confirmed)
+            evidence.shared.astype(np.float64), overlap.expected, overlap.confirmed)
 
     def among(self, rows: NDArray[np.int64]) -> _Links:
         """Returns the links of some images alone."""
@@ -128,7 +117,10 @@ def _worst_side(links: _Links, inliers: Cut) -> Cut | None:
     alone = _shares(*(matrix.sum(axis=1) for matrix in (
         inner.agreeing, inner.matches, inner.expected, inner.confirmed)))
     best, least = np.array([alone.argmin()]), alone.min()
-    for order in _orders(inner):
+    # A model breaks between parts that share few points, but not only there, so the cuts with the
+    # least agreement are swept too.
+    for order in (*view_graph.loose_orders(inner.shared),
+                  *view_graph.disagreement_orders(inner.agreeing, inner.matches)):
         shares = _shares(*(view_graph.sweep(matrix, order) for matrix in (
             inner.agreeing, inner.matches, inner.expected, inner.confirmed)))
         if shares.min() < least:
@@ -138,16 +130,6 @@ def _worst_side(links: _Links, inliers: Cut) -> Cut | None:
     side = np.zeros_like(inliers)
     side[rows[best]] = True
     return side if 2 * len(best) <= len(rows) else inliers & ~side
-
-
-def _orders(links: _Links) -> Iterator[Order]:
-    """Yields orders whose sweeps may hold the worst cut.
-
-    A model breaks between parts that share few points, but not only there, so the cuts with the
-    least agreement are swept too.
-    """
-    yield from view_graph.loose_orders(links.shared)
-    yield from view_graph.disputed_orders(links.agreeing, links.matches)
 
 
 def _shares(
@@ -170,15 +152,13 @@ def _cut(evidence: MatchEvidence, links: _Links, side: Cut, inliers: Cut) -> Wea
     other = inliers & ~side
     across = np.ix_(side, other)
     rows = np.flatnonzero(inliers)
+    names = np.array(evidence.names)
     return WeakestCut(
-        share=links.share(side, inliers),
-        reason="",
-        sides=(_names(evidence, side), _names(evidence, other)),
+        share=links.share(side, inliers), reason="",
+        sides=(tuple(names[side].tolist()), tuple(names[other].tolist())),
         pairs=int(np.count_nonzero(links.matches[across])),
-        matches=int(links.matches[across].sum()),
-        points=int(links.shared[across].sum()),
-        normalised_cut=view_graph.normalised_cut(links.shared[np.ix_(rows, rows)], side[rows]),
-    )
+        matches=int(links.matches[across].sum()), points=int(links.shared[across].sum()),
+        normalised_cut=view_graph.conductance(links.shared[np.ix_(rows, rows)], side[rows]))
 
 
 def _outliers(evidence: MatchEvidence, links: _Links, inliers: Cut) -> tuple[OutlierCamera, ...]:
@@ -188,7 +168,3 @@ def _outliers(evidence: MatchEvidence, links: _Links, inliers: Cut) -> tuple[Out
         share = links.agreeing[index, inliers].sum() / max(matches, 1.0)
         outliers.append(OutlierCamera(evidence.names[index], float(share), int(matches)))
     return tuple(outliers)
-
-
-def _names(evidence: MatchEvidence, side: Cut) -> tuple[str, ...]:
-    return tuple(evidence.names[index] for index in np.flatnonzero(side))

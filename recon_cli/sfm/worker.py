@@ -20,7 +20,7 @@ from typing import BinaryIO
 import filelock
 
 from recon_cli.errors import ReconError, WorkspaceError
-from recon_cli.sfm import align_world, database, fallbacks, known_poses, matching, undistort
+from recon_cli.sfm import database, fallbacks, known_poses, matching, undistort
 from recon_cli.sfm.job import LOCK, MappingJob, Reporter, Result, StepLog
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
@@ -36,7 +36,16 @@ def work(job: MappingJob, report: Reporter) -> None:
         FormatError: a frame cannot be read.
     """
     deadline = time.monotonic() + 60 * job.max_minutes
-    actions = _actions(job, report, deadline)
+    actions: dict[str, Callable[[], Result]] = {
+        "features": lambda: matching.extract_features(job, report),
+        "matches": lambda: (
+            known_poses.match_known if job.known_poses else fallbacks.match_first)(job, report),
+        "model": lambda: (
+            known_poses.build_known_model(job, report) if job.known_poses
+            else fallbacks.build_model(job, report, deadline=deadline)),
+        "sparse": lambda: undistort.place_model(job),
+        "undistorted": lambda: undistort.undistort(job, report),
+    }
     log = StepLog(job.out)
     if "features" in job.steps:
         _prepare_database(job, log)
@@ -50,25 +59,6 @@ def work(job: MappingJob, report: Reporter) -> None:
         result = actions[step]()
         result["seconds"] = round(time.monotonic() - start, 2)
         log.finish(step, result, job.out / step if step in _FOLDERS else None)
-
-
-def _actions(job: MappingJob, report: Reporter, deadline: float) -> dict[str, Callable[[], Result]]:
-    """Returns what is done in each step."""
-    cameras: dict[str, Callable[[], Result]] = {
-        "matches": lambda: fallbacks.match_first(job, report),
-        "model": lambda: fallbacks.build_model(job, report, deadline=deadline),
-    }
-    if job.known_poses:
-        cameras = {
-            "matches": lambda: known_poses.match_known(job, report),
-            "model": lambda: known_poses.build_known_model(job, report),
-        }
-    return {
-        "features": lambda: matching.extract_features(job, report),
-        **cameras,
-        "sparse": lambda: align_world.place_model(job),
-        "undistorted": lambda: undistort.undistort(job, report),
-    }
 
 
 def _prepare_database(job: MappingJob, log: StepLog) -> None:

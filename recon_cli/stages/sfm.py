@@ -12,13 +12,12 @@ from typing import Any
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, list_names
 from recon_cli.io import records as store
 from recon_cli.io.records import POSES, FrameList, read_poses
 from recon_cli.sfm import process
-from recon_cli.sfm.checks import list_names
+from recon_cli.sfm.align_world import parse_place
 from recon_cli.sfm.job import CameraGroup, MappingJob, StepLog
-from recon_cli.sfm.measure import parse_place
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
 
 APART = 1e6  # seconds from clip to clip: the camera may have gone anywhere meanwhile

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from recon_cli.io.records import FOLDER, POSES, read_frame_list, read_poses
 from recon_cli.sfm import known_poses
-from recon_cli.sfm import known_poses as spot_check
 from recon_cli.sfm.job import CameraGroup, MappingJob
 
 Poses = dict[str, NDArray[np.float64]]  # [4, 4] world to camera by name
@@ -56,9 +55,9 @@ def main(workspace: Path) -> None:
             max_features=3000, min_registered=0.5, accept_weak=False, gravity=True,
             scale_between=None, max_minutes=5.0, seed=0, threads=2, sharpness={}, times={})
         for label, viewmats in spoilt(dict(read_poses(ingest / POSES).viewmats)).items():
-            found = spot_check.spot_check(job, known_poses.neighbours(viewmats), viewmats)
-            share = "too few to tell" if found.share is None else f"{found.share:.3f}"
-            click.echo(f"{label:<24} {found.matches:>6} matches, share {share}")
+            check = known_poses.spot_check(job, viewmats)
+            share = "too few to tell" if check.share is None else f"{check.share:.3f}"
+            click.echo(f"{label:<24} {check.matches:>6} matches, share {share}")
 
 
 if __name__ == "__main__":

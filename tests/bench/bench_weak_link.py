@@ -23,7 +23,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from recon_cli.sfm.verdict import Verdict, examine
+from recon_cli.sfm.verdict import ModelVerdict, examine
 
 sys.path += [str(Path(__file__).parents[1] / "sfm"), str(Path(__file__).parent)]
 from made_model import MadeModel, along, wall
@@ -82,7 +82,7 @@ def row(name: str, model: pycolmap.Reconstruction, database: Path, reference: Pa
     return cells
 
 
-def shares(verdict: Verdict) -> Iterator[str]:
+def shares(verdict: ModelVerdict) -> Iterator[str]:
     """The two shares, or a dash where they cannot be told."""
     for share in (verdict.weakest_cut.share, verdict.aliasing.share):
         yield "-" if share is None else f"{share:.3f}"

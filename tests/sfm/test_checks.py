@@ -49,8 +49,3 @@ def test_points_seen_from_one_place_are_refused():
     checks.check_parallax(3.9)
     with pytest.raises(SfmError, match=r"below 1\.6 degrees"):
         checks.check_parallax(1.6)
-
-
-def test_a_short_list_is_given_in_full():
-    assert checks.list_names(["a", "b"]) == "a, b"
-    assert checks.list_names(["a", "b", "c"], most=2) == "a, b and 1 more"

@@ -73,7 +73,7 @@ def test_the_global_mapper_finds_the_cameras_and_leaves_the_database_alone(tmp_p
 def test_a_model_is_extended_by_the_images_that_fit(tmp_path):
     job, truth = make_capture(tmp_path)
     whole = mapper.extend_model(job, part(truth, job.names[:15]))
-    assert mapper.registered_names(whole) == list(job.names)
+    assert mapper.list_registered(whole) == list(job.names)
     assert center_error(whole, truth) < 1e-3
 
 

@@ -25,7 +25,7 @@ def test_two_parts_of_a_capture_become_one(capture, first):
     base = part(truth, job.names[:12])
     other = part(truth, job.names[first:], motion=moved())
     joined = merge_models.merge(job, base, other)
-    assert mapper.registered_names(joined) == list(job.names)
+    assert mapper.list_registered(joined) == list(job.names)
     assert center_error(joined, truth) < EXACT
     assert joined.compute_mean_reprojection_error() < 0.01
 
@@ -35,22 +35,22 @@ def test_the_similarity_between_two_parts_is_found_from_their_points(capture):
     base = part(truth, job.names[:12])
     shared = merge_models.find_shared_points(
         job.database, part(truth, job.names[12:], motion=moved()), base)
-    assert len(shared.source) == 300
-    found = merge_models.similarity(shared, base, seed=0)
-    np.testing.assert_allclose(found.matrix(), moved().inverse().matrix(), atol=1e-6)
+    assert len(shared[0]) == 300
+    estimate = merge_models.similarity(*shared, base, seed=0)
+    np.testing.assert_allclose(estimate.matrix(), moved().inverse().matrix(), atol=1e-6)
 
 
 def test_points_that_contradict_each_other_give_no_similarity(capture):
     _, truth = capture
     noise = np.random.default_rng(0)
-    shared = merge_models.SharedPoints(noise.normal(size=(200, 3)), noise.normal(size=(200, 3)))
-    assert merge_models.similarity(shared, truth, seed=0) is None
+    shared = noise.normal(size=(200, 3)), noise.normal(size=(200, 3))
+    assert merge_models.similarity(*shared, truth, seed=0) is None
 
 
 def test_too_few_shared_points_give_no_similarity(capture):
     _, truth = capture
     few = np.random.default_rng(0).normal(size=(merge_models.MIN_INLIERS - 1, 3))
-    assert merge_models.similarity(merge_models.SharedPoints(few, few), truth, seed=0) is None
+    assert merge_models.similarity(few, few, truth, seed=0) is None
 
 
 def test_a_part_that_brings_less_than_three_images_is_left_alone(capture):
@@ -63,8 +63,8 @@ def test_a_posed_model_holds_the_images_of_the_database_and_no_points(capture):
     job, truth = capture
     poses = {image.name: image.cam_from_world()
              for image in map(truth.image, truth.reg_image_ids()) if image.name in job.names[:5]}
-    model = merge_models.posed_model(job.database, None, poses)
-    assert mapper.registered_names(model) == list(job.names[:5])
+    model = merge_models.build_posed_model(job.database, None, poses)
+    assert mapper.list_registered(model) == list(job.names[:5])
     assert model.num_points3D() == 0
 
 
@@ -94,7 +94,7 @@ def test_parts_that_fit_become_one_model_and_nothing_is_apart(fresh_capture):
     job, truth = fresh_capture
     found = merge_models.best_model(job, [
         part(truth, job.names[12:], motion=moved()), part(truth, job.names[:12])])
-    assert mapper.registered_names(found.model) == list(job.names)
+    assert mapper.list_registered(found.model) == list(job.names)
     assert found.apart == ()
     assert center_error(found.model, truth) < 1e-3
 
@@ -105,7 +105,7 @@ def test_parts_that_cannot_be_put_together_are_named(fresh_capture, monkeypatch)
     found = merge_models.best_model(job, [
         part(truth, job.names[12:16]), part(truth, job.names[:12]), part(truth, job.names[10:13]),
         part(truth, job.names[14:])])
-    assert mapper.registered_names(found.model) == list(job.names[:12])
+    assert mapper.list_registered(found.model) == list(job.names[:12])
     assert found.apart == (job.names[14:],)  # 12 and 13 are fewer than three
 
 
@@ -113,7 +113,7 @@ def test_a_merge_that_cannot_be_trusted_is_undone(fresh_capture, monkeypatch):
     job, truth = fresh_capture
     say(monkeypatch, lambda model: Opinion(trusted=model.num_reg_images() < 20))
     found = merge_models.best_model(job, [part(truth, job.names[:12]), part(truth, job.names[12:])])
-    assert mapper.registered_names(found.model) == list(job.names[:12])
+    assert mapper.list_registered(found.model) == list(job.names[:12])
     assert found.apart == (job.names[12:],)
 
 
@@ -122,7 +122,7 @@ def test_a_camera_that_was_put_elsewhere_is_found_taken_out_and_named(fresh_capt
     wrong = job.names[7]
     model = astray(truth, wrong)
     found = merge_models.best_model(job, [model])
-    assert mapper.registered_names(found.model) == sorted(set(job.names) - {wrong})
+    assert mapper.list_registered(found.model) == sorted(set(job.names) - {wrong})
     assert list(found.rejected) == [wrong]
     assert "of its" in found.rejected[wrong]
     assert center_error(found.model, truth) < 1e-3

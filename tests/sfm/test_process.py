@@ -4,7 +4,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 
 from recon_cli.sfm.job import Phase
-from recon_cli.sfm.process import Monitor, gist
+from recon_cli.sfm.process import Monitor, last_error
 
 GLOG = "I20260101 10:00:00.000001 139 timer.cc:90] Elapsed time: 0.1 [minutes]\n"
 
@@ -19,30 +19,30 @@ def test_the_last_error_of_a_log_is_its_gist(tmp_path):
     log = written(tmp_path, GLOG + (
         "E20260101 10:00:00.000002 139 images.cc:55] b.png BITMAP_ERROR: Failed to read.\n"
         "F20260101 10:00:00.000003 139 pose.cc:12] Check failed: x > 0\n") + GLOG)
-    assert gist(log) == "Check failed: x > 0"
+    assert last_error(log) == "Check failed: x > 0"
 
 
 def test_the_error_of_python_is_found(tmp_path):
     log = written(tmp_path, GLOG + (
         "Traceback (most recent call last):\n  File x, line 1\nMemoryError: no room\n"))
-    assert gist(log) == "MemoryError: no room"
+    assert last_error(log) == "MemoryError: no room"
 
 
 def test_native_stack_frames_are_passed_over(tmp_path):
     log = written(tmp_path, GLOG + "free(): invalid pointer\n    @ 0x7f _Py_FatalErrorFormat\n")
-    assert gist(log) == "free(): invalid pointer"
+    assert last_error(log) == "free(): invalid pointer"
 
 
 def test_without_an_error_the_last_line_is_taken(tmp_path):
-    assert gist(written(tmp_path, GLOG)) == "Elapsed time: 0.1 [minutes]"
+    assert last_error(written(tmp_path, GLOG)) == "Elapsed time: 0.1 [minutes]"
 
 
 def test_an_empty_log_says_nothing(tmp_path):
-    assert gist(written(tmp_path, "")) == "nothing."
+    assert last_error(written(tmp_path, "")) == "nothing."
 
 
 def test_only_the_end_of_a_long_log_is_read(tmp_path):
-    assert gist(written(tmp_path, "Error: long ago\n" + GLOG * 2000)) == (
+    assert last_error(written(tmp_path, "Error: long ago\n" + GLOG * 2000)) == (
         "Elapsed time: 0.1 [minutes]")
 
 

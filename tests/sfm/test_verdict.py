@@ -8,19 +8,20 @@ import pytest
 from made_model import WIDTH, MadeModel, along, moved, wall
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm.checks import MAX_SHIFT, describe_shifted_centres
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.verdict import (
+    MAX_SHIFT,
     Histogram,
-    Verdict,
+    ModelVerdict,
     check_weak_link,
+    describe_shifted_centres,
     examine,
+    explain_unregistered,
     find_jumps,
-    unregistered_reasons,
 )
 
 
-def verdict_on(made: MadeModel, folder, **known) -> Verdict:
+def verdict_on(made: MadeModel, folder, **known) -> ModelVerdict:
     return examine(made.model(), made.write_database(folder / "database.db"), made.names, **known)
 
 
@@ -225,30 +226,30 @@ def capture(keypoints, pairs=(), matches=()):
 
 def test_the_sharpness_of_the_others_decides_what_is_blurred():
     evidence = capture([900, 900, 900])
-    assert unregistered_reasons(evidence, {"a": 50.0, "b": 60.0, "c": 20.0}) == {
+    assert explain_unregistered(evidence, {"a": 50.0, "b": 60.0, "c": 20.0}) == {
         "c": "blurred: sharpness 20, 50 is usual"}
-    assert "no overlap" in unregistered_reasons(evidence, {"a": 50.0, "b": 60.0, "c": 40.0})["c"]
+    assert "no overlap" in explain_unregistered(evidence, {"a": 50.0, "b": 60.0, "c": 40.0})["c"]
 
 
 def test_an_image_that_matches_another_room_is_not_called_blurred_alone():
     evidence = capture([900] * 4, [[0, 1], [2, 3]], [300, 300])
-    assert unregistered_reasons(evidence, {"a": 50.0, "b": 60.0, "c": 20.0, "d": 61.0})["c"] == (
+    assert explain_unregistered(evidence, {"a": 50.0, "b": 60.0, "c": 20.0, "d": 61.0})["c"] == (
         "no overlap: no verified match with an image that has a camera, only with 1 that have "
         "none; sharpness 20, 55 is usual")
 
 
 def test_an_image_of_a_bare_wall_has_too_few_features():
-    assert unregistered_reasons(capture([900, 900, 40]), {}) == {
+    assert explain_unregistered(capture([900, 900, 40]), {}) == {
         "c": "too few features: 40 keypoints"}
 
 
 def test_an_image_that_matches_nothing_has_no_overlap():
-    assert unregistered_reasons(capture([900] * 3, [[0, 1]], [300]), {"c": None}) == {
+    assert explain_unregistered(capture([900] * 3, [[0, 1]], [300]), {"c": None}) == {
         "c": "no overlap: no verified match with an image that has a camera"}
 
 
 def test_an_image_that_matches_is_said_to_match():
-    reasons = unregistered_reasons(capture([900] * 3, [[0, 1], [0, 2], [1, 2]], [300, 20, 30]), {})
+    reasons = explain_unregistered(capture([900] * 3, [[0, 1], [0, 2], [1, 2]], [300, 20, 30]), {})
     assert reasons == {"c": "matched but not placed: 50 matches to 2 images that have a camera"}
 
 

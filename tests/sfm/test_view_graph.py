@@ -24,8 +24,8 @@ def test_a_graph_without_images_has_no_pieces():
 
 def test_a_cut_is_as_loose_as_its_weight_is_small_for_the_lighter_side():
     assert view_graph.across(TRIANGLES, HALVES) == 1
-    assert view_graph.normalised_cut(TRIANGLES, HALVES) == pytest.approx(1 / (2 * 27 + 1))
-    assert view_graph.normalised_cut(np.zeros((6, 6)), HALVES) == 0
+    assert view_graph.conductance(TRIANGLES, HALVES) == pytest.approx(1 / (2 * 27 + 1))
+    assert view_graph.conductance(np.zeros((6, 6)), HALVES) == 0
 
 
 def test_a_sweep_gives_the_weight_across_every_cut_of_an_order():
@@ -49,7 +49,7 @@ def test_the_first_disputed_order_finds_a_dispute_where_the_ties_are_strong():
     pairs = np.column_stack([first, second])
     whole = view_graph.weights(8, pairs, np.full(28, 100))
     part = view_graph.weights(8, pairs, np.where((first + second) % 2, 10, 100))
-    order = next(view_graph.disputed_orders(part, whole))
+    order = next(view_graph.disagreement_orders(part, whole))
     cut = np.argmin(view_graph.sweep(part, order) / view_graph.sweep(whole, order))
     assert set(order[:cut + 1].tolist()) in ({0, 2, 4, 6}, {1, 3, 5, 7})
 
@@ -60,5 +60,5 @@ def test_a_single_image_cannot_be_cut(count):
 
 
 def test_images_without_any_weight_are_ordered_all_the_same():
-    order = next(view_graph.disputed_orders(np.zeros((4, 4)), np.zeros((4, 4))))
+    order = next(view_graph.disagreement_orders(np.zeros((4, 4)), np.zeros((4, 4))))
     assert sorted(order.tolist()) == [0, 1, 2, 3]
