@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from recon_cli.progress import NullProgress, Progress
 
@@ -129,8 +129,6 @@ class ProcessGroup:
 
 SINGLE_PROCESS = ProcessGroup()
 
-
-Summary = dict[str, Any]  # JSON values only; goes into the manifest
 
 logger = logging.getLogger("recon")
 

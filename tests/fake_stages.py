@@ -17,13 +17,25 @@ from pathlib import Path
 from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import STAGES
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.summaries import JsonRecord
 
-TABLE = tuple(dataclasses.replace(row, module="fake_stages", summary=None) for row in STAGES)
+
+@dataclasses.dataclass(frozen=True)
+class FakeSummary(JsonRecord):
+    """What every fake stage returns."""
+
+    steps: int
+    length: float
+    names: tuple[str, ...]
+
+
+TABLE = tuple(
+    dataclasses.replace(row, module="fake_stages", summary=FakeSummary) for row in STAGES)
 NAMES = [row.name for row in TABLE]
 STEPS = 6
 
@@ -32,7 +44,7 @@ actions: dict[str, Callable[[], None]] = {}  # done by a stage before it writes 
 seen: dict[str, StageInputs] = {}  # what a stage was given to read
 
 
-def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> FakeSummary:
     """Writes result.txt in steps, each of which survives a crash."""
     name = out.name
     ran.append(name)
@@ -54,7 +66,7 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
         path.parent.mkdir(exist_ok=True)
         path.write_text(str(time.time_ns()))
     (out / "table.txt").write_text(f"the table of {name}\n")
-    return {"steps": STEPS, "length": 1.5, "names": ["a", "b"]}
+    return FakeSummary(STEPS, 1.5, ("a", "b"))
 
 
 def job_at(root: Path, settings: Settings | None = None) -> Job:

@@ -3,8 +3,12 @@
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import (
     DenoiseSummary,
+    EvaluateSummary,
     IngestSummary,
+    PruneSummary,
+    RoundSummary,
     SfmSummary,
+    TrainSummary,
     WorldEvidence,
     WorldSummary,
 )
@@ -26,4 +30,18 @@ INGEST = IngestSummary(
     frames=12, held_out=2, groups=1, width=64, height=48)
 DENOISE = DenoiseSummary(
     mode="auto", filter="joint", frames=12, denoised=0, median_sigma_255=0.5)
-BY_STAGE = {"ingest": INGEST, "denoise": DENOISE, "sfm": SFM}
+TRAIN = TrainSummary(
+    iterations=100, gaussians=50, initial_gaussians=20, max_gaussians=60, max_size=48,
+    planned_iterations=100, stopped_early_at=None, training_views=9, validation_views=0, width=48,
+    height=36, validation_psnr_db=None, train_seconds=1.5, parts={"far": "off", "sh_degree": 0},
+    skipped_steps=0, estimated_seconds=2.0, calibration_seconds=0.5, cuda_peak_bytes=0)
+PRUNE = PruneSummary(
+    at="end", score="loo", ratio=0.5, gaussians_before=50, gaussians=25,
+    validation_psnr_db_pruned=None,
+    rounds=(RoundSummary(gaussians=25, removed=25, validation_psnr_db=None, kept=True),),
+    iterations=120, recovery_steps=20, validation_psnr_db_before=None, validation_psnr_db=None,
+    train_seconds=2.0)
+EVALUATE = EvaluateSummary(
+    test_views=3, unregistered_test=(), base_psnr_db=25.0, base_ssim=0.9, base_gaussians=50)
+BY_STAGE = {"ingest": INGEST, "denoise": DENOISE, "sfm": SFM, "train": TRAIN, "prune": PRUNE,
+            "evaluate": EVALUATE}

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from recon_cli.workspace.summaries import JsonRecord
+
 CONFIDENCE = 0.95
 _DRAWS = 10_000  # the ends of the interval then move by about 1% of its width from seed to seed
 
 
 @dataclass(frozen=True)
-class Interval:
+class Interval(JsonRecord):
     """A mean difference and the ends of its interval; both None where there is one pair only."""
 
     mean: float

@@ -12,13 +12,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.evaluation.metrics import (
     MIN_PIXELS,
@@ -263,11 +263,11 @@ def reference_digest(views: Sequence[ReferenceView]) -> str:
     return digest.hexdigest()
 
 
-def size_summary(cameras: Sequence[Camera]) -> Summary:
+def size_summary(cameras: Sequence[Camera]) -> dict[str, Any]:
     """Returns width and height of the largest camera; where sizes differ also all as `sizes`."""
     sizes = sizes_of(cameras)
-    summary: Summary = {"width": sizes[0][0], "height": sizes[0][1]}
-    return summary if len(sizes) == 1 else {**summary, "sizes": [list(size) for size in sizes]}
+    summary: dict[str, Any] = {"width": sizes[0][0], "height": sizes[0][1]}
+    return summary if len(sizes) == 1 else {**summary, "sizes": tuple(sizes)}
 
 
 def sizes_of(cameras: Sequence[Camera]) -> list[tuple[int, int]]:

@@ -6,14 +6,19 @@ import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Self
 
 import numpy as np
 
+from recon_cli.evaluation.intervals import Interval
 from recon_cli.evaluation.tables import Table
+from recon_cli.workspace.atomic import read_json
+from recon_cli.workspace.summaries import JsonRecord
 
 
 @dataclass(frozen=True)
-class ViewScore:
+class ViewScore(JsonRecord):
     """The scores of one view."""
 
     name: str
@@ -64,6 +69,58 @@ class ModelScore:
 
     def _mean(self, of: Callable[[ViewScore], float]) -> float:
         return float(np.mean([of(view) for view in self.views]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelMetrics(JsonRecord):
+    """The scores of one model in metrics.json."""
+
+    psnr_db: float
+    psnr_8bit_db: float
+    ssim: float
+    ssim_padded: float
+    lpips: float | None = None  # None where it was not measured
+    gaussians: int
+    bytes: int
+    render_ms: float
+    train_seconds: float | None  # None for an imported scene
+    gain_psnr_db: float | None = None  # after the best gain of each view, with --exposure
+    seen_psnr_db: Mapping[str, float]  # on some views of training, by split
+    views: tuple[ViewScore, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metrics(JsonRecord):
+    """What evaluate leaves in metrics.json."""
+
+    FILE: ClassVar[str] = "metrics.json"
+
+    models: Mapping[str, ModelMetrics]
+    pruned_minus_base: Mapping[str, Interval] | None = None  # by score
+    psnr_convention: str
+    psnr_8bit_convention: str
+    ssim_convention: str
+    ssim_padded_convention: str
+    lpips_convention: str
+    mask_convention: str | None = None
+    truth_digest: str  # of the views; scores can be paired where it is equal
+    width: int  # pixels, of the largest view
+    height: int
+    sizes: tuple[tuple[int, ...], ...] | None = None  # (width, height), where they differ
+    test_views: int
+    unregistered_test: tuple[str, ...]  # held-out frames without a camera
+    masked_out_test: tuple[str, ...] | None = None  # held-out frames whose masks leave too little
+    imported_from: str | None = None  # name of the file of an imported scene
+
+    @classmethod
+    def read(cls, evaluate: Path) -> Self:
+        """Returns the scores in a folder of evaluate.
+
+        Raises:
+            ManifestError: they are of another version.
+            FormatError: the file is missing or damaged.
+        """
+        return cls.from_json(read_json(evaluate / cls.FILE))
 
 
 _VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips")

@@ -101,12 +101,12 @@ def run_stage(
     out, earlier = workspace.begin(key)
     with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
-        summary = load(f"{row.module}.run")(config, inputs, out, ctx)
+        summary: JsonRecord = load(f"{row.module}.run")(config, inputs, out, ctx)
     outputs = workspace.seal(row.name)
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
         peak_memory_bytes=meter.peak_memory_bytes,
-        summary=summary.to_json() if isinstance(summary, JsonRecord) else summary,
+        summary=summary.to_json(),
         versions=machine.versions(),
         device=ctx.device if row.renders else None,
         backend=ctx.backend if row.renders else None,

@@ -216,8 +216,7 @@ def _accepts(config: type[StageConfig], name: str, value: object) -> bool:
 def _unreadable_summary(row: Stage, manifest: Manifest) -> list[str]:
     """Returns why the summary of a result cannot be read, as that of another version may not be."""
     try:
-        if row.summary:
-            row.summary.from_json(manifest.run.summary)
+        row.summary.from_json(manifest.run.summary)
     except ManifestError as error:
         return [error.message]
     return []

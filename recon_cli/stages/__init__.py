@@ -21,67 +21,58 @@ from recon_cli.config.stages import (
 )
 from recon_cli.workspace.summaries import (
     DenoiseSummary,
+    EvaluateSummary,
+    ExportSummary,
+    ImportSummary,
     IngestSummary,
     JsonRecord,
+    PruneSummary,
     SfmSummary,
+    TrainSummary,
 )
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One row: what a stage needs and how it is run.
+    """One row: what a stage needs and how it is run."""
 
-    Attributes:
-        name: its folder in the workspace and its section in recon.toml.
-        verb: what the user types.
-        needs: stages that must be fresh before it starts.
-        uses: stages whose result is taken where it is fresh and left out where it is not.
-        config: the class of its options.
-        version: goes up when its output changes meaning; every older result is then stale.
-        auto: it may be started because another stage needs it; training never is.
-        module: where its run() lives.
-        volatile: patterns of outputs that hold times or logs, or are kept only to resume, and so
-            take no part in the fingerprints of later stages.
-        renders: it needs a rasterizer, and so torch and a device.
-        takes: what the user hands in, as usage shows it; empty for stages that read others alone.
-        spares: of `needs`, what an imported scene does without: then they are among `uses`.
-        summary: the record that run() returns.
-    """
-
-    name: str
-    verb: str
-    needs: tuple[str, ...]
-    uses: tuple[str, ...]
-    config: type[StageConfig]
-    version: int
-    auto: bool
-    module: str
+    name: str  # its folder in the workspace and its section in recon.toml
+    verb: str  # that the user types
+    needs: tuple[str, ...]  # stages that must be fresh before it starts
+    uses: tuple[str, ...]  # stages whose result is read if it is fresh and ignored otherwise
+    config: type[StageConfig]  # class of its options
+    summary: type[JsonRecord]  # that run() returns
+    version: int  # goes up when its output changes meaning; every older result is then stale
+    auto: bool  # it may be started because another stage needs it; training never is
+    module: str  # of its run()
+    # patterns of outputs that hold times or logs, or only serve to resume, and so take no part in
+    # the fingerprints of later stages
     volatile: tuple[str, ...] = ()
-    renders: bool = False
-    takes: str = ""
-    spares: tuple[str, ...] = ()
-    summary: type[JsonRecord] | None = None
+    renders: bool = False  # it needs a rasterizer, and so torch and a device
+    takes: str = ""  # input from the user, as in usage; empty for stages that only read others
+    spares: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, 3, False, "recon_cli.stages.ingest",
-          takes="VIDEO", summary=IngestSummary),
-    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, 2, True,
-          "recon_cli.stages.denoise", summary=DenoiseSummary),
-    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, 3, True, "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json", "verdict.json", "model/*"),
-          summary=SfmSummary),
-    Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, 4, False,
+    Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 3, False,
+          "recon_cli.stages.ingest", takes="VIDEO"),
+    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 2, True,
+          "recon_cli.stages.denoise"),
+    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 3, True,
+          "recon_cli.stages.sfm",
+          ("database.db", "log.txt", "steps.json", "verdict.json", "model/*")),
+    Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 4, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
-    Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, 4, False,
+    Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),
-    Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig, 2, False,
-          "recon_cli.stages.evaluate", renders=True),
-    Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig, 4, False,
-          "recon_cli.stages.export", renders=True, spares=("ingest", "sfm")),
+    Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig,
+          EvaluateSummary, 2, False, "recon_cli.stages.evaluate", renders=True),
+    Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
+          ExportSummary, 4, False, "recon_cli.stages.export", renders=True,
+          spares=("ingest", "sfm")),
 )
 
-IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, 1, False,
+IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, takes="FILE")
 
 

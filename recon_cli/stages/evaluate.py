@@ -8,22 +8,25 @@ scored: they are painted in one colour in truth/ and black in difference/.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.config.stages import EvaluateConfig, RunConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
     CONVENTION_LINES,
-    CONVENTIONS,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
+    PSNR_8BIT_CONVENTION,
+    PSNR_CONVENTION,
+    SSIM_CONVENTION,
+    SSIM_PADDED_CONVENTION,
     Perceptual,
     load_lpips,
 )
@@ -40,7 +43,15 @@ from recon_cli.evaluation.reference_views import (
     size_summary,
     sizes_of,
 )
-from recon_cli.evaluation.scores import ModelScore, csv_table, model_table, paper_table, view_table
+from recon_cli.evaluation.scores import (
+    Metrics,
+    ModelMetrics,
+    ModelScore,
+    csv_table,
+    model_table,
+    paper_table,
+    view_table,
+)
 from recon_cli.io.images import to_uint8, write_png
 from recon_cli.io.ply import read_ply
 from recon_cli.io.records import ImportRecord
@@ -49,6 +60,7 @@ from recon_cli.train.callbacks import seconds_at
 from recon_cli.train.runner import LOG
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_bytes, write_json
+from recon_cli.workspace.summaries import EvaluateSummary
 
 _GAIN = 4  # of the difference images
 _ANY_ITERATION = 1 << 62  # beyond the last
@@ -74,7 +86,7 @@ class _Evaluation:
     out: Path
     folders: Mapping[str, Path]  # of train and prune, by model
     config: RunConfig  # of the training
-    origin: ImportRecord | None
+    import_record: ImportRecord | None
     scene: Scene
     held_out: Sequence[ReferenceView]
     seen: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
@@ -102,19 +114,20 @@ class _Evaluation:
         seen_db = {
             name: mean_psnr(splats, views, degree, backend, corrected=self.gains, on_view=on_view)
             for name, views in self.seen.items()}
-        seconds = None if self.origin else seconds_at(self.folders[model] / LOG, _ANY_ITERATION)
+        log = self.folders[model] / LOG
+        seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
         score = ModelScore(
             LABELS[model], scores.views, len(splats), path.stat().st_size, scores.render_ms,
             seconds)
         return _Model(score, scores.corrected_db, seen_db)
 
-    def counts(self) -> Summary:
-        """Returns how many views are scored, and the names of those that are not."""
+    def counts(self) -> dict[str, Any]:
+        """Returns how many views are scored, and the names of those that are not, for records."""
         hidden = {view.name for view in self.scene.test} - {view.name for view in self.held_out}
         return {
             "test_views": len(self.held_out),
-            "unregistered_test": list(self.scene.unregistered_test),
-            **({"masked_out_test": sorted(hidden)} if hidden else {}),
+            "unregistered_test": tuple(self.scene.unregistered_test),
+            "masked_out_test": tuple(sorted(hidden)) or None,
         }
 
     def note(self, lacking: str) -> str:
@@ -128,10 +141,12 @@ class _Evaluation:
         if masked:
             note += f"Masks on {masked} of {len(self.held_out)} views: {MASK_CONVENTION}\n"
         return note + "".join(
-            f"{text}\n" for text in (self.origin.warnings() if self.origin else ()))
+            f"{text}\n" for text in (self.import_record.warnings() if self.import_record else ()))
 
 
-def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+def run(
+    config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext
+) -> EvaluateSummary:
     """Renders and scores the held-out views and returns the means of each model."""
     evaluation = _load(config, inputs, out, ctx)
     for view in evaluation.held_out:
@@ -145,16 +160,16 @@ def run(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContex
     if unregistered:
         ctx.notice(f"{len(unregistered)} held-out views have no camera and are not scored: "
                    f"{', '.join(unregistered)}")
-    for text in evaluation.origin.warnings() if evaluation.origin else ():
+    for text in evaluation.import_record.warnings() if evaluation.import_record else ():
         ctx.notice(text)
     _write(evaluation, models, inputs.folders["ingest"].parent.resolve().name, lacking)
-    return {
-        **evaluation.counts(),
-        **{f"{name}_{key}": round(getattr(model.score, key), 4)
-           for name, model in models.items() for key in ("psnr_db", "ssim", "gaussians")},
-        **{f"{name}_gain_psnr_db": round(model.corrected_db, 4)
-           for name, model in models.items() if evaluation.gains},
-    }
+    means = evaluation.counts()
+    for name, model in models.items():
+        for key in ("psnr_db", "ssim", "gaussians"):
+            means[f"{name}_{key}"] = round(getattr(model.score, key), 4)
+        if evaluation.gains:
+            means[f"{name}_gain_psnr_db"] = round(model.corrected_db, 4)
+    return EvaluateSummary(**means)
 
 
 def _load(
@@ -201,19 +216,20 @@ def _write(
     scores = {name: model.score for name, model in models.items()}
     measured = next(iter(scores.values())).lpips is not None
     lacking = "" if measured else lacking or "views with a mask have none"
-    write_json(out / "metrics.json", {
-        "models": {name: _record(model, gains=gains) for name, model in models.items()},
-        **({"pruned_minus_base": {
-            key: dataclasses.asdict(_difference(scores, key)) for key in ("psnr_db", "ssim")}}
-           if len(scores) == 2 else {}),
-        **CONVENTIONS,
-        "lpips_convention": f"not measured: {lacking}" if lacking else LPIPS_CONVENTION,
-        **({"mask_convention": MASK_CONVENTION}
-           if any(view.mask is not None for view in held_out) else {}),
-        "truth_digest": reference_digest(held_out),
+    differences = {key: _difference(scores, key) for key in ("psnr_db", "ssim")} if len(
+        scores) == 2 else {}
+    masked = any(view.mask is not None for view in held_out)
+    write_json(out / Metrics.FILE, Metrics(
+        models={name: _model_metrics(model, gains=gains) for name, model in models.items()},
+        pruned_minus_base=differences or None,
+        psnr_convention=PSNR_CONVENTION, psnr_8bit_convention=PSNR_8BIT_CONVENTION,
+        ssim_convention=SSIM_CONVENTION, ssim_padded_convention=SSIM_PADDED_CONVENTION,
+        lpips_convention=f"not measured: {lacking}" if lacking else LPIPS_CONVENTION,
+        mask_convention=MASK_CONVENTION if masked else None,
+        truth_digest=reference_digest(held_out),
         **size_summary([view.camera for view in held_out]), **evaluation.counts(),
-        **({"imported_from": evaluation.origin.file} if evaluation.origin else {}),
-    })
+        imported_from=evaluation.import_record.file if evaluation.import_record else None,
+    ).to_json())
     table = list(scores.values())
     note = evaluation.note(lacking)
     for name, model in models.items():
@@ -221,9 +237,9 @@ def _write(
             note += (f"{LABELS[name]}, after the best gain per channel of each view: "
                      f"{model.corrected_db:.2f} dB\n")
         note += f"{LABELS[name]}, {_gap(model, gains=gains)}\n"
-    if len(scores) == 2:
-        note += (f"pruned minus base: PSNR {_difference(scores, 'psnr_db').text('+.2f')} dB, SSIM "
-                 f"{_difference(scores, 'ssim').text('+.4f')} (95% by bootstrap over the views)\n")
+    if differences:
+        note += (f"pruned minus base: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
+                 f"{differences['ssim'].text('+.4f')} (95% by bootstrap over the views)\n")
     first = model_table(table)
     write_bytes(out / "table.txt", f"{first.text(rule=True)}\n{note}".encode())
     write_bytes(
@@ -235,20 +251,14 @@ def _write(
     write_bytes(out / "metrics.tex", tex.encode())
 
 
-def _record(model: _Model, *, gains: bool) -> Summary:
-    """Returns what metrics.json holds of a model."""
+def _model_metrics(model: _Model, *, gains: bool) -> ModelMetrics:
     score = model.score
-    return {
-        "psnr_db": score.psnr_db, "psnr_8bit_db": score.psnr_8bit_db, "ssim": score.ssim,
-        "ssim_padded": score.ssim_padded,
-        **({"lpips": score.lpips} if score.lpips is not None else {}),
-        "gaussians": score.gaussians, "bytes": score.bytes, "render_ms": score.render_ms,
-        "train_seconds": score.train_seconds,
-        **({"gain_psnr_db": model.corrected_db} if gains else {}),
-        "seen_psnr_db": dict(model.seen_db),
-        "views": [{key: value for key, value in dataclasses.asdict(view).items()
-                   if value is not None} for view in score.views],
-    }
+    return ModelMetrics(
+        psnr_db=score.psnr_db, psnr_8bit_db=score.psnr_8bit_db, ssim=score.ssim,
+        ssim_padded=score.ssim_padded, lpips=score.lpips, gaussians=score.gaussians,
+        bytes=score.bytes, render_ms=score.render_ms, train_seconds=score.train_seconds,
+        gain_psnr_db=model.corrected_db if gains else None, seen_psnr_db=model.seen_db,
+        views=score.views)
 
 
 def _difference(scores: Mapping[str, ModelScore], key: str) -> Interval:

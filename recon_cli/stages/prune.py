@@ -10,24 +10,19 @@ from __future__ import annotations
 from pathlib import Path
 
 from recon_cli.config.stages import PruneConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import max_gaussians, write_ply
 from recon_cli.scene.splats import Splats
 from recon_cli.train.callbacks import seconds_at
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.prune_loop import RATIO, prune_loop, remaining
-from recon_cli.train.prune_run import (
-    Round,
-    StoredPruneRun,
-    load_prune_source,
-    prune_while_good,
-)
+from recon_cli.train.prune_run import StoredPruneRun, load_prune_source, prune_while_good
 from recon_cli.train.runner import LOG
-from recon_cli.train.state import TrainState
+from recon_cli.workspace.summaries import PruneSummary, RoundSummary
 
 
-def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> PruneSummary:
     """Prunes, recovers and returns what was removed and what it cost."""
     source = load_prune_source(config, inputs, ctx)
     start = source.begin()
@@ -51,13 +46,18 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     state = run.state
     write_ply(out / "splats.ply", state.splats)
     run.clear()
-    return {
-        **_summary(config, state, run.done, n), "iterations": state.steps,
-        "recovery_steps": state.steps - steps,
-        "validation_psnr_db_before": psnr_before,
-        "validation_psnr_db": validation_psnr(state, source.task),
-        "train_seconds": seconds_at(out / LOG, state.iteration),
-    }
+    left = len(state.splats)
+    return PruneSummary(
+        at=config.at, score=config.score, ratio=round(1 - left / n, 4), gaussians_before=n,
+        gaussians=left,
+        validation_psnr_db_pruned=run.done[0].validation_psnr_db_removed if run.done else None,
+        rounds=tuple(RoundSummary(
+            gaussians=row.gaussians, removed=row.gaussians_before - row.gaussians,
+            validation_psnr_db=row.validation_psnr_db, kept=row.kept) for row in run.done),
+        iterations=state.steps, recovery_steps=state.steps - steps,
+        validation_psnr_db_before=psnr_before,
+        validation_psnr_db=validation_psnr(state, source.task),
+        train_seconds=seconds_at(out / LOG, state.iteration))
 
 
 def _target(config: PruneConfig, splats: Splats) -> int:
@@ -77,15 +77,3 @@ def _target(config: PruneConfig, splats: Splats) -> int:
                 hint="Use --max-mb 1 or more: about 4,000 Gaussians.")
         return min(n, count)
     return remaining(n, RATIO if config.ratio is None else config.ratio)
-
-
-def _summary(config: PruneConfig, state: TrainState, rounds: list[Round], n: int) -> Summary:
-    """Returns the counts of all, and of each round what went and how good the rest is."""
-    return {
-        "at": config.at, "score": config.score, "ratio": round(1 - len(state.splats) / n, 4),
-        "gaussians_before": n, "gaussians": len(state.splats),
-        "validation_psnr_db_pruned": rounds[0].validation_psnr_db_removed if rounds else None,
-        "rounds": [{
-            "gaussians": one.gaussians, "removed": one.gaussians_before - one.gaussians,
-            "validation_psnr_db": one.validation_psnr_db, "kept": one.kept} for one in rounds],
-    }

@@ -7,22 +7,22 @@ validation PSNR, count and seconds every hundred steps.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import torch
 
 from recon_cli.config.stages import TrainConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_scene, size_summary
 from recon_cli.io.ply import write_ply
-from recon_cli.train.planning import first_or_saved, model_parts, planned_task, recorded_plan
+from recon_cli.train.planning import first_or_saved, model_parts, planned_task
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
+from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
 
 
-def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> Summary:
+def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs, validation=config.validation)
     task = planned_task(config, scene, out, ctx)
@@ -34,23 +34,20 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     save_state(out / "final.safetensors", state)
     write_ply(out / "splats.ply", state.splats)
     (out / CHECKPOINT).unlink(missing_ok=True)
-    return _summary(state, task, out, ctx)
+    return _summarize(state, task, out, ctx)
 
 
-def _summary(state: TrainState, task: Task, out: Path, ctx: StageContext) -> Summary:
-    config, made = task.schedule.config, recorded_plan(out)
-    last = json.loads((out / LOG).read_text(encoding="utf-8").splitlines()[-1])
-    return {
-        "iterations": state.steps, "gaussians": len(state.splats),
-        "initial_gaussians": state.first_count, "max_gaussians": config.max_gaussians,
-        "max_size": config.max_size, "planned_iterations": config.iterations,
-        "stopped_early_at": state.jump[0] if state.jump else None,
-        "training_views": len(task.train), "validation_views": len(task.validation),
+def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> TrainSummary:
+    config, plan, last = task.schedule.config, TrainPlan.read(out), LogRow.read_all(out / LOG)[-1]
+    return TrainSummary(
+        iterations=state.steps, gaussians=len(state.splats),
+        initial_gaussians=state.first_count, max_gaussians=config.max_gaussians,
+        max_size=config.max_size, planned_iterations=config.iterations,
+        stopped_early_at=state.jump[0] if state.jump else None,
+        training_views=len(task.train), validation_views=len(task.validation),
         **size_summary([view.camera for view in task.train]),
-        "validation_psnr_db": last["validation_psnr_db"], "train_seconds": last["seconds"],
-        "parts": model_parts(config),
-        "skipped_steps": state.skipped, "estimated_seconds": made["seconds"],
-        "calibration_seconds": round(made["cost"]["seconds"], 3),
-        **({} if ctx.ranks.alone else {"processes": ctx.ranks.count}),
-        "cuda_peak_bytes": torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,
-    }
+        validation_psnr_db=last.validation_psnr_db, train_seconds=last.seconds,
+        parts=model_parts(config), skipped_steps=state.skipped, estimated_seconds=plan.seconds,
+        calibration_seconds=round(plan.cost["seconds"], 3),
+        processes=None if ctx.ranks.alone else ctx.ranks.count,
+        cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0)

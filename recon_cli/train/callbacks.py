@@ -15,6 +15,7 @@ from recon_cli.progress import Bar
 from recon_cli.scene.splats import Splats
 from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
 from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.summaries import LogRow
 
 logger = logging.getLogger("recon")
 
@@ -22,10 +23,9 @@ logger = logging.getLogger("recon")
 def seconds_at(log: Path, iteration: int, *, clock: str = "seconds") -> float:
     """Returns the training seconds that a log counts up to an iteration, by one of its clocks."""
     seconds = 0.0
-    for line in log.read_text(encoding="utf-8").splitlines() if log.exists() else []:
-        row = json.loads(line)
-        if row["iteration"] <= iteration:
-            seconds = float(row[clock])
+    for row in LogRow.read_all(log):
+        if row.iteration <= iteration:
+            seconds = float(getattr(row, clock))
     return seconds
 
 

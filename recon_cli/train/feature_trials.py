@@ -27,6 +27,7 @@ from recon_cli.train.initialize import first_state
 from recon_cli.train.poses import worth_a_trial
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task, reduced
+from recon_cli.workspace.summaries import TrialDecision
 
 # A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
 # alone were .07 +- .06 dB apart (17 views, 500 steps at 200 pixels): the errors decide as well.
@@ -39,36 +40,16 @@ _DENSEST = 3  # of few views; what is left must still hang together
 Arm = Callable[[], Sequence[float]]
 
 
-@dataclass(frozen=True)
-class Decision:
-    """What a trial found.
-
-    Attributes:
-        name: of the part.
-        on: it pays.
-        mean_db: mean gain over the views in dB; None where nothing was tried.
-        standard_error_db: of that mean.
-        reason: one sentence for the log.
-        seconds: spent.
-    """
-
-    name: str
-    on: bool
-    mean_db: float | None
-    standard_error_db: float | None
-    reason: str
-    seconds: float
-
-
-def skipped(name: str, reason: str) -> Decision:
+def skipped(name: str, reason: str) -> TrialDecision:
     """Returns the decision against a part that nothing speaks for, untried."""
-    return Decision(name, False, None, None, reason, 0.0)
+    return TrialDecision(
+        name=name, on=False, mean_db=None, standard_error_db=None, reason=reason, seconds=0.0)
 
 
 def decide(
     name: str, arms: tuple[Arm, Arm], *, threshold_db: float = THRESHOLD_DB,
     clock: Callable[[], float] = time.perf_counter,
-) -> Decision:
+) -> TrialDecision:
     """Returns whether the second arm is better than the first.
 
     On, if the mean gain is above the threshold and above 1.65 standard errors of it. The standard
@@ -95,7 +76,9 @@ def decide(
     on = mean > needed  # False for what is not a number
     reason = (f"{mean:+.2f} dB +- {error:.2f} over {len(gains)} views, "
               f"{'more' if on else 'not more'} than the {needed:.2f} dB that count")
-    return Decision(name, on, mean, error, reason, clock() - start)
+    return TrialDecision(
+        name=name, on=on, mean_db=mean, standard_error_db=error, reason=reason,
+        seconds=clock() - start)
 
 
 @dataclass(frozen=True)
@@ -159,7 +142,7 @@ class Needs:
     """
 
     config: RunConfig
-    decisions: tuple[Decision, ...]
+    decisions: tuple[TrialDecision, ...]
 
     @property
     def seconds(self) -> float:
@@ -191,7 +174,7 @@ def examine(scene: Candidate) -> Needs:
     """Returns what a scene needs; parts that the options switch on or off are not tried."""
     config = scene.task.schedule.config
     bench = _Bench(scene)
-    decisions: list[Decision] = []
+    decisions: list[TrialDecision] = []
 
     def settled(part: str, sign: str | None, against: str) -> None:
         """Puts a part into `config`, by the options, a missing sign, or a trial."""
@@ -245,7 +228,7 @@ class _Bench:
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0))
         self._scores: dict[tuple[object, ...], list[float]] = {}
 
-    def tried(self, part: str, config: RunConfig, value: str) -> Decision:
+    def tried(self, part: str, config: RunConfig, value: str) -> TrialDecision:
         """Returns whether a part pays on top of what is on already."""
         if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
             return skipped(part, "there are too few views to try it on")
@@ -261,7 +244,7 @@ class _Bench:
 
         return decide(part, (lambda: told(without), lambda: told(with_it)))
 
-    def degree(self, config: RunConfig, decisions: list[Decision]) -> int:
+    def degree(self, config: RunConfig, decisions: list[TrialDecision]) -> int:
         """Returns the lowest degree of the colours that the highest does not beat by enough."""
         if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
             return config.sh_degree
@@ -270,7 +253,7 @@ class _Bench:
                 return low
         return config.sh_degree
 
-    def _gains(self, config: RunConfig, low: int, decisions: list[Decision]) -> bool:
+    def _gains(self, config: RunConfig, low: int, decisions: list[TrialDecision]) -> bool:
         """Tells whether all degrees are better than some, and adds the decision."""
         few = replace(config, sh_degree=low)
         decisions.append(decide(
@@ -319,8 +302,3 @@ class _Bench:
         fit(state, small, _STEPS)
         return [mean_psnr(state.splats, [reduced(view, LEVEL)], config.sh_degree, task.backend,
                           corrected=True) for view in held_out]
-
-
-def described(decisions: Sequence[Decision]) -> list[dict[str, object]]:
-    """Returns the decisions as JSON values."""
-    return [dataclasses.asdict(decision) for decision in decisions]

@@ -18,6 +18,7 @@ from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig, TrainConfig
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel
 from recon_cli.train.schedule import RECIPES, Schedule
+from recon_cli.workspace.summaries import TrainPlan
 
 CALIBRATION_SHARE = 0.05  # of the minutes, at most
 CALIBRATION_SECONDS = 0.5  # where no time is given: a twentieth of a draft
@@ -56,33 +57,6 @@ QUALITIES = {
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What was decided before the first step, and why.
-
-    Attributes:
-        iterations: steps.
-        max_gaussians: cap of the count.
-        max_size: longest side of a training image, pixels.
-        first_gaussians: at the start.
-        detail: pixels of a mean training view that hold detail.
-        seconds: that the training is expected to take, reports and checkpoints included.
-        cost: what the parts of the run take.
-    """
-
-    iterations: int
-    max_gaussians: int
-    max_size: int
-    first_gaussians: int
-    detail: int
-    seconds: float
-    cost: CostModel
-
-    def config(self, asked: TrainConfig) -> RunConfig:
-        """Returns the options of the run: what was asked for, and numbers for the rest."""
-        return _resolved(asked, self.iterations, self.max_gaussians, self.max_size)
-
-
-@dataclass(frozen=True)
 class Facts:
     """What a plan needs to know about a scene.
 
@@ -110,6 +84,11 @@ def first_config(asked: TrainConfig) -> RunConfig:
         asked.max_size or quality.max_size)
 
 
+def run_config(asked: TrainConfig, plan: TrainPlan) -> RunConfig:
+    """Returns the options of the run: what was asked for, and the plan's numbers for the rest."""
+    return _resolved(asked, plan.iterations, plan.max_gaussians, plan.max_size)
+
+
 def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
     """Returns the options whose cap is worth timing: of the run if its length is known."""
     config = first_config(asked)
@@ -118,7 +97,7 @@ def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
 
 def make_plan(
     asked: TrainConfig, facts: Facts, cost: CostModel, *, spent: float = 0.0
-) -> Plan:
+) -> TrainPlan:
     """Returns the plan: the steps asked for, those of the quality, or as many as fill the time.
 
     Args:
@@ -127,12 +106,15 @@ def make_plan(
         cost: what steps take here; with --minutes its own seconds count as well.
         spent: seconds of the time given that went before, on trials.
     """
-    def at(iterations: int) -> Plan:
+    def at(iterations: int) -> TrainPlan:
         most = cap(asked, facts, iterations)
         config = _resolved(asked, iterations, most, first_config(asked).max_size)
         first = first_count(config, facts.points)
-        return Plan(iterations, most, config.max_size, first, facts.detail,
-                    round(_LONGER * cost.run_seconds(Schedule(config), first), 2), cost)
+        return TrainPlan(
+            iterations=iterations, max_gaussians=most, max_size=config.max_size,
+            first_gaussians=first, detail=facts.detail,
+            seconds=round(_LONGER * cost.run_seconds(Schedule(config), first), 2),
+            cost=dataclasses.asdict(cost))
 
     if asked.minutes is None:
         return at(first_config(asked).iterations)

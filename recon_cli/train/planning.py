@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.config.stages import RunConfig, TrainConfig
-from recon_cli.context import StageContext, Summary
+from recon_cli.context import StageContext
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate, with_exchange
-from recon_cli.train.feature_trials import PARTS, Candidate, Needs, described, examine
+from recon_cli.train.feature_trials import PARTS, Candidate, Needs, examine
 from recon_cli.train.initialize import first_state, saved_state
 from recon_cli.train.memory import gaussians_that_fit
-from recon_cli.train.plan import Facts, Plan
+from recon_cli.train.plan import Facts
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
@@ -30,16 +30,15 @@ from recon_cli.train.train_data import (
     read_config,
     write_config,
 )
-from recon_cli.workspace.atomic import read_json, write_json
-
-PLAN = "plan.json"
+from recon_cli.workspace.atomic import write_json
+from recon_cli.workspace.summaries import TrainPlan
 
 logger = logging.getLogger("recon")
 
 
 def planned_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext) -> Task:
     """Returns the task of a run by its plan: a recorded one, or one that is made and recorded."""
-    if (out / PLAN).exists():
+    if (out / TrainPlan.FILE).exists():
         recorded = dataclasses.replace(
             read_config(out), checkpoint_every=config.checkpoint_every)
         return load_task(scene, recorded, ctx)
@@ -53,21 +52,16 @@ def planned_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext
     facts = Facts(plan.detail(task.train), len(task.train), len(scene.points), fit_memory)
     made = _plan(asked, facts, task, scene, out, ctx, spent=needs.seconds)
     _tell(made, asked, facts, ctx)
-    run_config = made.config(asked)
+    run_config = plan.run_config(asked, made)
     write_config(out, run_config)
-    write_json(out / PLAN, {**dataclasses.asdict(made), "needs": described(needs.decisions)})
+    write_json(
+        out / TrainPlan.FILE, dataclasses.replace(made, needs=needs.decisions).to_json())
     return _with(task, run_config)
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
     """Returns the parts of the model that trials decide on, by the names of their options."""
     return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
-
-
-def recorded_plan(out: Path) -> Summary:
-    """Returns what `planned_task` recorded."""
-    record: Summary = read_json(out / PLAN)
-    return record
 
 
 def parts_needed(
@@ -92,7 +86,7 @@ def parts_needed(
 def _plan(
     config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, ctx: StageContext, *,
     spent: float,
-) -> Plan:
+) -> TrainPlan:
     """Returns a plan, by the time that steps are found to take and that was spent already.
 
     Of several processes each step is timed with the views of one, and what they exchange.
@@ -113,7 +107,7 @@ def _with(task: Task, config: RunConfig) -> Task:
     return dataclasses.replace(task, schedule=Schedule(config))
 
 
-def _tell(made: Plan, config: TrainConfig, facts: Facts, ctx: StageContext) -> None:
+def _tell(made: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageContext) -> None:
     logger.info(
         "training takes about %.0f s: %s steps, up to %s Gaussians, images of up to %d pixels",
         made.seconds, f"{made.iterations:,}", f"{made.max_gaussians:,}", made.max_size)

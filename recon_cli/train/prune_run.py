@@ -34,6 +34,7 @@ from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task, read_config
 from recon_cli.workspace.atomic import read_json, write_bytes
+from recon_cli.workspace.summaries import JsonRecord
 
 logger = logging.getLogger("recon")
 
@@ -48,7 +49,7 @@ _LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
-class Round:
+class Round(JsonRecord):
     """One removal and what became of it. PSNR is None where there are no validation views.
 
     Attributes:
@@ -68,8 +69,8 @@ class Round:
     removed: float
     validation_psnr_db_before: float | None
     validation_psnr_db_removed: float | None
-    validation_psnr_db: float | None = None
-    kept: bool = True
+    validation_psnr_db: float | None
+    kept: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +200,7 @@ class StoredPruneRun(PruneRun):
         left = len(self.state.splats)
         save_state(self._out / _name(number + 1), self.state)
         self.done.append(Round(
-            self.state.iteration, n, left, 1 - left / n, before, self._psnr()))
+            self.state.iteration, n, left, 1 - left / n, before, self._psnr(), None, kept=True))
         logger.info("round %d removes %d of %d Gaussians", number + 1, n - left, n)
         self.write_rounds()
         (self._out / _name(number)).unlink(missing_ok=True)
@@ -224,7 +225,7 @@ class StoredPruneRun(PruneRun):
 
     def write_rounds(self) -> None:
         """Writes the list of rounds, whole or not at all."""
-        rows = [dataclasses.asdict(row) for row in self.done]
+        rows = [row.to_json() for row in self.done]
         write_bytes(self._out / ROUNDS, json.dumps(rows, indent=1).encode())
 
     def clear(self) -> None:
@@ -239,7 +240,8 @@ class StoredPruneRun(PruneRun):
         """Returns the list of rounds; empty where the state that it leads to is missing."""
         path = self._out / ROUNDS
         rows = read_json(path) if path.exists() else []
-        return [Round(**row) for row in rows] if (self._out / _name(len(rows))).exists() else []
+        resumable = (self._out / _name(len(rows))).exists()
+        return [Round.from_json(row) for row in rows] if resumable else []
 
 
 def prune_while_good(run: StoredPruneRun, psnr_before: float, max_drop: float) -> None:

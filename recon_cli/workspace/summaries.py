@@ -1,13 +1,15 @@
-"""What the stages return: one frozen record a stage, kept as `summary` in its manifest.
+"""Typed records between stages: what a stage returns, and the JSON files that others read.
 
-A stage builds its record, the pipeline commits `to_json()`, and whoever reads the result of another
-stage reads the same type by `from_json`. Fields are the JSON keys, in their order. A field whose
-default is None is left out of the JSON while it is None; every other field is always written.
+A stage builds its record, the pipeline stores `to_json()` as `summary` in its manifest, and whoever
+reads the result of another stage reads the same type by `from_json`. Fields are the JSON keys, in
+their order. A field whose default is None is left out of the JSON while it is None; every other
+field is always written.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import types
 import typing
 from collections.abc import Mapping
@@ -17,6 +19,9 @@ from typing import Any, Self
 
 from recon_cli.errors import ManifestError
 from recon_cli.workspace.atomic import read_json
+
+_SCALARS: Mapping[Any, tuple[type, ...]] = {
+    bool: (bool,), int: (int,), float: (float, int), str: (str,)}
 
 
 @dataclass(frozen=True)
@@ -29,18 +34,19 @@ class JsonRecord:
         for field in dataclasses.fields(self):
             item = getattr(self, field.name)
             if item is not None or field.default is not None:
-                value[field.name] = _encoded(item)
+                value[field.name] = _encode(item)
         return value
 
     @classmethod
     def from_json(cls, value: Any) -> Self:
-        """Returns the record that `to_json` wrote; keys that it does not know are ignored.
+        """Returns the record that `to_json` wrote; unknown keys are ignored.
 
         Raises:
-            ManifestError: the value is no mapping or lacks a field, as that of another version may.
+            ManifestError: the value is no mapping, lacks a field or holds one of another type, as
+                that of another version may.
         """
         if not isinstance(value, Mapping):
-            raise ManifestError("the summary is not a JSON object")
+            raise ManifestError("the record is not a JSON object")
         kinds = typing.get_type_hints(cls)
         fields = dataclasses.fields(cls)
         missing = [
@@ -49,193 +55,132 @@ class JsonRecord:
             and field.default_factory is dataclasses.MISSING]
         if missing:
             raise ManifestError(
-                f"the summary lacks {', '.join(missing)}: another version of recon wrote it")
+                f"the record lacks {', '.join(missing)}: another version of recon wrote it")
         return cls(**{
-            field.name: _decoded(kinds[field.name], value[field.name])
+            field.name: _decode(field.name, kinds[field.name], value[field.name])
             for field in fields if field.name in value})
 
 
-def _encoded(item: Any) -> Any:
+def _encode(item: Any) -> Any:
     if isinstance(item, JsonRecord):
         return item.to_json()
     if isinstance(item, (tuple, list)):
-        return [_encoded(part) for part in item]
+        return [_encode(part) for part in item]
     if isinstance(item, Mapping):
-        return {key: _encoded(part) for key, part in item.items()}
+        return {key: _encode(part) for key, part in item.items()}
     return item
 
 
-def _decoded(kind: Any, item: Any) -> Any:
-    """Returns a JSON value as the type that a field is annotated with."""
+def _decode(name: str, kind: Any, item: Any) -> Any:
+    """Returns a JSON value as the type that the field `name` is annotated with."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):  # X | None
-        return None if item is None else _decoded(arguments[0], item)
+        return None if item is None else _decode(name, arguments[0], item)
     if origin is tuple and isinstance(item, (list, tuple)):
-        return tuple(_decoded(arguments[0], part) for part in item)
+        return tuple(_decode(name, arguments[0], part) for part in item)
     if origin is Mapping and isinstance(item, Mapping):
-        return {key: _decoded(arguments[1], part) for key, part in item.items()}
+        return {key: _decode(name, arguments[1], part) for key, part in item.items()}
     if isinstance(kind, type) and issubclass(kind, JsonRecord):
         return kind.from_json(item)
-    return item
+    if kind is Any or isinstance(item, _SCALARS.get(kind, ())):
+        return item
+    raise ManifestError(
+        f"the record holds {item!r} as {name}: another version of recon wrote it")
 
 
 @dataclass(frozen=True, kw_only=True)
 class IngestSummary(JsonRecord):
-    """What ingest read and wrote.
+    """What ingest read and wrote."""
 
-    Attributes:
-        kind: "video", "photos", "mixed" or the layout of a data set.
-        declared_frames: that the files claim to hold; 0 where unknown.
-        decoded_frames: whole ones.
-        lost_frames: missing or damaged.
-        dropped_blurred: whole frames that were too blurred, clipped or flat.
-        skipped: names of the files that were left out.
-        metric: the poses of a data set are in metres; None without poses.
-        points: that a data set brings; None where it brings none.
-        frames: that were written.
-        held_out: how many of them are held out for the score.
-        groups: of frames that share intrinsics.
-        width: of the frames of the largest group, in pixels.
-        height: of the frames of the largest group, in pixels.
-    """
-
-    kind: str
-    declared_frames: int
-    decoded_frames: int
-    lost_frames: int
-    dropped_blurred: int
-    skipped: tuple[str, ...] = ()
-    metric: bool | None = None
-    points: int | None = None
-    frames: int
-    held_out: int
-    groups: int
-    width: int
+    kind: str  # video, photos, mixed, or the layout of a data set
+    declared_frames: int  # according to the files' headers; 0 where unknown
+    decoded_frames: int  # complete ones
+    lost_frames: int  # missing or damaged
+    dropped_blurred: int  # complete frames that were too blurred, clipped or flat
+    skipped: tuple[str, ...] = ()  # names of the files that were left out
+    metric: bool | None = None  # the poses of a data set are in metres; None without poses
+    points: int | None = None  # of a data set; None where it has none
+    frames: int  # written
+    held_out: int  # of these, for the score
+    groups: int  # of frames that share intrinsics
+    width: int  # pixels, of the largest group
     height: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class DenoiseSummary(JsonRecord):
-    """What denoise did; `median_sigma_255` is the noise of the median frame in 1/255."""
+    """Which frames denoise filtered."""
 
     mode: str
     filter: str
     frames: int
     denoised: int
-    median_sigma_255: float
+    median_sigma_255: float  # noise of the median frame in 1/255
 
 
 @dataclass(frozen=True, kw_only=True)
 class AttemptSummary(JsonRecord):
-    """What became of one mapper that was tried; see `sfm.fallbacks.MapperAttempt`.
+    """The outcome of one mapper; see `sfm.fallbacks.MapperAttempt`."""
 
-    Attributes:
-        name: of the mapper or of its choice of pairs.
-        reason: why it was tried.
-        skipped: why it was not run; empty where it was.
-        registered: frames that got a camera.
-        models: frames in the model and in what is left of the others.
-        weak_link: share of the matches that agree across the weakest cut; None where unknown.
-        reprojection_error_px: mean; None without a model.
-        seconds: that it took.
-        kept: its model is the result.
-    """
-
-    name: str
-    reason: str
-    skipped: str
-    registered: int
-    models: tuple[int, ...]
-    weak_link: float | None
-    reprojection_error_px: float | None
+    name: str  # of the mapper or of its choice of pairs
+    reason: str  # for trying it
+    skipped: str  # why it was not run; empty where it was
+    registered: int  # frames with a camera
+    models: tuple[int, ...]  # frames in the model and in what is left of the others
+    weak_link: float | None  # share of the matches that agree across the weakest cut
+    reprojection_error_px: float | None  # mean; None without a model
     seconds: float
-    kept: bool
+    kept: bool  # its model is the result
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosesSummary(JsonRecord):
-    """How given poses were used; how far refining moved them, None where it did not.
+    """How given poses were used, and how far refinement moved them (None where it did not)."""
 
-    Attributes:
-        use: "keep" or "refine".
-        metric: they are in metres.
-        moved_median: of the camera centres, as a share of the size of their path.
-        moved_max: the same of the camera that moved most.
-        turned_median_deg: of the orientations.
-        turned_max_deg: of the camera that turned most.
-        reprojection_error_px_before: mean, with the poses as they were given.
-    """
-
-    use: str
-    metric: bool
-    moved_median: float | None = None
+    use: str  # keep or refine
+    metric: bool  # in metres
+    moved_median: float | None = None  # of the camera centres, as a share of their path's size
     moved_max: float | None = None
     turned_median_deg: float | None = None
     turned_max_deg: float | None = None
-    reprojection_error_px_before: float | None = None
+    reprojection_error_px_before: float | None = None  # mean, with the given poses
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldEvidence(JsonRecord):
-    """Why the world frame is as it is. None stands for what was not measured or not found.
+    """Measurements behind the world frame; None where something was not measured or not found."""
 
-    Attributes:
-        up_found: z is up.
-        up_reason: why it is not; empty where it is.
-        camera_roll_deg: median angle of the cameras' x axes to the horizontal.
-        camera_spread_deg: standard deviation of their directions within it.
-        camera_error_deg: standard error of up from the cameras alone.
-        upright_share: of the cameras whose image is not upside down.
-        floor_found: z is 0 on the floor.
-        floor_share: of the points that lie in it.
-        floor_contrast: density of points in it over that right above it.
-        floor_tilt_deg: between its normal and up as the cameras have it.
-        axis: direction of x: "walls", "cameras" (their mean right) or "mapper".
-        wall_strength: how much sharper the points line up along the walls than along a median
-            direction.
-        scale_source: "arbitrary", "data set" or "measured".
-        metres: one world unit is one metre.
-    """
-
-    up_found: bool
-    up_reason: str
-    camera_roll_deg: float | None
-    camera_spread_deg: float | None
-    camera_error_deg: float | None
-    upright_share: float | None
-    floor_found: bool
-    floor_share: float | None
-    floor_contrast: float | None
-    floor_tilt_deg: float | None
-    axis: str
-    wall_strength: float | None
-    scale_source: str
-    metres: bool
+    up_found: bool  # z is up
+    up_reason: str  # why it is not; empty where it is
+    camera_roll_deg: float | None  # median angle of the cameras' x axes to the horizontal
+    camera_spread_deg: float | None  # standard deviation of their directions within it
+    camera_error_deg: float | None  # standard error of up from the cameras alone
+    upright_share: float | None  # of the cameras whose image is not upside down
+    floor_found: bool  # z is 0 on the floor
+    floor_share: float | None  # of the points that lie in it
+    floor_contrast: float | None  # density of points in it over that right above it
+    floor_tilt_deg: float | None  # between its normal and up according to the cameras
+    axis: str  # direction of x: walls, cameras (their mean right) or mapper
+    wall_strength: float | None  # sharpness of the points along the walls over the median direction
+    scale_source: str  # arbitrary, data set or measured
+    metres: bool  # one world unit is one metre
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldSummary(JsonRecord):
-    """The world frame of a workspace, as sfm/world.json and the summary of sfm hold it.
-
-    Attributes:
-        similarity: from the mapper's frame to the world; `Similarity.from_json` reads it.
-        evidence: for it.
-        measurement: what gave the scale; None where nothing was measured.
-        sentences: the same for a terminal.
-        seconds: that it took.
-    """
+    """The world frame of a workspace, in sfm/world.json and in the summary of sfm."""
 
     FILE: typing.ClassVar[str] = "world.json"
 
-    similarity: Mapping[str, Any]
+    similarity: Mapping[str, Any]  # from the mapper's frame; `Similarity.from_json` reads it
     evidence: WorldEvidence
-    measurement: Mapping[str, Any] | None
-    sentences: tuple[str, ...]
+    measurement: Mapping[str, Any] | None  # that gave the scale
+    sentences: tuple[str, ...]  # the same for a terminal
     seconds: float | None = None
 
     @classmethod
     def read(cls, sfm: Path) -> WorldSummary | None:
-        """Returns the world frame that the finished folder of sfm holds; None where there is none.
+        """Returns the world frame in the finished folder of sfm; None where there is none.
 
         Raises:
             ManifestError: the file is of another version.
@@ -247,47 +192,26 @@ class WorldSummary(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class SfmSummary(JsonRecord):
-    """The cameras that sfm found, and how far they can be trusted.
+    """The cameras that sfm found, and how far they can be trusted."""
 
-    Attributes:
-        frames: of ingest.
-        registered: frames with a camera.
-        points: of the model.
-        mean_track_length: images that see a point; None, as the next two, for given points.
-        reprojection_error_px: mean.
-        median_triangulation_angle_deg: widest angle between two rays to a point.
-        poses: of known poses; None without.
-        models: frames in the model and in what is left of the others.
-        apart: names of the frames that only other models hold.
-        rejected: why frames were taken out of the model, by name.
-        verdict: `sfm.verdict.Verdict` as JSON; None where given poses were not examined.
-        lines: the verdict in words.
-        rungs: the mappers that were tried.
-        seconds: by step.
-        unregistered: names of the frames without a camera.
-        unregistered_held_out: those of them that are held out.
-        world: the world frame.
-        cameras: width, height, focal_px (undistorted) and frames of each.
-    """
-
-    frames: int
-    registered: int
+    frames: int  # of ingest
+    registered: int  # frames with a camera
     points: int
-    mean_track_length: float | None
-    reprojection_error_px: float | None
-    median_triangulation_angle_deg: float | None
-    poses: PosesSummary | None
-    models: tuple[int, ...]
-    apart: tuple[tuple[str, ...], ...]
-    rejected: Mapping[str, str]
-    verdict: Mapping[str, Any] | None
-    lines: tuple[str, ...]
+    mean_track_length: float | None  # images that see a point; None, as the next two, if given
+    reprojection_error_px: float | None  # mean
+    median_triangulation_angle_deg: float | None  # widest angle between two rays to a point
+    poses: PosesSummary | None  # None without known poses
+    models: tuple[int, ...]  # frames in the model and in what is left of the others
+    apart: tuple[tuple[str, ...], ...]  # names of the frames that only other models hold
+    rejected: Mapping[str, str]  # why frames were taken out of the model, by name
+    verdict: Mapping[str, Any] | None  # `sfm.verdict.Verdict`; None for poses not examined
+    lines: tuple[str, ...]  # the verdict in words
     rungs: tuple[AttemptSummary, ...]
-    seconds: Mapping[str, float]
-    unregistered: tuple[str, ...]
-    unregistered_held_out: tuple[str, ...]
+    seconds: Mapping[str, float]  # by step
+    unregistered: tuple[str, ...]  # names of the frames without a camera
+    unregistered_held_out: tuple[str, ...]  # those of them that are held out
     world: WorldSummary
-    cameras: tuple[Mapping[str, float], ...]
+    cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
 
     @property
     def trusted(self) -> bool | None:
@@ -296,94 +220,186 @@ class SfmSummary(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TrialDecision(JsonRecord):
+    """Whether a short trial switched an optional part of the model on."""
+
+    name: str  # of the part
+    on: bool
+    mean_db: float | None  # mean gain over the views; None where nothing was tried
+    standard_error_db: float | None  # of that mean
+    reason: str  # one sentence for the log
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainPlan(JsonRecord):
+    """What training decided before its first step, in plan.json."""
+
+    FILE: typing.ClassVar[str] = "plan.json"
+
+    iterations: int
+    max_gaussians: int
+    max_size: int  # longest side of a training image, pixels
+    first_gaussians: int
+    detail: int  # pixels of a mean training view that hold detail
+    seconds: float  # expected for the training, with reports and checkpoints
+    cost: Mapping[str, Any]  # what the parts of a run take: `train.cost.CostModel`
+    needs: tuple[TrialDecision, ...] = ()
+
+    @classmethod
+    def read(cls, train: Path) -> TrainPlan:
+        """Returns the plan in a folder of train.
+
+        Raises:
+            ManifestError: the file is of another version.
+            FormatError: it is missing or damaged.
+        """
+        return cls.from_json(read_json(train / cls.FILE))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogRow(JsonRecord):
+    """One line of log.jsonl; None where it holds no such value."""
+
+    iteration: int
+    seconds: float  # of training from its start
+    cpu_seconds: float = 0.0
+    loss: float | None = None
+    validation_psnr_db: float | None = None
+    gaussians: int | None = None
+    goes_on_at: int | None = None  # iteration to which the run jumped
+
+    @classmethod
+    def read_all(cls, log: Path) -> tuple[LogRow, ...]:
+        """Returns the rows of a log, none if it is missing; an incomplete last line is left out.
+
+        Raises:
+            ManifestError: a row is of another version.
+            ValueError: a row is damaged.
+        """
+        lines = log.read_text(encoding="utf-8").splitlines(True) if log.exists() else []
+        return tuple(cls.from_json(json.loads(line)) for line in lines if line.endswith("\n"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSummary(JsonRecord):
+    """How a training ended."""
+
+    iterations: int  # steps taken
+    gaussians: int
+    initial_gaussians: int
+    max_gaussians: int
+    max_size: int  # longest side of a training image, pixels
+    planned_iterations: int
+    stopped_early_at: int | None
+    training_views: int
+    validation_views: int
+    width: int  # of the largest training image
+    height: int
+    sizes: tuple[tuple[int, ...], ...] | None = None  # (width, height), where they differ
+    validation_psnr_db: float | None  # None without validation views
+    train_seconds: float
+    parts: Mapping[str, Any]  # optional parts of the model, by the names of their options
+    skipped_steps: int  # the loss was not finite
+    estimated_seconds: float
+    calibration_seconds: float
+    processes: int | None = None  # None for one
+    cuda_peak_bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundSummary(JsonRecord):
+    """One round of pruning."""
+
+    gaussians: int  # left
+    removed: int
+    validation_psnr_db: float | None  # at its end
+    kept: bool  # False where it cost too much and was undone
+
+
+@dataclass(frozen=True, kw_only=True)
+class PruneSummary(JsonRecord):
+    """What was removed, and what it cost; PSNR is None without validation views."""
+
+    at: str  # end or mid
+    score: str
+    ratio: float  # share that was removed
+    gaussians_before: int
+    gaussians: int
+    validation_psnr_db_pruned: float | None  # right after the first removal
+    rounds: tuple[RoundSummary, ...]
+    iterations: int  # steps taken, those before included
+    recovery_steps: int
+    validation_psnr_db_before: float | None
+    validation_psnr_db: float | None
+    train_seconds: float  # those of the training before included
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateSummary(JsonRecord):
+    """Mean scores on the held-out views; those of the pruned model only where there is one."""
+
+    test_views: int
+    unregistered_test: tuple[str, ...]  # names of held-out views without a camera
+    masked_out_test: tuple[str, ...] | None = None  # of those whose masks leave too little
+    base_psnr_db: float
+    base_ssim: float
+    base_gaussians: int
+    pruned_psnr_db: float | None = None
+    pruned_ssim: float | None = None
+    pruned_gaussians: int | None = None
+    base_gain_psnr_db: float | None = None  # after the best gain of each view, with --exposure
+    pruned_gain_psnr_db: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class ImportSummary(JsonRecord):
-    """The scene that was imported, and how well it fits the views of the workspace.
+    """The imported scene, and how well it fits the views of the workspace."""
 
-    Attributes:
-        imported_from: name of the file.
-        format: of the file.
-        gaussians: count.
-        sh_degree: of the colours.
-        sha256: of the file, its first 12 digits.
-        views: training views that it was compared with; 0 without views, and None below.
-        frame: coordinate frame of the file, "source" or "workspace".
-        training_psnr_db: on these views.
-        flat_psnr_db: of flat images in the mean colours of the views.
-        tried_psnr_db: by frame that was tried.
-        transform: similarity from the file to the workspace.
-        notices: for the user; None where there are none.
-    """
-
-    imported_from: str
+    imported_from: str  # name of the file
     format: str
     gaussians: int
     sh_degree: int
-    sha256: str
-    views: int
-    frame: str | None = None
-    training_psnr_db: float | None = None
-    flat_psnr_db: float | None = None
-    tried_psnr_db: Mapping[str, float] | None = None
-    transform: Mapping[str, Any] | None = None
-    notices: tuple[str, ...] | None = None
+    sha256: str  # of the file, its first 12 digits
+    views: int  # training views that it was compared with; where 0, the next five are None
+    frame: str | None = None  # coordinate frame of the file: source or workspace
+    training_psnr_db: float | None = None  # on these views
+    flat_psnr_db: float | None = None  # of flat images in the mean colours of the views
+    tried_psnr_db: Mapping[str, float] | None = None  # by frame
+    transform: Mapping[str, Any] | None = None  # similarity from the file to the workspace
+    notices: tuple[str, ...] | None = None  # for the user
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportChange(JsonRecord):
-    """What an option of export removed.
-
-    Attributes:
-        option: name of the field.
-        gaussians: that are left.
-        gaussians_before: count.
-        degree: of the colours that is left.
-        degree_before: of the colours.
-        psnr_change_db: on the views that the export is checked on.
-    """
+    """What an option of export removed."""
 
     option: str
     gaussians: int
     gaussians_before: int
-    degree: int
+    degree: int  # of the spherical harmonics
     degree_before: int
-    psnr_change_db: float
+    psnr_change_db: float  # on the views that the export is checked on
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportedFile(JsonRecord):
-    """A file or folder beside the exported .ply; the size and loss are None for cameras and points.
+    """A file or folder beside the exported .ply."""
 
-    Attributes:
-        file: its name.
-        bytes: its size.
-        smaller: size of the .ply over its size.
-        psnr_change_db: on the views that the export is checked on.
-    """
-
-    file: str
-    bytes: int | None = None
-    smaller: float | None = None
-    psnr_change_db: float | None = None
+    file: str  # name
+    bytes: int | None = None  # None, as the next two, for cameras and points
+    smaller: float | None = None  # size of the .ply over its size
+    psnr_change_db: float | None = None  # on the views that the export is checked on
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportSummary(JsonRecord):
-    """What export wrote.
+    """What export wrote."""
 
-    Attributes:
-        model: "base" or "pruned".
-        file: name of the .ply.
-        gaussians: count.
-        bytes: size of the .ply.
-        transform: similarity from the world of the training to that of the files.
-        changes: what options removed, in order; None where nothing was asked for.
-        files: the other formats by name; None where there are none.
-    """
-
-    model: str
-    file: str
+    model: str  # base or pruned
+    file: str  # name of the .ply
     gaussians: int
-    bytes: int
-    transform: Mapping[str, Any]
-    changes: tuple[ExportChange, ...] | None = None
-    files: Mapping[str, ExportedFile] | None = None
+    bytes: int  # of the .ply
+    transform: Mapping[str, Any]  # similarity from the world of the training to the files
+    changes: tuple[ExportChange, ...] | None = None  # by options, in order
+    files: Mapping[str, ExportedFile] | None = None  # the other formats by name

@@ -17,7 +17,7 @@ import click
 from pose_errors import compare, model_poses, reference_poses
 
 from recon_cli.config.stages import DenoiseConfig, IngestConfig, SfmConfig
-from recon_cli.context import StageContext, StageInputs, Summary
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.progress import TqdmProgress
 from recon_cli.stages import denoise, ingest, sfm
 
@@ -43,11 +43,11 @@ def measured(
 ) -> dict[str, object]:
     """Runs sfm in `out` and returns what came out, how far from the truth, and the seconds."""
     out.mkdir(parents=True, exist_ok=True)
-    summary: Summary = sfm.run(config, inputs, out, ctx)
-    seconds = summary["seconds"]
+    summary = sfm.run(config, inputs, out, ctx)
+    seconds = summary.seconds
     rows: dict[str, object] = {
-        name: value for name, value in summary.items() if name in SHOWN}
-    rows["rungs"] = ", ".join(rung["name"] for rung in summary["rungs"])
+        name: value for name, value in summary.to_json().items() if name in SHOWN}
+    rows["rungs"] = ", ".join(rung.name for rung in summary.rungs)
     if reference is not None:
         errors = compare(model_poses(out / "sparse"), reference_poses(reference))
         rows |= {

@@ -32,7 +32,7 @@ def run(config, inputs, out, ctx):  # noqa: ARG001 - the signature of a stage
     if out.name == "sfm":
         world = replace(summaries.WORLD, evidence=replace(summaries.EVIDENCE, **evidence))
         return replace(summaries.SFM, world=world)
-    return summaries.BY_STAGE.get(out.name, {})
+    return summaries.BY_STAGE[out.name]
 
 
 def make_workspace(

@@ -94,10 +94,10 @@ def test_a_newer_version_of_a_stage_makes_its_results_stale(job: Job) -> None:
 
 
 def test_a_result_whose_record_another_version_wrote_is_stale(job: Job) -> None:
-    typed = [replace(row, summary=IngestSummary if row.name == "ingest" else None)
+    typed = [replace(row, summary=IngestSummary) if row.name == "ingest" else row
              for row in job.table]
     reason, = stale(replace(job, table=typed))["ingest"]
-    assert reason.startswith("the summary lacks kind, declared_frames")
+    assert reason.startswith("the record lacks kind, declared_frames")
 
 
 def test_an_option_that_no_longer_exists_makes_its_stage_stale(job: Job) -> None:

@@ -42,7 +42,7 @@ def run(config, inputs, out, ctx):  # noqa: ARG001 - the signature of a stage
     source = prepared["folder"] / out.name
     if source.is_dir():
         shutil.copytree(source, out, dirs_exist_ok=True)
-    return summaries.get(out.name, {})
+    return summaries[out.name]
 
 
 def make_workspace(folder: Path) -> Path:
@@ -58,7 +58,7 @@ def make_workspace(folder: Path) -> Path:
         (made / name).mkdir()
         summaries[name] = stage.run(config, inputs, made / name, CONTEXT)
         inputs = StageInputs({**inputs.folders, name: made / name})
-    summaries.update({**records.BY_STAGE, "ingest": INGEST, "sfm": SFM})
+    summaries.update({"ingest": INGEST, "denoise": records.DENOISE, "sfm": SFM})
     prepared["folder"] = made
     (folder / "room.mp4").write_text("a video")
     bring(folder / "ws", *(row.name for row in TABLE), video=folder / "room.mp4")

@@ -116,7 +116,7 @@ def test_a_held_out_frame_without_a_camera_is_named(inputs, tmp_path, caplog):
     (folder / "frames.json").write_text(json.dumps(frames))
     summary = run(evaluate, EvaluateConfig(), StageInputs({**inputs.folders, "ingest": folder}),
                   tmp_path / "out")
-    assert summary["unregistered_test"] == ["999999.png"]
+    assert summary.unregistered_test == ("999999.png",)
     assert "999999.png" in caplog.text
 
 

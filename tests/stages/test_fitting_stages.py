@@ -103,10 +103,10 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
 
 def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(inputs, tmp_path):
     summary = run(prune, PRUNE, inputs, tmp_path / "prune")
-    assert summary["gaussians"] == summary["gaussians_before"] - summary["gaussians_before"] // 2
-    assert summary["iterations"] == CONFIG.iterations
-    assert summary["recovery_steps"] == 64
-    assert len(read_ply(tmp_path / "prune" / "splats.ply")) == summary["gaussians"]
+    assert summary.gaussians == summary.gaussians_before - summary.gaussians_before // 2
+    assert summary.iterations == CONFIG.iterations
+    assert summary.recovery_steps == 64
+    assert len(read_ply(tmp_path / "prune" / "splats.ply")) == summary.gaussians
     assert (tmp_path / "prune" / "splats.ply").read_bytes() == (
         inputs.folders["prune"] / "splats.ply").read_bytes()
     assert (inputs.folders["train"] / "splats.ply").exists()
@@ -130,8 +130,8 @@ def test_pruning_the_finished_run_without_recovery_only_removes(inputs, tmp_path
                     for folder in (tmp_path / "out", inputs.folders["train"]))
     rows = torch.cdist(kept.means, before.means).argmin(1)
     assert torch.equal(before.means[rows], kept.means)
-    assert summary["recovery_steps"] == 0
-    assert summary["train_seconds"] > 0
+    assert summary.recovery_steps == 0
+    assert summary.train_seconds > 0
 
 
 def test_a_config_of_the_same_ratio_by_chance_keeps_other_gaussians(inputs, tmp_path):
@@ -139,7 +139,7 @@ def test_a_config_of_the_same_ratio_by_chance_keeps_other_gaussians(inputs, tmp_
     for score in ("loo", "paper"):
         config = PruneConfig(ratio=0.5, at="end", recovery=0, score=score)
         results.append(run(prune, config, inputs, tmp_path / score))
-    assert results[0]["gaussians"] == results[1]["gaussians"]
+    assert results[0].gaussians == results[1].gaussians
     assert results[0]["validation_psnr_db"] > results[1]["validation_psnr_db"]
 
 

@@ -140,10 +140,10 @@ def test_an_imported_scene_is_pruned_like_a_trained_one(inputs, tmp_path):
     (tmp_path / "prune").mkdir()
     config = PruneConfig(ratio=0.25, recovery=24)
     summary = prune.run(config, folders, tmp_path / "prune", CONTEXT)
-    assert (summary["gaussians_before"], summary["gaussians"]) == (60, 45)
-    assert summary["iterations"] == summary["recovery_steps"] == 24
-    assert summary["validation_psnr_db_before"] > 40
-    assert summary["validation_psnr_db"] > 35
+    assert (summary.gaussians_before, summary.gaussians) == (60, 45)
+    assert summary.iterations == summary.recovery_steps == 24
+    assert summary.validation_psnr_db_before > 40
+    assert summary.validation_psnr_db > 35
     with pytest.raises(ConfigError, match="imported from a"):
         prune.run(PruneConfig(at="mid"), folders, tmp_path / "prune", CONTEXT)
 

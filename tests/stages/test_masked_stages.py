@@ -143,7 +143,7 @@ def test_a_training_view_whose_mask_leaves_nothing_is_left_out_with_a_notice(
     before = json.loads((inputs.folders["ingest"] / "frames.json").read_text())["frames"]
     summary = run(train, replace(CONFIG, iterations=2), changed, tmp_path / "out", backend)
     kept = sum(not frame["held_out"] for frame in before) - 1
-    assert summary["training_views"] + summary["validation_views"] == kept
+    assert summary.training_views + summary.validation_views == kept
     assert "1 views are not trained on" in caplog.text
     assert "000003.png" in caplog.text
 
@@ -162,8 +162,8 @@ def test_a_held_out_view_whose_mask_leaves_nothing_is_not_scored_and_named(
     backend, (inputs, _) = given
     changed = copied(inputs, tmp_path, {UNMASKED: NOTHING})
     summary = run(evaluate, EvaluateConfig(), changed, tmp_path / "out", backend)
-    assert summary["test_views"] == 2
-    assert summary["masked_out_test"] == [UNMASKED]
+    assert summary.test_views == 2
+    assert summary.masked_out_test == (UNMASKED,)
     assert "1 views are not scored" in caplog.text
 
 

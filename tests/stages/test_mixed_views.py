@@ -66,7 +66,7 @@ def test_views_of_both_cameras_are_learned_and_scored_at_their_own_size(done, tm
 def test_summaries_and_metrics_name_the_largest_size_and_all_of_them(done, tmp_path):
     inputs, (summary, _), ctx = done
     metrics = evaluated(inputs, tmp_path / "out", ctx)
-    for held in (summary, metrics):
+    for held in (summary.to_json(), metrics):
         assert (held["width"], held["height"]) == (48, 36)
         assert held["sizes"] == [[48, 36], [30, 44]]
     assert "3 held-out views at 48x36 and 30x44" in (tmp_path / "out" / "table.txt").read_text()
@@ -80,9 +80,9 @@ def test_each_camera_is_reduced_to_the_longest_side_by_its_own_factor(done, tmp_
 
 def test_pruning_keeps_its_share_over_both_cameras(done):
     _, (_, summary), _ = done
-    before = summary["gaussians_before"]
-    assert summary["gaussians"] == before - int(0.3 * before)
-    assert np.isfinite(summary["validation_psnr_db"])
+    before = summary.gaussians_before
+    assert summary.gaussians == before - int(0.3 * before)
+    assert np.isfinite(summary.validation_psnr_db)
 
 
 def test_the_largest_view_decides_the_memory_and_masks_are_counted(tmp_path, monkeypatch):

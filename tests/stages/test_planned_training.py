@@ -61,10 +61,10 @@ def test_the_plan_is_recorded_with_what_it_was_made_from(done):
     out, summary = done
     plan = json.loads((out / "plan.json").read_text())
     assert [level["level"] for level in plan["cost"]["levels"]] == [1, 2]
-    assert plan["iterations"] == summary["planned_iterations"] >= 100
-    assert plan["max_gaussians"] == summary["max_gaussians"]
-    assert plan["seconds"] == summary["estimated_seconds"]
-    assert summary["calibration_seconds"] > 0
+    assert plan["iterations"] == summary.planned_iterations >= 100
+    assert plan["max_gaussians"] == summary.max_gaussians
+    assert plan["seconds"] == summary.estimated_seconds
+    assert summary.calibration_seconds > 0
     config = json.loads((out / "config.json").read_text())
     assert {name: config[name] for name in ("iterations", "max_gaussians", "max_size")} == {
         name: plan[name] for name in ("iterations", "max_gaussians", "max_size")}
@@ -74,8 +74,8 @@ def test_the_plan_is_recorded_with_what_it_was_made_from(done):
 def test_the_numbers_of_a_plan_repeat_the_run_to_the_byte(inputs, done, tmp_path):
     first, summary = done
     again = replace(
-        OPEN, minutes=None, iterations=summary["planned_iterations"],
-        max_gaussians=summary["max_gaussians"], max_size=summary["max_size"])
+        OPEN, minutes=None, iterations=summary.planned_iterations,
+        max_gaussians=summary.max_gaussians, max_size=summary.max_size)
     run(again, inputs, tmp_path / "again")
     assert same_bytes(first, tmp_path / "again")
 
@@ -93,8 +93,8 @@ def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monke
         summary = run(OPEN, inputs, out)
     assert (out / "plan.json").read_bytes() == recorded
     whole = replace(
-        OPEN, minutes=None, iterations=summary["planned_iterations"],
-        max_gaussians=summary["max_gaussians"], max_size=summary["max_size"])
+        OPEN, minutes=None, iterations=summary.planned_iterations,
+        max_gaussians=summary.max_gaussians, max_size=summary.max_size)
     run(whole, inputs, tmp_path / "whole")
     assert same_bytes(out, tmp_path / "whole")
 
@@ -104,36 +104,36 @@ def test_memory_that_is_short_lowers_the_cap_and_says_so(inputs, tmp_path, monke
     monkeypatch.setattr(memory, "free_memory_bytes", lambda: needed.total)
     monkeypatch.setattr(planning.plan, "wanted", lambda *_: 9000)
     summary = run(TrainConfig(iterations=2), inputs, tmp_path / "out")
-    assert summary["max_gaussians"] == pytest.approx(5500, abs=10)
+    assert summary.max_gaussians == pytest.approx(5500, abs=10)
     assert "9,000 would suit" in caplog.text
 
 
 def test_a_count_at_its_cap_from_the_start_stays_there(inputs, tmp_path):
     summary = run(replace(OPEN, minutes=None, iterations=120, max_gaussians=20), inputs,
                   tmp_path / "out")
-    assert (summary["initial_gaussians"], summary["max_gaussians"]) == (20, 20)
-    assert summary["gaussians"] <= 20
+    assert (summary.initial_gaussians, summary.max_gaussians) == (20, 20)
+    assert summary.gaussians <= 20
 
 
 def test_the_shortest_time_gives_the_smallest_run_and_says_so(inputs, tmp_path, caplog):
     summary = run(
         replace(OPEN, minutes=0.01), inputs, tmp_path / "out", StageContext(backend="torch"))
-    assert summary["iterations"] == 100
+    assert summary.iterations == 100
     assert "too short" in caplog.text
 
 
 def test_one_step_is_a_run(inputs, tmp_path):
     summary = run(TrainConfig(iterations=1), inputs, tmp_path / "out")
-    assert summary["iterations"] == 1
-    assert len(read_ply(tmp_path / "out" / "splats.ply")) == summary["gaussians"] == 60
+    assert summary.iterations == 1
+    assert len(read_ply(tmp_path / "out" / "splats.ply")) == summary.gaussians == 60
 
 
 def test_a_large_image_among_small_ones_is_planned_for(tmp_path):
     shapes = (Shape(48, 36, 40.0), Shape(48, 36, 40.0), Shape(900, 700, 700.0))
     inputs = make_inputs(tmp_path, shapes)
     summary = run(replace(OPEN, minutes=0.05, max_size=900), inputs, tmp_path / "out")
-    assert summary["iterations"] >= 100
-    assert [900, 700] in summary["sizes"]
+    assert summary.iterations >= 100
+    assert (900, 700) in summary.sizes
 
 
 def test_one_view_to_train_on_is_too_few(inputs, tmp_path):
@@ -161,8 +161,8 @@ def flat(monkeypatch):
 @pytest.mark.usefixtures("flat")
 def test_an_early_stop_is_recorded_and_pruning_follows_it(inputs, tmp_path):
     summary = run(STOPPING, inputs, tmp_path / "train")
-    assert summary["stopped_early_at"] == 100
-    assert summary["iterations"] == 160 - (128 - 100)
+    assert summary.stopped_early_at == 100
+    assert summary.iterations == 160 - (128 - 100)
     rows = [json.loads(line) for line in
             (tmp_path / "train" / "log.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows if row.get("goes_on_at")] == [100]
@@ -170,8 +170,8 @@ def test_an_early_stop_is_recorded_and_pruning_follows_it(inputs, tmp_path):
     (tmp_path / "prune").mkdir()
     both = StageInputs({**inputs.folders, "train": tmp_path / "train"})
     pruned = prune.run(PruneConfig(at="mid"), both, tmp_path / "prune", CONTEXT)
-    assert pruned["iterations"] == summary["iterations"]
-    assert pruned["recovery_steps"] == summary["iterations"] - 96
+    assert pruned.iterations == summary.iterations
+    assert pruned.recovery_steps == summary.iterations - 96
 
 
 @pytest.mark.usefixtures("flat")
@@ -191,8 +191,8 @@ def test_a_killed_run_that_stops_early_ends_with_the_same_bytes(
 @pytest.mark.usefixtures("flat")
 def test_pruning_takes_every_step_where_training_did(inputs, tmp_path):
     with_all = run(replace(STOPPING, early_stop=False), inputs, tmp_path / "train")
-    assert (with_all["stopped_early_at"], with_all["iterations"]) == (None, 160)
+    assert (with_all.stopped_early_at, with_all.iterations) == (None, 160)
     (tmp_path / "prune").mkdir()
     both = StageInputs({**inputs.folders, "train": tmp_path / "train"})
     assert prune.run(
-        PruneConfig(at="mid"), both, tmp_path / "prune", CONTEXT)["iterations"] == 160
+        PruneConfig(at="mid"), both, tmp_path / "prune", CONTEXT).iterations == 160

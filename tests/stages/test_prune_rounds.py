@@ -57,16 +57,16 @@ def whole(inputs, tmp_path_factory):
 
 def test_each_round_says_what_went_and_how_good_the_rest_is(whole):
     folder, summary = whole[THREE]
-    counts = [one["gaussians"] for one in summary["rounds"]]
+    counts = [one.gaussians for one in summary.rounds]
     assert counts == sorted(counts, reverse=True)
     assert len(counts) == 3
-    assert counts[-1] == summary["gaussians"] == len(read_ply(folder / "splats.ply"))
-    assert sum(one["removed"] for one in summary["rounds"]) == (
-        summary["gaussians_before"] - summary["gaussians"])
-    assert all(one["validation_psnr_db"] > 5 for one in summary["rounds"])
-    assert summary["rounds"][-1]["validation_psnr_db"] == summary["validation_psnr_db"]
+    assert counts[-1] == summary.gaussians == len(read_ply(folder / "splats.ply"))
+    assert sum(one.removed for one in summary.rounds) == (
+        summary.gaussians_before - summary.gaussians)
+    assert all(one.validation_psnr_db > 5 for one in summary.rounds)
+    assert summary.rounds[-1].validation_psnr_db == summary.validation_psnr_db
     assert json.loads((folder / "rounds.json").read_text())[0]["iteration"] == 130
-    assert summary["recovery_steps"] == 60
+    assert summary.recovery_steps == 60
 
 
 def test_nothing_is_left_that_only_a_resumed_run_would_need(whole):
@@ -108,7 +108,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     assert kills > 5
     for name in ("splats.ply", "rounds.json"):
         assert (tmp_path / "out" / name).read_bytes() == (expected / name).read_bytes()
-    assert {**resumed, "train_seconds": 0} == {**summary, "train_seconds": 0}
+    assert replace(resumed, train_seconds=0) == replace(summary, train_seconds=0)
 
 
 def test_ctrl_c_while_scores_are_gathered_costs_no_byte_either(
@@ -145,15 +145,15 @@ def test_the_number_of_threads_changes_no_byte(inputs, tmp_path):
 def test_every_score_prunes(score, inputs, tmp_path):
     config = PruneConfig(ratio=0.5, score=score, rounds=2, recovery=4)
     summary = run(config, inputs, tmp_path / "out")
-    assert summary["gaussians"] == summary["gaussians_before"] - summary["gaussians_before"] // 2
+    assert summary.gaussians == summary.gaussians_before - summary.gaussians_before // 2
 
 
 def test_at_most_so_many_gaussians_stay(inputs, tmp_path):
-    assert run(PruneConfig(max_gaussians=17, recovery=0), inputs, tmp_path / "a")[
-        "gaussians"] == 17
+    few = run(PruneConfig(max_gaussians=17, recovery=0), inputs, tmp_path / "a")
+    assert few.gaussians == 17
     summary = run(PruneConfig(max_gaussians=10**6, recovery=5), inputs, tmp_path / "b")
-    assert summary["gaussians"] == summary["gaussians_before"]
-    assert summary["rounds"] == []
+    assert summary.gaussians == summary.gaussians_before
+    assert summary.rounds == ()
 
 
 def test_the_ply_is_no_larger_than_asked_for_and_not_much_smaller(inputs, tmp_path):
@@ -168,29 +168,29 @@ def test_a_ply_too_small_for_one_gaussian_is_refused(inputs, tmp_path):
 
 
 def test_pruning_everything_leaves_one(inputs, tmp_path):
-    assert run(PruneConfig(ratio=1.0, recovery=2), inputs, tmp_path / "out")["gaussians"] == 1
+    assert run(PruneConfig(ratio=1.0, recovery=2), inputs, tmp_path / "out").gaussians == 1
 
 
 def test_the_search_ends_within_the_loss_that_it_was_allowed(whole):
     _, summary = whole[SEARCH]
-    drop = summary["validation_psnr_db_before"] - summary["validation_psnr_db"]
+    drop = summary.validation_psnr_db_before - summary.validation_psnr_db
     assert drop <= 1.0
-    assert 0 < summary["gaussians"] < summary["gaussians_before"]
-    tried = summary["rounds"]
-    assert [one["kept"] for one in tried].count(False) >= 1  # more would have been too much
-    last = [one for one in tried if one["kept"]][-1]
-    assert last["gaussians"] == summary["gaussians"]
-    assert last["validation_psnr_db"] == summary["validation_psnr_db"]
+    assert 0 < summary.gaussians < summary.gaussians_before
+    tried = summary.rounds
+    assert [one.kept for one in tried].count(False) >= 1  # more would have been too much
+    last = [one for one in tried if one.kept][-1]
+    assert last.gaussians == summary.gaussians
+    assert last.validation_psnr_db == summary.validation_psnr_db
     for one in tried:
-        good = summary["validation_psnr_db_before"] - one["validation_psnr_db"] <= 1.0
-        assert one["kept"] == good
+        good = summary.validation_psnr_db_before - one.validation_psnr_db <= 1.0
+        assert one.kept == good
 
 
 def test_where_every_removal_costs_too_much_nothing_goes(inputs, tmp_path, caplog):
     config = PruneConfig(max_psnr_drop=0.0, score="paper", recovery=0)
     summary = run(config, inputs, tmp_path / "out")
-    assert summary["gaussians"] == summary["gaussians_before"]
-    assert not any(one["kept"] for one in summary["rounds"])
+    assert summary.gaussians == summary.gaussians_before
+    assert not any(one.kept for one in summary.rounds)
     assert "nothing was removed" in caplog.text
     kept, before = (read_ply(folder / "splats.ply")
                     for folder in (tmp_path / "out", inputs.folders["train"]))

@@ -60,7 +60,7 @@ def test_every_stage_runs_and_a_killed_training_ends_with_the_same_bytes(tmp_pat
     summary = run(
         prune, PruneConfig(ratio=0.5, at="mid", rounds=1), inputs, tmp_path / "prune", ON_TRITON)
     left = len(read_ply(tmp_path / "prune" / "splats.ply"))
-    assert left == summary["gaussians"] == -(-summary["gaussians_before"] // 2)
+    assert left == summary.gaussians == -(-summary.gaussians_before // 2)
     inputs = StageInputs({**inputs.folders, "prune": tmp_path / "prune"})
     run(evaluate, EvaluateConfig(), inputs, tmp_path / "evaluate", ON_TRITON)
     models = json.loads((tmp_path / "evaluate" / "metrics.json").read_text())["models"]

@@ -62,7 +62,8 @@ def test_the_same_numbers_given_make_the_same_config():
     made = make_plan(asked, FACTS, COST)
     again = TrainConfig(iterations=made.iterations, max_gaussians=made.max_gaussians,
                         max_size=made.max_size, seed=4)
-    assert made.config(asked) == make_plan(again, FACTS, COST).config(again)
+    assert plan.run_config(asked, made) == plan.run_config(
+        again, make_plan(again, FACTS, COST))
 
 
 def test_the_cap_grows_with_the_root_of_the_steps_and_with_the_detail():

@@ -10,8 +10,11 @@ from recon_cli.errors import ManifestError
 from recon_cli.workspace.summaries import (
     AttemptSummary,
     IngestSummary,
+    LogRow,
     PosesSummary,
+    PruneSummary,
     SfmSummary,
+    TrainSummary,
     WorldSummary,
 )
 
@@ -23,7 +26,7 @@ MAPPED = replace(
     poses=PosesSummary(use="refine", metric=True, moved_median=0.1))
 
 
-@pytest.mark.parametrize("record", [MAPPED, summaries.SFM, summaries.INGEST])
+@pytest.mark.parametrize("record", [MAPPED, *summaries.BY_STAGE.values()])
 def test_a_record_comes_back_from_json_as_it_was(record):
     assert type(record).from_json(json.loads(json.dumps(record.to_json()))) == record
 
@@ -43,6 +46,20 @@ def test_a_record_of_another_version_is_refused_with_what_it_lacks():
         SfmSummary.from_json(value)
     with pytest.raises(ManifestError, match="not a JSON object"):
         SfmSummary.from_json({**value, "world": 3})
+
+
+def test_a_value_of_another_type_is_refused_with_its_name():
+    with pytest.raises(ManifestError, match=r"3\.5 as gaussians.*another version"):
+        TrainSummary.from_json({**summaries.TRAIN.to_json(), "gaussians": 3.5})
+    with pytest.raises(ManifestError, match=r"None as rounds.*another version"):
+        PruneSummary.from_json({**summaries.PRUNE.to_json(), "rounds": None})
+
+
+def test_a_log_is_read_without_an_incomplete_last_line(tmp_path):
+    log = tmp_path / "log.jsonl"
+    assert LogRow.read_all(log) == ()
+    log.write_text('{"iteration": 5, "seconds": 1.5}\n{"iteration": 9, "sec')
+    assert LogRow.read_all(log) == (LogRow(iteration=5, seconds=1.5),)
 
 
 def test_what_another_version_added_is_ignored():
