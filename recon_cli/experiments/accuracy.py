@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from recon_cli.experiments.synthetic_room import BenchScene
+from recon_cli.experiments.bench_scene import BenchScene
 from recon_cli.render.contract import Renderer
 from recon_cli.render.torch import tiles
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments.accuracy import Accuracy, accuracy, answer, oracle
 from recon_cli.experiments.bench_result import BackendResult, BenchedScene, Speed, VariantResult
-from recon_cli.experiments.host import (
+from recon_cli.experiments.instruments import (
     FLOPS_BACKWARD,
     FLOPS_FORWARD,
     Host,
@@ -29,7 +29,7 @@ from recon_cli.experiments.host import (
     timing_of,
 )
 from recon_cli.experiments.probes import COMPOSITE, DECOMPOSE, probe_for
-from recon_cli.experiments.synthetic_room import (
+from recon_cli.experiments.bench_scene import (
     CONTRACT,
     QUICK,
     BenchScene,

@@ -11,7 +11,7 @@ from typing import Any
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.evaluation.tables import Table, number
 from recon_cli.experiments.accuracy import Accuracy
-from recon_cli.experiments.host import Host, Timing
+from recon_cli.experiments.instruments import Host, Timing
 from recon_cli.workspace import atomic
 
 SCHEMA = "recon-bench"

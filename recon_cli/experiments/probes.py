@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from recon_cli.experiments.host import Stopwatch
+from recon_cli.experiments.instruments import Stopwatch
 from recon_cli.render.contract import RenderOutput
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import blocks, tiles

@@ -25,9 +25,9 @@ from recon_cli.experiments.bench_result import (
     ratio,
     read_record,
 )
-from recon_cli.experiments.host import Timing, examine, warm_start
+from recon_cli.experiments.instruments import Timing, examine, warm_start
 from recon_cli.experiments.outputs import OutputFiles, drawing
-from recon_cli.experiments.synthetic_room import QUICK, SIZES
+from recon_cli.experiments.bench_scene import QUICK, SIZES
 from recon_cli.progress import Progress
 from recon_cli.render import registry
 

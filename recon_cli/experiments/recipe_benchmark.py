@@ -14,7 +14,7 @@ import numpy as np
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.evaluation.tables import Table, number
-from recon_cli.experiments.host import Host, examine, timing_of
+from recon_cli.experiments.instruments import Host, examine, timing_of
 from recon_cli.experiments.outputs import OutputFiles, add_legend, drawing
 from recon_cli.experiments.runner import STEPS, ExperimentRequest, Runner, Runs, shared_options
 from recon_cli.experiments.scenes import check_scenes

@@ -10,7 +10,7 @@ from typing import Any
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.intervals import Interval, Spread, paired_t
-from recon_cli.experiments.host import Host
+from recon_cli.experiments.instruments import Host
 from recon_cli.experiments.runner import (
     ExperimentRequest,
     Record,

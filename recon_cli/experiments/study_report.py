@@ -16,7 +16,7 @@ from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread
 from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.evaluation.tables import Table
-from recon_cli.experiments.host import examine
+from recon_cli.experiments.instruments import examine
 from recon_cli.experiments.outputs import add_legend, draw_if_possible, drawing
 from recon_cli.experiments.runner import Records
 from recon_cli.experiments.scenes import check_scenes

@@ -42,7 +42,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from browser import launch_browser, watch_page
 
 from recon_cli.evaluation.metrics import psnr
-from recon_cli.experiments.synthetic_room import room
+from recon_cli.experiments.bench_scene import room
 from recon_cli.io.images import fit_camera, to_uint8
 from recon_cli.pipeline.execute import render_context
 from recon_cli.pipeline.plan import Job

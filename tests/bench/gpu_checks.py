@@ -10,7 +10,7 @@ from gpu_figures import Figures
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
 
-from recon_cli.experiments.synthetic_room import BenchScene, SceneSize, build_scene
+from recon_cli.experiments.bench_scene import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.render.triton import step as triton_step
 from recon_cli.render.triton.step_status import StepReport

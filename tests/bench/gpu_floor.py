@@ -40,7 +40,7 @@ from gpu_clock import StageClock, between, clear, hold, in_turn, middle, moment
 from gpu_figures import Figures, Goal
 from gpu_scene import AFTER, photometric, training, without_graphs
 
-from recon_cli.experiments.synthetic_room import SceneSize
+from recon_cli.experiments.bench_scene import SceneSize
 from recon_cli.render import render
 from recon_cli.render.contract import TILE
 from recon_cli.render.triton import passes

@@ -8,7 +8,7 @@ import importlib.util
 import torch
 from torch import Tensor
 
-from recon_cli.experiments.synthetic_room import BenchScene
+from recon_cli.experiments.bench_scene import BenchScene
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.splats import Splats
 

@@ -12,7 +12,7 @@ from gpu_gsplat import Gsplat, installed
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
 
-from recon_cli.experiments.synthetic_room import BenchScene, SceneSize, build_scene
+from recon_cli.experiments.bench_scene import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.train import async_trainer
 from recon_cli.train.state import TrainState

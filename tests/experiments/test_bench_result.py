@@ -26,7 +26,7 @@ from recon_cli.experiments.bench_result import (
     ratio,
     read_record,
 )
-from recon_cli.experiments.host import (
+from recon_cli.experiments.instruments import (
     FLOPS_BACKWARD,
     FLOPS_FORWARD,
     OPERATIONS_PER_PAIR,

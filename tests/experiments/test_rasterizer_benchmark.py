@@ -13,7 +13,7 @@ from recon_cli.experiments import outputs
 from recon_cli.experiments.accuracy import Answer, accuracy, answer, oracle
 from recon_cli.experiments.bench_result import FIGURES
 from recon_cli.experiments.probes import probe_for
-from recon_cli.experiments.synthetic_room import (
+from recon_cli.experiments.bench_scene import (
     CONTRACT,
     SceneSize,
     build_scene,

@@ -15,7 +15,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.experiments import outputs, runner, trial
 from recon_cli.experiments import recipe_benchmark as module
-from recon_cli.experiments.host import Host
+from recon_cli.experiments.instruments import Host
 from recon_cli.experiments.recipe_benchmark import (
     CurvesResult,
     RecipeRequest,

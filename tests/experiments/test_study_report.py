@@ -6,7 +6,7 @@ import pytest
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments import study_report
-from recon_cli.experiments.host import Host
+from recon_cli.experiments.instruments import Host
 from recon_cli.experiments.runner import Record
 from recon_cli.experiments.study import (
     COMPARISONS,
