@@ -37,7 +37,7 @@ def study(call: Call, /, scenes: SceneOptions, **typed: Any) -> None:
     and at equal seconds, and scores them on held-out views, with intervals over the seeds.
     """
     request = load("recon_cli.experiments.study.StudyRequest")
-    run = load("recon_cli.experiments.study_report.run")
+    run = load("recon_cli.experiments.study.run")
     # nothing looks at validation views here, so all but the test views are trained on
     shared = scenes.fields(call, validation=0.0)
     click.echo(run(request(**shared, **typed), TqdmProgress()))

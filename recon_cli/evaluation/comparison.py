@@ -22,12 +22,12 @@ from recon_cli.evaluation.reference_views import (
 )
 from recon_cli.evaluation.scores import (
     ModelScore,
+    Table,
     ViewScore,
     csv_table,
     model_table,
     paper_table,
 )
-from recon_cli.evaluation.tables import Table
 from recon_cli.io.splats.registry import read_splats
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +15,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.experiments.accuracy import Accuracy, accuracy, answer, oracle
-from recon_cli.experiments.bench_result import BackendResult, BenchedScene, Speed, VariantResult
+from recon_cli.experiments.bench_scene import (
+    CONTRACT,
+    QUICK,
+    Accuracy,
+    BenchScene,
+    SceneSize,
+    accuracy,
+    answer,
+    build_scene,
+    oracle,
+    renderer_of,
+    variants_for,
+)
 from recon_cli.experiments.instruments import (
+    COMPOSITE,
+    DECOMPOSE,
     FLOPS_BACKWARD,
     FLOPS_FORWARD,
     Host,
@@ -25,18 +40,9 @@ from recon_cli.experiments.instruments import (
     added_memory,
     alternate,
     peak_fraction,
+    probe_for,
     rate,
     timing_of,
-)
-from recon_cli.experiments.probes import COMPOSITE, DECOMPOSE, probe_for
-from recon_cli.experiments.bench_scene import (
-    CONTRACT,
-    QUICK,
-    BenchScene,
-    SceneSize,
-    build_scene,
-    renderer_of,
-    variants_for,
 )
 from recon_cli.progress import Bar, Progress
 from recon_cli.render import registry
@@ -315,3 +321,124 @@ def _speed(samples: Samples, pairs: Pairs, peak: float | None, threads: int) -> 
         forward, backward,
         peak_fraction(forward, FLOPS_FORWARD, peak, threads),
         peak_fraction(backward, FLOPS_BACKWARD, peak, threads), timings)
+
+
+SCHEMA = "recon-bench"
+
+
+VERSION = 1  # goes up when a key changes its name or meaning
+
+
+# What each backend has under its own name in every scene; --compare prints a ratio for each.
+FIGURES = (
+    "forward_ms", "backward_ms", "step_ms", "gpairs_per_s_forward", "gpairs_per_s_backward",
+    "peak_fraction_forward", "peak_fraction_backward", "image_error_max",
+    "gradient_relative_error")
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast a backend is with some number of threads."""
+
+    threads: int
+    forward: Timing  # a whole forward pass
+    backward: Timing
+    step: Timing  # forward, loss, backward, Adam
+    # evaluated pairs of Gaussian and pixel over the time of compositing; None where not counted
+    gpairs_per_s_forward: float | None
+    gpairs_per_s_backward: float | None
+    # arithmetic of those pairs over what the threads could do; None where no peak was measured
+    peak_fraction_forward: float | None
+    peak_fraction_backward: float | None
+    stages: dict[str, Timing]  # parts of the passes and of the step, in order, as "pass: part"
+
+    def record(self) -> dict[str, Any]:
+        """Returns the figures by the names of the JSON file."""
+        passes = {"forward": self.forward, "backward": self.backward, "step": self.step}
+        return {
+            "threads": self.threads,
+            **{f"{name}_ms": timing.ms for name, timing in passes.items()},
+            **{f"{name}_iqr_ms": timing.iqr_ms for name, timing in passes.items()},
+            **{name: getattr(self, name) for name in FIGURES[3:7]},
+            "stages": {name: asdict(timing) for name, timing in self.stages.items()},
+        }
+
+
+def _finite(accuracy: Accuracy) -> dict[str, Any]:
+    """Returns an accuracy for JSON, which knows no infinity: null stands for it."""
+    return {name: None if value == math.inf else value
+            for name, value in asdict(accuracy).items()}
+
+
+@dataclass(frozen=True)
+class BackendResult:
+    """One backend in one scene."""
+
+    speed: Speed  # with all the threads that were asked for
+    one_thread: Speed | None  # None on a GPU
+    accuracy: Accuracy  # against the oracle
+    pairs: tuple[int, int] | None  # evaluated forward and backward; None where not counted
+    memory_bytes: int  # most that a first forward and backward pass added, gradients included
+
+    def record(self) -> dict[str, Any]:
+        """Returns the figures by the names of the JSON file."""
+        return {
+            **self.speed.record(), **_finite(self.accuracy), "pairs": self.pairs,
+            "memory_bytes": self.memory_bytes,
+            "one_thread": self.one_thread.record() if self.one_thread else None,
+        }
+
+
+@dataclass(frozen=True)
+class VariantResult:
+    """One approximation on one backend."""
+
+    name: str
+    time: Timing | None  # forward and backward; None where a difference would mean nothing
+    accuracy: Accuracy  # against the oracle, which follows the contract
+
+
+@dataclass(frozen=True)
+class BenchedScene:
+    """Everything about one scene."""
+
+    gaussians: int
+    width: int  # of the image in pixels
+    height: int
+    sh_degree: int
+    backends: dict[str, BackendResult]  # by name, the fastest kind first
+    losses: dict[str, Timing]  # forward and backward of each photometric loss
+    variants_of: str  # the backend that the approximations were drawn by
+    variants: list[VariantResult]  # the contract first, then the approximations
+
+    def record(self) -> dict[str, Any]:
+        """Returns the figures by the names of the JSON file."""
+        return {
+            "gaussians": self.gaussians, "width": self.width, "height": self.height,
+            "sh_degree": self.sh_degree,
+            "backends": {name: backend.record() for name, backend in self.backends.items()},
+            "losses": {name: asdict(timing) for name, timing in self.losses.items()},
+            "variants_of": self.variants_of,
+            "variants": [
+                {"name": variant.name, "time": asdict(variant.time) if variant.time else None,
+                 **_finite(variant.accuracy)} for variant in self.variants],
+        }
+
+
+@dataclass(frozen=True)
+class BenchResult:
+    """A run of the benchmark."""
+
+    host: Host
+    rounds: int  # behind each median
+    scenes: dict[str, BenchedScene]
+    warm_start: Timing | None = None  # of the numba backend in a fresh process; None if left out
+
+    def record(self) -> dict[str, Any]:
+        """Returns what the JSON file holds."""
+        return {
+            "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
+            "rounds": self.rounds,
+            "warm_start": asdict(self.warm_start) if self.warm_start else None,
+            "scenes": {name: scene.record() for name, scene in self.scenes.items()},
+        }

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
-from recon_cli.evaluation.tables import Table
+from recon_cli.evaluation.scores import Table
 from recon_cli.experiments.variants import run_grid
 from recon_cli.io.images import read_png
 from recon_cli.io.records import FOLDER, read_frame_list

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import ConfigError, FormatError, InputError
-from recon_cli.evaluation.tables import Table
+from recon_cli.evaluation.scores import Table
 from recon_cli.workspace import atomic
 
 BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"

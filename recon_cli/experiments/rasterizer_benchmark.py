@@ -10,26 +10,25 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli import machine
-from recon_cli.errors import ConfigError
-from recon_cli.evaluation.tables import Table, number, percent
-from recon_cli.experiments.accuracy import Accuracy
-from recon_cli.experiments.bench_measure import BenchPlan, measure
-from recon_cli.experiments.bench_result import (
+from recon_cli.errors import ConfigError, FormatError
+from recon_cli.evaluation.scores import Table, number, percent
+from recon_cli.experiments.bench_measure import (
+    FIGURES,
+    SCHEMA,
+    VERSION,
     BackendResult,
     BenchedScene,
+    BenchPlan,
     BenchResult,
     Speed,
-    check_comparable,
-    comparison_table,
-    machine_difference,
-    ratio,
-    read_record,
+    measure,
 )
+from recon_cli.experiments.bench_scene import QUICK, SIZES, Accuracy
 from recon_cli.experiments.instruments import Timing, examine, warm_start
 from recon_cli.experiments.outputs import OutputFiles, drawing
-from recon_cli.experiments.bench_scene import QUICK, SIZES
 from recon_cli.progress import Progress
 from recon_cli.render import registry
+from recon_cli.workspace import atomic
 
 _ROUNDS, _QUICK_ROUNDS = 7, 2
 _REFERENCE = "torch"  # what the other backends and losses are compared with
@@ -363,3 +362,77 @@ def _scatter(axes: Any, places: Sequence[tuple[float, float]], backends: int) ->
     axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(color="0.92")
+
+
+def read_record(path: Path) -> Mapping[str, Any]:
+    """Returns what a JSON file of an earlier run holds.
+
+    Raises:
+        FormatError: it cannot be read, or is of another schema.
+    """
+    record = atomic.read_json(path)
+    kind = (record.get("schema"), record.get("version")) if isinstance(record, dict) else None
+    if kind != (SCHEMA, VERSION):
+        schema = "none" if kind is None or kind[0] is None else f"{kind[0]} {kind[1]}"
+        raise FormatError(
+            f"{path} has the schema {schema}, but {SCHEMA} {VERSION} was needed.",
+            hint="Write a new one with `recon bench --json FILE`.")
+    assert isinstance(record, dict)
+    return record
+
+
+def check_comparable(
+    old: Mapping[str, Any], scene: str, settings: Mapping[str, int], threads: int
+) -> None:
+    """Raises ConfigError unless the earlier run timed the same scene with as many threads.
+
+    Args:
+        old: the record of the earlier run.
+        scene: its name.
+        settings: gaussians, width, height and sh_degree of this run.
+        threads: of this run.
+    """
+    scenes = old["scenes"]
+    if scene not in scenes:
+        raise ConfigError(
+            f"The other file holds no scene {scene}, only {', '.join(scenes)}.",
+            hint=f"Add --scene {next(iter(scenes), 'room')}.")
+    was = {name: scenes[scene][name] for name in settings}
+    was_threads = old["machine"]["threads"]
+    if was != dict(settings) or was_threads != threads:
+        raise ConfigError(
+            f"The other file was measured with {_settings_text(was, was_threads)}, this run would "
+            f"be with {_settings_text(settings, threads)}.",
+            hint=f"Add --gaussians {was['gaussians']} --size {was['width']}x{was['height']} "
+                 f"--sh-degree {was['sh_degree']} --threads {was_threads}.")
+
+
+def _settings_text(settings: Mapping[str, int], threads: int) -> str:
+    return (f"{settings['gaussians']} Gaussians at {settings['width']}x{settings['height']}, "
+            f"SH degree {settings['sh_degree']}, {threads} threads")
+
+
+def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> Table:
+    """Returns old, new and old / new for each scene, backend and figure that both records have."""
+    rows = []
+    for scene, record in new["scenes"].items():
+        before = old["scenes"].get(scene, {"backends": {}})["backends"]
+        for backend, figures in record["backends"].items():
+            for figure in FIGURES if backend in before else ():
+                was, now = before[backend][figure], figures[figure]
+                rows.append((
+                    f"{scene} {backend} {figure}", number(was), number(now),
+                    number(ratio(was, now))))
+    return Table(("figure", "old", "new", "old / new"), rows, "Old against new")
+
+
+def ratio(old: float | None, new: float | None) -> float | None:
+    """Returns old / new; None where one of them is not known or new is zero."""
+    return None if old is None or not new else old / new
+
+
+def machine_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """Returns what differs between the machines of two records; empty where nothing does."""
+    was, now = old["machine"], new["machine"]
+    return "; ".join(f"{key} {was[key]} there, {now[key]} here"
+                     for key in ("cpu", "cores", "lanes", "device") if was[key] != now[key])

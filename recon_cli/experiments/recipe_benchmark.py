@@ -13,12 +13,18 @@ import numpy as np
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError
-from recon_cli.evaluation.tables import Table, number
+from recon_cli.evaluation.scores import Table, number
 from recon_cli.experiments.instruments import Host, examine, timing_of
 from recon_cli.experiments.outputs import OutputFiles, add_legend, drawing
-from recon_cli.experiments.runner import STEPS, ExperimentRequest, Runner, Runs, shared_options
-from recon_cli.experiments.scenes import check_scenes
-from recon_cli.experiments.trial import CurvePoint, LoadedScene
+from recon_cli.experiments.runner import (
+    STEPS,
+    CurvePoint,
+    ExperimentRequest,
+    Runner,
+    Runs,
+    shared_options,
+)
+from recon_cli.experiments.scenes import LoadedScene, check_scenes
 from recon_cli.experiments.variants import Variant
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from recon_cli.config.settings import Settings, build, merge
-from recon_cli.config.stages import ComputeConfig, IngestConfig, SfmConfig
-from recon_cli.context import StageInputs
-from recon_cli.errors import ConfigError, InputError
-from recon_cli.evaluation.reference_views import held_out_names
+from recon_cli.config.stages import ComputeConfig, IngestConfig, RunConfig, SfmConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.errors import ConfigError, InputError, ReconstructionError
+from recon_cli.evaluation.reference_views import (
+    MASK_HINT,
+    ReferenceView,
+    held_out_names,
+    load_reference_views,
+    load_scene,
+)
+from recon_cli.experiments.variants import TrainingRun
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.progress import Progress
+from recon_cli.scene.scene import Scene
+from recon_cli.train.feature_trials import PARTS
+from recon_cli.train.planning import model_parts, parts_needed
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import load_task
 from recon_cli.workspace.digests import digest_file, sha256_json
 from recon_cli.workspace.layout import Workspace
 
@@ -100,3 +115,65 @@ def open_scene(
             Target("sfm", build(SfmConfig, stages))])
     return SceneFolders(name, StageInputs({
         stage: workspace.folder(stage) for stage in ("ingest", "sfm")}))
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedScene:
+    """A scene in memory, ready to be trained on by any variant."""
+
+    folders: SceneFolders
+    scene: Scene
+    scored: Sequence[ReferenceView]
+    base: RunConfig  # options that all variants share
+    ctx: StageContext
+
+    @cached_property
+    def parts(self) -> dict[str, Any]:
+        """The parts of the model that the scene needs, as `recon train` finds them by trials."""
+        task = self._load_task(self.base)
+        return model_parts(parts_needed(task, self.scene, self.ctx, harmonics=True).config)
+
+    def task(self, run: TrainingRun) -> Task:
+        """Returns the task of a run; training itself looks at no view that it does not fit."""
+        config = run.config
+        undecided = [name for name in PARTS if getattr(config, name) == "auto"]
+        undecided += ["sh_degree"] if run.variant.tries_degree else []
+        if undecided:  # only then, because it may take trials
+            config = dataclasses.replace(config, **{name: self.parts[name] for name in undecided})
+        return dataclasses.replace(
+            self._load_task(config), validation=[], schedule=Schedule(config))
+
+    def _load_task(self, config: RunConfig) -> Task:
+        images = "denoised" if config.images == "denoised" else "original"
+        if images not in self._tasks:
+            self._tasks[images] = load_task(self.scene, config, self.ctx)
+        return dataclasses.replace(self._tasks[images], schedule=Schedule(config))
+
+    @cached_property
+    def _tasks(self) -> dict[str, Task]:
+        return {}
+
+
+def load_for_training(
+    folders: SceneFolders, split: str, base: RunConfig, ctx: StageContext
+) -> LoadedScene:
+    """Returns a scene with the views in memory that scores come from: "test" or "validation".
+
+    Raises:
+        ReconstructionError: no held-out view has a camera.
+        ConfigError: there are no validation views, the views are too small, or masks leave none.
+    """
+    scene = load_scene(folders.inputs, validation=base.validation)
+    if split == "test" and not scene.test:
+        raise ReconstructionError(
+            f"No held-out view of {folders.name} has a camera.",
+            hint="Run `recon ingest` with a --holdout such as every:8.")
+    if split == "validation" and not scene.validation:
+        raise ConfigError(
+            f"{folders.name} has no validation views.",
+            hint="Use --set train.validation=0.1, or give a scene with more views.")
+    views = load_reference_views(
+        scene.test if split == "test" else scene.validation, base.max_size, ctx)
+    if not views:
+        raise ConfigError(f"The masks of {folders.name} leave no view to score.", hint=MASK_HINT)
+    return LoadedScene(folders, scene, views, base, ctx)

@@ -23,7 +23,7 @@ from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.comparison import ScoredModel, read_workspace_scores
 from recon_cli.evaluation.intervals import Spread
 from recon_cli.evaluation.reference_views import LABELS
-from recon_cli.evaluation.tables import Table
+from recon_cli.evaluation.scores import Table
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.plan import Target

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread, paired_t
-from recon_cli.experiments.instruments import Host
+from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
+from recon_cli.evaluation.scores import Table
+from recon_cli.experiments.instruments import Host, examine
+from recon_cli.experiments.outputs import add_legend, draw_if_possible, drawing
 from recon_cli.experiments.runner import (
+    CurvePoint,
     ExperimentRequest,
     Record,
     Records,
@@ -20,10 +26,20 @@ from recon_cli.experiments.runner import (
     key_of,
     shared_options,
 )
-from recon_cli.experiments.trial import CurvePoint, LoadedScene, TrainingRun
-from recon_cli.experiments.variants import BUDGET, BUDGET_PRUNED, PAPER, REFERENCE, Variant
+from recon_cli.experiments.scenes import LoadedScene, check_scenes
+from recon_cli.experiments.variants import (
+    BUDGET,
+    BUDGET_PRUNED,
+    PAPER,
+    REFERENCE,
+    TrainingRun,
+    Variant,
+)
+from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
+from recon_cli.workspace import atomic, lock
 from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.layout import disk_errors
 
 # The paper compares the first two; the others are what `recon train` does without and with --prune.
 VARIANTS: tuple[Variant, ...] = (REFERENCE, PAPER, BUDGET, BUDGET_PRUNED)
@@ -255,3 +271,274 @@ class Study:
         first = [key_of(loaded, self._run(variant, self._request.iterations, 0))
                  for variant in VARIANTS]
         return sha256_json({"steps of": first, "clock": self._request.clock})
+
+
+_UNITS = {"psnr_db": ("PSNR", "dB", 2), "ssim": ("SSIM", "", 4)}
+
+
+_COLUMNS = (("PSNR dB", "psnr_db", 2), ("SSIM", "ssim", 4))
+
+
+_COSTS = (("steps", "steps", 0), ("Gaussians", "gaussians", 0), ("MB", "megabytes", 1),
+          ("s", "seconds", 1), ("CPU s", "cpu_seconds", 1))
+
+
+_OFFSET = 0.18  # between the lines of two variants, where two scenes are 1 apart
+
+
+logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True)
+class PublishedScores:
+    """One row of Table I (Replica): 3DGS, and the method of the paper."""
+
+    reference_psnr_db: float
+    reference_ssim: float
+    paper_psnr_db: float
+    paper_ssim: float
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """What the paper reports to gain, by figure."""
+        return {"psnr_db": self.paper_psnr_db - self.reference_psnr_db,
+                "ssim": self.paper_ssim - self.reference_ssim}
+
+
+TABLE_I = {
+    "office0": PublishedScores(38.45, 0.925, 39.05, 0.934),
+    "office1": PublishedScores(36.97, 0.938, 37.17, 0.954),
+    "office2": PublishedScores(36.39, 0.945, 36.68, 0.962),
+    "office3": PublishedScores(35.85, 0.941, 36.35, 0.958),
+    "office4": PublishedScores(36.54, 0.939, 36.66, 0.941),
+    "room0": PublishedScores(37.26, 0.915, 38.06, 0.923),
+    "room1": PublishedScores(36.28, 0.929, 37.75, 0.935),
+    "room2": PublishedScores(34.98, 0.913, 35.14, 0.927),
+}
+
+
+_CAUTION = ("The paper names neither its frames, sizes, held-out views nor its count of runs: its "
+            "figures and those of this study are no measurement of the same thing.")
+
+
+def run(request: StudyRequest, progress: Progress) -> str:
+    """Runs what is missing, writes the files, and returns what the terminal shows.
+
+    Raises:
+        ReconError: something cannot be done; what can be known is found before training.
+    """
+    paths, out = check_scenes(request.scenes), request.out
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WorkspaceError(
+            f"The folder {out} cannot be created: {error.strerror}.",
+            hint="Give another folder with --out.") from error
+    with (disk_errors(out, "running study"),
+          lock.hold(out, "study", other="another folder with --out")):
+        ctx = render_context(request.compute, progress)
+        host = examine(ctx.threads, ctx.device)
+        records = Records(out)
+        scenes = request.load(paths, out / "scenes", "test", ctx)
+        machine = f"{host.cpu}, {host.device}, {host.threads} threads"
+        study = Study(request, records, progress, machine)
+        logger.warning("%s", study.announcement(scenes))
+        result = StudyResult(host, request.seeds, request.base, request.clock, {
+            loaded.folders.name: study.run_scene(loaded) for loaded in scenes})
+        atomic.write_json(out / "study.json", result.record())
+        atomic.write_bytes(out / "study.md", markdown(result).encode())
+        draw_if_possible(lambda path: draw(result, path), out / "study.svg")
+    return text(result)
+
+
+def text(result: StudyResult) -> str:
+    """Returns what the terminal shows."""
+    parts = [head(result)]
+    for comparison in COMPARISONS:
+        parts += [scores(result, comparison).text(), differences(result, comparison).text(),
+                  words(result, comparison)]
+    if (table := beside_the_paper(result)) is not None:
+        parts += [table.text(), _CAUTION]
+    return "\n\n".join([*parts, *notes(result)])
+
+
+def markdown(result: StudyResult) -> str:
+    """Returns study.md."""
+    parts = ["# The paper's experiment", head(result) + "."]
+    for comparison in COMPARISONS:
+        parts += [f"## At {comparison}", scores(result, comparison).markdown(),
+                  differences(result, comparison).markdown(), words(result, comparison)]
+    if (table := beside_the_paper(result)) is not None:
+        parts += ["## Beside the paper", table.markdown(), _CAUTION]
+    return "\n\n".join([*parts, *notes(result)]) + "\n"
+
+
+def head(result: StudyResult) -> str:
+    """Returns what was run and where."""
+    scenes = "; ".join(
+        f"{name}: {scene.views} test views at {scene.width}x{scene.height}"
+        for name, scene in result.scenes.items())
+    return (f"{result.seeds} seeds, at most {result.base.max_gaussians:,} Gaussians; {scenes}; "
+            f"run on {' and '.join(result.machines)}")
+
+
+def scores(result: StudyResult, comparison: str) -> Table:
+    """Returns the table of means and standard deviations."""
+    header = ("scene, arm", *(name for label, _, _ in _COLUMNS for name in (label, "sd")),
+              *(label for label, _, _ in _COSTS))
+    rows = []
+    for row in result.rows:
+        for variant in VARIANTS:
+            cells = [cell for _, figure, digits in _COLUMNS for cell in _spread_cells(
+                result.spread(row, comparison, variant, figure), digits)]
+            costs = [f"{result.spread(row, comparison, variant, figure).mean:,.{digits}f}"
+                     for _, figure, digits in _COSTS]
+            rows.append((f"{row}, {variant.label}", *cells, *costs))
+    return Table(header, rows, f"Scores at {comparison}")
+
+
+def differences(result: StudyResult, comparison: str) -> Table:
+    """Returns the table of paired differences with their intervals."""
+    header = ("scene, arm - arm", *(
+        name for label, _, _ in _COLUMNS for name in (label, "95% from", "to")))
+    rows = []
+    for row in result.rows:
+        for pair in PAIRS:
+            cells = [cell for _, figure, digits in _COLUMNS for cell in _interval_cells(
+                result.difference(row, comparison, pair, figure), digits)]
+            rows.append((f"{row}, {pair[0].label} - {pair[1].label}", *cells))
+    return Table(header, rows, f"Differences at {comparison}")
+
+
+def _spread_cells(spread: Spread, digits: int) -> tuple[str, str]:
+    deviation = "-" if spread.deviation is None else f"{spread.deviation:.{digits}f}"
+    return f"{spread.mean:.{digits}f}", deviation
+
+
+def _interval_cells(interval: Interval, digits: int) -> list[str]:
+    return ["-" if value is None else f"{value:+.{digits}f}"
+            for value in (interval.mean, interval.low, interval.high)]
+
+
+def words(result: StudyResult, comparison: str) -> str:
+    """Returns one sentence a pair of variants and figure, on the mean of all scenes."""
+    row = MEAN if MEAN in result.rows else result.rows[0]
+    return "\n".join(f"- {_sentence(result, row, comparison, pair, figure)}"
+                     for pair in PAIRS for figure in _UNITS)
+
+
+def _sentence(
+    result: StudyResult, row: str, comparison: str, pair: tuple[Variant, Variant], figure: str
+) -> str:
+    name, unit, digits = _UNITS[figure]
+    difference = result.difference(row, comparison, pair, figure)
+    mean, low, high = _interval_cells(difference, digits)
+    lead = (f"{name} of {pair[0].label} against {pair[1].label}, {row}, {comparison}: "
+            f"{mean}{f' {unit}' if unit else ''}")
+    if difference.low is None or difference.high is None:
+        return f"{lead}; one seed shows no interval."
+    if difference.low <= 0 <= difference.high:
+        return f"{lead}; the interval [{low}, {high}] contains 0: no difference shown."
+    side = "above" if difference.low > 0 else "below"
+    return (f"{lead}; the interval [{low}, {high}] lies {side} 0: {pair[0].label} is "
+            f"{difference.verdict}.")
+
+
+def beside_the_paper(result: StudyResult) -> Table | None:
+    """Returns the paper's figures beside ours, None where no scene has a name of theirs."""
+    rows = list(_rows_beside_the_paper(result))
+    header = ("scene", "paper: 3DGS dB", "SSIM", "theirs dB", "SSIM", "gain dB", "SSIM",
+              "here: 3DGS dB", "SSIM", "paper's prune dB", "SSIM", "gain dB", "SSIM")
+    title = f"The paper's Table I beside this study, {EQUAL_STEPS}"
+    return Table(header, rows, title) if rows else None
+
+
+def _rows_beside_the_paper(result: StudyResult) -> Iterator[tuple[str, ...]]:
+    for scene in result.scenes:
+        theirs = published_scores(scene)
+        if theirs is None:
+            continue
+        base, paper = (
+            [result.spread(scene, EQUAL_STEPS, variant, figure).mean for figure in _UNITS]
+            for variant in (BASELINE, PAPER))
+        yield (
+            scene, *_pair(theirs.reference_psnr_db, theirs.reference_ssim),
+            *_pair(theirs.paper_psnr_db, theirs.paper_ssim),
+            *_pair(theirs.gains["psnr_db"], theirs.gains["ssim"], sign="+"),
+            *_pair(base[0], base[1]), *_pair(paper[0], paper[1]),
+            *_pair(paper[0] - base[0], paper[1] - base[1], sign="+"))
+
+
+def _pair(psnr_db: float, ssim: float, *, sign: str = "") -> tuple[str, str]:
+    return f"{psnr_db:{sign}.2f}", f"{ssim:{sign}.3f}"
+
+
+def published_scores(scene: str) -> PublishedScores | None:
+    """Returns the paper's figures for a scene of that name, None where it has none."""
+    return TABLE_I.get(scene.lower())
+
+
+def notes(result: StudyResult) -> list[str]:
+    """Returns how the figures are to be read."""
+    clock = {"wall": "on the wall", "cpu": "of the CPU"}[result.clock]
+    count = len(result.rows) * len(PAIRS) * len(_COLUMNS) * len(COMPARISONS)
+    lines = [
+        f"Equal seconds: each arm takes as many steps as fit into the seconds {clock} that the "
+        "slowest arm's take at equal steps, as measured first; the steps are "
+        "then fixed. Seconds are of training, pruning included, without scoring.",
+        "Each arm is trained on " + "; ".join(
+            f"{scene}: {_parts(result, scene)}" for scene in result.scenes)
+        + ". The trials that decide so are not timed.",
+        "Intervals: 95% by Student's t over the differences seed by seed. They speak of other "
+        f"seeds on these scenes, not of other scenes. Of {count} intervals about "
+        f"{max(1, round(0.05 * count))} would leave out 0 by chance if no arm differed.",
+        f"PSNR: {PSNR_CONVENTION}. SSIM: {SSIM_CONVENTION}. Scored on held-out test views, which "
+        "nothing was tuned on."]
+    if result.seeds < 5:
+        lines.append(f"{result.seeds} seeds are few: a claim needs 5.")
+    if len(result.machines) > 1:
+        lines.append("The runs are of several machines: their seconds do not compare.")
+    return lines
+
+
+def _parts(result: StudyResult, scene: str) -> str:
+    """Returns which parts the models of a scene have, variants of the same parts together."""
+    by_variant = result.parts(scene)
+    labels = {parts: " and ".join(
+        variant.label for variant in VARIANTS if by_variant[variant.name] == parts)
+        for parts in by_variant.values()}
+    return ", ".join(f"{parts} ({names})" for parts, names in labels.items())
+
+
+def draw(result: StudyResult, path: Path) -> None:
+    """Draws means and intervals of every scene into a .png or .svg, whole or not at all.
+
+    A cross is the gain that the paper reports for a scene of that name.
+    """
+    with drawing(path, 13, 2 + 1.4 * len(result.rows)) as figure:
+        panels = figure.subplots(len(_UNITS), len(COMPARISONS), squeeze=False, sharey=True)
+        for line, (label, name, _) in zip(panels, _COLUMNS, strict=True):
+            for axes, comparison in zip(line, COMPARISONS, strict=True):
+                _draw_panel(axes, result, comparison, name)
+                axes.set(xlabel=f"{label} against 3DGS", title=comparison)
+        add_legend(figure, panels[0][0])
+        figure.suptitle(f"{result.seeds} seeds, 95% intervals", fontsize=10)
+
+
+def _draw_panel(axes: Any, result: StudyResult, comparison: str, figure: str) -> None:
+    for number, variant in enumerate(variant for variant in VARIANTS if variant is not BASELINE):
+        intervals = [result.difference(row, comparison, (variant, BASELINE), figure)
+                     for row in result.rows]
+        axes.errorbar(
+            [interval.mean for interval in intervals],
+            [row + _OFFSET * (number - 1) for row in range(len(intervals))],
+            xerr=[0.0 if interval.high is None else interval.high - interval.mean
+                  for interval in intervals],
+            fmt="o", markersize=4, capsize=3, label=variant.label, color=f"C{number}")
+    for number, row in enumerate(result.rows):
+        if (theirs := published_scores(row)) is not None:
+            axes.plot(theirs.gains[figure], number - _OFFSET, "x", color="black")
+    axes.axvline(0, color="0.6", linewidth=0.8, zorder=0)
+    axes.set_yticks(range(len(result.rows)), result.rows)
+    axes.set_ylim(len(result.rows) - 0.5, -0.5)
+    axes.grid(axis="x", color="0.92")

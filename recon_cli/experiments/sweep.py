@@ -18,7 +18,7 @@ from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.evaluation.reference_views import MeanScore, mean_score
-from recon_cli.evaluation.tables import Table
+from recon_cli.evaluation.scores import Table
 from recon_cli.experiments.outputs import draw_if_possible, drawing
 from recon_cli.experiments.variants import run_grid
 from recon_cli.pipeline import execute, plan

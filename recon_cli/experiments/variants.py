@@ -132,3 +132,18 @@ def parse_recipes(texts: Sequence[str]) -> tuple[Variant, ...]:
     if twice:
         raise ConfigError(f"The recipe {twice[0]} appears twice.", hint="Remove one of them.")
     return tuple(parse_recipe(word) for word in words)
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """What is run: one variant from one seed for so many steps."""
+
+    variant: Variant
+    base: RunConfig  # options that all variants share
+    iterations: int
+    seed: int
+
+    @property
+    def config(self) -> RunConfig:
+        """The options of this run."""
+        return self.variant.config(self.base, iterations=self.iterations, seed=self.seed)

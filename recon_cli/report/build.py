@@ -28,10 +28,14 @@ from recon_cli.report.gallery import (
     legend_stops,
 )
 from recon_cli.report.headline import build_headline, format_facts
-from recon_cli.report.provenance import read_decisions, read_provenance
-from recon_cli.report.records import Metrics, read_metrics
-from recon_cli.report.scores import LABELS, build_scores
-from recon_cli.report.stage_status import StageStatus, Statuses, inspect_stages
+from recon_cli.report.records import LABELS, Metrics, build_scores, read_metrics
+from recon_cli.report.stage_status import (
+    StageStatus,
+    Statuses,
+    inspect_stages,
+    read_decisions,
+    read_provenance,
+)
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 from recon_cli.workspace.summaries import ExportSummary

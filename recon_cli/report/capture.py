@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import base64
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fit_image, read_png
 from recon_cli.io.records import FOLDER, Frame, read_frame_list
-from recon_cli.report import floor_plan
 from recon_cli.report.chart import draw_mark, legend_item
 from recon_cli.report.gallery import data_uri, encode_sheet
 from recon_cli.report.stage_status import Statuses
-from recon_cli.scene.scene import Scene
+from recon_cli.scene.gravity import find_gravity, mean_up
+from recon_cli.scene.scene import Scene, View
 from recon_cli.workspace.summaries import SfmSummary
 
 _SHEETS = 4  # contact sheets on the page; a capture may have many sources
@@ -88,31 +93,31 @@ def _read_scene(stages: Statuses, frames: Sequence[Frame]) -> Scene:
 def _draw_plan(scene: Scene, sfm: SfmSummary | None) -> tuple[Markup, tuple[str, ...]]:
     """Returns the floor plan and notes on it."""
     metres = sfm is not None and sfm.world.evidence.metres
-    axes = floor_plan.find_axes(scene, z_up=sfm is not None and sfm.world.evidence.up_found)
+    axes = find_axes(scene, z_up=sfm is not None and sfm.world.evidence.up_found)
     notes = [f"{len(scene.points):,} points."]
     if not axes.known:
         notes.append("Up is not known: the view is along the mean up of the cameras.")
     if not metres:
         notes.append("The scale is arbitrary, so there is no scale bar; "
                      "recon sfm --scale-between A B METRES sets it.")
-    return floor_plan.draw_plan(scene, axes, metres=metres), tuple(notes)
+    return draw_plan(scene, axes, metres=metres), tuple(notes)
 
 
 def _part_of_each(frames: Sequence[Frame], scene: Scene | None) -> list[str]:
     """Returns the part that each frame belongs to; without a mapping only what is held out."""
     if scene is None:
         return ["held out" if frame.held_out else "training" for frame in frames]
-    parts = {view.name: part for part, views in floor_plan.by_part(scene).items()
+    parts = {view.name: part for part, views in by_part(scene).items()
              for view in views}
     return [parts.get(frame.name, "lost") for frame in frames]
 
 
 def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
     """Returns one bar for each frame in order; held-out and lost frames are taller."""
-    step, bars = floor_plan.WIDTH / len(frames), []
+    step, bars = WIDTH / len(frames), []
     heights = {"training": 14, "validation": 20, "held out": 28, "lost": 28}
     for at, (frame, part) in enumerate(zip(frames, parts, strict=True)):
-        color = (floor_plan.PARTS.get(part) or floor_plan.LOST)[0]
+        color = (PARTS.get(part) or LOST)[0]
         time = "" if frame.time_seconds is None else f", {frame.time_seconds:g} s"
         bars.append(Markup(
             '<rect class="part c{}{}" x="{:.2f}" y="{}" width="{:.2f}" height="{}">'
@@ -123,14 +128,163 @@ def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
     return Markup(
         '<svg class="strip" viewBox="0 0 {} {}" preserveAspectRatio="none" role="img" '
         'aria-label="The frames in order">{}</svg>').format(
-            floor_plan.WIDTH, _STRIP_HEIGHT, Markup("").join(bars))
+            WIDTH, _STRIP_HEIGHT, Markup("").join(bars))
 
 
 def _draw_legend(parts: Sequence[str]) -> Markup:
     counts = Counter(parts)
     texts = {"training": "training", "validation": "validation (never trained on, steers progress)",
              "held out": "held out (only scored)", "lost": "without a camera"}
-    marks = {**floor_plan.PARTS, "lost": floor_plan.LOST}
+    marks = {**PARTS, "lost": LOST}
     return Markup('<ul class="legend">{}</ul>').format(Markup("").join(
         legend_item(f"{counts[part]:,} {texts[part]}", draw_mark(shape, 13, 7, 4.5, color))
         for part, (color, shape) in marks.items() if part in counts))
+
+
+WIDTH = 640  # pixels of the drawing; the page scales it
+
+
+_MOST_HEIGHT = 560
+
+
+_MARGIN = 26  # pixels around the content
+
+
+_CELL = 2  # pixels of the drawing in a cell of the density image
+
+
+_SHARE = (2.0, 98.0)  # percentiles of the points that fit in; outliers may lie far away
+
+
+_GRAY = 128  # of the points: visible on white and on black
+
+
+_MANY = 150  # cameras from which on marks are smaller
+
+
+_BAR = 0.25  # of the width that the scale bar takes at most
+
+
+# (color, mark) of the page's charts; green and blue are those of the contact sheet
+PARTS = {"training": (2, "circle"), "validation": (5, "square"), "held out": (0, "diamond")}
+
+
+LOST = (3, "cross")
+
+
+@dataclass(frozen=True, eq=False)
+class PlanAxes:
+    """The axes of a plan."""
+
+    axes: NDArray[np.float64]  # [2, 3] unit vectors of the world: right and up on the page
+    known: bool  # the vertical is known, from the mapping or from cameras and floor
+
+
+def find_axes(scene: Scene, *, z_up: bool) -> PlanAxes:
+    """Returns the axes of a plan: x and y if z is known to be up, else as level as can be told."""
+    if z_up:
+        return PlanAxes(np.eye(3)[:2], known=True)
+    viewmats = np.stack([view.camera.viewmat for views in by_part(scene).values()
+                         for view in views])
+    gravity = find_gravity(scene.points, viewmats).up
+    up = mean_up(viewmats) if gravity is None else gravity
+    right = np.eye(3)[np.argmin(np.abs(up))]
+    right = right - (right @ up) * up
+    right = right / np.linalg.norm(right)
+    return PlanAxes(np.stack([right, np.cross(up, right)]), known=gravity is not None)
+
+
+def draw_plan(scene: Scene, axes: PlanAxes, *, metres: bool) -> Markup:
+    """Returns the plan as SVG, with a scale bar if one world unit is a metre (`metres`)."""
+    parts = by_part(scene)
+    centers = np.stack([view.camera.center for views in parts.values() for view in views])
+    points, places = scene.points @ axes.axes.T, centers @ axes.axes.T
+    layout = _fit_layout(*_bounds(points, places))
+    size = 3.0 if len(centers) > _MANY else 4.5
+    marks = [_draw_camera(view, axes, layout, part, size)
+             for part, views in parts.items() for view in views]
+    bar = _draw_scale_bar(layout) if metres else Markup("")
+    return Markup(
+        '<svg class="plan" viewBox="0 0 {} {}" role="img" '
+        'aria-label="Cameras and points from above">{}{}{}</svg>').format(
+            WIDTH, layout.height, _draw_density(points, layout), Markup("").join(marks), bar)
+
+
+def by_part(scene: Scene) -> Mapping[str, Sequence[View]]:
+    """Returns the views of a scene by the names of PARTS."""
+    return dict(zip(PARTS, (scene.train, scene.validation, scene.test), strict=True))
+
+
+def _bounds(
+    points: NDArray[np.float64], places: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the corners [2] of the plan: every camera and nearly all points lie within."""
+    most = np.percentile(points, _SHARE, axis=0) if len(points) else places
+    low, high = (np.minimum(most.min(0), places.min(0)), np.maximum(most.max(0), places.max(0)))
+    room = np.maximum(0.02 * (high - low), 1e-6 + 0.02 * float((high - low).max()))
+    return low - room, high + room
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Maps plan coordinates to the drawing."""
+
+    scale: float  # pixels a unit
+    corner: NDArray[np.float64]  # [2] plan coordinates of the lower left corner
+    height: int  # of the drawing in pixels
+
+    def at(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns pixels from the left and from the top, [..., 2], of places [..., 2]."""
+        pixels = (places - self.corner) * self.scale
+        return np.stack([pixels[..., 0], self.height - pixels[..., 1]], axis=-1)
+
+
+def _fit_layout(low: NDArray[np.float64], high: NDArray[np.float64]) -> _Layout:
+    """Returns the layout that centres a box and draws it as large as possible."""
+    size, room = high - low, np.array([WIDTH, _MOST_HEIGHT]) - 2 * _MARGIN
+    scale = float((room / size).min())
+    height = round(float(size[1]) * scale) + 2 * _MARGIN
+    middle = np.array([WIDTH, height]) / 2
+    return _Layout(scale, (low + high) / 2 - middle / scale, height)
+
+
+def _draw_density(points: NDArray[np.float64], layout: _Layout) -> Markup:
+    """Returns the points as an image whose opacity grows with the logarithm of their number."""
+    rows, columns = math.ceil(layout.height / _CELL), math.ceil(WIDTH / _CELL)
+    pixels = layout.at(points)
+    counts, _, _ = np.histogram2d(
+        pixels[:, 1], pixels[:, 0], bins=(rows, columns),
+        range=((0, rows * _CELL), (0, columns * _CELL)))
+    full = np.percentile(counts[counts > 0], 99) if counts.any() else 1
+    opacity = np.where(counts > 0, 0.4 + 0.6 * np.log1p(counts) / np.log1p(full), 0).clip(0, 1)
+    picture = np.full((rows, columns, 4), _GRAY, np.uint8)
+    picture[..., 3] = np.rint(230 * opacity)
+    _, data = cv2.imencode(".png", picture)
+    return Markup('<image width="{}" height="{}" href="data:image/png;base64,{}"/>').format(
+        columns * _CELL, rows * _CELL, base64.b64encode(data.tobytes()).decode())
+
+
+def _draw_camera(view: View, axes: PlanAxes, layout: _Layout, part: str, size: float) -> Markup:
+    color, shape = PARTS[part]
+    camera = view.camera
+    x, y = map(float, layout.at(axes.axes @ camera.center))
+    ahead = axes.axes @ camera.viewmat[2, :3]  # z of the camera, projected onto the plan
+    line = Markup('<path class="line c{}" d="M{},{}l{},{}"/>').format(
+        color, round(x, 1), round(y, 1),
+        round(4 * size * float(ahead[0]), 1), round(-4 * size * float(ahead[1]), 1))
+    radius = size * (1.25 if part == "held out" else 1.0)
+    return line + draw_mark(shape, x, y, radius, color, f"{view.name} ({part})")
+
+
+def _draw_scale_bar(layout: _Layout) -> Markup:
+    """Returns a bar of 1, 2 or 5 times a power of ten of metres."""
+    most = _BAR * WIDTH / layout.scale
+    power = 10.0 ** math.floor(math.log10(most))
+    metres = max(factor * power for factor in (1, 2, 5) if factor * power <= most)
+    length, y = metres * layout.scale, layout.height - 10
+    x = WIDTH - _MARGIN - length
+    return Markup(
+        '<path class="axis scale" d="M{},{}v6h{}v-6"/>'
+        '<text class="label" x="{}" y="{}" text-anchor="middle">{} m</text>').format(
+            round(x, 1), y - 6, round(length, 1), round(x + length / 2, 1), y - 9,
+            f"{metres:g}")

@@ -22,7 +22,7 @@ import click
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_reference_views, load_scene
-from recon_cli.experiments.trial import score_as_ply
+from recon_cli.experiments.runner import score_as_ply
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.fit import fit

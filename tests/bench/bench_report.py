@@ -20,7 +20,7 @@ from pathlib import Path
 import click
 import cv2
 
-from recon_cli.evaluation.tables import Table
+from recon_cli.evaluation.scores import Table
 from recon_cli.io.images import read_png, write_png
 from recon_cli.io.records import FOLDER
 from recon_cli.pipeline.execute import Job

@@ -6,13 +6,13 @@ import pytest
 
 from recon_cli.evaluation.scores import (
     ModelScore,
+    Table,
     ViewScore,
     csv_table,
     model_table,
     paper_table,
     view_table,
 )
-from recon_cli.evaluation.tables import Table
 
 
 def view(name, psnr_db, ssim, lpips=None):

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
-from recon_cli.evaluation.tables import Table, number, percent
+from recon_cli.evaluation.scores import Table, number, percent
 from recon_cli.experiments import outputs, rasterizer_benchmark
-from recon_cli.experiments.accuracy import Accuracy
-from recon_cli.experiments.bench_result import (
+from recon_cli.experiments.bench_measure import (
     FIGURES,
     SCHEMA,
     BackendResult,
@@ -20,12 +19,8 @@ from recon_cli.experiments.bench_result import (
     BenchResult,
     Speed,
     VariantResult,
-    check_comparable,
-    comparison_table,
-    machine_difference,
-    ratio,
-    read_record,
 )
+from recon_cli.experiments.bench_scene import Accuracy
 from recon_cli.experiments.instruments import (
     FLOPS_BACKWARD,
     FLOPS_FORWARD,
@@ -38,7 +33,17 @@ from recon_cli.experiments.instruments import (
     timing_of,
 )
 from recon_cli.experiments.outputs import OutputFiles
-from recon_cli.experiments.rasterizer_benchmark import BenchRequest, head, parse_size, tables
+from recon_cli.experiments.rasterizer_benchmark import (
+    BenchRequest,
+    check_comparable,
+    comparison_table,
+    head,
+    machine_difference,
+    parse_size,
+    ratio,
+    read_record,
+    tables,
+)
 from recon_cli.machine import cpu_model
 
 EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)

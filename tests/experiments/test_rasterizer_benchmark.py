@@ -10,16 +10,19 @@ import torch
 
 from recon_cli.cli import main
 from recon_cli.experiments import outputs
-from recon_cli.experiments.accuracy import Answer, accuracy, answer, oracle
-from recon_cli.experiments.bench_result import FIGURES
-from recon_cli.experiments.probes import probe_for
+from recon_cli.experiments.bench_measure import FIGURES
 from recon_cli.experiments.bench_scene import (
     CONTRACT,
+    Answer,
     SceneSize,
+    accuracy,
+    answer,
     build_scene,
+    oracle,
     renderer_of,
     variants_for,
 )
+from recon_cli.experiments.instruments import probe_for
 from recon_cli.render import registry
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import tiles

@@ -13,7 +13,7 @@ from tiny_scene import make_inputs
 from recon_cli.cli import main
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.experiments import outputs, runner, trial
+from recon_cli.experiments import outputs, runner
 from recon_cli.experiments import recipe_benchmark as module
 from recon_cli.experiments.instruments import Host
 from recon_cli.experiments.recipe_benchmark import (
@@ -25,12 +25,8 @@ from recon_cli.experiments.recipe_benchmark import (
     score_steps,
     seconds_to,
 )
-from recon_cli.experiments.runner import Record, Runner
-from recon_cli.experiments.scenes import SceneFolders
-from recon_cli.experiments.trial import (
-    CurvePoint,
-    load_for_training,
-)
+from recon_cli.experiments.runner import CurvePoint, Record, Runner
+from recon_cli.experiments.scenes import SceneFolders, load_for_training
 from recon_cli.experiments.variants import (
     REFERENCE,
     Variant,
@@ -161,7 +157,7 @@ def test_seconds_become_steps_by_a_pilot(
     tiny = load_for_training(folders, "validation", BASE, StageContext(backend="numba"))
     a_step = Runner(BASE, NullProgress()).pilot_seconds(tiny, [REFERENCE])["reference"]
     request = RecipeRequest(scenes=(), seeds=1, base=BASE, recipes=(REFERENCE,), seconds=10.0)
-    assert module.steps_of(request, a_step) == round(trial.PILOT_STEPS * 10 / 4)
+    assert module.steps_of(request, a_step) == round(runner.PILOT_STEPS * 10 / 4)
     given = dataclasses.replace(request, iterations=77, seconds=None)
     assert module.steps_of(given, a_step) == 77
 

@@ -12,9 +12,9 @@ from recon_cli.cli import main
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
-from recon_cli.experiments import runner, trial
-from recon_cli.experiments.runner import RECORDS_FILE, Record, Records, key_of
-from recon_cli.experiments.scenes import SceneFolders
+from recon_cli.experiments import runner
+from recon_cli.experiments.runner import RECORDS_FILE, CurvePoint, Record, Records, key_of
+from recon_cli.experiments.scenes import SceneFolders, load_for_training
 from recon_cli.experiments.study import (
     EQUAL_SECONDS,
     EQUAL_STEPS,
@@ -24,7 +24,7 @@ from recon_cli.experiments.study import (
     corrected_steps,
     equal_seconds,
 )
-from recon_cli.experiments.trial import CurvePoint, TrainingRun, load_for_training
+from recon_cli.experiments.variants import TrainingRun
 from recon_cli.progress import NullProgress
 
 STEPS = 20
@@ -51,7 +51,7 @@ def made(monkeypatch):
         if len(found) == found.stop_at:
             raise KeyboardInterrupt
         found.append((run.variant.name, run.iterations, run.seed))
-        points = trial.run_trial(loaded, run, score_at, on_step=on_step)
+        points = runner.run_trial(loaded, run, score_at, on_step=on_step)
         seconds = COSTS[run.variant.name] * run.iterations
         return tuple(dataclasses.replace(point, seconds=seconds, cpu_seconds=2 * seconds)
                      for point in points)

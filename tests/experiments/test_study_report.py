@@ -5,21 +5,21 @@ import json
 import pytest
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.experiments import study_report
+from recon_cli.experiments import study
 from recon_cli.experiments.instruments import Host
-from recon_cli.experiments.runner import Record
+from recon_cli.experiments.runner import CurvePoint, Record
 from recon_cli.experiments.study import (
     COMPARISONS,
     EQUAL_SECONDS,
     EQUAL_STEPS,
     MEAN,
     PAIRS,
+    TABLE_I,
     VARIANTS,
     StudiedScene,
     StudyResult,
+    published_scores,
 )
-from recon_cli.experiments.study_report import TABLE_I, published_scores
-from recon_cli.experiments.trial import CurvePoint
 
 HOST = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
 NOISE = (0.0, 0.3, -0.3)  # of the seeds, the same for all arms
@@ -53,7 +53,7 @@ def rows(table):
 
 
 def test_every_scene_and_the_mean_has_a_row_for_each_arm():
-    found = rows(study_report.scores(result(), EQUAL_STEPS))
+    found = rows(study.scores(result(), EQUAL_STEPS))
     assert list(found) == [f"{row}, {variant.label}"
                            for row in ("office0", "home", MEAN) for variant in VARIANTS]
     assert found["office0, 3DGS"] == (
@@ -62,12 +62,12 @@ def test_every_scene_and_the_mean_has_a_row_for_each_arm():
 
 
 def test_a_single_scene_has_no_mean_of_scenes():
-    assert not any(MEAN in row for row in rows(study_report.scores(
+    assert not any(MEAN in row for row in rows(study.scores(
         result(home=scene(20.0, (0.0, 1.0, 1.0, 1.0))), EQUAL_STEPS)))
 
 
 def test_every_pair_has_its_interval():
-    found = rows(study_report.differences(result(), EQUAL_SECONDS))
+    found = rows(study.differences(result(), EQUAL_SECONDS))
     assert len(found) == 3 * len(PAIRS) == 15
     assert found["office0, paper - 3DGS"][:3] == ("+0.50", "+0.50", "+0.50")
     assert found["home, paper - 3DGS"][:3] == ("-0.10", "-0.10", "-0.10")
@@ -78,7 +78,7 @@ def test_every_pair_has_its_interval():
 
 
 def test_the_words_say_whether_an_interval_contains_zero():
-    text = study_report.text(result())
+    text = study.text(result())
     assert ("PSNR of paper against 3DGS, all scenes, equal steps: +0.20 dB; the interval "
             "[+0.20, +0.20] lies above 0: paper is higher.") in text
     assert ("PSNR of ours pruned against ours, all scenes, equal seconds: -0.90 dB; the interval "
@@ -90,25 +90,25 @@ def test_the_words_say_whether_an_interval_contains_zero():
     one = StudyResult(HOST, 1, RunConfig(), "wall", {"home": StudiedScene(1, 9, 9, "", {
         name: {variant: records[:1] for variant, records in arms.items()}
         for name, arms in scene(20.0, (0.0, 1.0, 1.0, 1.0)).runs.items()})})
-    assert "one seed shows no interval" in study_report.text(one)
+    assert "one seed shows no interval" in study.text(one)
 
 
 def test_runs_of_two_machines_are_told():
     found = result(home=scene(20.0, (0, 0, 0, 0)), office=scene(20.0, (0, 0, 0, 0), "Another"))
     assert found.machines == ("A CPU", "Another")
-    assert "several machines" in study_report.text(found)
+    assert "several machines" in study.text(found)
 
 
 def test_the_figures_of_the_paper_stand_beside_scenes_of_their_names():
     assert len(TABLE_I) == 8
     assert published_scores("Office0") is TABLE_I["office0"]
     assert published_scores("office") is None
-    table = study_report.beside_the_paper(result())
+    table = study.beside_the_paper(result())
     assert rows(table) == {"office0": (
         "38.45", "0.925", "39.05", "0.934", "+0.60", "+0.009",
         "30.00", "0.600", "30.50", "0.610", "+0.50", "+0.010")}
-    assert study_report.beside_the_paper(result(home=scene(20.0, (0, 0, 0, 0)))) is None
-    assert "no measurement of the same thing" in study_report.markdown(result())
+    assert study.beside_the_paper(result(home=scene(20.0, (0, 0, 0, 0)))) is None
+    assert "no measurement of the same thing" in study.markdown(result())
 
 
 def test_the_record_holds_every_seed_and_is_json():
@@ -126,6 +126,6 @@ def test_the_record_holds_every_seed_and_is_json():
 
 def test_the_picture_is_drawn(tmp_path):
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    study_report.draw(result(), tmp_path / "study.svg")
+    study.draw(result(), tmp_path / "study.svg")
     assert (tmp_path / "study.svg").stat().st_size > 5000
     assert list(tmp_path.iterdir()) == [tmp_path / "study.svg"]

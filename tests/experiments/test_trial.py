@@ -15,15 +15,9 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
 from recon_cli.experiments import trial
 from recon_cli.experiments.recipe_benchmark import score_steps
-from recon_cli.experiments.scenes import SceneFolders, check_scenes
-from recon_cli.experiments.trial import (
-    LoadedScene,
-    TrainingClock,
-    TrainingRun,
-    load_for_training,
-    run_trial,
-)
-from recon_cli.experiments.variants import BUDGET, PAPER, REFERENCE
+from recon_cli.experiments.runner import TrainingClock, run_trial
+from recon_cli.experiments.scenes import LoadedScene, SceneFolders, check_scenes, load_for_training
+from recon_cli.experiments.variants import BUDGET, PAPER, REFERENCE, TrainingRun
 
 BASE = RunConfig(iterations=1, max_size=48, max_gaussians=90, densify_every=10, validation=0.2)
 

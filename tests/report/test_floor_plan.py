@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon_cli.report.floor_plan import draw_plan, find_axes
+from recon_cli.report.capture import draw_plan, find_axes
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 
