@@ -29,7 +29,7 @@ from recon_cli.evaluation.metrics import (
     psnr,
     ssim,
 )
-from recon_cli.evaluation.scores import ViewScore
+from recon_cli.evaluation.scores import MeanScore, ViewScore
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fit_camera, read_masked_image, to_uint8
 from recon_cli.io.records import read_frame_list
@@ -62,12 +62,6 @@ class RenderScores:
     render_ms: float  # median milliseconds a view
 
 
-@dataclass(frozen=True)
-class MeanScore:
-    """Means over some views: PSNR in dB, and SSIM by scikit-image."""
-
-    psnr_db: float
-    ssim: float
 
 
 def held_out_names(ingest: Path) -> frozenset[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Self
@@ -30,8 +30,16 @@ class ViewScore(JsonRecord):
 
 
 @dataclass(frozen=True)
+class MeanScore(JsonRecord):
+    """Means over some views: PSNR in dB, and SSIM by scikit-image."""
+
+    psnr_db: float
+    ssim: float
+
+
+@dataclass(frozen=True)
 class ModelScore:
-    """The scores of one model over all held-out views."""
+    """The scores of one model over all held-out views; its own scores are means over these."""
 
     label: str  # in tables
     views: tuple[ViewScore, ...]
@@ -42,32 +50,65 @@ class ModelScore:
 
     @property
     def psnr_db(self) -> float:
-        """Mean over the views of the PSNR in dB."""
-        return self._mean(lambda view: view.psnr_db)
+        """Mean over the views."""
+        return _mean(self.views, "psnr_db")
 
     @property
     def psnr_8bit_db(self) -> float:
-        """Mean over the views of the PSNR of 8-bit pictures in dB."""
-        return self._mean(lambda view: view.psnr_8bit_db)
+        """Mean over the views."""
+        return _mean(self.views, "psnr_8bit_db")
 
     @property
     def ssim(self) -> float:
-        """Mean over the views of the SSIM by scikit-image."""
-        return self._mean(lambda view: view.ssim)
+        """Mean over the views."""
+        return _mean(self.views, "ssim")
 
     @property
     def ssim_padded(self) -> float:
-        """Mean over the views of the SSIM by INRIA's convention."""
-        return self._mean(lambda view: view.ssim_padded)
+        """Mean over the views."""
+        return _mean(self.views, "ssim_padded")
 
     @property
     def lpips(self) -> float | None:
-        """Mean over the views of the perceptual distance; None where it was not measured."""
-        values = [view.lpips for view in self.views if view.lpips is not None]
-        return float(np.mean(values)) if len(values) == len(self.views) else None
+        """Mean over the views; None where it was not measured."""
+        measured = all(view.lpips is not None for view in self.views)
+        return _mean(self.views, "lpips") if measured else None
 
-    def _mean(self, of: Callable[[ViewScore], float]) -> float:
-        return float(np.mean([of(view) for view in self.views]))
+
+def _mean(views: Sequence[ViewScore], key: str) -> float:
+    return float(np.mean([getattr(view, key) for view in views]))
+
+
+@dataclass(frozen=True)
+class SweepTrial(JsonRecord):
+    """One way to prune a model, and the result."""
+
+    score: str  # its name; Sweep.CONTROL for the controls
+    # Fraction that was removed; of a control with equal seconds that of the trial whose seconds it
+    # takes, None for the one with equal steps.
+    ratio: float | None
+    gaussians: int  # that are left
+    steps: int  # of recovery
+    seconds: float  # of recovery and scoring
+    removed: MeanScore | None  # right after the last removal; None where nothing was removed
+    recovered: MeanScore  # at the end
+
+
+@dataclass(frozen=True)
+class Sweep(JsonRecord):
+    """The content of sweep.json, which `recon prune --sweep` writes."""
+
+    FILE: ClassVar[str] = "sweep.json"
+    CONTROL: ClassVar[str] = "none"  # the score of trials that remove nothing
+
+    of_train: str | None  # digest of the training it started from; None in files of older versions
+    validation_views: int
+    at: str
+    rounds: int
+    recovery_steps: int
+    equal_seconds_of: str  # the score whose seconds the controls take
+    before: MeanScore
+    trials: tuple[SweepTrial, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,3 +271,5 @@ def number(value: float | None, digits: int = 3) -> str:
 def percent(value: float | None) -> str:
     """Returns a fraction in percent, "-" for one that is not known."""
     return "-" if value is None else f"{100 * value:.3g}%"
+
+

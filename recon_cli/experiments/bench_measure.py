@@ -1,4 +1,4 @@
-"""The measurement: every backend, thread count, loss and approximation on one scene."""
+"""The measurement of `recon bench`: every backend, thread count, loss and approximation."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.experiments import instruments
 from recon_cli.experiments.bench_scene import (
     CONTRACT,
     QUICK,
@@ -28,22 +29,7 @@ from recon_cli.experiments.bench_scene import (
     renderer_of,
     variants_for,
 )
-from recon_cli.experiments.instruments import (
-    COMPOSITE,
-    DECOMPOSE,
-    FLOPS_BACKWARD,
-    FLOPS_FORWARD,
-    Host,
-    Samples,
-    Stopwatch,
-    Timing,
-    added_memory,
-    alternate,
-    peak_fraction,
-    probe_for,
-    rate,
-    timing_of,
-)
+from recon_cli.experiments.instruments import Host, Samples, Stopwatch, Timing, timing_of
 from recon_cli.progress import Bar, Progress
 from recon_cli.render import registry
 from recon_cli.render.contract import Renderer, RenderOutput
@@ -54,14 +40,130 @@ from recon_cli.train.gradient import gradient_step
 from recon_cli.train.losses import photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 
+SCHEMA = "recon-bench"
+VERSION = 1  # goes up when a key changes its name or meaning
+PASSES = ("forward", "backward", "step")
+_RATES = ("gpairs_per_s_forward", "gpairs_per_s_backward", "peak_fraction_forward",
+          "peak_fraction_backward")
+# The figures of each backend in every scene for which --compare prints a ratio.
+FIGURES = (
+    *(f"{name}_ms" for name in PASSES), *_RATES, "image_error_max", "gradient_relative_error")
+_ADAM = "adam"  # the part of a step that updates the parameters
+
 Mark = Callable[[str], None]
-ADAM = "adam"  # the part of a step that moves the parameters
+Work = Callable[[], Mapping[str, float]]  # returns the milliseconds of its parts
+Pairs = tuple[int, int] | None  # evaluated forward and backward; None where not counted
+
+
+@dataclass(frozen=True)
+class Speed:
+    """The speed of a backend with some number of threads."""
+
+    threads: int
+    # of whole passes, by PASSES (a step is forward, loss, backward, Adam), and of their parts, in
+    # order, as "pass: part"
+    times: dict[str, Timing]
+    # evaluated pairs of Gaussian and pixel over the time of compositing; None where not counted
+    gpairs_per_s_forward: float | None
+    gpairs_per_s_backward: float | None
+    # arithmetic of those pairs over the peak of the threads; None where no peak was measured
+    peak_fraction_forward: float | None
+    peak_fraction_backward: float | None
+
+    @property
+    def both_ms(self) -> float:
+        """Forward and backward pass."""
+        return self.times["forward"].ms + self.times["backward"].ms
+
+    def record(self) -> dict[str, Any]:
+        """Returns the figures by the names of the JSON file."""
+        return {
+            "threads": self.threads,
+            **{f"{name}_ms": self.times[name].ms for name in PASSES},
+            **{f"{name}_iqr_ms": self.times[name].iqr_ms for name in PASSES},
+            **{name: getattr(self, name) for name in _RATES},
+            "stages": {name: asdict(timing) for name, timing in self.times.items()
+                       if name not in PASSES},
+        }
+
+
+@dataclass(frozen=True)
+class BackendResult:
+    """One backend in one scene."""
+
+    speed: Speed  # with all threads
+    one_thread: Speed | None  # None on a GPU
+    accuracy: Accuracy  # against the oracle
+    pairs: Pairs
+    memory_bytes: int  # peak that a first forward and backward pass added, gradients included
+
+    def record(self) -> dict[str, Any]:
+        """Returns the figures by the names of the JSON file."""
+        return {
+            **self.speed.record(), **_finite(self.accuracy), "pairs": self.pairs,
+            "memory_bytes": self.memory_bytes,
+            "one_thread": self.one_thread.record() if self.one_thread else None,
+        }
+
+
+def _finite(accuracy: Accuracy) -> dict[str, Any]:
+    """Returns an accuracy as JSON, with null for infinity."""
+    return {name: None if value == math.inf else value
+            for name, value in asdict(accuracy).items()}
+
+
+@dataclass(frozen=True)
+class VariantResult:
+    """One approximation on one backend."""
+
+    name: str
+    time: Timing | None  # forward and backward; None where a difference would mean nothing
+    accuracy: Accuracy  # against the oracle, which follows the contract
+
+
+@dataclass(frozen=True)
+class BenchedScene:
+    """All results of one scene."""
+
+    gaussians: int
+    width: int  # of the image in pixels
+    height: int
+    sh_degree: int
+    backends: dict[str, BackendResult]  # by name, the fastest kind first
+    losses: dict[str, Timing]  # forward and backward of each photometric loss
+    variants_of: str  # the backend that rendered the approximations
+    variants: list[VariantResult]  # the contract first, then the approximations
+
+
+@dataclass(frozen=True)
+class BenchResult:
+    """A run of the benchmark."""
+
+    host: Host
+    rounds: int  # behind each median
+    scenes: dict[str, BenchedScene]
+    warm_start: Timing | None = None  # of the numba backend in a fresh process
+
+    def record(self) -> dict[str, Any]:
+        """Returns the content of the JSON file."""
+        return {
+            "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
+            "rounds": self.rounds,
+            "warm_start": asdict(self.warm_start) if self.warm_start else None,
+            "scenes": {name: {
+                **asdict(scene),
+                "backends": {name: backend.record() for name, backend in scene.backends.items()},
+                "variants": [
+                    {"name": variant.name, "time": asdict(variant.time) if variant.time else None,
+                     **_finite(variant.accuracy)} for variant in scene.variants],
+            } for name, scene in self.scenes.items()},
+        }
 
 
 def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
     """Returns a function that takes one step as `recon_cli.train.fit` does and marks its parts.
 
-    The learning rates are zero, so that every step of every candidate meets the same scene; Adam
+    The learning rates are zero, so that every step of every candidate has the same scene; Adam
     does the same arithmetic.
     """
     still = replace(
@@ -75,24 +177,20 @@ def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
         compute(optimizer, view, scene.sh_degree, still.ssim_weight)
         mark("gradients")
         optimizer.step(still.means_rate, sh_rest=scene.sh_degree > 0)
-        mark(ADAM)
+        mark(_ADAM)
 
     return step
 
 
 def loss_passes(scene: BenchScene, device: str) -> dict[str, Callable[[], object]]:
-    """Returns, by name, what computes the photometric loss and its gradient on an image.
-
-    "torch" is what the others are compared with.
-    """
+    """Returns functions that compute the photometric loss and its gradient, by name."""
     weight, truth = RunConfig().ssim_weight, noise(scene)
     target = torch.from_numpy(truth).to(device).float() / 255
     image = target.flip(0).contiguous()
     leaf = image.clone().requires_grad_()
     passes: dict[str, Callable[[], object]] = {
-        "torch": lambda: torch.autograd.grad(photometric_loss(leaf, target, weight), leaf)}
-    passes["autograd"] = lambda: torch.autograd.grad(
-        convolution_loss(leaf, target, weight), leaf)
+        "torch": lambda: torch.autograd.grad(photometric_loss(leaf, target, weight), leaf),
+        "autograd": lambda: torch.autograd.grad(convolution_loss(leaf, target, weight), leaf)}
     if device == "cpu":
         rgb, gradient = image.numpy().reshape(-1), np.empty(image.numel(), np.float32)
         maps = np.empty(MAPS * image.numel(), np.float32)
@@ -103,10 +201,10 @@ def loss_passes(scene: BenchScene, device: str) -> dict[str, Callable[[], object
 
 
 def convolution_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor:
-    """Returns (1 - w) L1 + w (1 - SSIM) in the way that most trainers write it.
+    """Returns (1 - w) L1 + w (1 - SSIM) as most trainers compute it, for its time.
 
-    Five grouped convolutions with the 11x11 window, differentiated by autograd. Its numbers are
-    those of `photometric_loss`; only its time is of interest.
+    Five grouped convolutions with the 11x11 window, differentiated by autograd; the values are
+    those of `photometric_loss`.
     """
     line = image.new_tensor(taps())
     window = (line[:, None] * line).expand(3, 1, -1, -1)
@@ -126,13 +224,9 @@ def convolution_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor
 
 
 def noise(scene: BenchScene) -> NDArray[np.uint8]:
-    """Returns a random photograph of the scene's size, [H, W, 3]."""
+    """Returns a random image of the scene's size, [H, W, 3]."""
     size = (scene.camera.height, scene.camera.width, 3)
     return np.random.default_rng(0).integers(0, 256, size, np.uint8)
-
-
-Work = Callable[[], Mapping[str, float]]  # returns the milliseconds of its parts
-Pairs = tuple[int, int] | None
 
 
 @dataclass(frozen=True)
@@ -143,12 +237,12 @@ class BenchPlan:
     sh_degree: int
     backends: tuple[str, ...]  # by name
     device: str  # "cpu" or "cuda"
-    threads: int  # CPU threads; the figures of one thread are taken as well
+    threads: int  # CPU threads; one thread is measured as well
     rounds: int  # behind each median
 
 
 def measure(plan: BenchPlan, host: Host, progress: Progress) -> BenchedScene:
-    """Returns every figure of one scene."""
+    """Returns all results of one scene."""
     size = plan.size
     with use_threads(plan.threads), progress.bar(
         "bench", 3 * (plan.rounds + 1) + 1, unit="round"
@@ -164,7 +258,7 @@ def measure(plan: BenchPlan, host: Host, progress: Progress) -> BenchedScene:
 
 @contextmanager
 def use_threads(count: int, backend: str = "torch") -> Iterator[None]:
-    """Lets a backend use `count` threads within the block, in the way that training does."""
+    """Lets a backend use `count` threads within the block, as training does."""
     before, pool_before = torch.get_num_threads(), pool.threads
     registry.use_threads(backend, count)
     try:
@@ -180,7 +274,7 @@ class _Measurement:
     def __init__(self, plan: BenchPlan, bar: Bar) -> None:
         self._plan, self._bar = plan, bar
         self._scene = build_scene(plan.size, plan.sh_degree, plan.device)
-        self._memory = {name: self._added_memory(name) for name in plan.backends}
+        self._memory = {name: self._measure_memory(name) for name in plan.backends}
         self._pairs: dict[str, Pairs] = dict.fromkeys(plan.backends)
         self._truth = oracle(self._scene)
         bar.advance()
@@ -190,12 +284,12 @@ class _Measurement:
         plan, on_cpu = self._plan, self._plan.device == "cpu"
         counts = sorted({1, plan.threads}) if on_cpu else [plan.threads]
         samples = self._alternate({
-            f"{name} {threads}": self._timed_work(name, threads)
+            f"{name} {threads}": self._time_backend(name, threads)
             for threads in counts for name in plan.backends})
+        peak = host.peak_gflops if on_cpu else None
 
         def speed(name: str, threads: int) -> Speed:
-            peak = host.peak_gflops if on_cpu else None
-            return _speed(samples[f"{name} {threads}"], self._pairs[name], peak, threads)
+            return _compute_speed(samples[f"{name} {threads}"], self._pairs[name], peak, threads)
 
         return {
             name: BackendResult(
@@ -206,18 +300,16 @@ class _Measurement:
     def measure_losses(self) -> dict[str, Timing]:
         """Returns the time of every photometric loss, of the second of two passes.
 
-        In training the images have just been written; after the pause between candidates they have
-        left the caches.
+        In training the images have just been written; after the pause between candidates they are
+        no longer in the caches.
         """
-        def second(work: Callable[[], object]) -> Work:
-            def run() -> Mapping[str, float]:
-                work()
-                return self._time(work)
-
-            return run
+        def time_second(work: Callable[[], object]) -> Mapping[str, float]:
+            work()
+            return self._time(work)
 
         passes = loss_passes(self._scene, self._plan.device)
-        samples = self._alternate({name: second(work) for name, work in passes.items()})
+        samples = self._alternate({
+            name: partial(time_second, work) for name, work in passes.items()})
         return {name: timing_of(by_part["whole"]) for name, by_part in samples.items()}
 
     def measure_variants(self) -> list[VariantResult]:
@@ -237,16 +329,17 @@ class _Measurement:
             for variant in variants]
 
     def _alternate(self, works: Mapping[str, Work]) -> dict[str, Samples]:
-        return alternate(works, self._plan.rounds, self._bar.advance)
+        return instruments.alternate(works, self._plan.rounds, self._bar.advance)
 
     def _accuracy(self, renderer: Renderer) -> Accuracy:
         return accuracy(answer(self._scene, renderer), self._truth)
 
-    def _added_memory(self, backend: str) -> int:
-        """Returns the memory of a first pass, after one on a tiny scene has compiled everything."""
+    def _measure_memory(self, backend: str) -> int:
+        """Returns the memory of a first pass, after one on a tiny scene that compiles kernels."""
         renderer, device = registry.renderer(backend), self._plan.device
         _render_and_back(build_scene(QUICK, self._scene.sh_degree, device), renderer)
-        return added_memory(partial(_render_and_back, self._scene, renderer), device)
+        return instruments.measure_memory(
+            partial(_render_and_back, self._scene, renderer), device)
 
     def _time(self, work: Callable[[], object]) -> Mapping[str, float]:
         watch = Stopwatch(self._plan.device)
@@ -254,8 +347,8 @@ class _Measurement:
         watch.mark("whole")
         return watch.ms
 
-    def _timed_work(self, backend: str, threads: int) -> Work:
-        """Returns what takes one step of a backend, notes its pairs and returns its times."""
+    def _time_backend(self, backend: str, threads: int) -> Work:
+        """Returns a function that times both passes and a step, and stores the pairs."""
         step = training_step(self._scene, backend)
 
         def run() -> Mapping[str, float]:
@@ -266,7 +359,7 @@ class _Measurement:
 
     def _time_passes(self, backend: str) -> dict[str, float]:
         """Returns the milliseconds of both passes and of their parts."""
-        probe = probe_for(backend, self._plan.device)
+        probe = instruments.probe_for(backend, self._plan.device)
         with probe.watch():
             watch = Stopwatch(self._plan.device)
             output = _render(self._scene, registry.renderer(backend))
@@ -281,12 +374,12 @@ class _Measurement:
 
     def _time_step(self, step: Callable[[Mark], None], backend: str) -> dict[str, float]:
         """Returns the milliseconds of an optimization step and of its parts."""
-        probe = probe_for(backend, self._plan.device)
+        probe = instruments.probe_for(backend, self._plan.device)
         with probe.watch():
             watch = Stopwatch(self._plan.device)
             step(watch.mark)
         parts = probe.collect()
-        parts.setdefault(ADAM, watch.ms[ADAM])
+        parts.setdefault(_ADAM, watch.ms[_ADAM])
         return _parts("step", sum(watch.ms.values()), parts)
 
 
@@ -301,7 +394,7 @@ def _render_and_back(scene: BenchScene, renderer: Renderer) -> None:
 
 
 def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float]:
-    """Returns the time of a pass under its name, and of its parts with what they leave over."""
+    """Returns the time of a pass under its name, of its parts, and the rest."""
     times = {whole: ms}
     if parts:
         times |= {f"{whole}: {part}": part_ms for part, part_ms in parts.items()}
@@ -309,136 +402,15 @@ def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float
     return times
 
 
-def _speed(samples: Samples, pairs: Pairs, peak: float | None, threads: int) -> Speed:
+def _compute_speed(samples: Samples, pairs: Pairs, peak: float | None, threads: int) -> Speed:
     """Returns medians and rates; those of pairs are of the compositing stages alone."""
-    timings = {name: timing_of(values) for name, values in samples.items()}
-    inner = [timings.get(f"forward: {COMPOSITE}"), timings.get(f"backward: {DECOMPOSE}")]
+    times = {name: timing_of(values) for name, values in samples.items()}
+    inner = (times.get(f"forward: {instruments.COMPOSITE}"),
+             times.get(f"backward: {instruments.DECOMPOSE}"))
     forward, backward = (
-        rate(pairs[i] if pairs else None, stage.ms if stage else None)
+        instruments.rate(pairs[i] if pairs else None, stage.ms if stage else None)
         for i, stage in enumerate(inner))
     return Speed(
-        threads, timings.pop("forward"), timings.pop("backward"), timings.pop("step"),
-        forward, backward,
-        peak_fraction(forward, FLOPS_FORWARD, peak, threads),
-        peak_fraction(backward, FLOPS_BACKWARD, peak, threads), timings)
-
-
-SCHEMA = "recon-bench"
-
-
-VERSION = 1  # goes up when a key changes its name or meaning
-
-
-# What each backend has under its own name in every scene; --compare prints a ratio for each.
-FIGURES = (
-    "forward_ms", "backward_ms", "step_ms", "gpairs_per_s_forward", "gpairs_per_s_backward",
-    "peak_fraction_forward", "peak_fraction_backward", "image_error_max",
-    "gradient_relative_error")
-
-
-@dataclass(frozen=True)
-class Speed:
-    """How fast a backend is with some number of threads."""
-
-    threads: int
-    forward: Timing  # a whole forward pass
-    backward: Timing
-    step: Timing  # forward, loss, backward, Adam
-    # evaluated pairs of Gaussian and pixel over the time of compositing; None where not counted
-    gpairs_per_s_forward: float | None
-    gpairs_per_s_backward: float | None
-    # arithmetic of those pairs over what the threads could do; None where no peak was measured
-    peak_fraction_forward: float | None
-    peak_fraction_backward: float | None
-    stages: dict[str, Timing]  # parts of the passes and of the step, in order, as "pass: part"
-
-    def record(self) -> dict[str, Any]:
-        """Returns the figures by the names of the JSON file."""
-        passes = {"forward": self.forward, "backward": self.backward, "step": self.step}
-        return {
-            "threads": self.threads,
-            **{f"{name}_ms": timing.ms for name, timing in passes.items()},
-            **{f"{name}_iqr_ms": timing.iqr_ms for name, timing in passes.items()},
-            **{name: getattr(self, name) for name in FIGURES[3:7]},
-            "stages": {name: asdict(timing) for name, timing in self.stages.items()},
-        }
-
-
-def _finite(accuracy: Accuracy) -> dict[str, Any]:
-    """Returns an accuracy for JSON, which knows no infinity: null stands for it."""
-    return {name: None if value == math.inf else value
-            for name, value in asdict(accuracy).items()}
-
-
-@dataclass(frozen=True)
-class BackendResult:
-    """One backend in one scene."""
-
-    speed: Speed  # with all the threads that were asked for
-    one_thread: Speed | None  # None on a GPU
-    accuracy: Accuracy  # against the oracle
-    pairs: tuple[int, int] | None  # evaluated forward and backward; None where not counted
-    memory_bytes: int  # most that a first forward and backward pass added, gradients included
-
-    def record(self) -> dict[str, Any]:
-        """Returns the figures by the names of the JSON file."""
-        return {
-            **self.speed.record(), **_finite(self.accuracy), "pairs": self.pairs,
-            "memory_bytes": self.memory_bytes,
-            "one_thread": self.one_thread.record() if self.one_thread else None,
-        }
-
-
-@dataclass(frozen=True)
-class VariantResult:
-    """One approximation on one backend."""
-
-    name: str
-    time: Timing | None  # forward and backward; None where a difference would mean nothing
-    accuracy: Accuracy  # against the oracle, which follows the contract
-
-
-@dataclass(frozen=True)
-class BenchedScene:
-    """Everything about one scene."""
-
-    gaussians: int
-    width: int  # of the image in pixels
-    height: int
-    sh_degree: int
-    backends: dict[str, BackendResult]  # by name, the fastest kind first
-    losses: dict[str, Timing]  # forward and backward of each photometric loss
-    variants_of: str  # the backend that the approximations were drawn by
-    variants: list[VariantResult]  # the contract first, then the approximations
-
-    def record(self) -> dict[str, Any]:
-        """Returns the figures by the names of the JSON file."""
-        return {
-            "gaussians": self.gaussians, "width": self.width, "height": self.height,
-            "sh_degree": self.sh_degree,
-            "backends": {name: backend.record() for name, backend in self.backends.items()},
-            "losses": {name: asdict(timing) for name, timing in self.losses.items()},
-            "variants_of": self.variants_of,
-            "variants": [
-                {"name": variant.name, "time": asdict(variant.time) if variant.time else None,
-                 **_finite(variant.accuracy)} for variant in self.variants],
-        }
-
-
-@dataclass(frozen=True)
-class BenchResult:
-    """A run of the benchmark."""
-
-    host: Host
-    rounds: int  # behind each median
-    scenes: dict[str, BenchedScene]
-    warm_start: Timing | None = None  # of the numba backend in a fresh process; None if left out
-
-    def record(self) -> dict[str, Any]:
-        """Returns what the JSON file holds."""
-        return {
-            "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
-            "rounds": self.rounds,
-            "warm_start": asdict(self.warm_start) if self.warm_start else None,
-            "scenes": {name: scene.record() for name, scene in self.scenes.items()},
-        }
+        threads, times, forward, backward,
+        instruments.peak_fraction(forward, instruments.FLOPS_FORWARD, peak, threads),
+        instruments.peak_fraction(backward, instruments.FLOPS_BACKWARD, peak, threads))

@@ -1,4 +1,8 @@
-"""What the benchmark draws: Gaussians of a synthetic room, and approximations of the renderer."""
+"""The benchmark's synthetic room, approximations of the renderer, and errors against an oracle.
+
+The oracle is the torch backend in float64, which the tests compare with an untiled brute force
+within 1e-12. All parameters are rounded to float32 before, so that only arithmetic is measured.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ _THINNESS = 0.15  # of the axis across the wall: trained Gaussians lie flat on s
 
 @dataclass(frozen=True)
 class SceneSize:
-    """How much there is to draw."""
+    """The size of a scene."""
 
     gaussians: int
     width: int  # of the image in pixels
@@ -39,15 +43,13 @@ QUICK = SceneSize(1_500, 160, 90)
 
 @dataclass(frozen=True, eq=False)
 class BenchScene:
-    """What every candidate renders."""
+    """The input of every candidate."""
 
     splats: Splats  # N Gaussians, float32
     camera: Camera  # inside the room
     background: Tensor  # [3]
     sh_degree: int
-    # [H, W, 3] seeded normal numbers; the loss whose gradients are compared is the sum over the
-    # image times these
-    weights: Tensor
+    weights: Tensor  # [H, W, 3] seeded normal numbers; the loss is the sum of image times these
 
 
 def build_scene(size: SceneSize, sh_degree: int, device: str, *, seed: int = 0) -> BenchScene:
@@ -63,9 +65,8 @@ def build_scene(size: SceneSize, sh_degree: int, device: str, *, seed: int = 0) 
 def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Camera]:
     """Returns N Gaussians on the walls of a room and on boxes in it, and a camera inside.
 
-    Flat Gaussians at a spacing that follows their number, of all opacities and with
-    view-dependent colours: dense lists a tile, many layers behind each other, and needles at
-    grazing angles, as in a trained indoor scene.
+    As in a trained indoor scene: flat, of all opacities, with view-dependent colours, in many
+    layers, and needles at grazing angles.
     """
     rng = np.random.default_rng(seed)
     wall = rng.integers(0, 6, n)
@@ -102,13 +103,12 @@ def _camera(width: int, height: int) -> Camera:
 
 @dataclass(frozen=True)
 class RendererVariant:
-    """One way to be cheaper, or more careful, than the contract."""
+    """A cheaper, or more careful, variant of the contract."""
 
     name: str  # in the tables
     approximation: Approximation = field(default=EXACT)  # of the rasterizer
-    sh_degree: int | None = None  # the harmonics are cut here; None keeps those of the scene
-    # The SH coefficients are rounded to float16 first. The kernels have no float16 arithmetic, so
-    # this shows an error and can save no time.
+    sh_degree: int | None = None  # lower than that of the scene; None for the same
+    # SH coefficients are rounded to float16. The kernels compute in float32, so no time is saved.
     half_colors: bool = False
 
     @property
@@ -131,7 +131,7 @@ _ALL = (
 
 
 def variants_for(backend: str, sh_degree: int) -> list[RendererVariant]:
-    """Returns the approximations that a backend can draw of a scene with this SH degree."""
+    """Returns the approximations that a backend can render of a scene with this SH degree."""
     return [
         variant for variant in _ALL
         if (variant.approximation == EXACT or backend == "numba")
@@ -172,12 +172,12 @@ def _round_colors(splats: Splats) -> Splats:
         through(splats.sh_dc), through(splats.sh_rest))
 
 
-FLIP = 1e-5  # a pixel that errs by more has won or lost a fragment: rounding alone stays below
+FLIP = 1e-5  # a larger error of a pixel means a fragment more or less, not rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What one renderer makes of a scene, in float64."""
+    """The output of one renderer, in float64."""
 
     image: Tensor  # [H, W, 3]
     gradients: dict[str, Tensor]  # by raw parameter, of the sum of image times scene.weights
@@ -185,16 +185,14 @@ class Answer:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """The distance of an answer from the oracle's."""
+    """The error of an answer against the oracle's."""
 
     image_error_max: float  # largest difference of a channel of a pixel
     image_error_rms: float  # root of the mean square of the differences
     flipped_pixels: float  # fraction of the pixels with a channel that errs by more than FLIP
     gradient_relative_error: float  # ||g - g*|| / ||g*||, of the raw parameter where it is largest
     gradient_worst: str  # the name of that parameter
-    # between all gradients in a row, each parameter's divided by its ||g*|| first, so that no unit
-    # outweighs the others
-    gradient_cosine: float
+    gradient_cosine: float  # of all gradients in a row, each parameter's divided by its ||g*||
 
 
 def answer(scene: BenchScene, renderer: Renderer) -> Answer:
@@ -218,10 +216,10 @@ def oracle(scene: BenchScene) -> Answer:
 
 
 def accuracy(candidate: Answer, truth: Answer) -> Accuracy:
-    """Returns how far `candidate` is from `truth`.
+    """Returns the error of `candidate`; infinite, with a cosine of 0, where it is not finite.
 
-    A parameter whose true gradient is zero everywhere (the higher harmonics at SH degree 0) takes
-    no part. A candidate that is not finite has infinite errors and a cosine of 0.
+    A parameter whose true gradient is zero everywhere (the higher harmonics at SH degree 0) is
+    ignored.
     """
     difference = (candidate.image - truth.image).abs()
     relative, cosine = _compare(candidate.gradients, truth.gradients)

@@ -1,15 +1,14 @@
 """`recon denoise --compare`: what each noise filter would gain and lose on the frames of a capture.
 
-The truth is not known, so it is made: the capture's own frames, halve by area, which leaves half
-of their noise, and noise of known levels added to those. Compression, which follows noise in a
-video, is not imitated; on a video the figures are therefore what a filter could do at best.
-Nothing is filtered: compare.json lies beside the stages, so that no result turns stale.
+The reference is the capture's own frames reduced to half size by area, which halves their noise;
+noise of known levels is added to it. Video compression is not simulated, so for a video the figures
+are upper bounds. compare.json lies beside the stages, so that no stage becomes stale.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.evaluation.scores import Table
-from recon_cli.experiments.variants import run_grid
+from recon_cli.experiments.runner import run_grid
 from recon_cli.io.images import read_png
 from recon_cli.io.records import FOLDER, read_frame_list
 from recon_cli.pipeline import plan
@@ -33,14 +32,11 @@ _SAMPLES = 3  # frames, spread over the capture: 20 s in all at 1080x1920 on one
 _MEASURED = 16  # frames whose noise is measured: 3 s
 _LEAST_NOISE = 0.5  # 1/255; rounding to 8 bits alone makes .3
 LEVELS = (3.0, 5.0, 10.0, 15.0, 20.0)  # 1/255; 3 is the default threshold, 20 a phone at night
-_SAME_LEVEL = 0.1  # a measured level this close to one of those tells nothing of its own
+_SAME_LEVEL = 0.1  # relative: a measured level this close to one of those is not tested separately
 STRENGTHS = (2.0, 3.0, 4.0, 5.0)
-# Edges: the 5% of pixels with the steepest slope, where a blur is seen first.
-_STEEPEST = 95
-# The slope is taken after a blur of one pixel; without it noise would make edges of its own.
-_SLOPE_BLUR = 1.0
-# A filter that loses more than this fraction of the edges is no default, however flat the walls.
-_MAX_EDGE_LOSS = 0.05
+_STEEPEST = 95  # percentile: edges are the 5% of pixels with the steepest slope
+_SLOPE_BLUR = 1.0  # pixels; without a blur before the slope, noise would count as edges
+_MAX_EDGE_LOSS = 0.05  # fraction of the edges that the best filter may lose
 
 Pixels = NDArray[np.uint8]  # [H, W, 3]
 
@@ -54,19 +50,24 @@ class FilterVariant:
     apply: Callable[[Pixels, float], Pixels]  # (frame, noise in 1/255)
 
     @property
+    def key(self) -> str:
+        """A name that no other variant has."""
+        return f"{self.filter} {self.strength:g}"
+
+    @property
     def offered(self) -> bool:
-        """Whether `recon denoise --filter` takes it."""
+        """Whether `recon denoise --filter` accepts it."""
         return self.filter == "none" or self.filter in FILTERS
 
 
 @dataclass(frozen=True)
 class FilterScore:
-    """What one filter does at one level of noise; means over the frames."""
+    """The result of one filter at one level of noise; means over the frames."""
 
     filter: str
     strength: float
     offered: bool
-    noise_255: float  # standard deviation of the noise that was added
+    noise_255: float  # standard deviation of the added noise
     psnr_db: float  # against the frame without it
     edges_kept: float  # see `edges_kept`
     seconds_per_megapixel: float  # of the filter, on this machine
@@ -91,7 +92,7 @@ VARIANTS = (
 
 
 def compare_filters(job: Job, config: DenoiseConfig) -> str:
-    """Writes compare.json into the workspace and returns its table and what follows from it.
+    """Writes compare.json into the workspace and returns a table and a recommendation.
 
     Raises:
         StageError: there are no fresh frames.
@@ -160,39 +161,29 @@ def score_filters(
 
     def mean(variant: FilterVariant, level: float) -> FilterScore:
         psnr_db, edges, seconds = zip(*(
-            values for noisy, values in zip(grid, results[_key(variant)], strict=True)
+            values for noisy, values in zip(grid, results[variant.key], strict=True)
             if noisy[0] == level), strict=True)
         return FilterScore(
             variant.filter, variant.strength, variant.offered, level, float(np.mean(psnr_db)),
             float(np.mean(edges)), 0.0 if variant.filter == "none" else sum(seconds) / megapixels)
 
     grid = [(level, number) for level in levels for number in range(len(truths))]
-    results = run_grid({_key(variant): variant for variant in VARIANTS}, grid, measure)
+    results = run_grid({variant.key: variant for variant in VARIANTS}, grid, measure)
     return tuple(mean(variant, level) for variant in VARIANTS for level in levels)
 
 
-def _key(variant: FilterVariant) -> str:
-    return f"{variant.filter} {variant.strength:g}"
-
-
-def with_noise(
-    rgb: Pixels,  # [H, W, 3]
-    noise: float,
-    *,
-    seed: int,
-) -> Pixels:
-    """Returns a frame with white Gaussian noise of a level in 1/255, clipped to what fits."""
+def with_noise(rgb: Pixels, noise: float, *, seed: int) -> Pixels:
+    """Returns a frame with white Gaussian noise of a level in 1/255, clipped to 8 bits."""
     random = np.random.default_rng(seed)
     noisy = rgb + random.normal(0.0, noise, rgb.shape)
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
 
 def edges_kept(truth: Pixels, image: Pixels) -> float:
-    """Returns how much of the slope across the edges of `truth` is left in `image`.
+    """Returns the fraction of the slope across the edges of `truth` that is left in `image`.
 
     The mean slope of the image along the true gradient over the steepest 5% of the pixels, divided
-    by that of the truth: 1 where all edges stand, less where they are washed out. Noise, whose
-    slope points anywhere, cancels out.
+    by that of the truth. Noise, whose slope has a random direction, cancels out.
     """
     across, down = _slopes(truth)
     steepness = np.hypot(across, down)
@@ -211,9 +202,9 @@ def _slopes(image: Pixels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def best(scores: Sequence[FilterScore], level: float) -> FilterScore:
-    """Returns the best score among the offered filters, at the compared level nearest to `level`.
+    """Returns the highest PSNR of the offered filters, or none, that lose few edges.
 
-    Best is the highest PSNR among those that lose few edges; doing nothing is offered too.
+    It is of the compared level nearest to `level`.
     """
     near = min((score.noise_255 for score in scores), key=lambda noise: abs(noise - level))
     usable = [
@@ -224,7 +215,7 @@ def best(scores: Sequence[FilterScore], level: float) -> FilterScore:
 
 
 def gain_db(scores: Sequence[FilterScore], score: FilterScore) -> float:
-    """Returns by how many dB a filter comes closer to the truth than doing nothing."""
+    """Returns the gain in dB over doing nothing."""
     return score.psnr_db - _score_of_none(scores, score.noise_255).psnr_db
 
 
@@ -235,20 +226,20 @@ def _score_of_none(scores: Sequence[FilterScore], level: float) -> FilterScore:
 
 def _table(scores: Sequence[FilterScore]) -> str:
     levels = sorted({score.noise_255 for score in scores})
-    by_variant: Mapping[tuple[str, float], list[FilterScore]] = {
-        (score.filter, score.strength): [] for score in scores}
-    for score in scores:
-        by_variant[score.filter, score.strength].append(score)
+    rows = []
+    for first in range(0, len(scores), len(levels)):  # by filter, then by level
+        own = scores[first:first + len(levels)]
+        name, strength = own[0].filter, own[0].strength
+        rows.append((
+            name if own[0].offered else f"({name})", f"{strength:g}" if strength else "-",
+            *(f"{score.psnr_db:.1f} {score.edges_kept:4.0%}" for score in own),
+            f"{sum(score.seconds_per_megapixel for score in own) / len(own):.2f}"))
     return Table(
-        ("filter", "strength", *(f"noise {level:g}" for level in levels), "s/MP"),
-        tuple((name if own[0].offered else f"({name})", f"{strength:g}" if strength else "-",
-               *(f"{score.psnr_db:.1f} {score.edges_kept:4.0%}" for score in own),
-               f"{sum(score.seconds_per_megapixel for score in own) / len(own):.2f}")
-              for (name, strength), own in by_variant.items())).text()
+        ("filter", "strength", *(f"noise {level:g}" for level in levels), "s/MP"), rows).text()
 
 
 def _advice(config: DenoiseConfig, noise: float, scores: Sequence[FilterScore]) -> str:
-    """Returns what the frames' own noise calls for, in words."""
+    """Returns a recommendation for the frames' own noise."""
     lines = [f"The noise of the frames is {noise:.1f}/255 (median)."]
     chosen = best(scores, noise) if noise >= _LEAST_NOISE else None
     if chosen is None:

@@ -1,6 +1,7 @@
-"""Timing on this machine: stopwatch, alternating rounds, memory, and the arithmetic peak.
+"""Measuring on this machine: timings in alternated rounds, memory, arithmetic peak, and probes.
 
-And how much of that peak a pair of Gaussian and pixel needs.
+A probe takes the time of each stage of a backend and counts the evaluated pairs of Gaussian and
+pixel while it renders; it changes nothing that is computed.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from recon_cli.render.numba.simd_functions import fill, fma, store
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import blocks, tiles
 
-# OpenMP's threads of the candidate before spin on for some milliseconds after their last work.
+# OpenMP's threads of the previous candidate keep spinning for some milliseconds after their work.
 _SETTLE_SECONDS = 0.03
+_SAMPLE_SECONDS = 0.001  # of resident memory; a forward pass takes some twenty
 
 Samples = dict[str, list[float]]  # name of a part -> its milliseconds, round by round
 
@@ -53,7 +55,7 @@ def timing_of(samples: Sequence[float]) -> Timing:
 
 
 class Stopwatch:
-    """Counts the time between marks; waits for the device at each of them."""
+    """Measures the time between marks; waits for the device at each of them."""
 
     def __init__(self, device: str) -> None:
         self._device = device
@@ -73,14 +75,13 @@ class Stopwatch:
 
 
 def alternate(
-    works: Mapping[str, Callable[[], Mapping[str, float]]],
-    rounds: int,
+    works: Mapping[str, Callable[[], Mapping[str, float]]], rounds: int,
     on_round: Callable[[], None],
 ) -> dict[str, Samples]:
     """Runs all candidates in turn, A B A B, and returns the samples of each.
 
-    A slow minute then falls on all candidates alike. One round ahead is not counted: it compiles
-    and warms the caches.
+    A slow minute then affects all candidates alike. A first round is not counted: it compiles and
+    warms the caches.
     """
     samples: dict[str, Samples] = {name: {} for name in works}
     for number in range(rounds + 1):
@@ -100,9 +101,9 @@ class Host:
 
     cpu: str  # model name
     cores: int  # that this process may use
-    threads: int  # that the work was given
+    threads: int  # in use
     lanes: int  # float32 in a vector of the kernels
-    peak_gflops: float  # multiply-adds of one thread, measured in float32; each counts as two
+    peak_gflops: float  # measured float32 multiply-adds of one thread; each counts as two
     device: str  # "cpu", or the GPU's model name
     versions: dict[str, str]  # of Python and the packages
 
@@ -120,15 +121,12 @@ def examine(threads: int, device: str) -> Host:
     """Returns this machine with its measured peak."""
     name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
     return Host(
-        machine.cpu_model(), machine.usable_threads(), threads, LANES, measured_peak(), name,
+        machine.cpu_model(), machine.usable_threads(), threads, LANES, _measure_peak(), name,
         machine.versions())
 
 
-_SAMPLE_SECONDS = 0.001  # a forward pass takes some twenty
-
-
-def added_memory(work: Callable[[], object], device: str) -> int:
-    """Returns the most bytes above those at the start that `work` held.
+def measure_memory(work: Callable[[], object], device: str) -> int:
+    """Returns the peak bytes that `work` added.
 
     On a CPU this is resident memory, sampled every millisecond, which misses short peaks and
     counts what an allocator keeps; on a GPU it is what torch allocated.
@@ -158,9 +156,8 @@ def added_memory(work: Callable[[], object], device: str) -> int:
     return added
 
 
-# torch is there anyway; its import is not counted
-_SCRIPT = """
-import torch, time
+_WARM_START = """
+import torch, time  # torch is needed anyway; its import is not counted
 start = time.perf_counter()
 from recon_cli.render import registry
 registry.prepare("numba", lambda: None)
@@ -171,12 +168,11 @@ print(time.perf_counter() - start)
 def warm_start(rounds: int) -> Timing:
     """Returns the time from importing the backend to kernels that are ready, in new processes."""
     registry.prepare("numba", lambda: None)  # fills the cache
-    seconds = []
-    for _ in range(rounds):
-        done = subprocess.run(
-            [sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=True)
-        seconds.append(float(done.stdout.split()[-1]))
-    return timing_of([1e3 * value for value in seconds])
+    command = [sys.executable, "-c", _WARM_START]
+    return timing_of([
+        1e3 * float(subprocess.run(
+            command, capture_output=True, text=True, check=True).stdout.split()[-1])
+        for _ in range(rounds)])
 
 
 # Operations of an evaluated pair, forward and backward, counted in the inner loops of the
@@ -211,7 +207,7 @@ def _multiply_add(iterations: Any, out: Any) -> None:
     store(out, 0, s0 + s1 + s2 + s3 + s4 + s5 + s6 + s7 + s8 + s9 + s10 + s11)
 
 
-def measured_peak() -> float:
+def _measure_peak() -> float:
     """Returns the float32 GFLOP/s of one thread in multiply-adds alone, the best of several."""
     out = np.empty(LANES, np.float32)
     _multiply_add(1, out)  # compiles
@@ -231,28 +227,26 @@ def rate(pairs: int | None, ms: float | None) -> float | None:
 def peak_fraction(
     gpairs_per_s: float | None, flops: int, peak_gflops: float | None, threads: int
 ) -> float | None:
-    """Returns which part of the peak of `threads` threads the arithmetic of the pairs takes."""
+    """Returns the fraction of the peak of `threads` threads that the pairs' arithmetic takes."""
     if gpairs_per_s is None or peak_gflops is None:
         return None
     return gpairs_per_s * flops / (peak_gflops * threads)
 
 
 COMPOSITE, DECOMPOSE = "composite", "decompose"  # the stages whose pairs are counted
-
-
-# what results on disk call these kernels
+# names of kernels in the results on disk
 _STAGES = {"composite_backward": DECOMPOSE, "project_backward": "unproject"}
 
 
 class Probe:
-    """Measures a backend while `watch`."""
+    """Measures a backend while `watch`; this one, of any backend, measures nothing."""
 
     def __init__(self) -> None:
-        self.ms: dict[str, float] = {}  # by stage, since `collect` was last called
+        self.ms: dict[str, float] = {}  # by stage, since the last `collect`
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        """Measures within the block. This one sees nothing."""
+        """Measures within the block."""
         yield
 
     def collect(self) -> dict[str, float]:
@@ -274,8 +268,7 @@ class NumbaProbe(Probe):
     @contextmanager
     def watch(self) -> Iterator[None]:
         """Measures kernels within the block."""
-        pool.observer = lambda name, seconds: self._add(
-            _STAGES.get(name, name), 1e3 * seconds)
+        pool.observer = lambda name, seconds: self._add(_STAGES.get(name, name), 1e3 * seconds)
         try:
             yield
         finally:
@@ -288,7 +281,7 @@ class NumbaProbe(Probe):
 
 
 class TorchProbe(Probe):
-    """Stands between the torch backend and its own functions."""
+    """Wraps the functions of the torch backend."""
 
     def __init__(self, device: str) -> None:
         super().__init__()
@@ -307,12 +300,11 @@ class TorchProbe(Probe):
             ):
                 stack.enter_context(_replace(
                     place, name, self._time_calls(label, getattr(place, name))))
-            stack.enter_context(_replace(
-                tiles, "alphas", self._count_pairs(blocks.alphas)))
+            stack.enter_context(_replace(tiles, "alphas", self._count_pairs))
             yield
 
     def pairs(self, output: RenderOutput) -> tuple[int, int] | None:  # noqa: ARG002
-        """Returns what the blocks held: every pixel of a tile for every instance."""
+        """Returns the pairs in the blocks: every pixel of a tile for every instance."""
         return self._pairs[0], self._pairs[1]
 
     def _time_calls(self, label: str, work: Callable[..., Any]) -> Callable[..., Any]:
@@ -328,17 +320,14 @@ class TorchProbe(Probe):
 
         return run
 
-    def _count_pairs(self, alphas: Callable[..., Any]) -> Callable[..., Any]:
-        def run(table: Any, block: Any, *rest: Any) -> Any:
-            self._pairs[self._backward] += block.rows.numel() * blocks.PIXELS
-            return alphas(table, block, *rest)
-
-        return run
+    def _count_pairs(self, table: Any, block: Any, *rest: Any) -> Any:
+        self._pairs[self._backward] += block.rows.numel() * blocks.PIXELS
+        return blocks.alphas(table, block, *rest)
 
 
 @contextmanager
 def _replace(place: Any, name: str, function: Callable[..., Any]) -> Iterator[None]:
-    """Puts another function under a name of a module, or of a class as a static method."""
+    """Replaces a function of a module, or a static method of a class, within the block."""
     original = vars(place)[name]
     setattr(place, name, staticmethod(function) if isinstance(place, type) else function)
     try:
@@ -348,7 +337,7 @@ def _replace(place: Any, name: str, function: Callable[..., Any]) -> Iterator[No
 
 
 def probe_for(backend: str, device: str) -> Probe:
-    """Returns the probe of a backend."""
+    """Returns the probe of a backend; one without a probe is timed from outside only."""
     if backend == "numba":
         return NumbaProbe()
     return TorchProbe(device) if backend == "torch" else Probe()

@@ -1,7 +1,7 @@
-"""Files that an experiment writes beside what it prints: JSON, a picture, tables in a page.
+"""Files that an experiment writes: JSON, a picture, tables in a Markdown page.
 
-matplotlib is an extra and imported only while a picture is drawn. In a Markdown page only what
-stands between two marks is replaced; the text around it stays.
+matplotlib is an extra and imported only while a picture is drawn. In a Markdown page only the text
+between two marks is replaced.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from recon_cli.evaluation.scores import Table
 from recon_cli.workspace import atomic
 
 BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"
-_PICTURE_FORMATS = (".png", ".svg")
+_INSTALL = "pip install 'recon-cli[plot]'"
 
 logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True)
 class OutputFiles:
-    """The files that are wanted, None where one is not."""
+    """The files to write; None for those that are not wanted."""
 
     json_file: Path | None = None
     plot: Path | None = None
@@ -38,16 +38,21 @@ class OutputFiles:
             if path is not None and not path.absolute().parent.is_dir():
                 raise InputError(
                     f"The folder of {path} does not exist.", hint=f"mkdir -p {path.parent}")
-        if self.plot is not None:
-            _check_picture(self.plot)
+        if self.plot is not None and self.plot.suffix.lower() not in (".png", ".svg"):
+            raise ConfigError(
+                f"--plot is {self.plot}, but it must end in .png or .svg.",
+                hint=f"Try --plot {self.plot.with_suffix('.svg').name}.")
+        if self.plot is not None and not _can_draw():
+            raise ConfigError(
+                "--plot needs matplotlib, which is not installed.", hint=_INSTALL)
         if self.markdown is not None:
             _with_text(self.markdown, "")
 
     def write(
         self, record: Mapping[str, Any], head: str, tables: Sequence[Table],
         draw: Callable[[Path], None],
-    ) -> None:
-        """Writes them."""
+    ) -> str:
+        """Writes them, and returns the head and the tables for the terminal."""
         if self.json_file is not None:
             atomic.write_json(self.json_file, record)
         if self.plot is not None:
@@ -55,31 +60,24 @@ class OutputFiles:
         if self.markdown is not None:
             text = "\n\n".join([head + ".", *(table.markdown() for table in tables)])
             atomic.write_bytes(self.markdown, _with_text(self.markdown, text).encode())
+        return "\n\n".join([head, *(table.text() for table in tables)])
 
 
-def _check_picture(path: Path) -> None:
-    if path.suffix.lower() not in _PICTURE_FORMATS:
-        raise ConfigError(
-            f"--plot is {path}, but it must end in .png or .svg.",
-            hint=f"Try --plot {path.with_suffix('.svg').name}.")
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError(
-            "--plot needs matplotlib, which is not installed.",
-            hint="pip install 'recon-cli[plot]'")
+def _can_draw() -> bool:
+    return importlib.util.find_spec("matplotlib") is not None
 
 
 def draw_if_possible(draw: Callable[[Path], None], path: Path) -> None:
     """Draws a picture, or warns that matplotlib is missing."""
-    if importlib.util.find_spec("matplotlib") is None:
-        logger.warning("%s is not drawn: matplotlib is not installed; "
-                       "pip install 'recon-cli[plot]'", path.name)
-    else:
+    if _can_draw():
         draw(path)
+    else:
+        logger.warning("%s is not drawn: matplotlib is not installed; %s", path.name, _INSTALL)
 
 
 @contextmanager
 def drawing(path: Path, width: float, height: float, *, dpi: int = 110) -> Iterator[Any]:
-    """Opens a figure of some inches and saves it after the block, whole or not at all."""
+    """Opens a figure of a size in inches and saves it after the block, atomically."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -95,11 +93,7 @@ def add_legend(figure: Any, axes: Any) -> None:
 
 
 def replace_between_marks(page: str, text: str) -> str:
-    """Returns the page with `text` between its two marks.
-
-    Raises:
-        ValueError: the page lacks a mark, or they are not in order.
-    """
+    """Returns the page with `text` between its two marks; ValueError if it lacks one."""
     lines = page.splitlines()
     begins = [i for i, line in enumerate(lines) if line.strip() == BEGIN]
     ends = [i for i, line in enumerate(lines) if line.strip() == END]
@@ -110,7 +104,7 @@ def replace_between_marks(page: str, text: str) -> str:
 
 
 def _with_text(path: Path, text: str) -> str:
-    """Returns what the page at `path` is with `text` between its marks."""
+    """Returns the page at `path` with `text` between its marks."""
     try:
         return replace_between_marks(path.read_text(encoding="utf-8"), text)
     except OSError as error:

@@ -32,20 +32,14 @@ from recon_cli.workspace import atomic
 
 _ROUNDS, _QUICK_ROUNDS = 7, 2
 _REFERENCE = "torch"  # what the other backends and losses are compared with
-_RATED = {"forward: composite": "forward", "backward: decompose": "backward"}
-_FLOOR = 1e-9  # an error of zero has no place on a logarithmic axis
+_FLOOR = 1e-9  # for an error of zero on a logarithmic axis
 
 logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True)
 class BenchRequest:
-    """The options of `recon bench`.
-
-    Raises:
-        ConfigError: the size is not WIDTHxHEIGHT.
-        ReconError: an output cannot be written.
-    """
+    """The options of `recon bench`; a ReconError where size or outputs cannot be used."""
 
     scene: str = "room"  # or "small"
     gaussians: int | None = None  # instead of the scene's own number
@@ -65,11 +59,7 @@ class BenchRequest:
         self.outputs.check()
 
     def plan(self) -> BenchPlan:
-        """Returns what is measured.
-
-        Raises:
-            BackendError: a backend or device is not there.
-        """
+        """Returns what is measured; BackendError if a backend or device is not available."""
         if self.backends:
             resolved = [registry.resolve(name, self.device) for name in self.backends]
             backends, device = tuple(dict.fromkeys(name for name, _ in resolved)), resolved[0][1]
@@ -89,11 +79,7 @@ class BenchRequest:
                          self.threads or machine.usable_threads(), rounds)
 
     def earlier_record(self, plan: BenchPlan) -> Mapping[str, Any] | None:
-        """Returns the record to compare with, None where there is none.
-
-        Raises:
-            ReconError: the earlier run cannot be compared with.
-        """
+        """Returns the record to compare with, if any; ReconError if it does not compare."""
         if self.compare is None:
             return None
         old, size = read_record(self.compare), plan.size
@@ -104,11 +90,7 @@ class BenchRequest:
 
 
 def parse_size(size: str) -> tuple[int, int]:
-    """Returns width and height of "640x360".
-
-    Raises:
-        ConfigError: the text has another form, or a side is shorter than a pixel.
-    """
+    """Returns width and height of "640x360"; ConfigError for another form, or a side of 0."""
     match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", size)
     if not match:
         raise ConfigError(
@@ -118,41 +100,40 @@ def parse_size(size: str) -> tuple[int, int]:
 
 
 def run(request: BenchRequest, progress: Progress) -> str:
-    """Measures what was asked for, writes the files, and returns what the terminal shows.
-
-    Raises:
-        ReconError: something cannot be done; it is found before the measurement.
-    """
+    """Measures, writes the files, and returns the text for the terminal."""
     plan = request.plan()
     old = request.earlier_record(plan)
     host = examine(plan.threads, plan.device)
     warm = warm_start(plan.rounds) if "numba" in plan.backends else None
     result = BenchResult(host, plan.rounds, {request.scene: measure(plan, host, progress)}, warm)
     record = result.record()
-    request.outputs.write(
+    text = request.outputs.write(
         record, head(result), tables(result), lambda path: draw(result, path))
-    parts = [head(result), *(table.text() for table in tables(result))]
-    if old is not None:
-        parts.append(comparison_table(old, record).text())
-        if difference := machine_difference(old, record):
-            logger.warning("the other file is of another machine: %s", difference)
-    return "\n\n".join(parts)
+    if old is None:
+        return text
+    if difference := machine_difference(old, record):
+        logger.warning("the other file is of another machine: %s", difference)
+    return f"{text}\n\n{comparison_table(old, record).text()}"
 
 
 def tables(result: BenchResult) -> list[Table]:
     """Returns all tables of a result, in the order in which they are read."""
-    all_tables: list[Table] = []
-    for name, scene in result.scenes.items():
-        where = (f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
-                 f"SH degree {scene.sh_degree}")
-        all_tables += [
-            _figures(where, scene, result.warm_start), _stages(where, scene), _errors(where, scene),
-            _variants(where, scene)]
-    return all_tables
+    return [table for name, scene in result.scenes.items() for table in _scene_tables(
+        f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
+        f"SH degree {scene.sh_degree}", scene, result.warm_start)]
+
+
+def _scene_tables(where: str, scene: BenchedScene, warm_start: Timing | None) -> tuple[Table, ...]:
+    errors = Table(
+        ("backend", "ms", *_ERRORS),
+        [(name, number(backend.speed.both_ms), *_accuracy_cells(backend.accuracy))
+         for name, backend in scene.backends.items()], f"Error against float64 ({where})")
+    return (_figures(where, scene, warm_start), _stages(where, scene), errors,
+            _variants(where, scene))
 
 
 def head(result: BenchResult) -> str:
-    """Returns the line about machine and method that stands above the tables."""
+    """Returns the line about machine and method above the tables."""
     return (f"{result.host.line}; medians of {result.rounds} alternated rounds, "
             "interquartile range in brackets")
 
@@ -166,54 +147,53 @@ def _ratio(old: float | None, new: float | None) -> str:
     return "-" if (value := ratio(old, new)) is None else f"{value:.2f}x"
 
 
-def _both(speed: Speed) -> float:
-    return speed.forward.ms + speed.backward.ms
-
-
 def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> Table:
-    """Returns the figures that are quoted, one row each, a column a backend."""
-    backends = scene.backends
-    rows = [(name, *(figure(backend) for backend in backends.values()))
-            for name, figure in _quoted_rows(scene)]
-    width = len(backends) - 1
+    """Returns the main figures, one row each, a column a backend."""
+    backends = list(scene.backends.values())
+    rows = [(name, *map(cell, backends)) for name, cell in _figure_rows(scene)]
+    blank = [""] * (len(backends) - 1)
     if warm_start is not None:
-        rows.append(("kernels ready in a fresh process, ms", _ms(warm_start), *[""] * width))
+        rows.append(("kernels ready in a fresh process, ms", _ms(warm_start), *blank))
     fused = scene.losses.get("fused")
     for name, timing in scene.losses.items():
-        rows.append((f"loss {name}, ms", _ms(timing), *[""] * width))
+        rows.append((f"loss {name}, ms", _ms(timing), *blank))
         if fused and timing is not fused:
-            rows.append((f"loss {name} : fused", _ratio(timing.ms, fused.ms), *[""] * width))
-    return Table(("what", *backends), rows, f"Figures ({where})")
+            rows.append((f"loss {name} : fused", _ratio(timing.ms, fused.ms), *blank))
+    return Table(("what", *scene.backends), rows, f"Figures ({where})")
 
 
-def _quoted_rows(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult], str]]]:
+def _figure_rows(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult], str]]]:
     """Returns the names of the rows of `_figures`, and how a backend's cell is made."""
     reference = scene.backends.get(_REFERENCE)
     threads = next(iter(scene.backends.values())).speed.threads
 
-    def speedup(of: Callable[[BackendResult], Speed]) -> Callable[[BackendResult], str]:
-        return lambda backend: (
-            _ratio(_both(of(reference)), _both(of(backend))) if reference else "-")
+    def speedup(speed: Callable[[BackendResult], Speed]) -> Callable[[BackendResult], str]:
+        return lambda backend: _ratio(
+            speed(reference).both_ms, speed(backend).both_ms) if reference else "-"
 
-    def core(cell: Callable[[Speed], str]) -> Callable[[BackendResult], str]:
-        return lambda backend: cell(_core(backend))
+    def pairs(i: int) -> Callable[[BackendResult], str]:
+        return lambda backend: number(backend.pairs[i] / 1e6 if backend.pairs else None)
 
     several: list[tuple[str, Callable[[BackendResult], str]]] = [
         ("the same with 1 thread", speedup(_core)),
-        (f"1 thread : {threads} threads, whole step",
-         lambda backend: _ratio(_core(backend).step.ms, backend.speed.step.ms)),
+        (f"1 thread : {threads} threads, whole step", lambda backend: _ratio(
+            _core(backend).times["step"].ms, backend.speed.times["step"].ms)),
     ]
     return [
-        ("forward + backward, ms", lambda backend: number(_both(backend.speed))),
-        ("whole step, ms", lambda backend: _ms(backend.speed.step)),
+        ("forward + backward, ms", lambda backend: number(backend.speed.both_ms)),
+        ("whole step, ms", lambda backend: _ms(backend.speed.times["step"])),
         (f"{_REFERENCE} : this, forward + backward", speedup(lambda backend: backend.speed)),
-        *(several if threads > 1 and _has_core(scene) else []),
-        ("Gpairs/s a core, forward", core(lambda speed: number(speed.gpairs_per_s_forward))),
-        ("Gpairs/s a core, backward", core(lambda speed: number(speed.gpairs_per_s_backward))),
-        ("of the core's peak, forward", core(lambda speed: percent(speed.peak_fraction_forward))),
-        ("of the core's peak, backward", core(lambda speed: percent(speed.peak_fraction_backward))),
-        ("evaluated Mpairs, forward", lambda backend: _millions(backend.pairs, 0)),
-        ("evaluated Mpairs, backward", lambda backend: _millions(backend.pairs, 1)),
+        *(several if _has_several(scene) else []),
+        ("Gpairs/s a core, forward",
+         lambda backend: number(_core(backend).gpairs_per_s_forward)),
+        ("Gpairs/s a core, backward",
+         lambda backend: number(_core(backend).gpairs_per_s_backward)),
+        ("of the core's peak, forward",
+         lambda backend: percent(_core(backend).peak_fraction_forward)),
+        ("of the core's peak, backward",
+         lambda backend: percent(_core(backend).peak_fraction_backward)),
+        ("evaluated Mpairs, forward", pairs(0)),
+        ("evaluated Mpairs, backward", pairs(1)),
         ("memory added, MB", lambda backend: f"{backend.memory_bytes / 1e6:.0f}"),
     ]
 
@@ -223,52 +203,33 @@ def _core(backend: BackendResult) -> Speed:
     return backend.one_thread or backend.speed
 
 
-def _has_core(scene: BenchedScene) -> bool:
-    return all(backend.one_thread for backend in scene.backends.values())
-
-
-def _millions(pairs: tuple[int, int] | None, index: int) -> str:
-    return number(pairs[index] / 1e6 if pairs else None)
+def _has_several(scene: BenchedScene) -> bool:
+    """Returns whether one thread and all threads are different measurements."""
+    return all(backend.one_thread and backend.speed.threads > 1
+               for backend in scene.backends.values())
 
 
 def _stages(where: str, scene: BenchedScene) -> Table:
     """Returns every stage of every backend, with one thread and with all."""
-    threads = next(iter(scene.backends.values())).speed.threads
-    several = threads > 1 and _has_core(scene)  # otherwise both columns would say the same
+    several = _has_several(scene)
     rows: list[tuple[str, ...]] = []
     for name, backend in scene.backends.items():
-        speeds = (_core(backend), backend.speed) if several else (backend.speed,)
-        for label in ("forward", "backward", "step"):
-            parts = [part for part in backend.speed.stages if part.startswith(f"{label}: ")]
-            rows += [
-                (f"{name} {part}", *(_ms(_time(speed, part)) for speed in speeds),
-                 *_rates(_core(backend), part)) for part in (label, *parts)]
+        core, speed = _core(backend), backend.speed
+        rates = {"forward: composite": (core.gpairs_per_s_forward, core.peak_fraction_forward),
+                 "backward: decompose": (core.gpairs_per_s_backward, core.peak_fraction_backward)}
+        for part in speed.times:
+            gpairs_per_s, fraction = rates.get(part, (None, None))
+            rows.append((
+                f"{name} {part}", *([_ms(core.times.get(part))] if several else []),
+                _ms(speed.times[part]),
+                *((number(gpairs_per_s), percent(fraction)) if part in rates else ("", ""))))
+    threads = next(iter(scene.backends.values())).speed.threads
     columns = ("ms, 1 thread", f"ms, {threads} threads") if several else ("ms",)
     return Table(
         ("stage", *columns, "Gpairs/s a core", "of peak"), rows, f"Stages ({where})")
 
 
-def _time(speed: Speed, part: str) -> Timing | None:
-    passes = {"forward": speed.forward, "backward": speed.backward, "step": speed.step}
-    return passes.get(part) or speed.stages.get(part)
-
-
-def _rates(speed: Speed, part: str) -> tuple[str, str]:
-    if part not in _RATED:
-        return "", ""
-    if _RATED[part] == "forward":
-        return number(speed.gpairs_per_s_forward), percent(speed.peak_fraction_forward)
-    return number(speed.gpairs_per_s_backward), percent(speed.peak_fraction_backward)
-
-
 _ERRORS = ("image max", "image RMS", "pixels > 1e-5", "gradient rel.", "worst", "gradient 1 - cos")
-
-
-def _errors(where: str, scene: BenchedScene) -> Table:
-    """Returns every backend against the oracle."""
-    rows = [(name, number(_both(backend.speed)), *_accuracy_cells(backend.accuracy))
-            for name, backend in scene.backends.items()]
-    return Table(("backend", "ms", *_ERRORS), rows, f"Error against float64 ({where})")
 
 
 def _accuracy_cells(accuracy: Accuracy) -> tuple[str, ...]:
@@ -279,7 +240,7 @@ def _accuracy_cells(accuracy: Accuracy) -> tuple[str, ...]:
 
 
 def _variants(where: str, scene: BenchedScene) -> Table:
-    """Returns every approximation against the oracle, and what it saves."""
+    """Returns every approximation against the oracle, and the time it saves."""
     contract = scene.variants[0].time
     rows = []
     for variant in scene.variants:
@@ -291,7 +252,7 @@ def _variants(where: str, scene: BenchedScene) -> Table:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class SpeedErrorPoint:
     """One point of the picture."""
 
     name: str  # its label
@@ -300,23 +261,23 @@ class Candidate:
     gradient_error: float  # relative
 
 
-def candidates_of(scene: BenchedScene) -> list[Candidate]:
+def list_points(scene: BenchedScene) -> list[SpeedErrorPoint]:
     """Returns every backend, then every approximation that has a time.
 
-    The backend that drew the approximations has the time that was taken in turn with theirs.
+    The backend that rendered the approximations has the time that was taken in turn with theirs.
     """
     contract, *others = scene.variants
-    times = {name: _both(backend.speed) for name, backend in scene.backends.items()}
+    times = {name: backend.speed.both_ms for name, backend in scene.backends.items()}
     if contract.time:
         times[scene.variants_of] = contract.time.ms
     timed = [*((name, times[name], backend.accuracy) for name, backend in scene.backends.items()),
              *((other.name, other.time.ms, other.accuracy) for other in others if other.time)]
-    return [Candidate(name, ms, accuracy.image_error_rms, accuracy.gradient_relative_error)
+    return [SpeedErrorPoint(name, ms, accuracy.image_error_rms, accuracy.gradient_relative_error)
             for name, ms, accuracy in timed]
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Returns the points (ms, error) that no other beats in both, by rising milliseconds."""
+    """Returns the points (ms, error) that no other beats in both, by increasing milliseconds."""
     best, front = float("inf"), []
     for i in sorted(range(len(points)), key=lambda i: points[i]):
         if points[i][1] < best:
@@ -326,29 +287,29 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def draw(result: BenchResult, path: Path) -> None:
-    """Draws speed against error of the first scene into a .png or .svg, whole or not at all.
+    """Draws speed against error of the first scene into a .png or .svg.
 
-    Points bear numbers and the names stand beside: many lie on top of each other.
+    Points are numbered, with their names beside the panels: many overlap.
     """
     name, scene = next(iter(result.scenes.items()))
-    candidates = candidates_of(scene)
+    points = list_points(scene)
     with drawing(path, 15, 6, dpi=130) as figure:
         left, right, names = figure.subplots(1, 3, width_ratios=(5, 5, 2))
         figure.suptitle(
             f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
             f"{result.host.cpu}, threads: {result.host.threads}", fontsize=10)
         count = len(scene.backends)
-        _scatter(left, [(point.ms, point.image_error) for point in candidates], count)
-        _scatter(right, [(point.ms, point.gradient_error) for point in candidates], count)
+        _scatter(left, [(point.ms, point.image_error) for point in points], count)
+        _scatter(right, [(point.ms, point.gradient_error) for point in points], count)
         left.set_ylabel("image error against float64, RMS")
         right.set_ylabel("gradient error against float64, relative")
-        lines = [f"{i}  {point.name}" for i, point in enumerate(candidates, start=1)]
+        lines = [f"{i}  {point.name}" for i, point in enumerate(points, start=1)]
         names.text(0, 1, "\n".join(lines), va="top", fontsize=9, linespacing=1.6)
         names.axis("off")
 
 
 def _scatter(axes: Any, places: Sequence[tuple[float, float]], backends: int) -> None:
-    """Draws numbered points and a line through those that no other beats; backends come first."""
+    """Draws numbered points, backends first, and their Pareto front."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     places = [(ms, max(error, _FLOOR)) for ms, error in places]
@@ -365,11 +326,7 @@ def _scatter(axes: Any, places: Sequence[tuple[float, float]], backends: int) ->
 
 
 def read_record(path: Path) -> Mapping[str, Any]:
-    """Returns what a JSON file of an earlier run holds.
-
-    Raises:
-        FormatError: it cannot be read, or is of another schema.
-    """
+    """Returns the JSON file of an earlier run; FormatError for a damaged one or another schema."""
     record = atomic.read_json(path)
     kind = (record.get("schema"), record.get("version")) if isinstance(record, dict) else None
     if kind != (SCHEMA, VERSION):
@@ -386,11 +343,7 @@ def check_comparable(
 ) -> None:
     """Raises ConfigError unless the earlier run timed the same scene with as many threads.
 
-    Args:
-        old: the record of the earlier run.
-        scene: its name.
-        settings: gaussians, width, height and sh_degree of this run.
-        threads: of this run.
+    `settings` are gaussians, width, height and sh_degree of this run.
     """
     scenes = old["scenes"]
     if scene not in scenes:

@@ -29,7 +29,6 @@ from recon_cli.experiments.variants import Variant
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
 
-SCHEMA, VERSION = "recon-bench-train", 1
 _SCORES = 20  # along a run: each is of all validation views
 _INCH = 3.2  # of a panel
 
@@ -46,12 +45,7 @@ _PANELS = (
 
 @dataclass(frozen=True, kw_only=True)
 class RecipeRequest(ExperimentRequest):
-    """The options of `recon bench train`.
-
-    Raises:
-        ConfigError: steps and seconds are both given.
-        ReconError: an output cannot be written.
-    """
+    """The options of `recon bench train`; an output that cannot be written is a ReconError."""
 
     recipes: tuple[Variant, ...]
     iterations: int | None = None  # of every run; None where seconds or neither are given
@@ -64,6 +58,12 @@ class RecipeRequest(ExperimentRequest):
             raise ConfigError(
                 "--iterations and --seconds exclude each other.", hint="Leave one out.")
         self.outputs.check()
+
+    def steps(self, seconds_per_step: float) -> int:
+        """Returns the steps of every run of a recipe."""
+        if self.seconds is None:
+            return self.iterations or STEPS
+        return max(1, round(self.seconds / max(seconds_per_step, 1e-12)))
 
 
 @dataclass(frozen=True)
@@ -84,18 +84,18 @@ class CurvesResult:
     host: Host
     seeds: int
     base: RunConfig
-    targets_db: tuple[float, ...]  # that were asked for
+    targets_db: tuple[float, ...]  # of the command line
     scenes: Mapping[str, SceneCurves]
 
     def targets_of(self, scene: SceneCurves) -> tuple[float, ...]:
-        """Returns the targets of a scene: those asked for, or what all its runs reach."""
+        """Returns the targets of the command line, or the PSNR that all runs of a scene reach."""
         return self.targets_db or (common_target(
             [record.points for records in scene.runs.values() for record in records]),)
 
     def record(self) -> dict[str, Any]:
-        """Returns what the JSON file holds."""
+        """Returns the content of the JSON file."""
         return {
-            "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
+            "schema": "recon-bench-train", "version": 1, "machine": asdict(self.host),
             "seeds": self.seeds, "base": shared_options(self.base),
             "scenes": {name: {
                 "views": scene.views, "width": scene.width, "height": scene.height,
@@ -116,11 +116,7 @@ class CurvesResult:
 
 
 def run(request: RecipeRequest, progress: Progress) -> str:
-    """Trains what was asked for, writes the files, and returns what the terminal shows.
-
-    Raises:
-        ReconError: something cannot be done; what can be known is found before training.
-    """
+    """Trains every recipe, writes the files, and returns the text for the terminal."""
     paths = check_scenes(request.scenes)
     ctx = render_context(request.compute, progress)
     host = examine(ctx.threads, ctx.device)
@@ -129,15 +125,14 @@ def run(request: RecipeRequest, progress: Progress) -> str:
         scenes = request.load(paths, Path(scratch), "validation", ctx)
         result = CurvesResult(host, request.seeds, request.base, request.targets_db, {
             loaded.folders.name: measure(loaded, request, runner) for loaded in scenes})
-    request.outputs.write(
+    return request.outputs.write(
         result.record(), head(result), tables(result), lambda path: draw(result, path))
-    return "\n\n".join([head(result), *(table.text() for table in tables(result))])
 
 
 def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> SceneCurves:
-    """Returns the curves of every recipe; pilots warm up, and turn seconds into steps."""
+    """Returns the curves of every recipe; pilots warm caches, and turn seconds into steps."""
     seconds = runner.pilot_seconds(loaded, request.recipes)
-    steps = {name: steps_of(request, step) for name, step in seconds.items()}
+    steps = {name: request.steps(seconds_per_step) for name, seconds_per_step in seconds.items()}
     runs = runner.run_all(
         loaded, request.recipes, request.seeds, steps, label=loaded.folders.name,
         score_at=score_steps)
@@ -147,20 +142,13 @@ def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> Scen
         {recipe.name: recipe for recipe in request.recipes}, runs)
 
 
-def steps_of(request: RecipeRequest, seconds_a_step: float) -> int:
-    """Returns how many steps every run of a recipe takes."""
-    if request.seconds is None:
-        return request.iterations or STEPS
-    return max(1, round(request.seconds / max(seconds_a_step, 1e-12)))
-
-
 def score_steps(iterations: int, count: int = _SCORES) -> tuple[int, ...]:
     """Returns the steps to score after: 0, and `count` evenly spread ones up to the last."""
     return tuple(sorted({round(i * iterations / count) for i in range(count + 1)}))
 
 
 def seconds_to(points: Sequence[CurvePoint], target_db: float, clock: Figure) -> float | None:
-    """Returns when a curve first reaches a PSNR, on straight lines between its points, or None."""
+    """Returns when a curve first reaches a PSNR, by linear interpolation, or None."""
     before: CurvePoint | None = None
     for point in points:
         if point.psnr_db >= target_db:
@@ -173,13 +161,13 @@ def seconds_to(points: Sequence[CurvePoint], target_db: float, clock: Figure) ->
 
 
 def common_target(runs: Sequence[Sequence[CurvePoint]]) -> float:
-    """Returns the PSNR that every run reaches, down to a tenth of a dB."""
+    """Returns the PSNR that every run reaches, rounded down to a tenth of a dB."""
     best = min(max(point.psnr_db for point in points) for points in runs)
     return math.floor(10 * best) / 10
 
 
 def head(result: CurvesResult) -> str:
-    """Returns the lines about machine and method that stand above the tables."""
+    """Returns the line about machine and method above the tables."""
     return (f"{result.host.line}; medians of {result.seeds} seeds, interquartile range in "
             "brackets; scored on validation views, scoring not timed")
 
@@ -203,27 +191,27 @@ def _table(name: str, scene: SceneCurves, result: CurvesResult) -> Table:
     targets = result.targets_of(scene)
     header = ("recipe", *(f"{kind} to {db:g} dB" for db in targets for kind in ("s", "CPU s")),
               "PSNR dB", "SSIM", "Gaussians", "MB", "steps", "s", "CPU s")
+
+    def row(recipe: str) -> tuple[str, ...]:
+        records = scene.runs[recipe]
+
+        def last(figure: Figure, digits: int = 3) -> str:
+            return median_cell([figure(record.last) for record in records], digits)
+
+        reached = [median_cell([seconds_to(record.points, db, clock) for record in records])
+                   for db in targets for _, clock in (_WALL, _CPU)]
+        return (
+            recipe, *reached, last(_PSNR[1], 4), last(_SSIM[1], 4),
+            last(lambda point: point.gaussians), last(lambda point: point.bytes / 1e6),
+            f"{records[0].last.iteration:,}", last(_WALL[1]), last(_CPU[1]))
+
     title = (f"{name}: {scene.views} validation views at {scene.width}x{scene.height}, "
              f"at most {result.base.max_gaussians:,} Gaussians")
-    return Table(header, [_row(recipe, scene, targets) for recipe in scene.recipes], title)
-
-
-def _row(recipe: str, scene: SceneCurves, targets: Sequence[float]) -> tuple[str, ...]:
-    records = scene.runs[recipe]
-
-    def last(figure: Figure, digits: int = 3) -> str:
-        return median_cell([figure(record.last) for record in records], digits)
-
-    reached = [median_cell([seconds_to(record.points, db, clock) for record in records])
-               for db in targets for _, clock in (_WALL, _CPU)]
-    return (
-        recipe, *reached, last(_PSNR[1], 4), last(_SSIM[1], 4),
-        last(lambda point: point.gaussians), last(lambda point: point.bytes / 1e6),
-        f"{records[0].last.iteration:,}", last(_WALL[1]), last(_CPU[1]))
+    return Table(header, [row(recipe) for recipe in scene.recipes], title)
 
 
 def draw(result: CurvesResult, path: Path) -> None:
-    """Draws a row of panels a scene into a .png or .svg, whole or not at all.
+    """Draws a row of panels a scene into a .png or .svg.
 
     A line is the median over the seeds; the band reaches from the lowest to the highest.
     """

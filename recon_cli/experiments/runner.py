@@ -1,8 +1,9 @@
-"""The runner of training experiments: variants x seeds on a scene, as records that resume.
+"""The runner of all experiments: variants x repeats, and training runs as records that resume.
 
-`recon bench train` and `recon study` differ in what they run and in how they show it; both load
-their scenes and make their runs here. A finished run is one line of runs.jsonl, flushed before the
-next run starts, so that a kill loses the run at hand and no other.
+`run_grid` is the loop that every experiment uses. `Runner` fills it with training runs: each is
+scored, as its .ply stores the model, on views with their original pixels that it was not trained
+on. A finished run is one line of runs.jsonl, flushed before the next run starts, so that an
+interrupted experiment loses the current run only.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -25,12 +26,10 @@ from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig, RunConfig
 from recon_cli.context import StageContext, TrainCallback
 from recon_cli.errors import ConfigError, FormatError
-from recon_cli.evaluation.reference_views import (
-    MeanScore,
-    mean_score,
-)
+from recon_cli.evaluation.reference_views import mean_score
+from recon_cli.evaluation.scores import MeanScore
 from recon_cli.experiments.scenes import LoadedScene, load_for_training, open_scene
-from recon_cli.experiments.variants import MidPrune, TrainingRun, Variant, run_grid
+from recon_cli.experiments.variants import MidPrune, TrainingRun, Variant
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.progress import Progress
 from recon_cli.scene.splats import Splats
@@ -47,20 +46,40 @@ from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.digests import sha256_json
 
 RECORDS_FILE = "runs.jsonl"
-_VERSION = 1  # of the lines
-# A run of this many steps takes about half a minute on two cores and tells recipes apart.
-STEPS = 3000
-SECTIONS = ("ingest", "denoise", "sfm", "train")  # that --set may reach
+_VERSION = 1  # of its lines
+STEPS = 3000  # of a run: about half a minute on two cores, and enough to tell recipes apart
+PILOT_STEPS = 200  # the number of Gaussians changes twice in them at the usual interval of 100
+_WARM_STEPS = 10  # for caches and threads; the kernels are compiled before
+_SECTIONS = ("ingest", "denoise", "sfm", "train")  # that --set may change
 # training options that have command-line options of their own here, or no effect
 _OWN = {"iterations", "max_size", "max_gaussians", "seed", "densify", "mid", "checkpoint_every",
         "quality", "minutes", "early_stop", "sh_degree"}
 
+_Variant = TypeVar("_Variant")
+_Repeat = TypeVar("_Repeat")
+_Result = TypeVar("_Result")
+
+
+def run_grid(
+    variants: Mapping[str, _Variant], repeats: Sequence[_Repeat],
+    measure: Callable[[_Variant, _Repeat], _Result],
+) -> dict[str, tuple[_Result, ...]]:
+    """Returns the measurements of each variant by its name, one for each repeat.
+
+    Repeats are the outer loop: a slow minute of the machine then affects all variants alike.
+    """
+    results: dict[str, list[_Result]] = {name: [] for name in variants}
+    for repeat in repeats:
+        for name, variant in variants.items():
+            results[name].append(measure(variant, repeat))
+    return {name: tuple(by_repeat) for name, by_repeat in results.items()}
+
 
 @dataclass(frozen=True)
 class ExperimentRequest:
-    """What every training experiment is asked for."""
+    """The options that all training experiments share."""
 
-    scenes: tuple[Path, ...]  # workspaces or data sets with poses
+    scenes: tuple[Path, ...]  # workspaces, or data sets with poses
     seeds: int  # runs of each variant
     base: RunConfig  # options that all variants share, size and cap included
     settings: Settings = field(default_factory=dict)  # of ingest, denoise and sfm for data sets
@@ -69,7 +88,7 @@ class ExperimentRequest:
     def load(
         self, paths: Mapping[str, Path], scratch: Path, split: str, ctx: StageContext
     ) -> list[LoadedScene]:
-        """Returns the scenes of `scenes.check_scenes`, data sets made into workspaces first."""
+        """Returns the scenes of `scenes.check_scenes`; data sets become workspaces in `scratch`."""
         return [
             load_for_training(open_scene(
                 name, path, scratch, self.settings, self.compute, ctx.progress), split, self.base,
@@ -80,27 +99,27 @@ class ExperimentRequest:
 def base_config(
     settings: Settings, *, max_size: int, max_gaussians: int, validation: float | None = None
 ) -> RunConfig:
-    """Returns the options that all variants share; --set may say `validation` where it is None.
+    """Returns the options that all variants share; --set may set `validation` where it is None.
 
     Raises:
-        ConfigError: --set reaches a stage that is not run, or what has an option of its own.
+        ConfigError: --set changes a stage that is not run, or a field with its own option.
     """
-    for section in settings.keys() - set(SECTIONS):
+    for section in settings.keys() - set(_SECTIONS):
         if settings[section]:
             raise ConfigError(
                 f"--set {section}.{next(iter(settings[section]))} has no effect here.",
-                hint=f"Options of {', '.join(SECTIONS)} can be set.")
+                hint=f"Options of {', '.join(_SECTIONS)} can be set.")
     values: dict[str, Any] = dict(settings.get("train", {}))
     own = _OWN if validation is None else _OWN | {"validation"}
     for name in sorted(own & values.keys()):
         raise ConfigError(
             f"--set train.{name} has no effect here.",
-            hint="See --help for sizes, steps and seeds; recipes say how to densify.")
+            hint="See --help for sizes, steps and seeds; recipes define densification.")
     if validation is not None:
         values["validation"] = validation
-    return RunConfig(
+    return RunConfig(  # without early stopping: every run takes exactly its steps
         **values, iterations=STEPS, max_size=max_size, max_gaussians=max_gaussians,
-        early_stop=False)  # every run takes the steps that it is said to take
+        early_stop=False)
 
 
 def shared_options(base: RunConfig) -> dict[str, Any]:
@@ -110,16 +129,29 @@ def shared_options(base: RunConfig) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
+class CurvePoint:
+    """The state of a run after some steps."""
+
+    iteration: int
+    seconds: float  # wall time of training alone
+    cpu_seconds: float  # of training alone, of all threads
+    gaussians: int
+    bytes: int  # of the .ply
+    psnr_db: float  # mean over the scored views
+    ssim: float
+
+
+@dataclass(frozen=True)
 class Record:
     """One finished run."""
 
-    points: tuple[CurvePoint, ...]  # in order of steps; of a run that was read, its end alone
-    machine: str  # that it ran on; seconds of two machines do not compare
+    points: tuple[CurvePoint, ...]  # in order of steps; only the last one if read from a file
+    machine: str  # seconds of two machines do not compare
     parts: str = ""  # optional parts of the model that were on, and the pixels trained on
 
     @property
     def last(self) -> CurvePoint:
-        """How it ended."""
+        """The end of the run."""
         return self.points[-1]
 
 
@@ -127,9 +159,9 @@ Runs = Mapping[str, tuple[Record, ...]]  # by variant, then by seed
 
 
 def key_of(loaded: LoadedScene, run: TrainingRun) -> str:
-    """Returns the key of a run: everything that decides about its outcome.
+    """Returns the key of a run: everything that affects its result.
 
-    Threads and the machine are left out: they change the seconds alone.
+    Threads and the machine are left out: they affect the seconds only.
     """
     versions = [__version__, *(stage(name).version for name in ("train", "prune", "evaluate"))]
     return sha256_json({
@@ -139,10 +171,7 @@ def key_of(loaded: LoadedScene, run: TrainingRun) -> str:
 
 
 class Records:
-    """The lines of a folder, by key.
-
-    Args:
-        folder: an existing one. A last line that a kill cut short is dropped.
+    """The records in a folder, by key; a last line that was cut short is dropped.
 
     Raises:
         FormatError: the file holds something else.
@@ -154,18 +183,16 @@ class Records:
         lines = [line for line in text.splitlines(True) if line.endswith("\n")]
         if text != "".join(lines):
             write_bytes(self._path, "".join(lines).encode())
-        self._values = dict(self._read(lines))
-
-    def _read(self, lines: list[str]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        self._values: dict[str, Mapping[str, Any]] = {}
         for number, line in enumerate(lines, start=1):
             try:
                 entry = json.loads(line)
                 if entry["version"] == _VERSION:
-                    yield entry["key"], entry["value"]
+                    self._values[entry["key"]] = entry["value"]
             except (ValueError, KeyError, TypeError) as error:
                 raise FormatError(
                     f"{self._path}, line {number}, is not a record of a run.",
-                    hint="Remove that line; its run is then made again.") from error
+                    hint="Remove that line; its run is then repeated.") from error
 
     def run(self, key: str) -> Record | None:
         """Returns a finished run, None where there is none."""
@@ -174,18 +201,18 @@ class Records:
             (CurvePoint(**value["point"]),), value["machine"], value["parts"])
 
     def steps(self, key: str) -> Mapping[str, int] | None:
-        """Returns steps that were fixed by variant, None where they were not."""
+        """Returns the steps that were fixed for each variant, None where they were not."""
         value = self._values.get(key)
         return None if value is None else value["steps"]
 
     def add_run(self, key: str, record: Record, run: TrainingRun, scene: str) -> None:
-        """Appends a finished run; scene, variant and seed stand beside it for readers."""
+        """Appends a finished run, with scene, variant and seed for readers of the file."""
         self._add(key, {
             "point": asdict(record.last), "machine": record.machine, "parts": record.parts,
             "scene": scene, "arm": run.variant.name, "seed": run.seed})
 
     def add_steps(self, key: str, steps: Mapping[str, int]) -> None:
-        """Appends the steps that variants take in the same seconds."""
+        """Appends the steps that variants take in equal seconds."""
         self._add(key, {"steps": dict(steps)})
 
     def _add(self, key: str, value: Mapping[str, Any]) -> None:
@@ -198,7 +225,7 @@ class Records:
 
 
 class Runner:
-    """Makes the runs that are missing from the records, if there are any, and returns all."""
+    """Makes training runs, or takes them from the records, if there are any."""
 
     def __init__(
         self, base: RunConfig, progress: Progress, machine: str = "",
@@ -210,7 +237,7 @@ class Runner:
     def pilot_seconds(
         self, loaded: LoadedScene, variants: Sequence[Variant]
     ) -> dict[str, float]:
-        """Returns about how long a step takes by variant, from pilots, which warm caches too."""
+        """Returns the approximate seconds of a step by variant; the pilots also warm caches."""
         seconds = {}
         label = f"{loaded.folders.name}: pilots"
         with self._progress.bar(label, len(variants), unit="variant") as bar:
@@ -226,8 +253,8 @@ class Runner:
     ) -> Runs:
         """Returns the runs of every variant with every seed, 0 to seeds - 1.
 
-        `steps` are those of each run, by variant; `score_at` returns, for the steps of a run, those
-        after which it is scored beside its end.
+        `steps` are by variant; `score_at` maps the steps of a run to those after which it is scored
+        in addition to its end.
         """
         with self._progress.bar(label, seeds * sum(steps.values()), unit="step") as bar:
 
@@ -243,7 +270,7 @@ class Runner:
             return run_grid({variant.name: variant for variant in variants}, range(seeds), measure)
 
     def find_record(self, loaded: LoadedScene, run: TrainingRun) -> Record | None:
-        """Returns a run of earlier, None where it was not made or nothing is recorded."""
+        """Returns an earlier run, None where there is none or nothing is recorded."""
         return self._records.run(key_of(loaded, run)) if self._records else None
 
     def make(
@@ -261,33 +288,28 @@ class Runner:
         return record
 
 
-PILOT_STEPS = 200  # the count changes twice in them at the usual hundred steps
-
-
-_WARM_STEPS = 10  # caches and threads; the kernels are compiled before
-
-
 class TrainingClock:
-    """Counts wall and CPU seconds from its creation on, but for its pauses; waits for a GPU."""
+    """Measures wall and CPU seconds since its creation, without its pauses; waits for a GPU."""
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self._zero = self._now()
+        self._start = self._now()
 
     def seconds(self) -> tuple[float, float]:
         """Returns the wall seconds, and the CPU seconds of all threads of this process."""
         wall, cpu = self._now()
-        return wall - self._zero[0], cpu - self._zero[1]
+        return wall - self._start[0], cpu - self._start[1]
 
     @contextmanager
     def pause(self) -> Iterator[None]:
-        """Leaves out the time of the block."""
+        """Excludes the time of the block."""
         began = self._now()
         try:
             yield
         finally:
             ended = self._now()
-            self._zero = (self._zero[0] + ended[0] - began[0], self._zero[1] + ended[1] - began[1])
+            self._start = (
+                self._start[0] + ended[0] - began[0], self._start[1] + ended[1] - began[1])
 
     def _now(self) -> tuple[float, float]:
         if self._device == "cuda":
@@ -295,23 +317,10 @@ class TrainingClock:
         return time.perf_counter(), time.process_time()
 
 
-@dataclass(frozen=True)
-class CurvePoint:
-    """The state of a run after some steps."""
-
-    iteration: int
-    seconds: float  # of training alone, on the wall
-    cpu_seconds: float  # of training alone, of all threads
-    gaussians: int
-    bytes: int  # of the .ply that would be written
-    psnr_db: float  # mean over the scored views
-    ssim: float
-
-
 def score_as_ply(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, ctx: StageContext
 ) -> tuple[MeanScore, int]:
-    """Returns the scores of a model as its .ply holds it, and the bytes of that file."""
+    """Returns the scores of a model as its .ply stores it, and the bytes of that file."""
     with tempfile.TemporaryDirectory(prefix="recon-score-") as folder:
         path = Path(folder) / "splats.ply"
         write_ply(path, splats)
@@ -320,27 +329,13 @@ def score_as_ply(
     return mean_score(written, views, sh_degree, ctx.backend), size
 
 
-def prune_run(
-    state: TrainState, task: Task, prune: MidPrune, until: int, callbacks: Sequence[TrainCallback]
-) -> PruneRun:
-    """Returns the run that prunes a state at its step and trains until `until`."""
-    config, first = prune.config, state.iteration
-    epoch = task.schedule.epoch(len(task.train))
-    if prune.restarts:
-        schedule = RecoverySchedule(task.schedule.config, first=first, until=until)
-        task = dataclasses.replace(task, schedule=schedule)
-    return PruneRun(
-        state, task, first, until, rounds=config.rounds or rounds_within(until - first, epoch),
-        score=config.score, beta=config.beta, callbacks=callbacks)
-
-
 class _TrialCallback(TrainCallback):
-    """Calls `take_score` after certain steps, and `on_step` after each."""
+    """Calls `take_score` after certain steps, and `report_step` after each."""
 
     def __init__(
-        self, stops: Sequence[int], take_score: Callable[[], None], on_step: Callable[[], None]
+        self, stops: Sequence[int], take_score: Callable[[], None], report_step: Callable[[], None]
     ) -> None:
-        self._stops, self._take_score, self._on_step = stops, take_score, on_step
+        self._stops, self._take_score, self._report_step = stops, take_score, report_step
 
     def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
         """Returns True: the progress bar counts every step."""
@@ -348,7 +343,7 @@ class _TrialCallback(TrainCallback):
 
     def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
         """Scores the model where that is due."""
-        self._on_step()
+        self._report_step()
         if iteration in self._stops:
             self._take_score()
 
@@ -388,16 +383,27 @@ def run_trial(
     else:  # at least one step is left for recovery
         fit(state, task, min(run.iterations - 1, round(prune.at * run.iterations)), callbacks)
         ratio = RATIO if prune.config.ratio is None else prune.config.ratio
-        prune_loop(prune_run(state, task, prune, run.iterations, callbacks),
+        prune_loop(_prune_run(state, task, prune, run.iterations, callbacks),
                    remaining(len(state.splats), ratio))
     return tuple(points)
 
 
-def run_pilot(loaded: LoadedScene, variant: Variant) -> CurvePoint:
-    """Returns the end of a short run, whose seconds say what a step of the variant costs here.
+def _prune_run(
+    state: TrainState, task: Task, prune: MidPrune, until: int, callbacks: Sequence[TrainCallback]
+) -> PruneRun:
+    """Returns the run that prunes a state at its step and trains until `until`."""
+    config, first = prune.config, state.iteration
+    epoch = task.schedule.epoch(len(task.train))
+    if prune.restarts:
+        schedule = RecoverySchedule(task.schedule.config, first=first, until=until)
+        task = dataclasses.replace(task, schedule=schedule)
+    return PruneRun(
+        state, task, first, until, rounds=config.rounds or rounds_within(until - first, epoch),
+        score=config.score, beta=config.beta, callbacks=callbacks)
 
-    It goes through the whole plan of the recipe. A few steps ahead warm the caches.
-    """
+
+def run_pilot(loaded: LoadedScene, variant: Variant) -> CurvePoint:
+    """Returns the end of a short run of the whole recipe, after a few steps that warm caches."""
     for iterations in (_WARM_STEPS, PILOT_STEPS):
         points = run_trial(
             loaded, TrainingRun(variant, loaded.base, iterations, 0), (), on_step=lambda: None)

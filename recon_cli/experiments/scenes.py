@@ -39,14 +39,14 @@ _READ = ("images", "denoised", "masks", "sparse")  # below sfm/undistorted, what
 
 @dataclass(frozen=True, eq=False)
 class SceneFolders:
-    """The finished folders of ingest and sfm of a scene, under its name in tables and files."""
+    """The folders of ingest and sfm of a scene, and its name in tables and files."""
 
     name: str
     inputs: StageInputs
 
     @cached_property
     def digest(self) -> str:
-        """What the scene holds, whatever its folder is called: images, masks, cameras, split."""
+        """Digest of the scene's images, masks, cameras and split, not of its name."""
         undistorted = self.inputs.folders["sfm"] / "undistorted"
         files = [path for part in _READ for path in sorted((undistorted / part).rglob("*"))
                  if path.is_file()]
@@ -57,10 +57,10 @@ class SceneFolders:
 
 
 def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
-    """Returns the paths by the names of their scenes, once each can be one.
+    """Returns the paths by the names of their scenes.
 
     Raises:
-        ConfigError: there is none, or two have one name.
+        ConfigError: there is none, or two have the same name.
         InputError: a path is neither a workspace nor a data set with poses.
         StageError: a workspace has no fresh cameras.
     """
@@ -78,32 +78,25 @@ def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
         scenes[name] = path
         if Workspace(path).holds_results:
             plan.require_fresh(Job(Workspace(path)), ("ingest", "sfm"))
-        else:
-            _refuse_unposed(path)
+            continue
+        if not path.exists():
+            raise InputError(f"{path} does not exist.", hint="Check the path.")
+        refuse_incomplete(path)
+        if recognise(path) is None:
+            raise InputError(
+                f"{path} is neither a workspace with cameras nor a data set with poses.",
+                hint=f"Run `recon ingest {path} -w WORKSPACE` and `recon sfm -w WORKSPACE`, and "
+                     "give that workspace.")
     return scenes
-
-
-def _refuse_unposed(path: Path) -> None:
-    if not path.exists():
-        raise InputError(f"{path} does not exist.", hint="Check the path.")
-    refuse_incomplete(path)
-    if recognise(path) is None:
-        raise InputError(
-            f"{path} is neither a workspace with cameras nor a data set with poses.",
-            hint=f"Run `recon ingest {path} -w WORKSPACE` and `recon sfm -w WORKSPACE`, and give "
-                 "that workspace.")
 
 
 def open_scene(
     name: str, path: Path, scratch: Path, settings: Settings, compute: ComputeConfig,
     progress: Progress,
 ) -> SceneFolders:
-    """Returns the folders of a scene; a data set is read and mapped with the poses it has.
+    """Returns the folders of a workspace, which is only read, or of a data set.
 
-    A workspace is only read. Those of data sets lie in `scratch`; what is fresh there is kept.
-
-    Raises:
-        ReconError: whatever the stages raise.
+    A data set is made into a workspace in `scratch`, with its own poses; fresh results are kept.
     """
     workspace = Workspace(path)
     if not workspace.holds_results:
@@ -134,11 +127,11 @@ class LoadedScene:
         return model_parts(parts_needed(task, self.scene, self.ctx, harmonics=True).config)
 
     def task(self, run: TrainingRun) -> Task:
-        """Returns the task of a run; training itself looks at no view that it does not fit."""
+        """Returns the task of a run, without validation views: training uses only what it fits."""
         config = run.config
         undecided = [name for name in PARTS if getattr(config, name) == "auto"]
         undecided += ["sh_degree"] if run.variant.tries_degree else []
-        if undecided:  # only then, because it may take trials
+        if undecided:  # `parts` may take trials
             config = dataclasses.replace(config, **{name: self.parts[name] for name in undecided})
         return dataclasses.replace(
             self._load_task(config), validation=[], schedule=Schedule(config))
@@ -157,7 +150,7 @@ class LoadedScene:
 def load_for_training(
     folders: SceneFolders, split: str, base: RunConfig, ctx: StageContext
 ) -> LoadedScene:
-    """Returns a scene with the views in memory that scores come from: "test" or "validation".
+    """Returns a scene with the views to score in memory, those of `split`: test or validation.
 
     Raises:
         ReconstructionError: no held-out view has a camera.

@@ -1,8 +1,8 @@
-"""`recon eval --seeds N`: how far the scores of a workspace's models move from seed to seed.
+"""`recon eval --seeds N`: mean and deviation of the scores of a workspace's models over seeds.
 
-Each further seed is a workspace of its own below `seeds/`, whose frames and cameras are hard links
-to those of the workspace, so that an interrupted run resumes as any other and disk space goes to
-models alone. seeds.json lies beside the stages, so that nothing turns stale.
+Each further seed is a workspace of its own below `seeds/`, with hard links to the frames and
+cameras of the workspace, so that it resumes like any other and takes disk space for models only.
+seeds.json lies beside the stages, so that no stage becomes stale.
 """
 
 from __future__ import annotations
@@ -50,10 +50,14 @@ class SeedScores:
 
     def table(self) -> Table:
         """Returns mean and deviation of every figure."""
-        rows = [(LABELS[name], *_cells(figures)) for name, figures in self.models.items()]
+        def cells(figures: Figures, sign: str = "") -> list[str]:
+            return [Spread.of(values).text(sign + _FORMATS[name])
+                    for name, values in figures.items()]
+
+        rows = [(LABELS[name], *cells(figures)) for name, figures in self.models.items()]
         if self.difference:
-            rows.append(("pruned minus base", *_cells(self.difference, sign="+")))
-        return Table(("model", "PSNR dB", "SSIM", "Gaussians", "train s"), tuple(rows))
+            rows.append(("pruned minus base", *cells(self.difference, "+")))
+        return Table(("model", "PSNR dB", "SSIM", "Gaussians", "train s"), rows)
 
     def record(self) -> dict[str, Any]:
         """Returns what seeds.json holds."""
@@ -65,18 +69,14 @@ class SeedScores:
                 "models": {name: spreads(figures) for name, figures in self.models.items()},
                 "pruned_minus_base": spreads(self.difference)}
 
-    def csv(self) -> str:
-        """Returns one row for each model and seed."""
-        rows = [f"{name},{seed}," + ",".join(f"{values[at]:.6f}" for values in figures.values())
-                for name, figures in self.models.items() for at, seed in enumerate(self.seeds)]
-        return "\n".join([f"model,seed,{','.join(_FORMATS)}", *rows])
-
     def text(self, form: str) -> str:
         """Returns it as text, markdown, csv, latex or json."""
         if form == "json":
             return json.dumps(self.record(), indent=1)
-        if form == "csv":
-            return self.csv()
+        if form == "csv":  # one row for each model and seed
+            rows = [f"{name},{seed}," + ",".join(f"{values[i]:.6f}" for values in figures.values())
+                    for name, figures in self.models.items() for i, seed in enumerate(self.seeds)]
+            return "\n".join([f"model,seed,{','.join(_FORMATS)}", *rows])
         table = self.table()
         if form == "latex":
             return table.latex().rstrip()
@@ -86,14 +86,8 @@ class SeedScores:
         return f"{body}\n{note}"
 
 
-def _cells(figures: Figures, *, sign: str = "") -> list[str]:
-    return [Spread.of(values).text(sign + _FORMATS[name]) for name, values in figures.items()]
-
-
 def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
-    """Trains a workspace's models with further seeds, writes seeds.json and returns the scores.
-
-    The first seed is that of the workspace, the others follow it.
+    """Trains a workspace's models with the next seeds, writes seeds.json and returns the scores.
 
     Raises:
         StageError: there is no fresh model.
@@ -114,31 +108,28 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
         by_seed = [read_workspace_scores(root.name, job.workspace.folder("evaluate"))]
         for seed in seeds[1:]:
             logger.info("seed %d", seed)
-            seeded = {"train": dataclasses.replace(train, seed=seed), **configs}
-            by_seed.append(_score_seed(job, {**seeded, "evaluate": config}, seed))
+            by_seed.append(_score_seed(job, {
+                "train": dataclasses.replace(train, seed=seed), **configs, "evaluate": config},
+                seed))
         result = _collect(seeds, by_seed)
         atomic.write_json(root / RESULT, result.record())
     return result
 
 
 def _score_seed(job: Job, configs: Mapping[str, StageConfig], seed: int) -> list[ScoredModel]:
-    """Runs some stages, in their order, with another seed and returns the scores of its models."""
+    """Runs stages, in their order, with another seed and returns the scores of its models."""
     workspace = Workspace(job.workspace.root / SEEDS / str(seed))
-    _link_upstream(job.workspace, workspace)
+    for name in dict.fromkeys(("ingest", "denoise", *stage("train").needs)):
+        source, target = job.workspace.folder(name), workspace.folder(name)
+        remove(target)
+        if source.exists():
+            workspace.root.mkdir(parents=True, exist_ok=True)
+            shutil.copytree(source, target, copy_function=_link)
     seeded = dataclasses.replace(
         job, workspace=workspace,
         settings=layers.merge([job.settings, {"train": {"seed": seed}}]))
     plan.run(seeded, "eval --seeds", [Target(name, value) for name, value in configs.items()])
     return read_workspace_scores(f"seed {seed}", workspace.folder("evaluate"))
-
-
-def _link_upstream(source: Workspace, target: Workspace) -> None:
-    """Links what training reads, as it is now, into another workspace."""
-    for name in dict.fromkeys(("ingest", "denoise", *stage("train").needs)):
-        remove(target.folder(name))
-        if source.folder(name).exists():
-            target.root.mkdir(parents=True, exist_ok=True)
-            shutil.copytree(source.folder(name), target.folder(name), copy_function=_link)
 
 
 def _link(source: str, target: str) -> None:
@@ -149,11 +140,7 @@ def _link(source: str, target: str) -> None:
 
 
 def _collect(seeds: tuple[int, ...], by_seed: Sequence[Sequence[ScoredModel]]) -> SeedScores:
-    """Returns the scores of all seeds.
-
-    Raises:
-        WorkspaceError: they were scored on different views.
-    """
+    """Returns the scores of all seeds; WorkspaceError if they are of different views."""
     if len({scored.digest for models in by_seed for scored in models}) != 1:
         raise WorkspaceError(
             "The seeds were scored on different views.",
@@ -162,10 +149,8 @@ def _collect(seeds: tuple[int, ...], by_seed: Sequence[Sequence[ScoredModel]]) -
         name: tuple(float(getattr(scored.score, name)) for models in by_seed
                     for scored in models if scored.model == first.model)
         for name in _FORMATS} for first in by_seed[0]}
-    difference = {}
-    if {"base", "pruned"} <= models.keys():
-        difference = {name: tuple(
-            ours - theirs for ours, theirs in zip(
-                models["pruned"][name], models["base"][name], strict=True))
-            for name in _FORMATS}
+    difference = {name: tuple(
+        ours - theirs for ours, theirs in zip(
+            models["pruned"][name], models["base"][name], strict=True))
+        for name in _FORMATS if {"base", "pruned"} <= models.keys()}
     return SeedScores(seeds, models, difference)

@@ -1,10 +1,14 @@
-"""`recon study`: the paper's experiment, repeated over seeds, at equal steps and equal seconds."""
+"""`recon study`: the paper's experiment, repeated over seeds, at equal steps and equal seconds.
+
+Scenes that Table I of the paper, "3D Reconstruction of Indoor Scenes Based on 3DGS Models", has as
+well are shown beside its scores.
+"""
 
 from __future__ import annotations
 
 import logging
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +21,6 @@ from recon_cli.evaluation.scores import Table
 from recon_cli.experiments.instruments import Host, examine
 from recon_cli.experiments.outputs import add_legend, draw_if_possible, drawing
 from recon_cli.experiments.runner import (
-    CurvePoint,
     ExperimentRequest,
     Record,
     Records,
@@ -47,16 +50,34 @@ BASELINE, DEFAULT = REFERENCE, BUDGET  # what the others are compared with
 PAIRS: tuple[tuple[Variant, Variant], ...] = (
     *((variant, BASELINE) for variant in VARIANTS if variant is not BASELINE),
     *((variant, DEFAULT) for variant in VARIANTS if variant not in (BASELINE, DEFAULT)))
-EQUAL_STEPS, EQUAL_SECONDS = "equal steps", "equal seconds"
-COMPARISONS = (EQUAL_STEPS, EQUAL_SECONDS)
-MEAN = "all scenes"  # where tables name a scene: their mean
-SCHEMA, VERSION = "recon-study", 1
+EQUAL_STEPS, EQUAL_SECONDS = COMPARISONS = ("equal steps", "equal seconds")
+MEAN = "all scenes"  # in place of a scene's name: the mean over scenes
 FIGURES = {
     "psnr_db": lambda point: point.psnr_db, "ssim": lambda point: point.ssim,
     "gaussians": lambda point: point.gaussians, "megabytes": lambda point: point.bytes / 1e6,
     "seconds": lambda point: point.seconds, "cpu_seconds": lambda point: point.cpu_seconds,
     "steps": lambda point: point.iteration}
-_NEAR = 0.05  # the same run takes seconds that differ by as much when it is repeated
+_NEAR = 0.05  # relative: the seconds of a repeated run differ by as much
+
+_UNITS = {"psnr_db": ("PSNR", "dB", 2), "ssim": ("SSIM", "", 4)}
+_COLUMNS = (("PSNR dB", "psnr_db", 2), ("SSIM", "ssim", 4))
+_COSTS = (("steps", "steps", 0), ("Gaussians", "gaussians", 0), ("MB", "megabytes", 1),
+          ("s", "seconds", 1), ("CPU s", "cpu_seconds", 1))
+_OFFSET = 0.18  # between the lines of two variants, where two scenes are 1 apart
+
+logger = logging.getLogger("recon")
+
+
+PublishedScores = tuple[float, float, float, float]
+# Table I (Replica): PSNR in dB and SSIM of 3DGS, then of the method of the paper
+TABLE_I: dict[str, PublishedScores] = {
+    "office0": (38.45, 0.925, 39.05, 0.934), "office1": (36.97, 0.938, 37.17, 0.954),
+    "office2": (36.39, 0.945, 36.68, 0.962), "office3": (35.85, 0.941, 36.35, 0.958),
+    "office4": (36.54, 0.939, 36.66, 0.941), "room0": (37.26, 0.915, 38.06, 0.923),
+    "room1": (36.28, 0.929, 37.75, 0.935), "room2": (34.98, 0.913, 35.14, 0.927),
+}
+_CAUTION = ("The paper names neither its frames, sizes, held-out views nor its count of runs: its "
+            "figures and those of this study are no measurement of the same thing.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,17 +96,13 @@ class StudiedScene:
     views: int  # test views that were scored
     width: int  # of the first of them in pixels
     height: int
-    digest: str  # of what the scene holds
+    digest: str  # of the scene's files
     runs: Mapping[str, Runs]  # by comparison
-
-    def values(self, comparison: str, variant: Variant, figure: str) -> list[float]:
-        """Returns a figure by seed."""
-        return [FIGURES[figure](record.last) for record in self.runs[comparison][variant.name]]
 
 
 @dataclass(frozen=True)
 class StudyResult:
-    """The study."""
+    """The runs of a study, and the figures made of them."""
 
     host: Host  # where the tables were made
     seeds: int
@@ -99,9 +116,9 @@ class StudyResult:
         return (*self.scenes, *((MEAN,) if len(self.scenes) > 1 else ()))
 
     def parts(self, scene: str) -> dict[str, str]:
-        """Returns the optional parts that the model of each variant was made of."""
-        runs = next(iter(self.scenes[scene].runs.values()))
-        return {name: records[0].parts for name, records in runs.items()}
+        """Returns the optional parts in the model of each variant."""
+        return {name: records[0].parts
+                for name, records in self.scenes[scene].runs[EQUAL_STEPS].items()}
 
     @property
     def machines(self) -> tuple[str, ...]:
@@ -113,8 +130,10 @@ class StudyResult:
     def values(self, row: str, comparison: str, variant: Variant, figure: str) -> list[float]:
         """Returns a figure by seed, of a scene or of the mean over all."""
         scenes = self.scenes.values() if row == MEAN else (self.scenes[row],)
-        by_scene = [scene.values(comparison, variant, figure) for scene in scenes]
-        return [sum(seed) / len(by_scene) for seed in zip(*by_scene, strict=True)]
+        by_scene = [
+            [FIGURES[figure](record.last) for record in scene.runs[comparison][variant.name]]
+            for scene in scenes]
+        return [sum(values) / len(by_scene) for values in zip(*by_scene, strict=True)]
 
     def spread(self, row: str, comparison: str, variant: Variant, figure: str) -> Spread:
         """Returns mean and standard deviation over the seeds."""
@@ -127,9 +146,9 @@ class StudyResult:
         return paired_t(*(self.values(row, comparison, variant, figure) for variant in pair))
 
     def record(self) -> dict[str, Any]:
-        """Returns what the JSON file holds."""
+        """Returns the content of study.json."""
         return {
-            "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
+            "schema": "recon-study", "version": 1, "machine": asdict(self.host),
             "run_on": list(self.machines), "seeds": self.seeds,
             "base": shared_options(self.base), "clock": self.clock,
             "arms": [variant.record() | {"label": variant.label} for variant in VARIANTS],
@@ -153,180 +172,12 @@ class StudyResult:
                          **asdict(self.spread(row, comparison, variant, figure))}
                 for figure in FIGURES} for variant in VARIANTS},
             "differences": {f"{pair[0].name} - {pair[1].name}": {
-                figure: interval(pair, figure) for figure in ("psnr_db", "ssim")}
-                for pair in PAIRS},
+                figure: interval(pair, figure) for figure in _UNITS} for pair in PAIRS},
         }
 
 
-def equal_seconds(iterations: int, seconds: Mapping[str, float]) -> dict[str, int]:
-    """Returns the steps of each variant that take as long as the slowest one's `iterations`.
-
-    A first guess: steps of a longer run cost as much where the count has reached its cap in both.
-    """
-    slowest = max(seconds.values())
-    return {name: max(iterations, round(iterations * slowest / own)) if own > 0 else iterations
-            for name, own in seconds.items()}
-
-
-def corrected_steps(
-    iterations: int, guess: int, seconds: float, guess_seconds: float, target: float
-) -> int:
-    """Returns the steps that take `target` seconds, on the line through two measured runs.
-
-    The runs took `iterations` steps in `seconds`, and more, `guess`, in `guess_seconds`.
-    """
-    near = abs(guess_seconds - target) <= _NEAR * target
-    if near or guess <= iterations or guess_seconds <= seconds:
-        return guess
-    steps = iterations + (target - seconds) * (guess - iterations) / (guess_seconds - seconds)
-    return max(iterations, round(steps))
-
-
-class Study:
-    """The runs of a study: those that are recorded, and those that are still to be made."""
-
-    def __init__(
-        self, request: StudyRequest, records: Records, progress: Progress, machine: str
-    ) -> None:
-        self._request, self._records, self._progress = request, records, progress
-        self._runner = Runner(request.base, progress, machine, records)
-
-    def announcement(self, scenes: Sequence[LoadedScene]) -> str:
-        """Returns in words what is to be run and about how long it will take."""
-        seconds, missing, done = 0.0, 0, 0
-        seeds, iterations = self._request.seeds, self._request.iterations
-        for loaded in scenes:
-            counts = {variant.name: self._missing(loaded, variant) for variant in VARIANTS}
-            missing += sum(counts.values())
-            done += 2 * len(VARIANTS) * seeds - sum(counts.values())
-            if any(counts.values()):
-                costs = {name: iterations * step for name, step in
-                         self._runner.pilot_seconds(loaded, VARIANTS).items()}
-                seconds += sum(
-                    costs[name] * min(count, seeds) + max(costs.values()) * max(0, count - seeds)
-                    for name, count in counts.items())
-        if not missing:
-            return f"all {done} runs are kept from before"
-        return (f"about {missing} runs are to be made, {done} are kept from before; about "
-                f"{max(1, round(seconds / 60))} minutes")
-
-    def _missing(self, loaded: LoadedScene, variant: Variant) -> int:
-        """Returns how many runs of a variant are missing; those of unknown steps are, too."""
-        steps = [{variant.name: self._request.iterations},
-                 self._records.steps(self._steps_key(loaded))]
-        return sum(
-            by_variant is None or self._runner.find_record(
-                loaded, self._run(variant, by_variant[variant.name], seed)) is None
-            for by_variant in steps for seed in range(self._request.seeds))
-
-    def run_scene(self, loaded: LoadedScene) -> StudiedScene:
-        """Returns all runs on a scene, those that are missing made now."""
-        steps = dict.fromkeys((variant.name for variant in VARIANTS), self._request.iterations)
-        equal = self._run_all(loaded, EQUAL_STEPS, steps)
-        runs = {EQUAL_STEPS: equal,
-                EQUAL_SECONDS: self._run_all(loaded, EQUAL_SECONDS, self._steps(loaded, equal))}
-        camera = loaded.scored[0].camera
-        return StudiedScene(
-            len(loaded.scored), camera.width, camera.height, loaded.folders.digest, runs)
-
-    def _run_all(self, loaded: LoadedScene, comparison: str, steps: Mapping[str, int]) -> Runs:
-        return self._runner.run_all(
-            loaded, VARIANTS, self._request.seeds, steps,
-            label=f"{loaded.folders.name}, {comparison}")
-
-    def _steps(self, loaded: LoadedScene, equal: Runs) -> Mapping[str, int]:
-        """Returns the steps at equal seconds; once computed they stay, whatever comes."""
-        key = self._steps_key(loaded)
-        steps = self._records.steps(key)
-        if steps is None:
-            seconds = {name: statistics.median(self._seconds(record) for record in records)
-                       for name, records in equal.items()}
-            steps = self._find_steps(loaded, seconds)
-            self._records.add_steps(key, steps)
-        return steps
-
-    def _find_steps(self, loaded: LoadedScene, seconds: Mapping[str, float]) -> dict[str, int]:
-        """Returns the steps of each variant at equal seconds, corrected by one run of its guess."""
-        count, target = self._request.iterations, max(seconds.values())
-        steps = equal_seconds(count, seconds)
-        label = f"{loaded.folders.name}, finding {EQUAL_SECONDS}"
-        with self._progress.bar(label, sum(steps.values()), unit="step") as bar:
-            for variant in VARIANTS:
-                guess = self._run(variant, steps[variant.name], 0)
-                record = self._runner.find_record(loaded, guess) or self._runner.make(
-                    loaded, guess, (), bar.advance)
-                steps[variant.name] = corrected_steps(
-                    count, guess.iterations, seconds[variant.name], self._seconds(record), target)
-        return steps
-
-    def _seconds(self, record: Record) -> float:
-        point: CurvePoint = record.last
-        return point.cpu_seconds if self._request.clock == "cpu" else point.seconds
-
-    def _run(self, variant: Variant, iterations: int, seed: int) -> TrainingRun:
-        return TrainingRun(variant, self._request.base, iterations, seed)
-
-    def _steps_key(self, loaded: LoadedScene) -> str:
-        """Returns the key of the steps at equal seconds, whatever the number of seeds."""
-        first = [key_of(loaded, self._run(variant, self._request.iterations, 0))
-                 for variant in VARIANTS]
-        return sha256_json({"steps of": first, "clock": self._request.clock})
-
-
-_UNITS = {"psnr_db": ("PSNR", "dB", 2), "ssim": ("SSIM", "", 4)}
-
-
-_COLUMNS = (("PSNR dB", "psnr_db", 2), ("SSIM", "ssim", 4))
-
-
-_COSTS = (("steps", "steps", 0), ("Gaussians", "gaussians", 0), ("MB", "megabytes", 1),
-          ("s", "seconds", 1), ("CPU s", "cpu_seconds", 1))
-
-
-_OFFSET = 0.18  # between the lines of two variants, where two scenes are 1 apart
-
-
-logger = logging.getLogger("recon")
-
-
-@dataclass(frozen=True)
-class PublishedScores:
-    """One row of Table I (Replica): 3DGS, and the method of the paper."""
-
-    reference_psnr_db: float
-    reference_ssim: float
-    paper_psnr_db: float
-    paper_ssim: float
-
-    @property
-    def gains(self) -> dict[str, float]:
-        """What the paper reports to gain, by figure."""
-        return {"psnr_db": self.paper_psnr_db - self.reference_psnr_db,
-                "ssim": self.paper_ssim - self.reference_ssim}
-
-
-TABLE_I = {
-    "office0": PublishedScores(38.45, 0.925, 39.05, 0.934),
-    "office1": PublishedScores(36.97, 0.938, 37.17, 0.954),
-    "office2": PublishedScores(36.39, 0.945, 36.68, 0.962),
-    "office3": PublishedScores(35.85, 0.941, 36.35, 0.958),
-    "office4": PublishedScores(36.54, 0.939, 36.66, 0.941),
-    "room0": PublishedScores(37.26, 0.915, 38.06, 0.923),
-    "room1": PublishedScores(36.28, 0.929, 37.75, 0.935),
-    "room2": PublishedScores(34.98, 0.913, 35.14, 0.927),
-}
-
-
-_CAUTION = ("The paper names neither its frames, sizes, held-out views nor its count of runs: its "
-            "figures and those of this study are no measurement of the same thing.")
-
-
 def run(request: StudyRequest, progress: Progress) -> str:
-    """Runs what is missing, writes the files, and returns what the terminal shows.
-
-    Raises:
-        ReconError: something cannot be done; what can be known is found before training.
-    """
+    """Makes the missing runs, writes the files, and returns the text for the terminal."""
     paths, out = check_scenes(request.scenes), request.out
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -351,26 +202,131 @@ def run(request: StudyRequest, progress: Progress) -> str:
     return text(result)
 
 
+def equal_seconds(iterations: int, seconds: Mapping[str, float]) -> dict[str, int]:
+    """Returns the steps of each variant that take as long as the slowest one's `iterations`.
+
+    A first guess: it assumes that later steps cost as much as the measured ones.
+    """
+    slowest = max(seconds.values())
+    return {name: max(iterations, round(iterations * slowest / own)) if own > 0 else iterations
+            for name, own in seconds.items()}
+
+
+def correct_steps(
+    iterations: int, guess: int, seconds: float, guess_seconds: float, target: float
+) -> int:
+    """Returns the steps that take `target` seconds, on the line through two measured runs."""
+    near = abs(guess_seconds - target) <= _NEAR * target
+    if near or guess <= iterations or guess_seconds <= seconds:
+        return guess
+    steps = iterations + (target - seconds) * (guess - iterations) / (guess_seconds - seconds)
+    return max(iterations, round(steps))
+
+
+class Study:
+    """The runs of a study: recorded ones, and those still to be made."""
+
+    def __init__(
+        self, request: StudyRequest, records: Records, progress: Progress, machine: str
+    ) -> None:
+        self._request, self._records, self._progress = request, records, progress
+        self._runner = Runner(request.base, progress, machine, records)
+
+    def announcement(self, scenes: list[LoadedScene]) -> str:
+        """Returns a sentence about how many runs are missing and how long they will take."""
+        seconds, missing = 0.0, 0
+        seeds, iterations = self._request.seeds, self._request.iterations
+        for loaded in scenes:
+            counts = {variant.name: self._count_missing(loaded, variant) for variant in VARIANTS}
+            missing += sum(counts.values())
+            if any(counts.values()):
+                costs = {name: iterations * step for name, step in
+                         self._runner.pilot_seconds(loaded, VARIANTS).items()}
+                seconds += sum(
+                    costs[name] * min(count, seeds) + max(costs.values()) * max(0, count - seeds)
+                    for name, count in counts.items())
+        recorded = len(scenes) * 2 * len(VARIANTS) * seeds - missing
+        if not missing:
+            return f"all {recorded} runs are kept from before"
+        return (f"about {missing} runs are to be made, {recorded} are kept from before; about "
+                f"{max(1, round(seconds / 60))} minutes")
+
+    def _count_missing(self, loaded: LoadedScene, variant: Variant) -> int:
+        """Returns how many runs of a variant are missing; those of unknown steps are, too."""
+        steps = [{variant.name: self._request.iterations},
+                 self._records.steps(self._steps_key(loaded))]
+        return sum(
+            by_variant is None or self._runner.find_record(loaded, TrainingRun(
+                variant, self._request.base, by_variant[variant.name], seed)) is None
+            for by_variant in steps for seed in range(self._request.seeds))
+
+    def run_scene(self, loaded: LoadedScene) -> StudiedScene:
+        """Returns all runs on a scene; the missing ones are made now."""
+        steps = dict.fromkeys((variant.name for variant in VARIANTS), self._request.iterations)
+        equal = self._run_all(loaded, EQUAL_STEPS, steps)
+        runs = {EQUAL_STEPS: equal,
+                EQUAL_SECONDS: self._run_all(loaded, EQUAL_SECONDS, self._steps(loaded, equal))}
+        camera = loaded.scored[0].camera
+        return StudiedScene(
+            len(loaded.scored), camera.width, camera.height, loaded.folders.digest, runs)
+
+    def _run_all(self, loaded: LoadedScene, comparison: str, steps: Mapping[str, int]) -> Runs:
+        return self._runner.run_all(
+            loaded, VARIANTS, self._request.seeds, steps,
+            label=f"{loaded.folders.name}, {comparison}")
+
+    def _steps(self, loaded: LoadedScene, equal: Runs) -> Mapping[str, int]:
+        """Returns the steps at equal seconds: fixed ones, or a guess corrected by one run each."""
+        key, count = self._steps_key(loaded), self._request.iterations
+        if (fixed := self._records.steps(key)) is not None:
+            return fixed
+        seconds = {name: statistics.median(self._seconds(record) for record in records)
+                   for name, records in equal.items()}
+        steps = equal_seconds(count, seconds)
+        label = f"{loaded.folders.name}, finding {EQUAL_SECONDS}"
+        with self._progress.bar(label, sum(steps.values()), unit="step") as bar:
+            for name, variant in zip(steps, VARIANTS, strict=True):
+                guess = TrainingRun(variant, self._request.base, steps[name], 0)
+                record = self._runner.find_record(loaded, guess) or self._runner.make(
+                    loaded, guess, (), bar.advance)
+                steps[name] = correct_steps(
+                    count, steps[name], seconds[name], self._seconds(record), max(seconds.values()))
+        self._records.add_steps(key, steps)
+        return steps
+
+    def _seconds(self, record: Record) -> float:
+        return record.last.cpu_seconds if self._request.clock == "cpu" else record.last.seconds
+
+    def _steps_key(self, loaded: LoadedScene) -> str:
+        """Returns the key of the steps at equal seconds, whatever the number of seeds."""
+        request = self._request
+        first = [key_of(loaded, TrainingRun(variant, request.base, request.iterations, 0))
+                 for variant in VARIANTS]
+        return sha256_json({"steps of": first, "clock": request.clock})
+
+
 def text(result: StudyResult) -> str:
-    """Returns what the terminal shows."""
-    parts = [head(result)]
-    for comparison in COMPARISONS:
-        parts += [scores(result, comparison).text(), differences(result, comparison).text(),
-                  words(result, comparison)]
-    if (table := beside_the_paper(result)) is not None:
-        parts += [table.text(), _CAUTION]
-    return "\n\n".join([*parts, *notes(result)])
+    """Returns the text for the terminal."""
+    return "\n\n".join([head(result), *_sections(result, Table.text, lambda _title: [])])
 
 
 def markdown(result: StudyResult) -> str:
     """Returns study.md."""
-    parts = ["# The paper's experiment", head(result) + "."]
+    sections = _sections(result, Table.markdown, lambda title: [f"## {title}"])
+    return "\n\n".join(["# The paper's experiment", head(result) + ".", *sections]) + "\n"
+
+
+def _sections(
+    result: StudyResult, render: Callable[[Table], str], heading: Callable[[str], list[str]]
+) -> list[str]:
+    """Returns tables, sentences and notes, each table rendered by `render`."""
+    parts = []
     for comparison in COMPARISONS:
-        parts += [f"## At {comparison}", scores(result, comparison).markdown(),
-                  differences(result, comparison).markdown(), words(result, comparison)]
+        parts += [*heading(f"At {comparison}"), render(scores(result, comparison)),
+                  render(differences(result, comparison)), words(result, comparison)]
     if (table := beside_the_paper(result)) is not None:
-        parts += ["## Beside the paper", table.markdown(), _CAUTION]
-    return "\n\n".join([*parts, *notes(result)]) + "\n"
+        parts += [*heading("Beside the paper"), render(table), _CAUTION]
+    return [*parts, *notes(result)]
 
 
 def head(result: StudyResult) -> str:
@@ -386,33 +342,29 @@ def scores(result: StudyResult, comparison: str) -> Table:
     """Returns the table of means and standard deviations."""
     header = ("scene, arm", *(name for label, _, _ in _COLUMNS for name in (label, "sd")),
               *(label for label, _, _ in _COSTS))
-    rows = []
-    for row in result.rows:
-        for variant in VARIANTS:
-            cells = [cell for _, figure, digits in _COLUMNS for cell in _spread_cells(
-                result.spread(row, comparison, variant, figure), digits)]
-            costs = [f"{result.spread(row, comparison, variant, figure).mean:,.{digits}f}"
-                     for _, figure, digits in _COSTS]
-            rows.append((f"{row}, {variant.label}", *cells, *costs))
-    return Table(header, rows, f"Scores at {comparison}")
+
+    def cells(row: str, variant: Variant) -> Iterator[str]:
+        for _, figure, digits in _COLUMNS:
+            spread = result.spread(row, comparison, variant, figure)
+            yield f"{spread.mean:.{digits}f}"
+            yield "-" if spread.deviation is None else f"{spread.deviation:.{digits}f}"
+        for _, figure, digits in _COSTS:
+            yield f"{result.spread(row, comparison, variant, figure).mean:,.{digits}f}"
+
+    return Table(header, [
+        (f"{row}, {variant.label}", *cells(row, variant))
+        for row in result.rows for variant in VARIANTS], f"Scores at {comparison}")
 
 
 def differences(result: StudyResult, comparison: str) -> Table:
     """Returns the table of paired differences with their intervals."""
     header = ("scene, arm - arm", *(
         name for label, _, _ in _COLUMNS for name in (label, "95% from", "to")))
-    rows = []
-    for row in result.rows:
-        for pair in PAIRS:
-            cells = [cell for _, figure, digits in _COLUMNS for cell in _interval_cells(
-                result.difference(row, comparison, pair, figure), digits)]
-            rows.append((f"{row}, {pair[0].label} - {pair[1].label}", *cells))
+    rows = [(f"{row}, {pair[0].label} - {pair[1].label}", *(
+        cell for _, figure, digits in _COLUMNS for cell in _interval_cells(
+            result.difference(row, comparison, pair, figure), digits)))
+        for row in result.rows for pair in PAIRS]
     return Table(header, rows, f"Differences at {comparison}")
-
-
-def _spread_cells(spread: Spread, digits: int) -> tuple[str, str]:
-    deviation = "-" if spread.deviation is None else f"{spread.deviation:.{digits}f}"
-    return f"{spread.mean:.{digits}f}", deviation
 
 
 def _interval_cells(interval: Interval, digits: int) -> list[str]:
@@ -445,41 +397,49 @@ def _sentence(
 
 
 def beside_the_paper(result: StudyResult) -> Table | None:
-    """Returns the paper's figures beside ours, None where no scene has a name of theirs."""
-    rows = list(_rows_beside_the_paper(result))
+    """Returns the paper's scores beside ours, None where no scene has a name of theirs."""
+    rows = [_row_beside_the_paper(result, scene, published)
+            for scene in result.scenes if (published := published_scores(scene))]
     header = ("scene", "paper: 3DGS dB", "SSIM", "theirs dB", "SSIM", "gain dB", "SSIM",
               "here: 3DGS dB", "SSIM", "paper's prune dB", "SSIM", "gain dB", "SSIM")
     title = f"The paper's Table I beside this study, {EQUAL_STEPS}"
     return Table(header, rows, title) if rows else None
 
 
-def _rows_beside_the_paper(result: StudyResult) -> Iterator[tuple[str, ...]]:
-    for scene in result.scenes:
-        theirs = published_scores(scene)
-        if theirs is None:
-            continue
-        base, paper = (
-            [result.spread(scene, EQUAL_STEPS, variant, figure).mean for figure in _UNITS]
-            for variant in (BASELINE, PAPER))
-        yield (
-            scene, *_pair(theirs.reference_psnr_db, theirs.reference_ssim),
-            *_pair(theirs.paper_psnr_db, theirs.paper_ssim),
-            *_pair(theirs.gains["psnr_db"], theirs.gains["ssim"], sign="+"),
-            *_pair(base[0], base[1]), *_pair(paper[0], paper[1]),
-            *_pair(paper[0] - base[0], paper[1] - base[1], sign="+"))
+def _row_beside_the_paper(
+    result: StudyResult, scene: str, published: PublishedScores
+) -> tuple[str, ...]:
+    def pair(psnr_db: float, ssim: float, *, sign: str = "") -> tuple[str, str]:
+        return f"{psnr_db:{sign}.2f}", f"{ssim:{sign}.3f}"
 
-
-def _pair(psnr_db: float, ssim: float, *, sign: str = "") -> tuple[str, str]:
-    return f"{psnr_db:{sign}.2f}", f"{ssim:{sign}.3f}"
+    base, paper = (
+        [result.spread(scene, EQUAL_STEPS, variant, figure).mean for figure in _UNITS]
+        for variant in (BASELINE, PAPER))
+    return (
+        scene, *pair(*published[:2]), *pair(*published[2:]),
+        *pair(*published_gains(published).values(), sign="+"),
+        *pair(base[0], base[1]), *pair(paper[0], paper[1]),
+        *pair(paper[0] - base[0], paper[1] - base[1], sign="+"))
 
 
 def published_scores(scene: str) -> PublishedScores | None:
-    """Returns the paper's figures for a scene of that name, None where it has none."""
+    """Returns the paper's scores of a scene of that name, None where it has none."""
     return TABLE_I.get(scene.lower())
+
+
+def published_gains(published: PublishedScores) -> dict[str, float]:
+    """Returns the gains that the paper reports, by figure."""
+    return {"psnr_db": published[2] - published[0], "ssim": published[3] - published[1]}
 
 
 def notes(result: StudyResult) -> list[str]:
     """Returns how the figures are to be read."""
+    def list_parts(scene: str) -> str:  # variants of the same parts together
+        labels: dict[str, list[str]] = {}
+        for variant in VARIANTS:
+            labels.setdefault(result.parts(scene)[variant.name], []).append(variant.label)
+        return ", ".join(f"{parts} ({' and '.join(names)})" for parts, names in labels.items())
+
     clock = {"wall": "on the wall", "cpu": "of the CPU"}[result.clock]
     count = len(result.rows) * len(PAIRS) * len(_COLUMNS) * len(COMPARISONS)
     lines = [
@@ -487,7 +447,7 @@ def notes(result: StudyResult) -> list[str]:
         "slowest arm's take at equal steps, as measured first; the steps are "
         "then fixed. Seconds are of training, pruning included, without scoring.",
         "Each arm is trained on " + "; ".join(
-            f"{scene}: {_parts(result, scene)}" for scene in result.scenes)
+            f"{scene}: {list_parts(scene)}" for scene in result.scenes)
         + ". The trials that decide so are not timed.",
         "Intervals: 95% by Student's t over the differences seed by seed. They speak of other "
         f"seeds on these scenes, not of other scenes. Of {count} intervals about "
@@ -501,17 +461,8 @@ def notes(result: StudyResult) -> list[str]:
     return lines
 
 
-def _parts(result: StudyResult, scene: str) -> str:
-    """Returns which parts the models of a scene have, variants of the same parts together."""
-    by_variant = result.parts(scene)
-    labels = {parts: " and ".join(
-        variant.label for variant in VARIANTS if by_variant[variant.name] == parts)
-        for parts in by_variant.values()}
-    return ", ".join(f"{parts} ({names})" for parts, names in labels.items())
-
-
 def draw(result: StudyResult, path: Path) -> None:
-    """Draws means and intervals of every scene into a .png or .svg, whole or not at all.
+    """Draws means and intervals of every scene into a .png or .svg.
 
     A cross is the gain that the paper reports for a scene of that name.
     """
@@ -536,8 +487,8 @@ def _draw_panel(axes: Any, result: StudyResult, comparison: str, figure: str) ->
                   for interval in intervals],
             fmt="o", markersize=4, capsize=3, label=variant.label, color=f"C{number}")
     for number, row in enumerate(result.rows):
-        if (theirs := published_scores(row)) is not None:
-            axes.plot(theirs.gains[figure], number - _OFFSET, "x", color="black")
+        if (published := published_scores(row)) is not None:
+            axes.plot(published_gains(published)[figure], number - _OFFSET, "x", color="black")
     axes.axvline(0, color="0.6", linewidth=0.8, zorder=0)
     axes.set_yticks(range(len(result.rows)), result.rows)
     axes.set_ylim(len(result.rows) - 0.5, -0.5)

@@ -1,7 +1,7 @@
-"""`recon prune --sweep`: quality after pruning by every score to every ratio, beside controls.
+"""`recon prune --sweep`: quality after pruning by every score to every ratio, with controls.
 
 The controls remove nothing: one takes as many steps, the others as many seconds. sweep.json and
-sweep.svg lie in the workspace beside the stages, so that no result of a stage turns stale.
+sweep.svg lie in the workspace beside the stages, so that no stage becomes stale.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
@@ -17,10 +16,10 @@ from torch import Tensor
 from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import TrainingError
-from recon_cli.evaluation.reference_views import MeanScore, mean_score
-from recon_cli.evaluation.scores import Table
+from recon_cli.evaluation.reference_views import mean_score
+from recon_cli.evaluation.scores import MeanScore, Sweep, SweepTrial, Table
 from recon_cli.experiments.outputs import draw_if_possible, drawing
-from recon_cli.experiments.variants import run_grid
+from recon_cli.experiments.runner import run_grid
 from recon_cli.pipeline import execute, plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.stages import stage
@@ -33,30 +32,14 @@ from recon_cli.train.task import Task
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 
-RESULT, PICTURE = "sweep.json", "sweep.svg"
-NONE = "none"  # stands for no score where nothing is removed
+PICTURE = "sweep.svg"
 _WARM_STEPS = 10  # before anything is timed: the first steps load kernels and make buffers
-
-
-@dataclass(frozen=True)
-class SweepTrial:
-    """One way to prune the model and what came of it."""
-
-    score: str  # its name; `none` for the controls
-    # Fraction that was removed; for a control with equal seconds that of the trial whose seconds it
-    # takes, None for the one with equal steps.
-    ratio: float | None
-    gaussians: int  # that are left
-    steps: int  # of recovery
-    seconds: float  # of recovery and scoring
-    removed: MeanScore | None  # right after the last removal; None where nothing was removed
-    recovered: MeanScore  # at the end
 
 
 def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
     """Writes sweep.json and sweep.svg into the workspace and returns the table.
 
-    The options are those of `recon prune`, but for score, ratio and limits; each ratio is the
+    The options are those of `recon prune`, except for score, ratio and limits; each ratio is the
     fraction to remove, in (0, 1).
 
     Raises:
@@ -76,15 +59,13 @@ def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
                 "A sweep is scored on validation views, but the run has none.",
                 hint="Run `recon train --validation 0.05` first.")
         state = source.begin()
-        before = score_validation(state, source.task)
+        before = _score_validation(state, source.task)
         with job.progress.bar("sweep", count_trials(ratios), unit="run") as bar:
             trials = sweep(source, ratios, on_trial=bar.advance)
-        of_train = job.workspace.manifest("train")
-        atomic.write_json(root / RESULT, {
-            "of_train": of_train.digest if of_train else None, "validation_views": views,
-            "at": config.at, "rounds": source.rounds, "recovery_steps": steps,
-            "equal_seconds_of": config.score, "before": dataclasses.asdict(before),
-            "trials": [dataclasses.asdict(trial) for trial in trials]})
+        train = job.workspace.manifest("train")
+        atomic.write_json(root / Sweep.FILE, Sweep(
+            train.digest if train else None, views, config.at, source.rounds, steps, config.score,
+            before, tuple(trials)).to_json())
         draw_if_possible(lambda path: draw(trials, before.psnr_db, path), root / PICTURE)
     return (
         f"PSNR in dB and SSIM on {views} validation views, right after the last removal and after "
@@ -103,59 +84,54 @@ def sweep(
 ) -> list[SweepTrial]:
     """Returns the control with equal steps, then for every ratio all scores and their control.
 
-    Equal seconds are those of the score that the options name.
+    Equal seconds are those of the configured score.
     """
     steps = source.until - source.first
-    _train_on(source, None, min(_WARM_STEPS, steps))
-    control = _train_on(source, None, steps)
+    _run_trial(source, Sweep.CONTROL, None, min(_WARM_STEPS, steps))
+    control = configured = _run_trial(source, Sweep.CONTROL, None, steps)
     on_trial()
-    of_options = control
 
     def measure(score: str, ratio: float) -> SweepTrial:
-        nonlocal of_options
-        if score == NONE:
-            share = of_options.seconds / max(control.seconds, 1e-9)
-            trial = _train_on(source, ratio, max(1, round(share * steps)))
+        nonlocal configured
+        if score == Sweep.CONTROL:
+            share = configured.seconds / max(control.seconds, 1e-9)
+            trial = _run_trial(source, score, ratio, max(1, round(share * steps)))
         else:
-            trial = _prune(source, score, ratio)
-            of_options = trial if score == source.config.score else of_options
+            trial = _run_trial(source, score, ratio, steps)
+            configured = trial if score == source.config.score else configured
         on_trial()
         return trial
 
-    by_score = run_grid({score: score for score in (*SCORES, NONE)}, ratios, measure)
+    by_score = run_grid({score: score for score in (*SCORES, Sweep.CONTROL)}, ratios, measure)
     return [control, *(trial for by_ratio in zip(*by_score.values(), strict=True)
                        for trial in by_ratio)]
 
 
-def _train_on(source: PruneSource, ratio: float | None, steps: int) -> SweepTrial:
-    """Trains on without removing anything."""
-    state, until = source.begin(), source.first + steps
-    run = _SweepRun(state, source.recovery(source.first, until), source.first, until, rounds=0)
-    return run.trial(NONE, ratio, len(state.splats))
-
-
-def _prune(source: PruneSource, score: str, ratio: float) -> SweepTrial:
-    """Prunes by one score to one ratio."""
-    state, first, until = source.begin(), source.first, source.until
-    run = _SweepRun(state, source.recovery(first, until), first, until, rounds=source.rounds,
-                    score=score, beta=source.config.beta)
+def _run_trial(source: PruneSource, score: str, ratio: float | None, steps: int) -> SweepTrial:
+    """Prunes by a score to a ratio and recovers; a control only trains on."""
+    state, first = source.begin(), source.first
+    run = _SweepRun(state, source.recovery(first, first + steps), first, first + steps,
+                    rounds=0 if score == Sweep.CONTROL else source.rounds, score=score,
+                    beta=source.config.beta)
+    if score == Sweep.CONTROL or ratio is None:
+        return run.trial(score, ratio, len(state.splats))
     return run.trial(score, ratio, remaining(len(state.splats), ratio))
 
 
 class _SweepRun(PruneRun):
-    """Trains without a look at the validation views, and scores the model off the clock."""
+    """Trains without validation, and scores the model off the clock."""
 
     _removed: MeanScore | None = None
     _scoring_seconds = 0.0
 
     def trial(self, name: str, ratio: float | None, target: int) -> SweepTrial:
-        """Returns what becomes of the model that is pruned to `target` Gaussians."""
+        """Prunes the model to `target` Gaussians and returns its scores."""
         self._target, begin = target, time.perf_counter()
         prune_loop(self, target)
         seconds = time.perf_counter() - begin - self._scoring_seconds
         return SweepTrial(
             name, ratio, len(self.state.splats), self.until - self.first, seconds, self._removed,
-            score_validation(self.state, self.task))
+            _score_validation(self.state, self.task))
 
     def advance(self, until: int, importance: Importance | None = None) -> None:
         """Trains up to a step."""
@@ -166,48 +142,47 @@ class _SweepRun(PruneRun):
         super().remove(score, count)
         if count == self._target:
             begin = time.perf_counter()
-            self._removed = score_validation(self.state, self.task)
+            self._removed = _score_validation(self.state, self.task)
             self._scoring_seconds = time.perf_counter() - begin
 
 
-def score_validation(state: TrainState, task: Task) -> MeanScore:
-    """Returns the scores of a model on the validation views, of masked ones where they count."""
+def _score_validation(state: TrainState, task: Task) -> MeanScore:
+    """Returns the scores of a model on the validation views."""
     degree = task.schedule.sh_degree(max(1, state.iteration))
     return mean_score(state.splats, task.validation, degree, task.backend)
 
 
 def table(trials: Sequence[SweepTrial], score: str) -> str:
-    """Returns the trials as a table; the controls are called by what is equal in them."""
-    def cells(quality: MeanScore | None) -> tuple[str, str]:
-        return ("-", "-") if quality is None else (
-            f"{quality.psnr_db:.2f}", f"{quality.ssim:.4f}")
+    """Returns the trials as a table; a control is named by what it has in common with them."""
+    def cells(scores: MeanScore | None) -> tuple[str, str]:
+        return ("-", "-") if scores is None else (f"{scores.psnr_db:.2f}", f"{scores.ssim:.4f}")
 
-    rows = []
-    for trial in trials:
-        name, ratio = trial.score, "-" if trial.removed is None else f"{trial.ratio:.0%}"
-        if trial.removed is None:
-            name = "(no prune, equal steps)" if trial.ratio is None else (
-                f"(no prune, seconds of {score} {trial.ratio:g})")
-        rows.append((name, ratio, f"{trial.gaussians:,}", f"{trial.steps}", f"{trial.seconds:.1f}",
-                     *cells(trial.removed), *cells(trial.recovered)))
+    def name(trial: SweepTrial) -> tuple[str, str]:
+        if trial.removed is not None:
+            return trial.score, f"{trial.ratio:.0%}"
+        if trial.ratio is None:
+            return "(no prune, equal steps)", "-"
+        return f"(no prune, seconds of {score} {trial.ratio:g})", "-"
+
+    rows = [(*name(trial), f"{trial.gaussians:,}", f"{trial.steps}", f"{trial.seconds:.1f}",
+             *cells(trial.removed), *cells(trial.recovered)) for trial in trials]
     return Table(("score", "removed", "Gaussians", "steps", "seconds", "PSNR removed",
-                  "SSIM removed", "PSNR recovered", "SSIM recovered"), tuple(rows)).text()
+                  "SSIM removed", "PSNR recovered", "SSIM recovered"), rows).text()
 
 
 def draw(trials: Sequence[SweepTrial], before_db: float, path: Path) -> None:
-    """Draws PSNR against the fraction removed, a line a score and the controls, into a .svg."""
+    """Draws PSNR against the fraction removed into a .svg: a line a score, and the controls."""
     with drawing(path, 8, 5.5) as figure:
         axes = figure.subplots()
-        for name in (*SCORES, NONE):
+        for name in (*SCORES, Sweep.CONTROL):
             line = [(trial.ratio, trial.recovered.psnr_db) for trial in trials
                     if trial.score == name and trial.ratio is not None]
             style = {"color": "0.3", "linestyle": "--", "label": "no prune, equal seconds"}
-            axes.plot(*zip(*line, strict=True), **style if name == NONE else {
+            axes.plot(*zip(*line, strict=True), **style if name == Sweep.CONTROL else {
                 "marker": "o", "markersize": 4, "label": name})
-        axes.axhline(
-            trials[0].recovered.psnr_db, color="0.3", label="no prune, equal steps")
+        axes.axhline(trials[0].recovered.psnr_db, color="0.3", label="no prune, equal steps")
         axes.axhline(before_db, color="0.7", linestyle=":", label="before")
-        axes.set(xlabel="share of the Gaussians that was removed",
+        axes.set(xlabel="fraction of the Gaussians that was removed",
                  ylabel="PSNR on the validation views after recovery, dB")
         axes.legend(fontsize=8)
         axes.grid(color="0.92")

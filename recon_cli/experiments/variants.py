@@ -1,79 +1,67 @@
-"""Variants of an experiment, and the loop over variants and repeats that all experiments share.
-
-A variant of training is a recipe by name: changes of the training options, and of pruning.
-"""
+"""Variants of training, by name and from the command line, and a run of one of them."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 from recon_cli.config.settings import parse_assignment
 from recon_cli.config.stages import PruneConfig, RunConfig
 from recon_cli.errors import ConfigError
 
 _MID = RunConfig().mid  # where `recon train --prune` branches off
-# options that all recipes of a benchmark have in common, or that have no effect here
+# options that all recipes of a benchmark share, or that have no effect here
 _SHARED = {"iterations", "seed", "max_size", "quality", "minutes", "early_stop", "mid"}
-
-_Variant = TypeVar("_Variant")
-_Repeat = TypeVar("_Repeat")
-_Result = TypeVar("_Result")
-
-
-def run_grid(
-    variants: Mapping[str, _Variant], repeats: Sequence[_Repeat],
-    measure: Callable[[_Variant, _Repeat], _Result],
-) -> dict[str, tuple[_Result, ...]]:
-    """Returns what was measured of each variant, by its name, one result for each repeat.
-
-    Repeats are the outer loop: a slow minute of the machine then affects all variants alike.
-    """
-    results: dict[str, list[_Result]] = {name: [] for name in variants}
-    for repeat in repeats:
-        for name, variant in variants.items():
-            results[name].append(measure(variant, repeat))
-    return {name: tuple(by_repeat) for name, by_repeat in results.items()}
 
 
 @dataclass(frozen=True)
 class MidPrune:
-    """A removal in mid-training, after which the rest of the run goes on."""
+    """Pruning in mid-training."""
 
-    at: float  # share of the run's steps
-    config: PruneConfig  # which Gaussians go; its `at` and `recovery` are those of the run
-    # learning rates start anew for the rest, as in `recon prune`; otherwise they just go on
-    restarts: bool = True
+    at: float  # fraction of the run's steps
+    config: PruneConfig  # which Gaussians are removed; its `at` and `recovery` are ignored
+    restarts: bool = True  # the learning rates restart afterwards, as in `recon prune`
 
 
 @dataclass(frozen=True)
 class Variant:
     """One way to train."""
 
-    name: str  # for the files and the command line
-    label: str  # for the tables
+    name: str  # in files and on the command line
+    label: str  # in tables
     options: Mapping[str, Any] = field(default_factory=dict)  # that differ from the base
     prune: MidPrune | None = None
     tries_degree: bool = False  # a trial decides on the SH degree, as in `recon train`
 
     def config(self, base: RunConfig, *, iterations: int, seed: int) -> RunConfig:
-        """Returns the options of one run.
-
-        Raises:
-            ConfigError: an option has a value that cannot be used.
-        """
+        """Returns the options of one run; ConfigError for a value out of range."""
         return dataclasses.replace(
             base, **{**self.options, "iterations": iterations, "seed": seed})
 
     def record(self) -> dict[str, Any]:
-        """Returns what decides about the outcome, as JSON holds it."""
+        """Returns everything that affects the result, as JSON."""
         prune = self.prune and {
             "at": self.prune.at, "restarts": self.prune.restarts,
             **self.prune.config.hashed_fields()}
         return {"name": self.name, "options": dict(self.options), "prune": prune,
                 "tries_degree": self.tries_degree}
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """One variant with one seed for a number of steps."""
+
+    variant: Variant
+    base: RunConfig  # options that all variants share
+    iterations: int
+    seed: int
+
+    @property
+    def config(self) -> RunConfig:
+        """The options of this run."""
+        return self.variant.config(self.base, iterations=self.iterations, seed=self.seed)
 
 
 # LightGaussian, whose score the paper takes over, removes 60% at step 20,000 of 30,000.
@@ -96,11 +84,7 @@ KNOWN: dict[str, Variant] = {variant.name: variant for variant in (
 
 
 def parse_recipe(text: str) -> Variant:
-    """Returns the variant that `NAME` or `NAME+FIELD=VALUE+...` stands for.
-
-    Raises:
-        ConfigError: there is no such name, or no such field of the training options.
-    """
+    """Returns the variant of `NAME` or `NAME+FIELD=VALUE+...`; ConfigError for unknown names."""
     name, *changes = text.split("+")
     if name not in KNOWN:
         raise ConfigError(
@@ -120,11 +104,7 @@ def parse_recipe(text: str) -> Variant:
 
 
 def parse_recipes(texts: Sequence[str]) -> tuple[Variant, ...]:
-    """Returns the variants of some words, each of which may list several with commas.
-
-    Raises:
-        ConfigError: as `parse_recipe`, one appears twice, or there is none.
-    """
+    """Returns the variants of comma-separated lists; ConfigError if empty or with duplicates."""
     words = [word.strip() for text in texts for word in text.split(",") if word.strip()]
     if not words:
         raise ConfigError("No recipe was given.", hint="Try --recipes reference,budget.")
@@ -132,18 +112,3 @@ def parse_recipes(texts: Sequence[str]) -> tuple[Variant, ...]:
     if twice:
         raise ConfigError(f"The recipe {twice[0]} appears twice.", hint="Remove one of them.")
     return tuple(parse_recipe(word) for word in words)
-
-
-@dataclass(frozen=True)
-class TrainingRun:
-    """What is run: one variant from one seed for so many steps."""
-
-    variant: Variant
-    base: RunConfig  # options that all variants share
-    iterations: int
-    seed: int
-
-    @property
-    def config(self) -> RunConfig:
-        """The options of this run."""
-        return self.variant.config(self.base, iterations=self.iterations, seed=self.seed)

@@ -157,9 +157,9 @@ def test_seconds_become_steps_by_a_pilot(
     tiny = load_for_training(folders, "validation", BASE, StageContext(backend="numba"))
     a_step = Runner(BASE, NullProgress()).pilot_seconds(tiny, [REFERENCE])["reference"]
     request = RecipeRequest(scenes=(), seeds=1, base=BASE, recipes=(REFERENCE,), seconds=10.0)
-    assert module.steps_of(request, a_step) == round(runner.PILOT_STEPS * 10 / 4)
+    assert request.steps(a_step) == round(runner.PILOT_STEPS * 10 / 4)
     given = dataclasses.replace(request, iterations=77, seconds=None)
-    assert module.steps_of(given, a_step) == 77
+    assert given.steps(a_step) == 77
 
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:

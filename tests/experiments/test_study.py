@@ -13,7 +13,14 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
 from recon_cli.experiments import runner
-from recon_cli.experiments.runner import RECORDS_FILE, CurvePoint, Record, Records, key_of
+from recon_cli.experiments.runner import (
+    RECORDS_FILE,
+    CurvePoint,
+    Record,
+    Records,
+    key_of,
+    run_trial,
+)
 from recon_cli.experiments.scenes import SceneFolders, load_for_training
 from recon_cli.experiments.study import (
     EQUAL_SECONDS,
@@ -21,7 +28,8 @@ from recon_cli.experiments.study import (
     VARIANTS,
     Study,
     StudyRequest,
-    corrected_steps,
+    StudyResult,
+    correct_steps,
     equal_seconds,
 )
 from recon_cli.experiments.variants import TrainingRun
@@ -45,19 +53,25 @@ def made(monkeypatch):
     class Made(list):
         stop_at = None
 
-    found = Made()
+    runs = Made()
 
     def run_timed(loaded, run, score_at, *, on_step):
-        if len(found) == found.stop_at:
+        if len(runs) == runs.stop_at:
             raise KeyboardInterrupt
-        found.append((run.variant.name, run.iterations, run.seed))
-        points = runner.run_trial(loaded, run, score_at, on_step=on_step)
+        runs.append((run.variant.name, run.iterations, run.seed))
+        points = run_trial(loaded, run, score_at, on_step=on_step)
         seconds = COSTS[run.variant.name] * run.iterations
         return tuple(dataclasses.replace(point, seconds=seconds, cpu_seconds=2 * seconds)
                      for point in points)
 
     monkeypatch.setattr(runner, "run_trial", run_timed)
-    return found
+    return runs
+
+
+def values(scene, comparison, variant, figure):
+    """Returns a figure by seed."""
+    return StudyResult(None, 1, BASE, "wall", {"tiny": scene}).values(
+        "tiny", comparison, variant, figure)
 
 
 def work(folder, seeds=2, **changes):
@@ -76,10 +90,10 @@ def test_cheaper_steps_give_more_of_them():
 
 def test_a_guess_is_corrected_on_the_line_through_two_runs():
     # 100 steps in 4 s and 250 in 13 s: 6 s for 100 steps, so that 10 s hold 200
-    assert corrected_steps(100, 250, 4.0, 13.0, 10.0) == 200
-    assert corrected_steps(100, 250, 4.0, 10.4, 10.0) == 250  # near enough
-    assert corrected_steps(100, 100, 10.0, 12.0, 10.0) == 100  # the slowest arm
-    assert corrected_steps(100, 250, 4.0, 3.0, 10.0) == 250  # a line that falls says nothing
+    assert correct_steps(100, 250, 4.0, 13.0, 10.0) == 200
+    assert correct_steps(100, 250, 4.0, 10.4, 10.0) == 250  # near enough
+    assert correct_steps(100, 100, 10.0, 12.0, 10.0) == 100  # the slowest arm
+    assert correct_steps(100, 250, 4.0, 3.0, 10.0) == 250  # a line that falls says nothing
 
 
 @pytest.mark.integration
@@ -91,19 +105,19 @@ def test_arms_whose_steps_grow_dearer_still_take_the_same_seconds(
             return 0.25 * steps + 0.25 * max(0, steps - STEPS)
 
     monkeypatch.setitem(COSTS, "budget", Dearer())
-    found = work(tmp_path / "out", seeds=2).run_scene(scene)
-    assert found.values(EQUAL_SECONDS, VARIANTS[2], "steps") == [30, 30]
-    assert found.values(EQUAL_SECONDS, VARIANTS[2], "seconds") == pytest.approx([10.0, 10.0])
+    studied = work(tmp_path / "out", seeds=2).run_scene(scene)
+    assert values(studied, EQUAL_SECONDS, VARIANTS[2], "steps") == [30, 30]
+    assert values(studied, EQUAL_SECONDS, VARIANTS[2], "seconds") == pytest.approx([10.0, 10.0])
     assert made.count(("budget", 40, 0)) == 1  # the guess
 
 
 def test_arms_take_the_steps_that_fit_into_the_seconds_of_the_slowest(scene, made, tmp_path):
-    found = work(tmp_path / "out", seeds=1).run_scene(scene)
+    studied = work(tmp_path / "out", seeds=1).run_scene(scene)
     expected = {"reference": 20, "paper": 25, "budget": 40, "budget-pruned": 50}
     for variant in VARIANTS:
-        assert found.values(EQUAL_STEPS, variant, "steps") == [STEPS]
-        assert found.values(EQUAL_SECONDS, variant, "steps") == [expected[variant.name]]
-        assert found.values(EQUAL_SECONDS, variant, "seconds") == pytest.approx([10.0])
+        assert values(studied, EQUAL_STEPS, variant, "steps") == [STEPS]
+        assert values(studied, EQUAL_SECONDS, variant, "steps") == [expected[variant.name]]
+        assert values(studied, EQUAL_SECONDS, variant, "seconds") == pytest.approx([10.0])
     # the slowest arm's run serves both comparisons
     assert made.count(("reference", STEPS, 0)) == 1
     assert len(made) == 7
@@ -114,8 +128,8 @@ def test_steps_at_equal_seconds_stay_fixed_when_seeds_are_added(
 ):
     work(tmp_path / "out", seeds=1).run_scene(scene)
     monkeypatch.setitem(COSTS, "budget", 0.1)  # a quieter hour
-    found = work(tmp_path / "out", seeds=2).run_scene(scene)
-    assert found.values(EQUAL_SECONDS, VARIANTS[2], "steps") == [40, 40]
+    studied = work(tmp_path / "out", seeds=2).run_scene(scene)
+    assert values(studied, EQUAL_SECONDS, VARIANTS[2], "steps") == [40, 40]
     assert [one[2] for one in made] == [0] * 7 + [1] * 7
 
 

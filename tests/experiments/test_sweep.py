@@ -6,8 +6,8 @@ import pytest
 from posed_sets import make_replica
 
 from recon_cli.cli import main
-from recon_cli.evaluation.reference_views import MeanScore
-from recon_cli.experiments.sweep import NONE, SweepTrial, count_trials, table
+from recon_cli.evaluation.scores import MeanScore, Sweep, SweepTrial
+from recon_cli.experiments.sweep import count_trials, table
 from recon_cli.train.importance import SCORES
 
 RATIOS = (0.5, 0.9)
@@ -40,8 +40,8 @@ def test_every_score_meets_every_ratio_and_the_controls_stand_beside(swept):
     assert len(found["trials"]) == count_trials(RATIOS)
     for ratio in RATIOS:
         names = [one["score"] for one in found["trials"] if one["ratio"] == ratio]
-        assert names == [*SCORES, NONE]
-    assert found["trials"][0]["score"] == NONE  # no prune, equal steps
+        assert names == [*SCORES, Sweep.CONTROL]
+    assert found["trials"][0]["score"] == Sweep.CONTROL  # no prune, equal steps
     assert found["trials"][0]["steps"] == found["recovery_steps"] == 6
 
 
@@ -49,9 +49,9 @@ def test_the_counts_are_those_of_the_ratios_and_nothing_goes_in_the_controls(swe
     trials_found = swept[2]["trials"]
     n = trials_found[0]["gaussians"]
     for one in trials_found:
-        gone = 0 if one["score"] == NONE else int(one["ratio"] * n)
+        gone = 0 if one["score"] == Sweep.CONTROL else int(one["ratio"] * n)
         assert one["gaussians"] == n - gone
-        assert (one["removed"] is None) == (one["score"] == NONE)
+        assert (one["removed"] is None) == (one["score"] == Sweep.CONTROL)
 
 
 def test_a_sweep_says_which_training_it_is_of(workspace, swept):
@@ -106,9 +106,9 @@ def test_ratios_that_are_none_are_a_usage_error(ratios, capsys):
 def test_a_table_says_what_is_equal_in_each_control():
     good = MeanScore(30.0, 0.9)
     text = table([
-        SweepTrial(NONE, None, 100, 60, 6.0, None, good),
+        SweepTrial(Sweep.CONTROL, None, 100, 60, 6.0, None, good),
         SweepTrial("loo", 0.8, 20, 60, 3.0, MeanScore(20.0, 0.5), good),
-        SweepTrial(NONE, 0.8, 100, 30, 3.0, None, good)], "loo")
+        SweepTrial(Sweep.CONTROL, 0.8, 100, 30, 3.0, None, good)], "loo")
     lines = text.splitlines()
     assert "equal steps" in lines[1]
     assert "80%" in lines[2]

@@ -52,10 +52,10 @@ ROUGH = Accuracy(0.1, 0.01, 0.5, 0.2, "quats", 0.9)
 
 def speed(threads: int, ms: float) -> Speed:
     """A backend whose forward pass takes `ms`, the backward pass twice and the step four times."""
-    stages = {"forward: composite": Timing(ms / 2, 0.0), "forward: rest": Timing(ms / 2, 0.0)}
-    return Speed(
-        threads, Timing(ms, 0.1), Timing(2 * ms, 0.2), Timing(4 * ms, 0.4), 2.0, 1.0, 0.25, None,
-        stages)
+    return Speed(threads, {
+        "forward": Timing(ms, 0.1), "forward: composite": Timing(ms / 2, 0.0),
+        "forward: rest": Timing(ms / 2, 0.0), "backward": Timing(2 * ms, 0.2),
+        "step": Timing(4 * ms, 0.4)}, 2.0, 1.0, 0.25, None)
 
 
 def backend(ms: float) -> BackendResult:
@@ -274,7 +274,7 @@ def test_the_front_holds_what_nothing_else_beats() -> None:
 
 
 def test_the_points_are_backends_and_timed_approximations() -> None:
-    points = rasterizer_benchmark.candidates_of(next(iter(result().scenes.values())))
+    points = rasterizer_benchmark.list_points(next(iter(result().scenes.values())))
     assert [(p.name, p.ms, p.image_error) for p in points] == [
         ("numba", 30.0, 1e-7), ("torch", 240.0, 1e-7), ("rough", 20.0, 0.01)]
 
