@@ -76,6 +76,47 @@ def make_scannet(folder, frames=4, lost=(1,), depth_size=(WIDTH // 2, HEIGHT // 
     return folder
 
 
+def make_seven_scenes(folder, frames=4, lost=(1,)):
+    """Writes a 7-Scenes sequence with its intrinsics; one corner of the depth is unknown."""
+    for number in range(frames):
+        c2w = pose(number)
+        write_image(folder / f"frame-{number:06d}.color.png")
+        depth = plane_depth(c2w)
+        depth[:2, :3] = 65.535
+        write_depth(folder / f"frame-{number:06d}.depth.png", depth, 1000)
+        np.savetxt(folder / f"frame-{number:06d}.pose.txt",
+                   np.full((4, 4), -np.inf) if number in lost else c2w)
+    np.savetxt(folder / "camera-intrinsics.txt", [
+        [FOCAL, 0, CX - 0.5], [0, FOCAL, CY - 0.5], [0, 0, 1]])
+    return folder
+
+
+def make_tum(folder, frames=4):
+    """Writes a TUM RGB-D sequence whose motion capture ends before the last frame.
+
+    Frames are .1 s apart, depth comes 5 ms later, and the path has a pose each .02 s.
+    """
+    def write_list(name, rows):
+        (folder / name).write_text("# a comment\n" + "".join(
+            " ".join(map(str, row)) + "\n" for row in rows))
+
+    for number in range(frames):
+        write_image(folder / "rgb" / f"{number}.png", 640, 480)
+        write_depth(folder / "depth" / f"{number}.png",
+                    plane_depth(pose(number), 640, 480, 525.0, 320.0, 240.0), 5000)
+    write_list("rgb.txt", [(f"{10 + 0.1 * n:.6f}", f"rgb/{n}.png") for n in range(frames)])
+    write_list("depth.txt", [
+        (f"{10.005 + 0.1 * n:.6f}", f"depth/{n}.png") for n in range(frames)])
+    rows = []
+    for step in range(5 * frames - 5):  # from .03 s before the first frame on
+        at = 0.2 * step - 0.3
+        half = 0.05 * at / 2  # as in `pose`
+        turn = 0, np.sin(half), 0, np.cos(half)
+        rows.append((f"{10 + 0.1 * at:.6f}", 0.1 * at, 0.05, -0.2, *turn))
+    write_list("groundtruth.txt", rows)
+    return folder
+
+
 def transforms(frames=4, **more):
     """Returns what a transforms.json of nerfstudio holds."""
     return {

@@ -41,9 +41,9 @@ _inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=click.Pa
 def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
     """Choose frames from videos, photos or a data set with poses.
 
-    INPUT: videos, photos, folders of photos, or a COLMAP model, transforms.json, Replica or ScanNet
-    scene, recognised by its layout. Each video and each folder gets its own intrinsics. Without
-    INPUT, the previous input is used.
+    INPUT: videos, photos, folders of photos, or a data set with poses (COLMAP, transforms.json,
+    Replica, ScanNet, 7-Scenes, TUM RGB-D), recognised by its layout. Each video and each folder
+    gets its own intrinsics. Without INPUT, the previous input is used.
     """
     run_stages(call, "ingest", ["ingest"], sources=inputs)
 

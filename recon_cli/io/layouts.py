@@ -8,6 +8,13 @@ from pathlib import Path
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_set import is_colmap, lacks_cameras, read_colmap
+from recon_cli.io.kinect import (
+    find_unposed,
+    is_seven_scenes,
+    is_tum,
+    read_seven_scenes,
+    read_tum,
+)
 from recon_cli.io.posed import PosedSet
 from recon_cli.io.rgbd import is_replica, is_scannet, lacks_trajectory, read_replica, read_scannet
 from recon_cli.io.transforms import is_transforms, read_transforms
@@ -31,6 +38,11 @@ LAYOUTS: tuple[Layout, ...] = (
            "results/frame%06d.jpg, traj.txt and cam_params.json", is_replica, read_replica),
     Layout("scannet", "a ScanNet scene (exported)",
            "color/, pose/ and intrinsic/, with depth/ or without", is_scannet, read_scannet),
+    Layout("7scenes", "a 7-Scenes sequence",
+           "frame-000000.color.png, .depth.png and .pose.txt in one folder", is_seven_scenes,
+           read_seven_scenes),
+    Layout("tum", "a TUM RGB-D sequence", "rgb/, rgb.txt and groundtruth.txt, with depth/ or "
+           "without", is_tum, read_tum),
     Layout("transforms", "a transforms.json data set (nerfstudio, instant-ngp)",
            "transforms.json, or transforms_train.json, and the images", is_transforms,
            read_transforms),
@@ -56,6 +68,8 @@ def refuse_incomplete(path: Path) -> None:
         lacks, images = "a COLMAP model without cameras.bin or cameras.txt", path / "images"
     elif lacks_trajectory(path):
         lacks, images = "Replica frames without traj.txt", path / "results" / "frame*"
+    elif unposed := find_unposed(path):
+        lacks, images = unposed
     else:
         return
     raise FormatError(

@@ -6,6 +6,7 @@ exists, each with a lens of its size, as a `PosedSet`.
 
 from __future__ import annotations
 
+import math
 import struct
 import warnings
 import zlib
@@ -38,13 +39,15 @@ class DepthFile:
     unit: float  # world units of a value of 1
     lens: Lens  # intrinsics of the image
     own: Lens | None = None  # intrinsics of the depth; None if it covers the same field of view
+    unknown: float = math.inf  # the value of the file that means unknown, as 0 does
 
     def __call__(self) -> NDArray[np.float32]:
         """Returns [H, W] z-depth at the size of the image, in world units, 0 where unknown.
 
         FormatError if the file is missing, damaged or no depth.
         """
-        values = _read_depth(self.path).astype(np.float64) * self.unit
+        stored = _read_depth(self.path).astype(np.float64)
+        values = np.where(stored == self.unknown, 0, stored) * self.unit
         depth = np.where((values > 0) & (values < _MAX_DEPTH), values, 0).astype(np.float32)
         height, width = depth.shape
         own = self.own if self.own is not None else self.lens.resized(width, height)
@@ -127,7 +130,7 @@ class PosedImage:
 class PosedSet:
     """A data set with poses."""
 
-    layout: str  # "colmap", "transforms", "replica" or "scannet"
+    layout: str  # the name of one of `layouts.LAYOUTS`
     lenses: tuple[Lens, ...]  # intrinsics at the full size of the images
     images: tuple[PosedImage, ...]  # in the order of the data set
     missing: tuple[str, ...] = ()  # names of images that it lists, but whose files do not exist

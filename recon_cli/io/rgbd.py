@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -164,18 +165,30 @@ def read_scannet(folder: Path) -> PosedSet:
     own = _read_lens(folder, "depth", image_size(next(iter(depths.values())))) if depths else None
     listed, lost = [], 0
     for number, path in colors.items():
-        viewmat = _read_pose(poses[number]) if number in poses else None
+        viewmat = read_pose(poses[number]) if number in poses else None
         if viewmat is None:
             lost += 1
             continue
         depth = DepthFile(depths[number], _MILLIMETRE, lens, own) if number in depths else None
         listed.append(ListedImage(path.name, path, lens, viewmat, depth=depth))
+    return tracked_sequence("scannet", listed, folder, lost)
+
+
+def tracked_sequence(
+    layout: str, listed: Sequence[ListedImage], folder: Path, lost: int,
+    notices: tuple[str, ...] = (),
+) -> PosedSet:
+    """Returns the frames of a metric sequence that have a pose; `lost` others have none.
+
+    InputError if no frame has an image and a pose.
+    """
     if not listed:
         raise InputError(
-            f"{folder} has no frame with a pose: tracking was lost in all {len(colors)}.",
-            hint="Give the photos alone (color/), so that `recon` finds the poses itself.")
-    posed = find_images("scannet", listed, folder)
-    notices = (f"{lost} frames whose tracking was lost have no pose and are left out",) * bool(lost)
+            f"{folder} has no frame with a pose: tracking was lost in all {lost}.",
+            hint="Give the color images alone, so that `recon` finds the poses itself.")
+    posed = find_images(layout, listed, folder)
+    if lost:
+        notices += (f"{lost} frames whose tracking was lost have no pose and are left out",)
     return replace(posed, metric=True, sequence=True, notices=notices + posed.notices)
 
 
@@ -194,7 +207,7 @@ def _read_lens(folder: Path, kind: str, size: tuple[int, int]) -> Lens:
     if not path.is_file():
         raise FormatError(
             f"{path} is missing.", hint="Export it with ScanNet's SensReader --export_intrinsics.")
-    lens = lens_from_matrix(_read_numbers(path), *size, str(path))
+    lens = lens_from_matrix(read_matrix(path), *size, str(path))
     # ScanNet's cameras have it within 2% of the middle; images reduced after the export to half
     # their size or less have it at the border or beyond.
     shares = [center / side for center, side in zip(lens.params[2:], size, strict=True)]
@@ -206,13 +219,13 @@ def _read_lens(folder: Path, kind: str, size: tuple[int, int]) -> Lens:
     return lens
 
 
-def _read_pose(path: Path) -> NDArray[np.float64] | None:
+def read_pose(path: Path) -> NDArray[np.float64] | None:
     """Returns [4, 4] world to camera, None where tracking was lost."""
-    matrix = _read_numbers(path)
+    matrix = read_matrix(path)
     return viewmat_from_pose(matrix, str(path)) if not np.isinf(matrix).any() else None
 
 
-def _read_numbers(path: Path) -> NDArray[np.float64]:
+def read_matrix(path: Path) -> NDArray[np.float64]:
     """Returns a 4x4 (or 3x3) matrix of text."""
     text = path.read_text(encoding="utf-8", errors="replace")
     values = _parse_numbers(text, str(path), (9, 16))

@@ -15,6 +15,7 @@ from recon_cli.workspace.summaries import IngestSummary, SfmSummary
 _KINDS = {
     "video": "a video", "photos": "photos", "mixed": "videos and photos",
     "replica": "a Replica sequence with poses", "scannet": "a ScanNet scan with poses",
+    "7scenes": "a 7-Scenes sequence with poses", "tum": "a TUM RGB-D sequence with poses",
     "colmap": "a COLMAP model with its images", "transforms": "a transforms.json with poses"}
 _LACKING = "-"
 _UNITS = {"_db": "dB", "_px": "px", "_deg": "degrees", "_255": "of 255"}

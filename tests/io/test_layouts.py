@@ -21,6 +21,8 @@ MAKERS = {
     "replica": (posed_sets.make_replica, "a Replica sequence (NICE-SLAM layout): 4 frames, 2 with "
                 "depth, 2 held-out views"),
     "scannet": (posed_sets.make_scannet, "a ScanNet scene (exported): 3 frames, 3 with depth"),
+    "7scenes": (posed_sets.make_seven_scenes, "a 7-Scenes sequence: 3 frames, 3 with depth"),
+    "tum": (posed_sets.make_tum, "a TUM RGB-D sequence: 3 frames, 3 with depth"),
     "transforms": (posed_sets.make_transforms,
                    "a transforms.json data set (nerfstudio, instant-ngp): 4 images"),
     "colmap": (make_colmap, "a COLMAP model: 1 image, 1 point"),
@@ -58,6 +60,7 @@ def test_recognition_opens_nothing(tmp_path):
 @pytest.mark.parametrize(("make", "lost", "message"), [
     (make_colmap, "sparse/cameras.txt", "a COLMAP model without cameras.bin"),
     (posed_sets.make_replica, "traj.txt", "Replica frames without traj.txt"),
+    (posed_sets.make_tum, "groundtruth.txt", "a TUM RGB-D sequence without groundtruth.txt"),
 ])
 def test_a_data_set_that_lost_its_poses_is_not_taken_for_photos(tmp_path, make, lost, message):
     make(tmp_path)
@@ -65,6 +68,15 @@ def test_a_data_set_that_lost_its_poses_is_not_taken_for_photos(tmp_path, make, 
     (tmp_path / lost).unlink()
     with pytest.raises(FormatError, match=message):
         refuse_incomplete(tmp_path)
+
+
+def test_frames_of_7_scenes_without_poses_are_not_taken_for_photos(tmp_path):
+    posed_sets.make_seven_scenes(tmp_path)
+    for path in tmp_path.glob("*.pose.txt"):
+        path.unlink()
+    with pytest.raises(FormatError, match="7-Scenes frames without") as refused:
+        refuse_incomplete(tmp_path)
+    assert "frame-*.color.*" in refused.value.hint
 
 
 def test_photos_and_videos_have_no_layout(tmp_path):
