@@ -11,8 +11,11 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from functools import cached_property
+from itertools import takewhile
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -135,6 +138,79 @@ class _Frame:
         return PurePosixPath(self.path.relative_to(self.folder).as_posix())
 
 
+class _FileFinder:
+    """Finds the files that a list names, also by paths of the machine that it was written on.
+
+    Such a file is the one below the folder that has the same name and, among several, shares the
+    most folders at the end of its path. A file that the list names by its own path stands for no
+    other. Nothing outside the folder is ever opened.
+
+    Args:
+        folder: of the list.
+        names: all that it lists.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[object]) -> None:
+        self._folder = folder
+        self._names = names
+        self._moved: list[str] = []  # the names that are no path in the folder
+
+    def find(self, name: object, where: str) -> Path:
+        """Returns the path of a file, which exists unless none has its name.
+
+        FormatError if `name` is no text, or leads out of the folder and no file has its name.
+        """
+        try:
+            path = _with_suffix(resolve_inside(self._folder, name, where))
+        except FormatError:
+            match = self._match(name)
+            if match is None:
+                raise
+            return match
+        return path if is_file(path) else self._match(name) or path
+
+    def notices(self) -> list[str]:
+        """Returns a notice where files were found by their names alone."""
+        if not self._moved:
+            return []
+        return [f"{len(self._moved)} of its paths do not exist here, the first is "
+                f"{self._moved[0]}: the files of the same names in the folder are used"]
+
+    @cached_property
+    def _files(self) -> dict[str, list[tuple[str, ...]]]:
+        """The files below the folder that the list does not name, by name, as parts of paths."""
+        named = set()
+        for name in self._names:
+            with suppress(FormatError):
+                named.add(_with_suffix(resolve_inside(self._folder, name, "")))
+        files: dict[str, list[tuple[str, ...]]] = {}
+        for path in sorted(self._folder.rglob("*")):
+            if path not in named and path.is_file():
+                parts = path.relative_to(self._folder).parts
+                files.setdefault(parts[-1], []).append(parts)
+        return files
+
+    def _match(self, name: object) -> Path | None:
+        """Returns the one file that fits a name best, None if there is none or a tie."""
+        # Windows' rules split at both kinds of slashes.
+        wanted = PureWindowsPath(name).parts if isinstance(name, str) else ()
+        if not wanted:
+            return None
+        candidates = [parts for suffix in ("", *SUFFIXES)
+                      for parts in self._files.get(wanted[-1] + suffix, ())]
+        shared = [_shared_folders(parts[:-1], wanted[:-1]) for parts in candidates]
+        if not candidates or shared.count(max(shared)) > 1:
+            return None
+        self._moved.append(str(name))
+        return self._folder.joinpath(*candidates[shared.index(max(shared))])
+
+
+def _shared_folders(folders: Sequence[str], others: Sequence[str]) -> int:
+    """Returns how many folders two paths share at their ends."""
+    pairs = zip(reversed(folders), reversed(others), strict=False)
+    return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
+
+
 def is_transforms(path: Path) -> bool:
     """Returns whether a folder has the layout, or a file is such a .json by its name."""
     if path.suffix == ".json" and path.is_file():
@@ -151,8 +227,12 @@ def read_transforms(path: Path) -> PosedSet:
     name.
     """
     frames: list[_Frame] = []
-    for file, part in _files(path):
-        frames += _read_frames(file, part)
+    lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
+    finder = _FileFinder(path.parent if path.is_file() else path, [
+        entry[key] for _, _, (_, entries) in lists for entry in entries
+        for key in ("file_path", "depth_file_path", "mask_path") if key in entry])
+    for file, part, (common, entries) in lists:
+        frames += _list_entries(file, part, common, entries, finder)
     frames, notices = _drop_duplicates(frames)
     held_out = "test" if "test" in {frame.part for frame in frames} else "val"
     used = [frame for frame in frames if frame.part in (None, "train", held_out)]
@@ -163,11 +243,12 @@ def read_transforms(path: Path) -> PosedSet:
     listed, missing = [], []
     for frame, name in zip(used, _short_names(used), strict=True):
         if is_file(frame.path):
-            listed.append(_list_frame(frame, name, held_out))
+            listed.append(_list_frame(frame, name, held_out, finder))
         else:
             missing.append(name)
     posed = find_images("transforms", listed, path, missing=missing)
     points, colors, point_notices = _read_points(path if path.is_file() else path / _FILE)
+    notices += finder.notices()
     return replace(
         posed, metric=any(image.depth is not None for image in posed.images),
         splits=any(image.held_out for image in posed.images), points=points, colors=colors,
@@ -184,19 +265,27 @@ def _files(path: Path) -> list[tuple[Path, str | None]]:
     return [(file, part) for file, part in files if file.is_file()]
 
 
-def _read_frames(file: Path, part: str | None) -> list[_Frame]:
+def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Returns what a file says of all frames, and its entries."""
     value = read_json(file)
     entries = value.get("frames") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{file} lists no frames.", hint=_HINT)
-    common = {key: item for key, item in value.items() if key != "frames"}
-    parts = _read_parts(common, file)
-    frames = []
     for at, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise FormatError(f"{file}, frame {at}, is no entry with names.", hint=_HINT)
+    return {key: item for key, item in value.items() if key != "frames"}, entries
+
+
+def _list_entries(
+    file: Path, part: str | None, common: dict[str, Any], entries: Sequence[dict[str, Any]],
+    finder: _FileFinder,
+) -> list[_Frame]:
+    parts = _read_parts(common, file)
+    frames = []
+    for at, entry in enumerate(entries):
         text = entry.get("file_path")
-        path = _with_suffix(resolve_inside(file.parent, text, f"{file}, frame {at},"))
+        path = finder.find(text, f"{file}, frame {at},")
         own = part if parts is None else parts.get(_plain(text), "")
         frames.append(_Frame({**common, **entry}, f"{file}, frame {text},", file.parent, path, own))
     return frames
@@ -270,22 +359,24 @@ def _short_names(frames: Sequence[_Frame]) -> list[str]:
     return ["/".join(path[shared:]) for path in parts]
 
 
-def _list_frame(frame: _Frame, name: str, held_out: str) -> ListedImage:
+def _list_frame(
+    frame: _Frame, name: str, held_out: str, finder: _FileFinder
+) -> ListedImage:
     viewmat = viewmat_from_pose(
         frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
-    depth, unit = _beside(frame, "depth_file_path"), _unit(frame)
+    depth, unit = _beside(frame, "depth_file_path", finder), _unit(frame)
     return ListedImage(
         name, frame.path, lens, viewmat, frame.part == held_out,
         None if depth is None else DepthFile(depth, unit, lens),
-        _beside(frame, "mask_path"))
+        _beside(frame, "mask_path", finder))
 
 
-def _beside(frame: _Frame, key: str) -> Path | None:
+def _beside(frame: _Frame, key: str, finder: _FileFinder) -> Path | None:
     """Returns the file of depth or mask that a frame names, which must exist."""
     if frame.entry.get(key) is None:
         return None
-    path = resolve_inside(frame.folder, frame.entry[key], f"{frame.where} {key}")
+    path = finder.find(frame.entry[key], f"{frame.where} {key}")
     if not is_file(path):
         raise FormatError(
             f"{frame.where} names the {key} {path}, which is missing.",

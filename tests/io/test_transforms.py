@@ -127,6 +127,52 @@ def test_a_file_outside_the_data_set_is_refused(tmp_path, name):
         read_transforms(tmp_path)
 
 
+@pytest.mark.parametrize("folder", [
+    "/home/someone/scene/images/", "C:\\captures\\scene\\images\\", "../scene/images/", "frames/"])
+def test_paths_of_another_machine_are_found_by_their_names(tmp_path, folder):
+    posed_sets.make_transforms(tmp_path)
+    posed_sets.write_image(tmp_path / "masks" / "0002.png")
+
+    def move(value):
+        for frame in value["frames"]:
+            frame["file_path"] = frame["file_path"].replace("images/", folder)
+        value["frames"][2]["mask_path"] = "masks/0002.png"
+
+    rewrite(tmp_path, move)
+    posed = read_transforms(tmp_path)
+    assert [image.path for image in posed.images] == [
+        tmp_path / "images" / f"{number:04d}.png" for number in range(4)]
+    assert posed.images[2].mask == tmp_path / "masks" / "0002.png"
+    assert any(notice.startswith(f"4 of its paths do not exist here, the first is {folder}0000")
+               for notice in posed.notices)
+
+
+def test_among_files_of_one_name_the_folders_decide(tmp_path):
+    posed_sets.make_transforms(tmp_path)
+    posed_sets.write_image(tmp_path / "images_2" / "0001.png")
+    rewrite(tmp_path, lambda value: value["frames"][1].update(file_path="D:\\x\\images\\0001.png"))
+    assert read_transforms(tmp_path).images[1].path == tmp_path / "images" / "0001.png"
+    rewrite(tmp_path, lambda value: value["frames"][1].update(file_path="D:\\x\\other\\0001.png"))
+    with pytest.raises(FormatError, match="lies outside"):
+        read_transforms(tmp_path)
+
+
+def test_an_image_that_is_listed_stands_for_no_other(tmp_path):
+    posed_sets.make_transforms(tmp_path)
+    rewrite(tmp_path, lambda value: value["frames"][1].update(file_path="other/0002.png"))
+    posed = read_transforms(tmp_path)
+    assert [image.path.name for image in posed.images] == ["0000.png", "0002.png", "0003.png"]
+    assert len(posed.missing) == 1
+
+
+def test_a_file_outside_is_not_found_by_its_name(tmp_path):
+    posed_sets.make_transforms(tmp_path / "set")
+    posed_sets.write_image(tmp_path / "secret.png")
+    rewrite(tmp_path / "set", lambda value: value["frames"][1].update(file_path="../secret.png"))
+    with pytest.raises(FormatError, match="lies outside"):
+        read_transforms(tmp_path / "set")
+
+
 @pytest.mark.parametrize("name", [None, 3, "", "a\0b"])
 def test_a_frame_without_a_file_name_is_refused(tmp_path, name):
     posed_sets.make_transforms(tmp_path)
