@@ -38,7 +38,7 @@ VERBS = {
     "clean": ("workspace.clean", "Free disk space."),
     "doctor": ("doctor.doctor", "Show versions, rasterizers, memory and disk."),
     "bench": ("bench.bench", "Measure the rasterizers: speed against error."),
-    "study": ("study.study", "Repeat the paper's experiment: 3DGS against ours."),
+    "study": ("bench.study", "Repeat the paper's experiment: 3DGS against ours."),
 }
 
 logger = logging.getLogger("recon")

@@ -1,7 +1,9 @@
-"""`recon bench`: the options of the rasterizer benchmark."""
+"""The verbs of experiments: `recon bench`, `recon bench train` and `recon study`."""
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +11,84 @@ import click
 from click.core import ParameterSource
 
 from recon_cli.commands import options
-from recon_cli.commands.bench_train import output_options, train
-from recon_cli.commands.options import Call, pass_call
+from recon_cli.commands.options import Call, Command, Decorator, pass_call
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.experiments.outputs import OutputFiles
 from recon_cli.lazy import load
 from recon_cli.progress import TqdmProgress
+
+_FILE = click.Path(dir_okay=False, path_type=Path)
+_SCENE = click.Path(path_type=Path)
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """The scenes of a training experiment, and the size and cap of their runs."""
+
+    paths: tuple[Path, ...]
+    max_size: int
+    max_gaussians: int
+
+    def fields(self, call: Call, *, validation: float | None = None) -> dict[str, Any]:
+        """Returns the fields of an ExperimentRequest; `validation` as of `runner.base_config`."""
+        base_config = load("recon_cli.experiments.runner.base_config")
+        return {
+            "scenes": self.paths, "settings": call.assigned,
+            "compute": settings.build(ComputeConfig, call.settings),
+            "base": base_config(call.assigned, max_size=self.max_size,
+                                max_gaussians=self.max_gaussians, validation=validation)}
+
+
+def _scene_options(function: Command) -> Command:
+    """Adds SCENE..., `--scenes`, and the size and cap of their runs as one `scenes`."""
+    @functools.wraps(function)
+    def collect(
+        *args: Any, more: tuple[Path, ...], scenes: tuple[Path, ...], max_size: int,
+        max_gaussians: int, **typed: Any,
+    ) -> Any:
+        collected = SceneOptions((*scenes, *more), max_size, max_gaussians)
+        return function(*args, scenes=collected, **typed)
+
+    return options.stack([
+        click.argument("more", metavar="[SCENE]...", nargs=-1, type=_SCENE),
+        click.option(
+            "--scenes", multiple=True, type=_SCENE, metavar="SCENE...",
+            help="Workspaces with cameras, or data sets with poses; the words after it are scenes "
+                 "too.  [default: none]"),
+        click.option(
+            "--max-size", type=click.IntRange(min=16), default=600, metavar="N",
+            help="Longest side of the images.  [pixels; default: 600]"),
+        click.option(
+            "--max-gaussians", type=click.IntRange(min=1), default=60_000, metavar="N",
+            help="Cap of the count.  [default: 60000]")])(collect)
+
+
+_compute_options = options.stack([
+    options.assignments("ingest.frames=200"), options.of(ComputeConfig), options.verbosity])
+
+
+def _output_options(plot: str) -> Decorator:
+    """Returns a decorator that adds --json, --plot and --markdown as one `outputs`."""
+    def decorate(function: Command) -> Command:
+        @functools.wraps(function)
+        def collect(
+            *args: Any, json_file: Path | None, plot: Path | None, markdown: Path | None,
+            **typed: Any,
+        ) -> Any:
+            return function(*args, outputs=OutputFiles(json_file, plot, markdown), **typed)
+
+        return options.stack([
+            click.option("--json", "json_file", type=_FILE,
+                         help="Write all figures to FILE.  [default: nowhere]"),
+            click.option("--plot", type=_FILE, help=(
+                f"{plot} into a .png or .svg; needs recon-cli[plot].  [default: nowhere]")),
+            click.option(
+                "--markdown", type=_FILE,
+                help="Write the tables between the lines `<!-- recon bench: begin -->` and "
+                     "`<!-- recon bench: end -->` of FILE.  [default: nowhere]")])(collect)
+
+    return decorate
 
 
 @click.group("bench", invoke_without_command=True, subcommand_metavar="[train ...]")
@@ -40,7 +113,7 @@ from recon_cli.progress import TqdmProgress
 @click.option(
     "--quick", is_flag=True,
     help="A tiny scene and few rounds: whether it works, not how fast.  [default: off]")
-@output_options("Draw speed against error")
+@_output_options("Draw speed against error")
 @click.option(
     "--compare", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
     help="Print the ratio of each figure of an earlier --json FILE to this run's.  "
@@ -74,4 +147,68 @@ def _refuse_own_options(ctx: click.Context) -> None:
                 f"{parameter.opts[0]} has no effect on {ctx.invoked_subcommand}.", ctx)
 
 
+@click.command("train")
+@_scene_options
+@click.option(
+    "--recipes", multiple=True, metavar="NAME,...",
+    help="reference, budget, paper, budget-pruned, budget-l1 or budget-degree-1, each with "
+         "options of training if wanted: budget+sh_degree=2.  [default: reference,budget]")
+@click.option(
+    "--iterations", type=click.IntRange(min=1), metavar="N",
+    help="Steps of every run.  [default: 3000]")
+@click.option(
+    "--seconds", type=click.FloatRange(min=0, min_open=True), metavar="X",
+    help="As many steps as fit, by the steps of a short pilot.  [default: --iterations counts]")
+@click.option(
+    "--seeds", type=click.IntRange(min=1), default=3, metavar="N",
+    help="Runs of each recipe, with seeds 0 to N - 1.  [default: 3]")
+@click.option(
+    "--target-db", "targets_db", multiple=True, type=float, metavar="DB",
+    help="PSNR whose time is reported; may be repeated.  [default: what all runs of a scene "
+         "reach]")
+@_output_options("Draw the curves")
+@_compute_options
+@pass_call
+def train(call: Call, /, scenes: SceneOptions, recipes: tuple[str, ...], **typed: Any) -> None:
+    """Measure recipes of training: quality over time.
+
+    Trains every recipe on every SCENE and writes curves of PSNR and SSIM on validation views
+    against seconds, with the count and the size of the .ply.
+    """
+    parse = load("recon_cli.experiments.variants.parse_recipes")
+    request = load("recon_cli.experiments.recipe_benchmark.RecipeRequest")
+    run = load("recon_cli.experiments.recipe_benchmark.run")
+    variants = parse(recipes or ("reference,budget",))
+    click.echo(run(request(**scenes.fields(call), **typed, recipes=variants), TqdmProgress()))
+
+
 bench.add_command(train)
+
+
+@click.command("study")
+@_scene_options
+@click.option(
+    "--seeds", type=click.IntRange(min=1), default=5, metavar="N",
+    help="Runs of each variant, with seeds 0 to N - 1.  [default: 5]")
+@click.option(
+    "--iterations", type=click.IntRange(min=1), default=3000, metavar="N",
+    help="Steps of every variant where steps are equal.  [default: 3000]")
+@click.option(
+    "--clock", type=click.Choice(["wall", "cpu"]), default="wall",
+    help="Which seconds are made equal; cpu on a machine that others use too.  [default: wall]")
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("study"),
+    help="Folder of finished runs, study.json, study.md and study.svg; runs found there are not "
+         "made again.  [default: study]")
+@_compute_options
+@pass_call
+def study(call: Call, /, scenes: SceneOptions, **typed: Any) -> None:
+    """Repeat the paper's experiment: 3DGS against ours.
+
+    Trains 3DGS, 3DGS with the paper's prune, ours and ours pruned on every SCENE, at equal steps
+    and at equal seconds, and scores them on held-out views, with intervals over the seeds.
+    """
+    request = load("recon_cli.experiments.study.StudyRequest")
+    run = load("recon_cli.experiments.study.run")
+    # nothing looks at validation views here, so all but the test views are trained on
+    click.echo(run(request(**scenes.fields(call, validation=0.0), **typed), TqdmProgress()))

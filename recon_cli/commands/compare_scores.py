@@ -36,15 +36,13 @@ def compare(
     Args:
         open_job: returns the job and the options of a workspace, its own recon.toml among them.
         workspace: that of -w.
-        items: workspaces and files, at least one.
+        items: workspaces and files, at least one; InputError if a path is neither.
         form: text, markdown, csv, latex or json.
-
-    Raises:
-        InputError: a path is neither.
-        StageError: a workspace has no fresh model, or the one of -w no fresh cameras.
     """
     _check_items(items)
-    names = _names(items)
+    short = {path: path.resolve().name for path in items}
+    shared = Counter(short.values())
+    names = {path: name if shared[name] == 1 else str(path) for path, name in short.items()}
     models: list[ScoredModel] = []
     held_out: tuple[str, list[ReferenceView], StageContext] | None = None
     for path in items:
@@ -71,13 +69,6 @@ def _check_items(items: Sequence[Path]) -> None:
         if path.resolve() in resolved:
             raise ConfigError(f"{path} appears twice.", hint="Remove one of them.")
         resolved.add(path.resolve())
-
-
-def _names(items: Sequence[Path]) -> dict[Path, str]:
-    """Returns the name of each path in tables: its last part, or all of it if two share that."""
-    short = {path: path.resolve().name for path in items}
-    shared = Counter(short.values())
-    return {path: name if shared[name] == 1 else str(path) for path, name in short.items()}
 
 
 def _load_held_out(

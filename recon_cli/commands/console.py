@@ -34,9 +34,8 @@ class _BarAwareHandler(logging.StreamHandler[TextIO]):
 def show_log(*, detailed: Callable[[], bool]) -> logging.Handler:
     """Shows the log on stderr and returns the handler, to be removed at the end.
 
-    Args:
-        detailed: whether debug messages are shown too; asked for each of them, because the log
-            starts before the command line is parsed.
+    `detailed` says whether debug messages are shown too; it is asked for each of them, because the
+    log starts before the command line is parsed.
     """
     handler = _BarAwareHandler()
     handler.setFormatter(_NoticeFormatter())

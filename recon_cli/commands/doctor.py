@@ -36,31 +36,18 @@ def doctor(call: Call, as_json: bool) -> None:
 
 @dataclass(frozen=True)
 class Findings:
-    """What `recon doctor --json` prints under these names.
+    """What `recon doctor --json` prints under these names."""
 
-    Attributes:
-        versions: of Python, recon and the packages that matter.
-        device: the GPU by name, or "cpu".
-        backends: every rasterizer, the fastest first.
-        cores: CPU cores that this process may use.
-        memory_total_bytes: RAM.
-        memory_free_bytes: RAM that is available now.
-        disk_free_bytes: where the workspace lies or would lie.
-        workspace: its path.
-        writable: whether files can be made there.
-        self_check: of the triton kernels on this GPU; None where they cannot run.
-    """
-
-    versions: dict[str, str]
-    device: str
-    backends: tuple[BackendStatus, ...]
-    cores: int
+    versions: dict[str, str]  # of Python, recon and the packages that matter
+    device: str  # the GPU by name, or "cpu"
+    backends: tuple[BackendStatus, ...]  # every rasterizer, the fastest first
+    cores: int  # CPU cores that this process may use
     memory_total_bytes: int
-    memory_free_bytes: int
-    disk_free_bytes: int
-    workspace: str
-    writable: bool
-    self_check: Verdict | None
+    memory_free_bytes: int  # available now
+    disk_free_bytes: int  # where the workspace lies or would lie
+    workspace: str  # its path
+    writable: bool  # files can be made there
+    self_check: Verdict | None  # of the triton kernels on this GPU; None where they cannot run
 
 
 def examine(workspace: Path) -> Findings:

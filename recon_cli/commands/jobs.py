@@ -21,15 +21,9 @@ from recon_cli.workspace.layout import Workspace
 
 
 def run_stages(
-    call: Call,
-    verb: str,
-    stages: Sequence[str],
-    *,
-    sources: tuple[Path, ...] = (),
-    base: Settings | None = None,
-    forced: Settings | None = None,
-    callbacks: tuple[TrainCallback, ...] = (),
-    table: Sequence[Stage] = (),
+    call: Call, verb: str, stages: Sequence[str], *, sources: tuple[Path, ...] = (),
+    base: Settings | None = None, forced: Settings | None = None,
+    callbacks: tuple[TrainCallback, ...] = (), table: Sequence[Stage] = (),
 ) -> None:
     """Runs stages one after the other, or prints their options.
 

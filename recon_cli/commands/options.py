@@ -40,26 +40,16 @@ _METAVARS = {int: "N", float: "X", str: "TEXT"}
 
 @dataclass
 class Call:
-    """What was typed, collected option by option.
+    """What was typed, collected option by option."""
 
-    Attributes:
-        workspace: of -w, RECON_WORKSPACE or the default.
-        config_file: of --config.
-        verbose: -v.
-        again: run even if up to date.
-        print_config: show the merged options and stop.
-        settings: the fields that were given as options of their own.
-        assigned: the fields that were given by --set.
-        ranks: the processes that train together, which this one leads; nobody types it.
-    """
-
-    workspace: Path = Path("workspace")
+    workspace: Path = Path("workspace")  # of -w, RECON_WORKSPACE or the default
     config_file: Path | None = None
     verbose: bool = False
     again: bool = False
     print_config: bool = False
-    settings: Settings = field(default_factory=dict)
-    assigned: Settings = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)  # given as options of their own
+    assigned: Settings = field(default_factory=dict)  # given by --set
+    # The processes that train together, which this one leads; nobody types it.
     ranks: ProcessGroup = SINGLE_PROCESS
 
 
@@ -139,11 +129,7 @@ def verb(name: str) -> Callable[[Command], Verb]:
 
 
 def explicit_settings(call: Call) -> Settings:
-    """Returns what recon.toml, --config and --set set, checked.
-
-    Raises:
-        ConfigError: a file cannot be read, or a value cannot be used.
-    """
+    """Returns what recon.toml, --config and --set set; ConfigError if a value cannot be used."""
     in_workspace = call.workspace / FILE
     files = [in_workspace] if in_workspace.exists() else []
     files += [call.config_file] if call.config_file else []
@@ -176,11 +162,10 @@ print_config = _switch("--print-config", "Print options as TOML and exit.")
 def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPACE") -> Decorator:
     """Returns a decorator that adds -w, --config and -v.
 
-    Args:
-        workspace: folder where -w is not given.
-        envvar: environment variable that stands in for -w, if any.
+    `workspace` is the folder where neither -w nor the environment variable `envvar`, if any, names
+    one.
     """
-    return _stack([
+    return stack([
         click.option(
             "-w", "--workspace", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
             default=workspace, envvar=envvar, show_default=True, show_envvar=True,
@@ -194,11 +179,7 @@ def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPAC
 
 
 def assignments(example: str = "train.iterations=1000") -> Decorator:
-    """Returns a decorator that adds --set, for the verbs that run many stages.
-
-    Args:
-        example: that the help shows.
-    """
+    """Returns a decorator that adds --set, for the verbs that run many stages."""
     def store(ctx: click.Context, _parameter: click.Parameter, values: tuple[str, ...]) -> None:
         ctx.ensure_object(Call).assigned = merge(parse_assignment(text) for text in values)
 
@@ -211,12 +192,10 @@ def assignments(example: str = "train.iterations=1000") -> Decorator:
 def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
     """Returns a decorator that adds all options of a verb that runs one stage.
 
-    Args:
-        config: of the stage.
-        renders: the stage needs a rasterizer, so that device and backend can be chosen.
+    If the stage `renders` it needs a rasterizer, so that device and backend can be chosen.
     """
     compute: Decorator = of(ComputeConfig, only=() if renders else ("threads",))
-    return _stack([of(config), compute, again, print_config, common()])
+    return stack([of(config), compute, again, print_config, common()])
 
 
 def of(
@@ -242,7 +221,7 @@ def of(
         ] or [_field(
             config, item.name, f"{lead}{info.help}  [{describe_default(item)}]",
             expert=info.expert or item.name in expert)]
-    return _stack(decorators)
+    return stack(decorators)
 
 
 def describe_default(item: dataclasses.Field[Any]) -> str:
@@ -311,7 +290,7 @@ def _flag(config: type[StageConfig], name: str, choice: str, text: str) -> Decor
         callback=store, help=f"{text}  [default: off]")
 
 
-def _stack(decorators: Sequence[Decorator]) -> Decorator:
+def stack(decorators: Sequence[Decorator]) -> Decorator:
     """Returns one decorator that applies all, so that --help lists them in this order."""
     def apply(function: Command) -> Command:
         for decorator in reversed(decorators):

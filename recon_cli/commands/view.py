@@ -56,7 +56,7 @@ def view(
         call.workspace = workspace
         job = open_job(call)
         content = load("recon_cli.viewer.content.load_workspace")(job, model)
-        photos = load("recon_cli.viewer.photo_pairs.PhotoPairs")(job, content.max_size)
+        photos = load("recon_cli.viewer.content.PhotoPairs")(job, content.max_size)
     serve_scene = load("recon_cli.viewer.server.serve_scene")
     try:
         with serve_scene(content, photos, host, port) as (_, address):
@@ -70,11 +70,7 @@ def view(
 
 @contextmanager
 def show_training(call: Call) -> Iterator[TrainCallback]:
-    """Yields a callback that shows a training in the browser, on this machine alone.
-
-    Raises:
-        ConfigError: no port is free.
-    """
+    """Yields a callback that shows a training in the browser, on this machine alone."""
     start_server = load("recon_cli.viewer.server.start_server")
     host = load("recon_cli.viewer.server.HOST")
     with start_server(host, None, label="recon train") as (server, address):
@@ -88,11 +84,7 @@ def show_training(call: Call) -> Iterator[TrainCallback]:
 
 
 def _workspace(call: Call, item: Path | None) -> Path | None:
-    """Returns the workspace to show; None where ITEM is a file.
-
-    Raises:
-        InputError: there is no such file or workspace.
-    """
+    """Returns the workspace to show; None where ITEM is a file."""
     if item is None:
         return call.workspace
     source = click.get_current_context().get_parameter_source("workspace")

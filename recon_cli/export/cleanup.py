@@ -61,13 +61,7 @@ logger = logging.getLogger("recon")
 def drop_floaters(splats: Splats, views: Sequence[TrainView], ctx: StageContext) -> Splats:
     """Returns a scene without floaters, and logs how many of each kind are removed.
 
-    Args:
-        splats: the scene, on the CPU.
-        views: training views with cameras in its world.
-        ctx: backend, device and progress.
-
-    Raises:
-        ConfigError: nothing would be left.
+    The cameras of the training views are in its world. ConfigError if nothing would be left.
     """
     on_device = splats.map(lambda tensor: tensor.to(ctx.device))
     with ctx.progress.bar("look for floaters", 3 * len(views), unit="view") as bar:
@@ -85,12 +79,8 @@ def drop_islands(
 ) -> Splats:
     """Returns a scene without small groups of Gaussians far from all others.
 
-    Args:
-        splats: the scene, on the CPU.
-        scene: with the extent of the room, in the world of the training.
-        similarity: from there to the world of `splats`.
-        views: training views with cameras in that world; None if there are none.
-        ctx: backend and device.
+    `scene` has the extent of the room in the world of the training, and `similarity` leads from
+    there to that of `splats` and of the training views (None if there are none).
     """
     center = similarity.points(scene.center).tolist()
     near = splats.within(center, similarity.scale * scene.reach)
@@ -130,12 +120,8 @@ def find_floaters(
 ) -> Floaters:
     """Returns which Gaussians are floaters.
 
-    Args:
-        splats: N Gaussians.
-        views: training views, whose cameras are in the world of the Gaussians; never validation or
-            test views.
-        backend: rasterizer.
-        on_view: called after each rendered view.
+    The views are training views, whose cameras are in the world of the Gaussians; `on_view` is
+    called after each rendered one.
     """
     none = torch.zeros(len(splats), dtype=torch.bool, device=splats.means.device)
     seen_by = count_sightings(splats, views, backend=backend, on_view=on_view)
@@ -161,11 +147,7 @@ def measure_harm(
 ) -> tuple[Tensor, float]:
     """Returns the decrease of the squared error without each one [N] float64, and the error.
 
-    Args:
-        splats: N Gaussians.
-        views: with their images; pixels that a mask ignores have no error.
-        backend: rasterizer.
-        on_view: called after each view.
+    Pixels that a mask ignores have no error.
     """
     leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(True))
     device = splats.means.device
@@ -195,10 +177,7 @@ def count_sightings(
     splats: Splats, views: Sequence[TrainView], *, backend: str,
     on_view: Callable[[], None] = lambda: None,
 ) -> Tensor:
-    """Returns how many views blend each Gaussian with a weight of 0.01 or more, [N] int64.
-
-    The arguments are those of `floaters`.
-    """
+    """Returns how many views blend each Gaussian with a weight of 0.01 or more, [N] int64."""
     seen_by = torch.zeros(len(splats), dtype=torch.int64, device=splats.means.device)
     with torch.no_grad():
         for view in views:
@@ -250,14 +229,9 @@ def _is_before(means: Tensor, camera: Camera, behind: RenderOutput) -> Tensor:
 def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor:
     """Returns which Gaussians belong to islands, [N] bool.
 
-    Groups outside the box of the scene that a view shows are no islands: they are seen through a
-    window.
-
-    Args:
-        splats: N Gaussians.
-        near: [N] bool, Gaussians near enough to be islands.
-        visible: [N] bool, what a training view shows; None if unknown, and then groups outside
-            are islands too.
+    `near` [N] are those near enough to be islands, `visible` [N] what a training view shows, None
+    if unknown. Groups outside the box of the scene that a view shows are no islands: they are seen
+    through a window.
     """
     drawn = (near & (splats.opacities >= _VISIBLE)).cpu()
     rows = torch.nonzero(drawn)[:, 0]
@@ -285,7 +259,9 @@ def _find_groups(means: NDArray[np.float64], splats: Splats) -> NDArray[np.int64
     """Returns the index of the group of each Gaussian, [K]."""
     distance, other = cKDTree(means).query(means, k=_NEIGHBOURS + 1)
     scales = splats.scales.detach().double().cpu().numpy()
-    rotation = Rotation.from_quat(_valid_quats(splats), scalar_first=True).as_matrix()
+    quats = splats.quats.detach().double().cpu().numpy()
+    quats[~quats.any(axis=1)] = [1, 0, 0, 0]
+    rotation = Rotation.from_quat(quats, scalar_first=True).as_matrix()
     sources, targets = [], []
     for rank in range(1, _NEIGHBOURS + 1):  # one at a time: all at once would take gigabytes
         neighbour, apart = other[:, rank], distance[:, rank]
@@ -305,13 +281,6 @@ def _deviations_along(
 ) -> NDArray[np.float64]:
     """Returns the standard deviations [K] along unit vectors: sqrt(d^T Sigma d) = |S R^T d|."""
     return np.asarray(np.linalg.norm(scales * np.einsum("kij,ki->kj", rotation, way), axis=1))
-
-
-def _valid_quats(splats: Splats) -> NDArray[np.float64]:
-    """Returns quaternions [K, 4] wxyz, zeros replaced by no rotation."""
-    quats = splats.quats.detach().double().cpu().numpy()
-    quats[~quats.any(axis=1)] = [1, 0, 0, 0]
-    return np.asarray(quats)
 
 
 def _find_far_groups(

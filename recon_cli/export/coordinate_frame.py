@@ -35,8 +35,7 @@ class ExportFrame:
 def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
     """Returns the coordinate frame that the options select.
 
-    Raises:
-        ConfigError: --scale-between names no place, or --transform is no similarity.
+    ConfigError if --scale-between names no place, or --transform is no similarity.
     """
     measurement = _measure_scale(config, inputs)
     similarity = Similarity(scale=measurement.scale) if measurement else Similarity()

@@ -47,15 +47,7 @@ logger = logging.getLogger("recon")
 
 
 class Exporter:
-    """Reduces a scene and writes it in any format; views are loaded only once they are needed.
-
-    Args:
-        config: the options.
-        inputs: finished folders.
-        out: folder of the files.
-        frame: coordinate frame of the files.
-        ctx: backend and device.
-    """
+    """Reduces a scene and writes it in any format; views are loaded only once they are needed."""
 
     def __init__(
         self, config: ExportConfig, inputs: StageInputs, out: Path, frame: ExportFrame,
@@ -70,15 +62,13 @@ class Exporter:
         """Returns the scene after the options that remove something, in order, and the changes.
 
         Floaters and islands come before --crop: it takes away what views show behind the rest.
-
-        Raises:
-            ConfigError: nothing would be left.
+        ConfigError if nothing would be left.
         """
         config, changes = self._config, []
         self._whole = splats
 
         def step(option: str, after: Splats) -> Splats:
-            changes.append(measure_change(option, splats, after, self._psnr_db))
+            changes.append(measure_change(option, splats, after, self._psnr.psnr_db))
             return after
 
         if config.drop_floaters:
@@ -95,14 +85,13 @@ class Exporter:
         if config.max_mb is not None:
             splats = step("max_mb", fit_to_size(
                 splats, int(1e6 * config.max_mb), size_of=self._size_of(config.formats[0]),
-                score_of=self._score, psnr_db=self._psnr_db))
+                score_of=self._score, psnr_db=self._psnr.psnr_db))
         return splats, changes
 
     def write(self, name: str, splats: Splats) -> ExportedFile:
         """Writes the scene, whose .ply exists already, in one more format.
 
-        Raises:
-            ReconstructionError: it loses more than it may.
+        ReconstructionError if it loses more than it may.
         """
         others: dict[str, Callable[[Splats], Path]] = {
             "points.ply": self._write_points, "colmap": self._write_colmap,
@@ -115,7 +104,7 @@ class Exporter:
 
     def _check(self, name: str, path: Path, splats: Splats) -> ExportedFile:
         """Reads a file back and logs its size and its loss."""
-        gain = self._psnr_db(FORMATS[name].read(path)) - self._psnr_db_before(splats)
+        gain = self._psnr.psnr_db(FORMATS[name].read(path)) - self._psnr_db_before(splats)
         size, whole = path.stat().st_size, (self._out / "splats.ply").stat().st_size
         text = f"{name}: {whole / size:.1f}x smaller, {gain:+.2f} dB"
         max_loss = self._config.max_loss
@@ -156,13 +145,10 @@ class Exporter:
 
         return size_of
 
-    def _psnr_db(self, splats: Splats) -> float:
-        return self._psnr.psnr_db(splats)
-
     def _psnr_db_before(self, splats: Splats) -> float:
         """Returns the PSNR of the scene that all files are made of, rendered once."""
         if self._last is None or self._last[0] is not splats:
-            self._last = splats, self._psnr_db(splats)
+            self._last = splats, self._psnr.psnr_db(splats)
         return self._last[1]
 
     def _score(self, splats: Splats) -> Tensor:

@@ -66,11 +66,7 @@ class Alignment:
 def read_world(sfm: Path) -> Similarity:
     """Returns the similarity from the world of the capture's cameras to that of the workspace.
 
-    Args:
-        sfm: finished folder of the stage.
-
-    Raises:
-        FormatError: its record is damaged.
+    `sfm` is the finished folder of the stage; FormatError if its record is damaged.
     """
     world = WorldSummary.read(sfm)
     try:
@@ -95,7 +91,6 @@ def align_to_views(
         ctx: backend and device.
 
     Raises:
-        ConfigError: the views are too small to score.
         ReconstructionError: no training view can be compared.
     """
     frames = {WORKSPACE: Similarity(), SOURCE: world}

@@ -36,12 +36,8 @@ def synthetic_scene(splats: Splats, *, z_up: bool, max_size: int) -> Scene:
     """Returns a scene whose training views are cameras without images; deterministic.
 
     The first four stand around the bulk of the opaque Gaussians and look at its middle, the other
-    four stand where there is most space inside and look outward.
-
-    Args:
-        splats: at least one Gaussian.
-        z_up: up is z; else it is -y.
-        max_size: longest side of the images in pixels.
+    four stand where there is most space inside and look outward. Up is z, or -y; `max_size` is the
+    longest side of the images in pixels.
     """
     opaque = splats.opacities >= _OPAQUE
     means = splats.means[opaque if bool(opaque.any()) else ~opaque].double().cpu().numpy()
@@ -95,8 +91,7 @@ class SelfPsnr:
     def of(splats: Splats, scene: Scene, ctx: StageContext) -> SelfPsnr:
         """Renders `splats` at the training cameras of `scene`.
 
-        Raises:
-            ReconstructionError: none of them sees anything.
+        ReconstructionError if none of them sees anything.
         """
         renders = [(view.camera, *_render(splats, view.camera, ctx)) for view in scene.train]
         views = tuple(view for view in renders if view[2].any())

@@ -61,14 +61,8 @@ def load_reference_psnr(
 ) -> ReferencePsnr:
     """Loads the validation views, or some training views if there are none.
 
-    Args:
-        scene: the views in the world of the training.
-        similarity: from there to the world of the files.
-        max_size: longest side of the images in pixels.
-        ctx: backend and device.
-
-    Raises:
-        ReconstructionError: masks leave nothing of any of them.
+    `similarity` leads from the world of the training to that of the files. ReconstructionError if
+    masks leave nothing of any view.
     """
     chosen = evenly_spread(scene.validation or scene.train, _VIEWS)
     views = [dataclasses.replace(view, camera=similarity.camera(view.camera))

@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.calibration import viewmat_from_pose
+from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
 from recon_cli.io.transforms import read_number
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.atomic import read_json, write_json
 
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # y up and z backward, from y down and z forward
 # With a wider field of view the focal length is below a twentieth of the height, where the affine
 # approximation of a Gaussian's projection fails; a narrower one shows no room.
 _FOV_DEG = (1.0, 170.0)
@@ -60,26 +59,17 @@ def write_camera_path(path: Path, cameras: CameraPath) -> None:
         "render_width": cameras.width, "render_height": cameras.height,
         "fps": fps, "seconds": len(cameras.viewmats) / fps, "is_cycle": False, "keyframes": [],
         "camera_path": [
-            {"camera_to_world": _pose(viewmat).ravel().tolist(), "fov": float(fov),
+            {"camera_to_world": pose_from_viewmat(viewmat).ravel().tolist(), "fov": float(fov),
              "aspect": aspect}
             for viewmat, fov in zip(cameras.viewmats, cameras.fovs_deg, strict=True)],
     })
 
 
-def _pose(viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns [4, 4] camera to world, OpenGL axes."""
-    pose = np.eye(4)
-    pose[:3, :3] = viewmat[:3, :3].T
-    pose[:3, 3] = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    return pose @ _OPENGL
-
-
 def read_camera_path(path: Path) -> CameraPath:
     """Returns the cameras of a file.
 
-    Raises:
-        FormatError: the file is missing or no JSON, lists no cameras, or one lacks a finite rigid
-            pose or a valid field of view.
+    FormatError if it is missing or no JSON, lists no cameras, or one lacks a finite rigid pose or a
+    valid field of view.
     """
     value = read_json(path)
     entries = value.get("camera_path") if isinstance(value, dict) else None

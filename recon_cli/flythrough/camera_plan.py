@@ -38,10 +38,8 @@ class CameraPlan:
 def plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
     """Returns the requested cameras.
 
-    Raises:
-        StageError: views are requested, and there are none.
-        ConfigError: a size or a view's name cannot be used.
-        FormatError: the file of a path cannot be used.
+    StageError if views are requested and there are none, ConfigError for a size or name that cannot
+    be used, FormatError for the file of a path.
     """
     if not trained.has_views and (request.views or request.path == TRAINING):
         raise StageError(
@@ -120,10 +118,8 @@ def _no_such_view(
 def frame_size(width: int, height: int, request: RenderRequest) -> tuple[int, int]:
     """Returns the (width, height) of frames whose own size is `width` x `height`.
 
-    A side that is not requested follows from the other; for a video it is even.
-
-    Raises:
-        ConfigError: a requested side of a video is odd.
+    A side that is not requested follows from the other; for a video it is even. ConfigError if a
+    requested side of a video is odd.
     """
     sides = (request.width, request.height)
     if request.size:

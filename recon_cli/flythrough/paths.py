@@ -28,16 +28,10 @@ _FASTER = 2.0  # times the mean turn rate of the view, above which the path slow
 
 
 def smooth_path(viewmats: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Returns `count` cameras along a smooth path through cameras, at constant speed.
+    """Returns `count` cameras [count, 4, 4] along a smooth path through cameras, at constant speed.
 
-    Where the view would turn faster than twice its mean rate, the path slows down.
-
-    Args:
-        viewmats: [C, 4, 4] world to camera, OpenCV axes, in the order of the path; C at least 1.
-        count: cameras to return, at least 1; the first and the last are the ends of the path.
-
-    Returns:
-        [count, 4, 4] world to camera.
+    Where the view would turn faster than twice its mean rate, the path slows down. `viewmats` are
+    [C, 4, 4] world to camera, OpenCV axes, in the order of the path; its ends are kept.
     """
     rotations = viewmats[:, :3, :3].transpose(0, 2, 1)
     centers = -np.einsum("cij,cj->ci", rotations, viewmats[:, :3, 3])
@@ -102,20 +96,11 @@ def _to_viewmats(centers: NDArray[np.float64], rotations: Rotation) -> NDArray[n
 def orbit_path(
     centers: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """Returns `count` cameras on a circle around a point, all of them looking at it.
+    """Returns `count` cameras [count, 4, 4] on a circle around a point, all of them looking at it.
 
-    The circle has the median horizontal distance and the median height of `centers`, starts on the
-    side of the first of them and turns anticlockwise as seen from above. It is closed: one more
-    camera would be the first again.
-
-    Args:
-        centers: [C, 3] of the cameras that give distance and height.
-        target: [3] the point.
-        up: [3] unit vector.
-        count: cameras to return, at least 1.
-
-    Returns:
-        [count, 4, 4] world to camera, OpenCV axes.
+    The circle has the median horizontal distance and the median height of `centers` [C, 3], starts
+    on the side of the first of them and turns anticlockwise as seen from above; `up` is a unit
+    vector. It is closed: one more camera would be the first again.
     """
     offsets = centers - target
     heights = offsets @ up
@@ -140,12 +125,8 @@ def _horizontal(up: NDArray[np.float64]) -> NDArray[np.float64]:
 def find_look_at(cameras: list[Camera], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the point [3] that cameras look at, by the points in the middle of their pictures.
 
-    Each camera looks at the point on its axis at the median depth of those points; the result is
-    the median of these, coordinate by coordinate.
-
-    Args:
-        cameras: at least one.
-        points: [P, 3] of the scene, at least one.
+    Each camera looks at the point on its axis at the median depth of those points [P, 3]; the
+    result is the median of these, coordinate by coordinate.
     """
     places = []
     for camera in cameras:

@@ -20,11 +20,7 @@ MAX_FRAMES = 100_000
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """The options of the command.
-
-    Raises:
-        ConfigError: an option is out of range, or options exclude each other.
-    """
+    """The options of the command; ConfigError if one is out of range, or two exclude each other."""
 
     path: str = TRAINING  # "training", "orbit" or a .json with cameras
     views: tuple[str, ...] = ()  # test, train, validation or names of frames, instead of a path

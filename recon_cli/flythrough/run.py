@@ -19,16 +19,18 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
 from recon_cli.flythrough.camera_path import write_camera_path
 from recon_cli.flythrough.camera_plan import CameraPlan, check_frame_memory, plan_cameras
-from recon_cli.flythrough.images import (
+from recon_cli.flythrough.output import (
     FOLDERS,
     VIDEO_FRAMES,
     DepthScale,
+    VideoEncoding,
+    check_encoding,
     depth_scale,
+    encode_video,
     write_frame,
 )
 from recon_cli.flythrough.request import DEPTH, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
-from recon_cli.flythrough.video import VideoEncoding, check_encoding, encode_video
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render import render
 from recon_cli.workspace import lock
@@ -54,10 +56,7 @@ logger = logging.getLogger("recon")
 class FrameFolder:
     """The frames in one folder, and the record of their settings.
 
-    Args:
-        root: an existing folder.
-        names: stems of all frames, in order.
-        outputs: which of rgb, depth, alpha.
+    `names` are the stems of all frames, in order; `outputs` are of rgb, depth, alpha.
     """
 
     def __init__(self, root: Path, names: Sequence[str], outputs: Sequence[str]) -> None:
@@ -67,12 +66,8 @@ class FrameFolder:
     def prepare(self, settings: Mapping[str, Any], about: Mapping[str, Any]) -> tuple[str, ...]:
         """Prepares the folder for these settings and returns which frames are missing.
 
-        Args:
-            settings: JSON values of everything that decides what a frame shows.
-            about: further JSON values for readers of the record.
-
-        Raises:
-            FormatError: the record of an earlier run is damaged.
+        `settings` are JSON values of everything that decides what a frame shows, `about` more of
+        them for readers of the record. FormatError if the record of an earlier run is damaged.
         """
         settings = {"schema": _SCHEMA, **settings}
         before = self._read_record()
@@ -141,11 +136,8 @@ def check_folder(root: Path) -> None:
 def render_frames(request: RenderRequest, job: Job) -> str:
     """Renders the missing frames of a request and returns what was written, in words.
 
-    Raises:
-        StageError: the workspace holds no trained model that is fresh.
-        ConfigError: a size, a view or a codec cannot be used.
-        FormatError: a file cannot be read.
-        WorkspaceError: the folder is in use, full, not writable, or holds files of others.
+    StageError without a fresh model, ConfigError for a size, view or codec that cannot be used,
+    FormatError for a damaged file, WorkspaceError for a folder that cannot be used.
     """
     with disk_errors(job.workspace.root, "reading the model"):
         trained = open_trained_scene(job, request.model)

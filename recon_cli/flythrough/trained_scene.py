@@ -61,14 +61,8 @@ class TrainedScene:
 def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> TrainedScene:
     """Returns the trained scene of a workspace.
 
-    Args:
-        job: holds the workspace.
-        model: auto, base or pruned; auto is the pruned one if it is fresh.
-        verb: the command, for messages.
-
-    Raises:
-        StageError: the model is missing or stale.
-        FormatError: a file of the workspace is damaged.
+    `model` is auto, base or pruned; auto is the pruned one if it is fresh. `verb` is the command,
+    for messages. StageError if the model is missing or stale.
     """
     inspection = job.inspect()
     origin = ImportRecord.read(job.workspace.folder("train"))

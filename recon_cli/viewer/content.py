@@ -1,26 +1,31 @@
-"""The content of the viewer: the models and views of a workspace, or a splat file."""
+"""The content of the viewer: models and views of a workspace, or a splat file, and a crop box."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
+from recon_cli.evaluation.metrics import leaves_enough, psnr
+from recon_cli.evaluation.reference_views import render_on_black
 from recon_cli.flythrough.paths import visible_depths
 from recon_cli.flythrough.trained_scene import open_trained_scene
+from recon_cli.io.images import fit_camera, fit_size, read_image, read_masked_image, to_uint8
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import read_splats
-from recon_cli.pipeline.execute import Job
+from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import View
-from recon_cli.viewer.crop_box import box_around
+from recon_cli.scene.splats import Splats
 from recon_cli.viewer.gaussians import PackedSplats, pack_splats
 
 HELD_OUT, TRAINING, VALIDATION = "held-out", "training", "validation"
@@ -29,6 +34,11 @@ FAR = 1000.0  # world units; viser's default
 _FOV = math.radians(60)  # for a file, which has no camera
 # Cosine between the up of the image and of the world, below which a view looks up or down.
 _STEEP = 0.05
+_SHARE = 0.05  # of the Gaussians outside the initial box at either end of each axis
+_MARGIN = 0.1  # of its sides
+_CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
+_EDGES = [(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1]
+_THUMBNAIL = 160  # pixels, longest side
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +80,7 @@ class ViewerContent:
 def load_workspace(job: Job, model: str) -> ViewerContent:
     """Returns the trained scene of a workspace, with both models if both are fresh.
 
-    Args:
-        job: holds the workspace.
-        model: auto, base or pruned: the initial one.
-
-    Raises:
-        StageError: the model is missing or stale.
-        FormatError: a file of the workspace is damaged.
+    `model` is auto, base or pruned: the initial one. StageError if it is missing or stale.
     """
     trained = open_trained_scene(job, model, verb="view")
     models = {trained.model: pack_splats(trained.splats)}
@@ -96,10 +100,7 @@ def load_workspace(job: Job, model: str) -> ViewerContent:
 
 
 def load_file(path: Path) -> ViewerContent:
-    """Returns a splat file, seen from a corner of its room.
-
-    Raises:
-        FormatError: its format is not known, or it is damaged or empty.
+    """Returns a splat file, seen from a corner of its room; FormatError if it is damaged or empty.
     """
     splats = read_splats(path)
     models = {path.name: pack_splats(splats)}
@@ -153,3 +154,94 @@ def set_initial_camera(server: viser.ViserServer, start: BrowserCamera) -> None:
     camera = server.initial_camera
     camera.position, camera.look_at = start.position, start.look_at
     camera.fov, camera.near, camera.far = start.fov, start.near, start.far
+
+
+@dataclass(frozen=True)
+class CropBox:
+    """An axis-aligned box in world units."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    @staticmethod
+    def between(low: Sequence[float], high: Sequence[float]) -> CropBox:
+        """Returns the box of two corners, rounded as `arguments` writes them."""
+        first, second = ((float(_format(x)), float(_format(y)), float(_format(z)))
+                         for x, y, z in (low, high))
+        return CropBox(first, second)
+
+    @property
+    def arguments(self) -> str:
+        """The six numbers for `recon export --crop`."""
+        return " ".join(_format(value) for value in (*self.low, *self.high))
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether its low corner is below its high corner."""
+        return all(a < b for a, b in zip(self.low, self.high, strict=True))
+
+    def contains(self, splats: Splats) -> NDArray[np.bool_]:
+        """Returns [N] which centres are inside, its faces included."""
+        low, high = splats.means.new_tensor(self.low), splats.means.new_tensor(self.high)
+        inside: NDArray[np.bool_] = (
+            (splats.means >= low) & (splats.means <= high)).all(dim=1).numpy()
+        return inside
+
+    def edges(self) -> NDArray[np.float32]:
+        """Returns its edges [12, 2, 3]."""
+        corners = np.where(_CORNERS, self.high, self.low)
+        return np.asarray(corners[np.array(_EDGES)], np.float32)
+
+
+def box_around(splats: Splats) -> CropBox:
+    """Returns the initial box: 90% of the Gaussians along each axis, plus a tenth of its sides."""
+    if not len(splats):
+        return CropBox((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    low, high = np.quantile(splats.means.numpy(), [_SHARE, 1 - _SHARE], axis=0)
+    margin = _MARGIN * (high - low) + 1e-3
+    return CropBox.between((low - margin).tolist(), (high + margin).tolist())
+
+
+def _format(value: float) -> str:
+    return f"{value:.4g}"
+
+
+class PhotoPairs:
+    """Photos of views next to recon's own renders of them, made on request, by one thread at a
+    time.
+
+    `job` has the device, backend and threads to render with; `max_size` is the longest side in
+    pixels.
+    """
+
+    def __init__(self, job: Job, max_size: int) -> None:
+        self._job, self._max_size = job, max_size
+        self._thumbnails: dict[str, NDArray[np.uint8]] = {}
+
+    @cached_property
+    def _ctx(self) -> StageContext:
+        return render_context(self._job.compute, self._job.progress)
+
+    def load_photo(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+        """Returns a photo [H, W, 3] at the size of training, painted under its mask [H, W]."""
+        camera = fit_camera(view.camera, self._max_size)
+        return read_masked_image(view.original, view.mask, camera.width, camera.height)
+
+    def render_view(self, view: View, splats: Splats) -> tuple[NDArray[np.uint8], float | None]:
+        """Returns recon's render [H, W, 3] of a view and its PSNR in dB, as `recon eval` has it.
+
+        The PSNR is None if a mask leaves too little of the view.
+        """
+        truth, mask = self.load_photo(view)
+        camera, device = fit_camera(view.camera, self._max_size), self._ctx.device
+        on_device = splats.map(lambda tensor: tensor.to(device))
+        rgb = render_on_black(on_device, camera, splats.sh_degree, self._ctx.backend).rgb
+        image: NDArray[np.float32] = rgb.cpu().numpy()
+        return to_uint8(image), psnr(image, truth, mask) if leaves_enough(mask) else None
+
+    def thumbnail(self, view: View) -> NDArray[np.uint8]:
+        """Returns a small picture of a view."""
+        if view.name not in self._thumbnails:
+            size = fit_size(view.camera.width, view.camera.height, _THUMBNAIL)
+            self._thumbnails[view.name] = read_image(view.original, *size)
+        return self._thumbnails[view.name]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.render.torch.projection import colors_from_sh
+from recon_cli.render.torch.projection import colors_from_sh, rotation_matrices
 from recon_cli.scene.splats import Splats
 
 _LARGEST = 200.0  # standard deviation as sent; its square fits into half precision
@@ -55,7 +55,8 @@ def pack_splats(splats: Splats) -> PackedSplats:
         longest) else 0.0
     scale = largest / _LARGEST or 1.0
     spread = np.clip(scales, _THINNEST * longest[:, None], None).clip(max=largest) / scale
-    factors = _rotations(splats.quats.numpy()) * spread[:, None, :]
+    rotations = rotation_matrices(splats.quats.double()).numpy()
+    factors = rotations * spread[:, None, :]
     return PackedSplats(
         splats, scale, (splats.means.numpy() / scale).astype(np.float32),
         (factors @ factors.transpose(0, 2, 1)).astype(np.float16),
@@ -69,18 +70,6 @@ def _drop_non_finite(splats: Splats) -> Splats:
         rows = finite[:, None] if value.ndim == 1 else finite.flatten(1)
         good[:len(value)] &= rows.all(dim=1)  # sh_rest may have fewer
     return splats if bool(good.all()) else splats.select(good)
-
-
-def _rotations(quats: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Returns the rotations [N, 3, 3] of quaternions [N, 4] of any length; zero is the identity."""
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    unit = np.where(length > 0, quats / np.maximum(length, 1e-30), [1.0, 0.0, 0.0, 0.0])
-    w, x, y, z = unit.astype(np.float64).T
-    return np.asarray(np.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], axis=-1).reshape(-1, 3, 3))
 
 
 def _eight_bit(values: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -39,11 +39,8 @@ logger = logging.getLogger("recon")
 
 
 class LiveView(TrainCallback):
-    """Sends the Gaussians in training to all browsers.
-
-    Args:
-        server: that browsers connect to.
-        workspace: of the training; its sfm knows the vertical.
+    """Sends the Gaussians in training to all browsers of a server; the workspace's sfm knows the
+    up.
     """
 
     def __init__(self, server: Server, workspace: Workspace) -> None:

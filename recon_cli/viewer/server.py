@@ -15,8 +15,7 @@ import rich
 import viser
 
 from recon_cli.errors import ConfigError
-from recon_cli.viewer.content import ViewerContent, set_initial_camera
-from recon_cli.viewer.photo_pairs import PhotoPairs
+from recon_cli.viewer.content import PhotoPairs, ViewerContent, set_initial_camera
 from recon_cli.viewer.session import UPS, Session
 
 HOST, PORT = "127.0.0.1", 8080
@@ -37,13 +36,8 @@ class Server(viser.ViserServer):
 def start_server(host: str, port: int | None, *, label: str) -> Iterator[tuple[Server, str]]:
     """Yields a running server and its address; the port is free again afterwards.
 
-    Args:
-        host: address to listen on.
-        port: None takes PORT, or the first free one after it.
-        label: title of the panel.
-
-    Raises:
-        ConfigError: the port is in use, or the address is not of this machine.
+    `port` None takes PORT, or the first free one after it; `label` is the title of the panel.
+    ConfigError if the port is in use, or the address is not of this machine.
     """
     chosen = _free_port(host, port)
     # viser prints to stdout; the commands print what a user has to know
@@ -83,11 +77,7 @@ def _port_error(port: int) -> ConfigError:
 
 
 def _is_free(host: str, port: int) -> bool:
-    """Returns whether a server can listen there.
-
-    Raises:
-        ConfigError: the address is not of this machine, or the port needs privileges.
-    """
+    """Returns whether a server can listen there; ConfigError if it never could."""
     try:
         addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except socket.gaierror as error:
@@ -122,10 +112,8 @@ def _is_local(host: str) -> bool:
 
 
 def _address(host: str, port: int) -> str:
-    name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
-    if ":" in name and not name.startswith("["):
-        name = f"[{name}]"
-    return f"http://{name}:{port}"
+    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
 
 @contextmanager
@@ -134,14 +122,7 @@ def serve_scene(
 ) -> Iterator[tuple[Server, str]]:
     """Yields a server that shows a scene to every browser, and its address.
 
-    Args:
-        content: the scene.
-        photos: of its views; None without views.
-        host: address to listen on.
-        port: None takes the first free one.
-
-    Raises:
-        ConfigError: the port is in use, or the address is not of this machine.
+    `photos` are of its views, None without views; the errors are those of `start_server`.
     """
     sessions: dict[int, Session] = {}
     with start_server(host, port, label="recon") as (server, address):

@@ -16,15 +16,16 @@ from recon_cli.errors import ReconError
 from recon_cli.scene.splats import quaternion
 from recon_cli.viewer.content import (
     HELD_OUT,
+    CropBox,
     LabeledView,
+    PhotoPairs,
     ViewerContent,
+    box_around,
     browser_camera,
     move_browser,
     vertical_fov,
 )
-from recon_cli.viewer.crop_box import CropBox, box_around
 from recon_cli.viewer.gaussians import PackedSplats
-from recon_cli.viewer.photo_pairs import PhotoPairs
 
 _FRUSTUM_SIZE = 0.03  # of the distance to what is looked at
 _HELD_OUT_COLOR, _FRUSTUM_COLOR = (255, 140, 40), (150, 170, 200)
@@ -41,11 +42,7 @@ logger = logging.getLogger("recon")
 class Session:
     """Shows the content in one browser, from its connection until it leaves.
 
-    Args:
-        client: the browser.
-        content: the scene.
-        photos: of its views; None without views.
-        work: runs slow tasks one at a time.
+    `photos` are of the views, None without views; `work` runs slow tasks one at a time.
     """
 
     def __init__(
@@ -277,10 +274,7 @@ class Session:
 class Frustums:
     """The cameras of all views in one browser.
 
-    Args:
-        client: the browser.
-        content: has the views.
-        jump: called with the label of the view whose camera was clicked.
+    `jump` is called with the label of the view whose camera was clicked.
     """
 
     def __init__(

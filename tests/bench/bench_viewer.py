@@ -51,13 +51,13 @@ from recon_cli.scene.camera import Camera
 from recon_cli.viewer.content import (
     FAR,
     HELD_OUT,
+    PhotoPairs,
     ViewerContent,
     browser_camera,
     load_workspace,
     move_browser,
 )
 from recon_cli.viewer.gaussians import pack_splats
-from recon_cli.viewer.photo_pairs import PhotoPairs
 from recon_cli.viewer.server import HOST, serve_scene
 from recon_cli.workspace.layout import Workspace
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from prepared_workspace import wall
 
-from recon_cli.flythrough.images import DepthScale, depth_colors, depth_scale, depth_steps
+from recon_cli.flythrough.output import DepthScale, depth_colors, depth_scale, depth_steps
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View

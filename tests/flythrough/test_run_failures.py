@@ -7,8 +7,8 @@ import shutil
 import pytest
 from render_cli import SHORT, pictures, record, render
 
+from recon_cli.flythrough import output
 from recon_cli.flythrough import run as running
-from recon_cli.flythrough import video as videos
 from recon_cli.io.images import read_image
 
 
@@ -62,7 +62,7 @@ def test_what_cannot_be_rendered_is_a_usage_error(copied, capsys, words, said):
 def test_a_codec_that_is_missing_is_said_before_anything_is_rendered(
     copied, monkeypatch, capsys
 ):
-    monkeypatch.setitem(videos.ENCODERS, "av1", ("libnone",))
+    monkeypatch.setitem(output.ENCODERS, "av1", ("libnone",))
     assert render(copied, "--format", "mp4", "--codec", "av1") == 2
     assert "cannot encode av1" in capsys.readouterr().err
     assert not (copied / "render").exists()

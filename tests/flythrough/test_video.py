@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from recon_cli.errors import ConfigError, FormatError
-from recon_cli.flythrough import video
-from recon_cli.flythrough.video import VideoEncoding, check_encoding, encode_video
+from recon_cli.flythrough import output
+from recon_cli.flythrough.output import VideoEncoding, check_encoding, encode_video
 from recon_cli.io.images import read_image, write_png
 
 
@@ -84,7 +84,7 @@ def test_a_smaller_crf_is_closer(pictures, tmp_path):
 
 
 def test_a_codec_that_this_build_lacks_is_refused(monkeypatch):
-    monkeypatch.setitem(video.ENCODERS, "h264", ("libnone",))
+    monkeypatch.setitem(output.ENCODERS, "h264", ("libnone",))
     with pytest.raises(ConfigError, match=r"cannot encode h264: it lacks libnone") as caught:
         check_encoding(VideoEncoding("h264", 18, 64, 48, 30))
     assert "av1" in caught.value.hint

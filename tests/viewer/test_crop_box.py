@@ -5,7 +5,7 @@ import torch
 from scenes import random_splats
 
 from recon_cli.export.reduce import crop
-from recon_cli.viewer.crop_box import CropBox, box_around
+from recon_cli.viewer.content import CropBox, box_around
 
 
 def test_what_is_shown_is_what_export_keeps_of_the_same_words():

@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 from browser import WatchedPage
 
 from recon_cli.pipeline.plan import Job
-from recon_cli.viewer.content import ViewerContent, load_workspace
-from recon_cli.viewer.photo_pairs import PhotoPairs
+from recon_cli.viewer.content import PhotoPairs, ViewerContent, load_workspace
 from recon_cli.viewer.server import HOST, Server, serve_scene
 from recon_cli.workspace.layout import Workspace
 

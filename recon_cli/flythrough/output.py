@@ -1,0 +1,228 @@
+"""The files of a flythrough: colour, 16-bit depth and its colours, alpha, and videos of them.
+
+Videos are H.264 or AV1 in an .mp4, through PyAV. Colours are stored and tagged as BT.709 of limited
+range: without the tags, players guess from the size of the picture.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from av.codec import Codec
+from av.codec.codec import UnknownCodecError
+from av.video.codeccontext import VideoCodecContext
+from av.video.reformatter import ColorRange, Colorspace
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon_cli.errors import ConfigError
+from recon_cli.flythrough.paths import visible_depths
+from recon_cli.flythrough.request import ALPHA, DEPTH, RGB
+from recon_cli.io.images import read_image, to_uint8, write_png
+from recon_cli.render import RenderOutput
+from recon_cli.scene.scene import Scene
+from recon_cli.scene.splats import Splats
+from recon_cli.workspace.atomic import replacing
+
+DEPTH_COLOR = "depth_color"
+VIDEO_FRAMES = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA}  # the frames of its video
+FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,)}
+FARTHEST = 65_535  # steps; greater depths are clipped to it
+_MIN_ALPHA = 0.5  # a pixel with less has no depth
+# Depths that nearly all points lie between. Few points may cover much of a picture where a camera
+# comes close, so the colours begin at half of the first.
+_ENDS = (0.02, 0.98)
+_BLUE = 0.08  # of the colour map; colours before that are nearly black
+ENCODERS = {"h264": ("libx264",), "av1": ("libsvtav1", "libaom-av1")}  # the first available
+_BT709 = 1  # in FFmpeg's lists of primaries, transfer functions and matrices alike
+os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 prints its settings to stderr; 1 leaves errors
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """The scale of depth pictures; lengths are in world units."""
+
+    metres: bool  # a step is a millimetre; else it is a thousandth of the scene's extent
+    step: float  # of a 16-bit depth
+    near: float  # depth that is drawn red
+    far: float  # depth that is drawn blue
+    center: tuple[float, float, float]  # of the training cameras
+    reach: float  # Gaussians farther than this from `center` count as no surface
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the scale for readers of the pictures."""
+        return {
+            "unit": "millimetre" if self.metres else "thousandth of the scene's extent",
+            "world_units_per_step": self.step, "nothing": 0, "this_or_farther": FARTHEST,
+            "colors": {"near_red_steps": self.near / self.step,
+                       "far_blue_steps": self.far / self.step},
+            "surfaces_within": {"center": list(self.center), "world_units": self.reach},
+        }
+
+    def select_surfaces(self, splats: Splats) -> Splats:
+        """Returns the Gaussians of the room, without the distant ones outside its windows.
+
+        Distant Gaussians are a hundred extents away: with a weight of a hundredth behind a wall,
+        they would move the wall's mean depth by an extent.
+        """
+        inside = splats.within(self.center, self.reach)
+        return splats if bool(inside.all()) else splats.select(inside)
+
+
+def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
+    """Returns the scale for a scene; colours span the depths that its training cameras see.
+
+    The range is that of the scene, not of each frame, so that a video does not flicker.
+    """
+    depths = np.concatenate([visible_depths(view.camera, scene.points) for view in scene.train])
+    near, far = np.quantile(depths, _ENDS) if len(depths) else (0.0, scene.extent)
+    step = 1e-3 if metres else 1e-3 * scene.extent
+    x, y, z = map(float, scene.center)
+    return DepthScale(
+        metres, step, float(near / 2), float(max(far, near + step)), (x, y, z), scene.reach)
+
+
+def write_frame(
+    folder: Path, name: str, output: RenderOutput, surfaces: RenderOutput, kinds: Sequence[str],
+    scale: DepthScale,
+) -> None:
+    """Writes the pictures of one frame, each atomically; depth is that of `surfaces`."""
+    file = f"{name}.png"
+    for kind in kinds:
+        if kind == RGB:
+            write_png(folder / RGB / file, to_uint8(_array(output.rgb)))
+        elif kind == ALPHA:
+            write_png(folder / ALPHA / file, to_uint8(_array(output.alpha)))
+        else:
+            steps = depth_steps(_array(surfaces.depth), _array(surfaces.alpha), scale.step)
+            write_png(folder / DEPTH / file, steps)
+            write_png(folder / DEPTH_COLOR / file, depth_colors(steps, scale))
+
+
+def _array(tensor: Tensor) -> NDArray[np.float32]:
+    array: NDArray[np.float32] = tensor.cpu().numpy()
+    return array
+
+
+def depth_steps(
+    depth: NDArray[np.float32], alpha: NDArray[np.float32], step: float
+) -> NDArray[np.uint16]:
+    """Returns z-depth [H, W] in whole steps of world units, the mean weighted by alpha T.
+
+    0 where alpha is below one half; otherwise clipped to 1 to 65535. `depth` is the sum of alpha T
+    z.
+    """
+    covered = alpha >= _MIN_ALPHA
+    mean = depth.astype(np.float64) / np.where(covered, alpha, 1) / step
+    return np.where(covered, np.clip(np.rint(mean), 1, FARTHEST), 0).astype(np.uint16)
+
+
+def depth_colors(steps: NDArray[np.uint16], scale: DepthScale) -> NDArray[np.uint8]:
+    """Returns RGB [H, W, 3]: red is near, blue is far, black is nothing."""
+    nearness = np.clip((scale.far - steps * scale.step) / (scale.far - scale.near), 0, 1)
+    level = (_BLUE + (1 - _BLUE) * nearness).astype(np.float32)
+    colors = cv2.applyColorMap(to_uint8(level), cv2.COLORMAP_TURBO)
+    rgb = np.asarray(colors[:, :, ::-1], np.uint8).copy()
+    rgb[steps == 0] = 0
+    return rgb
+
+
+@dataclass(frozen=True)
+class VideoEncoding:
+    """The parameters of a video."""
+
+    codec: str  # h264 or av1
+    crf: int  # quality, smaller is better
+    width: int  # in pixels, even
+    height: int  # in pixels, even
+    fps: float
+
+    @property
+    def rate(self) -> Fraction:
+        """Frames a second; the denominator is small, or that of NTSC."""
+        return Fraction(self.fps).limit_denominator(1001)
+
+    def encoder(self) -> str:
+        """Returns the name of an encoder; ConfigError if this build of PyAV has none."""
+        for name in ENCODERS[self.codec]:
+            try:
+                return str(Codec(name, "w").name)
+            except UnknownCodecError:
+                continue
+        others = ", ".join(codec for codec in ENCODERS if codec != self.codec)
+        raise ConfigError(
+            f"The installed PyAV {av.__version__} cannot encode {self.codec}: it lacks "
+            f"{' or '.join(ENCODERS[self.codec])}.",
+            hint=f"Give another --codec ({others}), or install PyAV with pip.")
+
+
+def check_encoding(encoding: VideoEncoding) -> None:
+    """Raises ConfigError if there is no encoder, or it rejects this size or rate."""
+    encoder = encoding.encoder()
+    context = VideoCodecContext.create(encoder, "w")
+    assert isinstance(context, VideoCodecContext)
+    _configure(context, encoding)
+    context.time_base = 1 / encoding.rate
+    try:
+        with _restore_scheduling():
+            context.open()
+    except av.error.FFmpegError as error:
+        raise ConfigError(
+            f"{encoder} cannot encode a video of {encoding.width}x{encoding.height} pixels at "
+            f"{encoding.fps:g} fps.", hint="Give another --size, --fps or --codec.") from error
+
+
+@contextmanager
+def _restore_scheduling() -> Iterator[None]:
+    """Restores the scheduling of this thread at the end.
+
+    SVT-AV1 gives the thread that opens it real-time priority where the user is root, as in a
+    container, and leaves it so: what spins on that thread later would starve all others for good.
+    """
+    if not hasattr(os, "sched_getscheduler"):  # Linux alone has it
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
+
+
+def _configure(context: VideoCodecContext, encoding: VideoEncoding) -> None:
+    context.width, context.height = encoding.width, encoding.height
+    context.pix_fmt = "yuv420p"
+    context.framerate = encoding.rate
+    context.options = {"crf": str(encoding.crf)}
+    context.color_primaries = context.color_trc = context.colorspace = _BT709
+    context.color_range = ColorRange.MPEG
+
+
+def encode_video(
+    pictures: Sequence[Path], path: Path, encoding: VideoEncoding, *, threads: int,
+    on_frame: Callable[[], None],
+) -> None:
+    """Writes RGB or gray pictures as a video, atomically; `on_frame` is called after each."""
+    with _restore_scheduling(), replacing(path) as temporary, av.open(
+            str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream(encoding.encoder(), rate=encoding.rate)
+        assert isinstance(stream, VideoStream)
+        _configure(stream.codec_context, encoding)
+        stream.codec_context.thread_count = threads
+        for picture in pictures:
+            image = read_image(picture, encoding.width, encoding.height)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24").reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG)))
+            on_frame()
+        container.mux(stream.encode(None))
