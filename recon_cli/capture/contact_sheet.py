@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from recon_cli.capture.selection_record import MEANINGS, FrameCandidate, Reason, count_reasons
+from recon_cli.capture.frame_selection import MEANINGS, FrameCandidate, Reason, count_reasons
 from recon_cli.workspace import atomic
 
 SHEET = "contact.png"
@@ -35,18 +35,18 @@ CELL_WIDTH = 118  # at least, for the caption
 HELD_OUT = "held out"
 
 Colour = tuple[int, int, int]
+Words = list[tuple[str, Colour | None]]  # texts, some with a colour swatch
 PAPER, INK, FAINT = (255, 255, 255), (20, 20, 20), (110, 110, 110)
 # Okabe and Ito (2008): eight colours that people with any colour vision tell apart.
 COLOURS: dict[str, Colour] = {
     Reason.KEPT: (0, 158, 115), HELD_OUT: (0, 114, 178), Reason.BLURRED: (213, 94, 0),
     Reason.CLIPPED: (20, 20, 20), Reason.DUPLICATE: (204, 121, 167), Reason.CLOSE: (190, 190, 190),
     Reason.DAMAGED: (240, 228, 66)}
-
 MOST_OBLONG = 4  # width to height of a cell; a longer picture, such as a panorama, has margins
 
 
 @dataclass(frozen=True)
-class _Layout:
+class _SheetLayout:
     """Sizes in pixels of a thumbnail and of its cell, and the number of cells."""
 
     thumb: tuple[int, int]
@@ -56,28 +56,21 @@ class _Layout:
 
 
 class ContactSheet:
-    """Collects the thumbnails of a capture and draws them in order.
-
-    Args:
-        title: what the capture is called.
-        candidates: all of one capture, in order.
-        width: of the frames, in pixels.
-        height: of the frames, in pixels.
-    """
+    """Collects thumbnails of the frames, [height, width], of a capture and draws them in order."""
 
     def __init__(
         self, title: str, candidates: Sequence[FrameCandidate], width: int, height: int
     ) -> None:
         self._title, self._candidates = title, candidates
         self._several = len({candidate.source for candidate in candidates}) > 1
-        self._layout = _layout(width, height)
-        self._shown = _sample(candidates, self._layout.most)
+        self._layout = _plan_layout(width, height)
+        self._sample = _choose_sample(candidates, self._layout.most)
         self._thumbs: dict[int, Image.Image] = {}
 
     @property
     def wanted(self) -> frozenset[int]:
         """Indices of the candidates whose pixels the sheet shows."""
-        return frozenset(candidate.index for candidate in self._shown)
+        return frozenset(candidate.index for candidate in self._sample)
 
     def add(self, index: int, rgb: NDArray[np.uint8]) -> None:
         """Adds the pixels [H, W, 3] of a candidate; those that are not shown are ignored."""
@@ -85,31 +78,26 @@ class ContactSheet:
             self._thumbs[index] = _thumbnail(rgb, self._layout.thumb)
 
     def write(self, path: Path, held_out: Collection[str]) -> None:
-        """Draws the sheet as a PNG, whole or not at all.
-
-        Args:
-            path: the file.
-            held_out: names of the stored frames that are held out.
-        """
+        """Draws the sheet as a PNG, whole or not at all; `held_out` are names of stored frames."""
         width, height = self._layout.cell
-        columns = min(self._layout.columns, max(1, len(self._shown)))
+        columns = min(self._layout.columns, max(1, len(self._sample)))
         head = _wrap(self._heading(held_out), max(columns * width, 4 * width))
-        top = GAP + sum(LINE for _ in head) + GAP
-        rows = math.ceil(len(self._shown) / columns)
+        top = GAP + len(head) * LINE + GAP
+        rows = math.ceil(len(self._sample) / columns)
         canvas = Image.new("RGB", (max(columns, 4) * width + GAP, top + rows * height + GAP), PAPER)
         draw = ImageDraw.Draw(canvas)
         for line, words in enumerate(head):
             _write_words(draw, words, GAP, GAP + line * LINE)
-        for place, candidate in enumerate(self._shown):
+        for place, candidate in enumerate(self._sample):
             row, column = divmod(place, columns)
             kind = _kind(candidate, held_out)
-            self._draw_cell(canvas, draw, candidate, kind, GAP + column * width, top + row * height)
+            self._draw_cell(canvas, candidate, kind, GAP + column * width, top + row * height)
         atomic.write_bytes(path, _encode(canvas))
 
     def _draw_cell(
-        self, canvas: Image.Image, draw: ImageDraw.ImageDraw, candidate: FrameCandidate, kind: str,
-        x: int, y: int,
+        self, canvas: Image.Image, candidate: FrameCandidate, kind: str, x: int, y: int
     ) -> None:
+        draw = ImageDraw.Draw(canvas)
         thumb_width, thumb_height = self._layout.thumb
         right, bottom = x + thumb_width + 2 * BORDER, y + thumb_height + 2 * BORDER
         draw.rectangle((x, y, right - 1, bottom - 1), COLOURS[kind])
@@ -121,24 +109,21 @@ class ContactSheet:
         font, width = ImageFont.load_default(TEXT), self._layout.cell[0] - GAP
         like = "" if candidate.like is None else f" #{candidate.like}"
         draw.text((x, bottom), _shorten(f"#{candidate.index} {kind}{like}", font, width), INK, font)
-        draw.text((x, bottom + LINE), _shorten(self._detail(candidate), font, width), FAINT, font)
-
-    def _detail(self, candidate: FrameCandidate) -> str:
-        """Returns the second line of a caption: sharpness, and of several files the name."""
         sharp = "" if candidate.sharpness is None else f"{candidate.sharpness:.0f}"
-        return f"{sharp} {candidate.source}".strip() if self._several else f"sharp {sharp}"
+        detail = f"{sharp} {candidate.source}".strip() if self._several else f"sharp {sharp}"
+        draw.text((x, bottom + LINE), _shorten(detail, font, width), FAINT, font)
 
-    def _heading(self, held_out: Collection[str]) -> list[tuple[str, Colour | None]]:
-        """Returns the counts and the legend: texts, some with a colour swatch."""
+    def _heading(self, held_out: Collection[str]) -> Words:
+        """Returns the counts and the legend."""
         counts = count_reasons(self._candidates)
         chosen = counts.pop(Reason.KEPT, 0)
         held = sum(_kind(candidate, held_out) == HELD_OUT for candidate in self._candidates)
         dropped = sum(counts.values())
-        drawn = sum(candidate.reason is not Reason.KEPT for candidate in self._shown)
-        words: list[tuple[str, Colour | None]] = [
+        drawn = sum(candidate.reason is not Reason.KEPT for candidate in self._sample)
+        words: Words = [
             (f"{self._title}: {chosen} of {chosen + dropped} frames kept, {held} of them held out "
              f"for the score; {dropped} dropped.", None),
-            (f"Shown in order: {len(self._shown) - drawn} kept, {drawn} dropped; below each: "
+            (f"Shown in order: {len(self._sample) - drawn} kept, {drawn} dropped; below each: "
              f"sharpness{', file' if self._several else ''}.", None),
             (f"{chosen - held} kept for training", COLOURS[Reason.KEPT]),
             (f"{held} held out", COLOURS[HELD_OUT])]
@@ -155,23 +140,19 @@ def _kind(candidate: FrameCandidate, held_out: Collection[str]) -> str:
 
 def _encode(canvas: Image.Image) -> bytes:
     """Returns a PNG of at most `MAX_BYTES`."""
-    data = b""
+    stored = io.BytesIO()
     for colours in PALETTES:
         stored = io.BytesIO()
         canvas.quantize(
             colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE,
         ).save(stored, "PNG", optimize=True)
-        data = stored.getvalue()
-        if len(data) <= MAX_BYTES:
+        if stored.tell() <= MAX_BYTES:
             break
-    return data
+    return stored.getvalue()
 
 
-def _thumbnail(
-    rgb: NDArray[np.uint8],  # [H, W, 3]
-    size: tuple[int, int],
-) -> Image.Image:
-    """Returns a picture reduced to fit into `size`, whatever its orientation."""
+def _thumbnail(rgb: NDArray[np.uint8], size: tuple[int, int]) -> Image.Image:
+    """Returns a picture [H, W, 3] reduced to fit into `size`, whatever its orientation."""
     height, width = rgb.shape[:2]
     scale = min(size[0] / width, size[1] / height)
     fitted = max(1, round(width * scale)), max(1, round(height * scale))
@@ -181,7 +162,7 @@ def _thumbnail(
     return thumb
 
 
-def _layout(width: int, height: int) -> _Layout:
+def _plan_layout(width: int, height: int) -> _SheetLayout:
     width, height = max(width, height // MOST_OBLONG), max(height, width // MOST_OBLONG)
     scale = math.sqrt(THUMB_PIXELS / (width * height))
     thumb = max(8, round(width * scale)), max(8, round(height * scale))
@@ -190,10 +171,10 @@ def _layout(width: int, height: int) -> _Layout:
     # The heading takes part of the budget: some lines of the full width.
     pixels = MAX_PIXELS - (columns * cell[0] + GAP) * (8 * LINE + 3 * GAP)
     rows = max(1, pixels // ((columns * cell[0] + GAP) * cell[1]))
-    return _Layout(thumb, cell, columns * rows, columns)
+    return _SheetLayout(thumb, cell, columns * rows, columns)
 
 
-def _sample(candidates: Sequence[FrameCandidate], most: int) -> list[FrameCandidate]:
+def _choose_sample(candidates: Sequence[FrameCandidate], most: int) -> list[FrameCandidate]:
     """Returns at most `most` candidates in order, every reason among them."""
     by_reason = {
         reason: [frame for frame in candidates if frame.reason is reason] for reason in Reason}
@@ -212,12 +193,10 @@ def _sample(candidates: Sequence[FrameCandidate], most: int) -> list[FrameCandid
     return sorted(sample, key=lambda frame: frame.index)
 
 
-def _wrap(
-    words: Sequence[tuple[str, Colour | None]], width: int
-) -> list[list[tuple[str, Colour | None]]]:
+def _wrap(words: Words, width: int) -> list[Words]:
     """Returns texts in lines that are no wider than `width` where possible."""
     font = ImageFont.load_default(TEXT)
-    lines: list[list[tuple[str, Colour | None]]] = [[]]
+    lines: list[Words] = [[]]
     used = 0.0
     for text, colour in words:
         needed = font.getlength(text) + 2 * LINE + GAP
@@ -229,9 +208,7 @@ def _wrap(
     return lines
 
 
-def _write_words(
-    draw: ImageDraw.ImageDraw, words: Sequence[tuple[str, Colour | None]], x: float, y: float
-) -> None:
+def _write_words(draw: ImageDraw.ImageDraw, words: Words, x: float, y: float) -> None:
     font = ImageFont.load_default(TEXT)
     for text, colour in words:
         if colour is not None:

@@ -46,14 +46,14 @@ class MotionMeter:
     def advance(self, gray: NDArray[np.uint8]) -> float:
         """Returns how much further from the anchor this frame is than any frame since the anchor.
 
-        Args:
-            gray: the next frame, [H, W] uint8, of any constant size.
-
-        Returns:
-            The median displacement gained, as a fraction of the width; 0 for the first frame and
-            for one that moves back; NaN where too few corners can be followed.
+        That is the median displacement gained by the next frame [H, W], of constant size, as a
+        fraction of the width; 0 for the first frame and for one that moves back; NaN where too few
+        corners can be followed.
         """
-        small = _shrink(gray)
+        small, (height, width) = gray, gray.shape
+        if width > TRACK_WIDTH:
+            size = (TRACK_WIDTH, max(1, round(height * TRACK_WIDTH / width)))
+            small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
         if self._anchor is None:
             self._drop_anchor(small)
             return 0.0
@@ -90,18 +90,8 @@ class MotionMeter:
         return float(np.median(steps) / small.shape[1])
 
 
-def _shrink(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height, width = gray.shape
-    if width <= TRACK_WIDTH:
-        return gray
-    size = (TRACK_WIDTH, max(1, round(height * TRACK_WIDTH / width)))
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
-
-
-def measure_exposure(
-    gray: NDArray[np.uint8],  # [H, W]
-) -> tuple[float, float, float]:
-    """Returns the share of black pixels, that of blown-out ones, and the spread of the rest.
+def measure_exposure(gray: NDArray[np.uint8]) -> tuple[float, float, float]:
+    """Returns the shares of black and of blown-out pixels of a frame [H, W], and its spread.
 
     The spread is the standard deviation over 32x32 areas, in gray values of 8 bits.
     """
@@ -132,13 +122,10 @@ def check_exposure(
     least: int,
     unit: str = "frames",
 ) -> None:
-    """Raises InputError when too few frames show anything, and says what is wrong with most.
+    """Raises InputError when fewer than `least` frames show anything, and says what is wrong.
 
-    Args:
-        name: of the capture, for the message.
-        exposures: of all frames that could be read.
-        least: how many must show something.
-        unit: what the capture consists of, for the message.
+    `name` is that of the capture, which consists of `unit`; `exposures` are those of all frames
+    that could be read.
     """
     usable = int(has_content(exposures).sum())
     if usable >= least:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import read_as_stored
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource
 from recon_cli.capture.masks import opaque, read_mask, write_mask
-from recon_cli.capture.photos import MIN_FRAMES, names_in_order
+from recon_cli.capture.photos import make_frame_names
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import records as store
@@ -39,8 +40,8 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
     for notice in posed.notices:
         ctx.notice(f"{notice[0].upper()}{notice[1:]}.")
     images = _choose_images(config, posed, ctx)
-    names = names_in_order([Path(image.name).stem for image in images])
-    broken = _write(images, names, posed.lenses, config.max_size, out, ctx)
+    names = make_frame_names([Path(image.name).stem for image in images])
+    broken = _write_images(images, names, posed.lenses, config.max_size, out, ctx)
     for reason in broken.values():
         ctx.notice(f"An image is left out: {reason}")
     readable = [
@@ -49,12 +50,14 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
         raise InputError(
             f"{path}: {len(readable)} images can be read, but at least {MIN_FRAMES} are needed.",
             hint="Check that the images are where the data set says.")
-    poses = _known_poses(posed, readable)
+    poses = _make_known_poses(posed, readable)
     poses.write(out)
     masks = out / store.MASKS
+    sizes = [fit_size(lens.width, lens.height, config.max_size) for lens in posed.lenses]
     return IngestedSource(
         posed.layout,
-        tuple(_group(path.name, lens, config.max_size) for lens in posed.lenses),
+        tuple(Group(path.name, *size, lens=lens.resized(*size))
+              for lens, size in zip(posed.lenses, sizes, strict=True)),
         tuple(Frame(name, None, image.path.name, None, image.held_out, image.lens,
                     (masks / name).exists()) for name, image in readable),
         declared=len(posed.images) + len(posed.missing), decoded=len(readable),
@@ -75,7 +78,7 @@ def _choose_images(config: IngestConfig, posed: PosedSet, ctx: IngestContext) ->
     return rest + held_out
 
 
-def _write(
+def _write_images(
     images: Sequence[PosedImage], names: Sequence[str], lenses: Sequence[Lens], max_size: int,
     out: Path, ctx: IngestContext,
 ) -> dict[str, str]:
@@ -86,7 +89,7 @@ def _write(
             target = out / store.FOLDER / name
             if not target.exists():
                 try:
-                    rgb, mask = _pixels(image, lenses[image.lens], max_size)
+                    rgb, mask = _read_pixels(image, lenses[image.lens], max_size)
                 except InputError as error:
                     broken[name] = error.message
                 else:
@@ -98,7 +101,7 @@ def _write(
     return broken
 
 
-def _pixels(
+def _read_pixels(
     image: PosedImage, lens: Lens, max_size: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
     """Returns RGB and mask at the stored size, ignoring EXIF orientation as the poses do."""
@@ -115,7 +118,7 @@ def _pixels(
     return rgb, opaque(opacity, image.name, width, height)
 
 
-def _known_poses(posed: PosedSet, readable: Sequence[tuple[str, PosedImage]]) -> KnownPoses:
+def _make_known_poses(posed: PosedSet, readable: Sequence[tuple[str, PosedImage]]) -> KnownPoses:
     viewmats = {name: image.viewmat for name, image in readable}
     points, colors = posed.points, posed.colors
     if points is None and any(image.depth for image in posed.images):
@@ -123,8 +126,3 @@ def _known_poses(posed: PosedSet, readable: Sequence[tuple[str, PosedImage]]) ->
         rest = tuple(image for image in posed.images if not image.held_out)
         points, colors = points_from_depth(replace(posed, images=rest))
     return KnownPoses(viewmats, posed.metric, points, colors)
-
-
-def _group(name: str, lens: Lens, max_size: int) -> Group:
-    width, height = fit_size(lens.width, lens.height, max_size)
-    return Group(name, width, height, lens=lens.resized(width, height))

@@ -3,77 +3,45 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.contact_sheet import ContactSheet
+from recon_cli.capture.frame_selection import (
+    NAMED,
+    FrameCandidate,
+    PhotoMeasures,
+    Reason,
+    choose_photos,
+    describe_dropped,
+    measure_photo,
+)
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.images import Photo, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
-from recon_cli.capture.masks import FoundMasks, find_masks, photo_mask, write_mask
-from recon_cli.capture.near_duplicates import (
-    NAMED,
-    PhotoMeasures,
-    choose_photos,
-    describe_dropped,
-    list_names,
-    measure_photo,
-)
+from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.photos import (
     PhotoFolder,
     PhotoGroup,
     check_count,
-    frame_names,
     group_notices,
     group_photos,
     list_photos,
+    make_frame_names,
     photo_folder,
 )
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
-from recon_cli.capture.selection_record import FrameCandidate, Reason
 from recon_cli.config.stages import IngestConfig
-from recon_cli.errors import InputError
+from recon_cli.errors import InputError, list_names
 from recon_cli.io import records as store
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
 from recon_cli.io.records import Frame, Group
 from recon_cli.workspace import atomic
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
-
-
-@dataclass(frozen=True)
-class _Writer:
-    """Writes the photos of a folder into ingest's folder `out`."""
-
-    out: Path
-    max_size: int  # longest side of a frame
-    masks: dict[str, Path]  # by the file name of the photo
-    plan: RawPlan
-
-    def write(self, photo: Photo, name: str) -> NDArray[np.uint8]:
-        """Writes a mask and then its frame, and returns the stored pixels, RGB, [H, W, 3]."""
-        target = self.out / store.FOLDER / name
-        if target.exists():
-            return read_png(target)
-        rgb = fit_image(self._read(photo), self.max_size)
-        height, width = rgb.shape[:2]
-        mask = photo_mask(photo, self.masks.get(photo.path.name), width, height)
-        if mask is not None:
-            write_mask(self.out / store.MASKS / name, mask)
-        write_png(target, rgb)
-        return rgb
-
-    def remove(self, name: str) -> None:
-        """Deletes a frame and its mask."""
-        for folder in (store.FOLDER, store.MASKS):
-            (self.out / folder / name).unlink(missing_ok=True)
-
-    def _read(self, photo: Photo) -> NDArray[np.uint8]:
-        return develop(photo, self.plan) if photo.is_raw else read_photo(photo)
 
 
 def ingest(
@@ -90,11 +58,11 @@ def ingest(
     path, folder = _list_photos(paths, ctx)
     check_count(path, len(folder.photos), folder.broken)
     plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
-    photos = _without_twins(folder.photos, plan, ctx)
-    masks = _masks(paths, photos, ctx)
-    names = [f"{prefix}{name}" for name in frame_names(photos)]
-    writer = _Writer(out, config.max_size, masks.by_photo, plan)
-    measures, unreadable = _write(photos, names, writer, ctx)
+    photos = _drop_raw_twins(folder.photos, plan, ctx)
+    masks = _find_masks(paths, photos, ctx)
+    names = [f"{prefix}{name}" for name in make_frame_names([photo.path.stem for photo in photos])]
+    measures, unreadable = _write_photos(
+        dict(zip(names, photos, strict=True)), masks.by_photo, plan, out, config.max_size, ctx)
     broken = folder.broken | unreadable
     readable = sum(photo is not None for photo in measures)
     check_count(path, readable, broken)
@@ -102,11 +70,15 @@ def ingest(
     record = choose_photos(path.name, [photo.path.name for photo in photos], names, measures)
     for text in describe_dropped(record):
         ctx.notice(text)
-    sheet = _sheet(path.name, record, names, writer)
+    sheet = _make_sheet(path.name, record, names, out)
     frame_of = {photos[candidate.index]: candidate.name for candidate in record
                 if candidate.name is not None}
     dropped = {candidate.source for candidate in record if candidate.name is None}
-    groups = _group_photos(list(frame_of), config.max_size, ctx)
+    groups = group_photos(list(frame_of))
+    for notice in group_notices(groups):
+        ctx.notice(notice)
+    for width, height in dict.fromkeys((group.first.width, group.first.height) for group in groups):
+        report_reduced(width, height, config.max_size, ctx)
     return IngestedSource(
         "photos",
         _frame_groups(groups, path, config.max_size),
@@ -119,7 +91,11 @@ def _list_photos(paths: Sequence[Path], ctx: IngestContext) -> tuple[Path, Photo
     """Returns the path that represents the photos in messages, and the photos."""
     path = paths[0]
     if not path.is_dir():
-        _refuse_namesakes(paths)
+        (name, count), = Counter(path.name for path in paths).most_common(1)
+        if count > 1:
+            raise InputError(
+                f"{count} photos are called {name}.",
+                hint="Give their folders instead of the files.")
         return (path if len(paths) == 1 else path.absolute().parent), list_photos(paths)
     home = photo_folder(path)
     if home != path:
@@ -135,24 +111,15 @@ def _report_broken(reasons: Sequence[str], ctx: IngestContext) -> None:
         ctx.notice(f"{len(reasons) - NAMED} more photos are left out for similar reasons.")
 
 
-def _refuse_namesakes(paths: Sequence[Path]) -> None:
-    counts = Counter(path.name for path in paths)
-    name, count = counts.most_common(1)[0]
-    if count > 1:
-        raise InputError(
-            f"{count} photos are called {name}.",
-            hint="Give their folders instead of the files.")
-
-
-def _masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestContext) -> FoundMasks:
+def _find_masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestContext) -> FolderMasks:
     """Returns the masks in a given folder; given files have none."""
     if not paths[0].is_dir():
-        return FoundMasks({}, ())
+        return FolderMasks({}, ())
     masks = find_masks(paths[0], photo_folder(paths[0]), photos)
     if masks.outside:
         ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
     if masks.unused:
-        ctx.notice(f"Masks without a photo are left out: {list_names(masks.unused)}.")
+        ctx.notice(f"Masks without a photo are left out: {list_names(masks.unused, NAMED)}.")
     if masks.unused and not masks.by_photo:
         ctx.notice(
             f"No mask is used: that of {photos[0].path.name} must be called "
@@ -160,11 +127,11 @@ def _masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestContext) -
     return masks
 
 
-def _sheet(
-    title: str, record: Sequence[FrameCandidate], names: Sequence[str], writer: _Writer
+def _make_sheet(
+    title: str, record: Sequence[FrameCandidate], names: Sequence[str], out: Path
 ) -> ContactSheet:
     """Returns the contact sheet, and removes the files of photos that are not selected."""
-    files = {candidate.index: writer.out / store.FOLDER / names[candidate.index]
+    files = {candidate.index: out / store.FOLDER / names[candidate.index]
              for candidate in record if candidate.reason is not Reason.DAMAGED}
     height, width = read_png(next(iter(files.values()))).shape[:2]
     sheet = ContactSheet(title, record, width, height)
@@ -172,7 +139,8 @@ def _sheet(
         sheet.add(index, read_png(files[index]))
     for candidate in record:
         if candidate.index in files and candidate.name is None:
-            writer.remove(names[candidate.index])
+            for folder in (store.FOLDER, store.MASKS):
+                (out / folder / names[candidate.index]).unlink(missing_ok=True)
     return sheet
 
 
@@ -191,7 +159,7 @@ def _plan_raw(photos: Sequence[Photo], record: Path, ctx: IngestContext) -> RawP
     return plan
 
 
-def _without_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) -> list[Photo]:
+def _drop_raw_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) -> list[Photo]:
     """Returns the photos without those beside a RAW photo of the same name.
 
     Such a view could be trained on and held out at once.
@@ -205,32 +173,40 @@ def _without_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) -
     return [photo for photo in photos if photo.path.name not in twins]
 
 
-def _write(
-    photos: Sequence[Photo], names: Sequence[str], writer: _Writer, ctx: IngestContext
+def _write_photos(
+    photos: Mapping[str, Photo], masks: Mapping[str, Path], plan: RawPlan, out: Path, max_size: int,
+    ctx: IngestContext,
 ) -> tuple[list[PhotoMeasures | None], dict[str, str]]:
-    """Writes the photos; returns their measures, and why some cannot be read by file name."""
+    """Writes photos by frame name; returns their measures, and why some cannot be read."""
     measures: list[PhotoMeasures | None] = []
-    broken: dict[str, str] = {}
+    unreadable: dict[str, str] = {}
     with ctx.progress.bar("photos", len(photos), unit="photo") as bar:
-        for photo, name in zip(photos, names, strict=True):
+        for name, photo in photos.items():
+            mask = masks.get(photo.path.name)
             try:
-                measures.append(measure_photo(writer.write(photo, name)))
+                measures.append(measure_photo(_write_photo(photo, mask, plan, out, name, max_size)))
             except InputError as error:
-                broken[photo.path.name] = f"{error.message} {error.hint}".rstrip()
+                unreadable[photo.path.name] = f"{error.message} {error.hint}".rstrip()
                 measures.append(None)
             bar.advance()
             ctx.record(len(measures), len(photos))
-    return measures, broken
+    return measures, unreadable
 
 
-def _group_photos(photos: Sequence[Photo], max_size: int, ctx: IngestContext) -> list[PhotoGroup]:
-    """Returns the photos by intrinsics and gives notices about the groups."""
-    groups = group_photos(photos)
-    for notice in group_notices(groups):
-        ctx.notice(notice)
-    for width, height in dict.fromkeys((group.width, group.height) for group in groups):
-        report_reduced(width, height, max_size, ctx)
-    return groups
+def _write_photo(
+    photo: Photo, mask_file: Path | None, plan: RawPlan, out: Path, name: str, max_size: int
+) -> NDArray[np.uint8]:
+    """Writes a mask and then its frame, and returns the stored pixels, RGB, [H, W, 3]."""
+    target = out / store.FOLDER / name
+    if target.exists():
+        return read_png(target)
+    rgb = fit_image(develop(photo, plan) if photo.is_raw else read_photo(photo), max_size)
+    height, width = rgb.shape[:2]
+    mask = photo_mask(photo, mask_file, width, height)
+    if mask is not None:
+        write_mask(out / store.MASKS / name, mask)
+    write_png(target, rgb)
+    return rgb
 
 
 def _frame_groups(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> tuple[Group, ...]:
@@ -238,9 +214,10 @@ def _frame_groups(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> 
     frame_groups = []
     for group in groups:
         name = source.name if len(groups) == 1 else f"{source.name}: {group.name}"
-        width, height = fit_size(group.width, group.height, max_size)
-        scale = min(1.0, max_size / max(group.width, group.height))
-        focal = None if group.focal_px is None else group.focal_px * scale
+        photo = group.first
+        width, height = fit_size(photo.width, photo.height, max_size)
+        scale = min(1.0, max_size / max(photo.width, photo.height))
+        focal = None if photo.focal_px is None else photo.focal_px * scale
         frame_groups.append(Group(name, width, height, focal_px=focal))
     return tuple(frame_groups)
 

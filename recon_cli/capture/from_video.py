@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture import selection_record
+from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_measures import check_exposure, well_exposed
 from recon_cli.capture.frame_selection import (
-    NO_MOTION,
+    MIN_FRAMES,
     Judgement,
     automatic_count,
     check_motion,
@@ -22,9 +22,8 @@ from recon_cli.capture.frame_selection import (
     path_length,
 )
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
-from recon_cli.capture.photos import MIN_FRAMES
 from recon_cli.capture.scan import Scan, decode_threads, scan_video
-from recon_cli.capture.video import declared_length, frames_at
+from recon_cli.capture.video import frames_at, read_declared_length
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import records as store
@@ -57,7 +56,7 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     if scan_file.exists():
         scan = Scan.from_json(atomic.read_json(scan_file))
     else:
-        claim = declared_length(path)
+        claim = read_declared_length(path)
         with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
             scan = scan_video(path, threads=ctx.threads, step=bar.advance)
         atomic.write_json(scan_file, scan.to_json())
@@ -65,7 +64,12 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
     check_exposure(path.name, scan.exposure[scan.whole], least=MIN_FRAMES)
-    _report_clipped(path, scan, ctx)
+    whole = int(scan.whole.sum())
+    clipped = whole - int(well_exposed(scan.exposure[scan.whole]).sum())
+    if 2 * clipped > whole:  # the rest cannot replace what they showed
+        ctx.notice(
+            f"{clipped} of {whole} frames of {path.name} are left out: they are mostly black or "
+            "blown out.")
     warning = check_motion(path.name, scan.motion)
     if warning:
         ctx.notice(warning)
@@ -106,8 +110,8 @@ def ingest(
     _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
-    record = selection_record.video_candidates(
-        path.name, scan.sharpness, judgement.refused, source.lengths, names, same=NO_MOTION)
+    record = frame_selection.video_candidates(
+        path.name, scan.sharpness, judgement.refused, source.lengths, names)
     sheet = ContactSheet(path.name, record, scan.width, scan.height)
     _write(source, names, sheet, config.max_size, out, ctx)
     frames = tuple(
@@ -138,27 +142,17 @@ def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
         ctx.notice(f"{path.name} declares {scan.declared} frames but holds {decoded}.")
 
 
-def _report_clipped(path: Path, scan: Scan, ctx: IngestContext) -> None:
-    """Says that most of a video is clipped, since the rest cannot replace what it showed."""
-    whole = int(scan.whole.sum())
-    clipped = whole - int(well_exposed(scan.exposure[scan.whole]).sum())
-    if 2 * clipped > whole:
-        ctx.notice(
-            f"{clipped} of {whole} frames of {path.name} are left out: they are mostly black or "
-            "blown out.")
-
-
-def _report_short(scan: Scan, chosen: int, asked: int | None, ctx: IngestContext) -> None:
-    """Says why fewer frames were chosen than asked for; refuses too few."""
+def _report_short(scan: Scan, chosen: int, requested: int | None, ctx: IngestContext) -> None:
+    """Says why fewer frames were chosen than requested; refuses too few."""
     whole = int(scan.whole.sum())
     if chosen < MIN_FRAMES:
         raise InputError(
             f"Only {chosen} of {whole} frames are sharp, but at least {MIN_FRAMES} are needed.",
             hint="Lower --sharpness, or record again with slower movements.")
-    if asked is None or chosen == asked:
+    if requested is None or chosen == requested:
         return
-    if whole < asked:
-        ctx.notice(f"{asked} frames were asked for, but the video has {whole}.")
+    if whole < requested:
+        ctx.notice(f"{requested} frames were requested, but the video has {whole}.")
     if chosen < whole:
         ctx.notice(
             f"Only {chosen} of {whole} frames are sharp enough, and all of them are used; "

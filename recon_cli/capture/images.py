@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 import struct
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -76,6 +77,11 @@ class Photo:
         """Whether it holds sensor values, which `raw.develop` turns into colours."""
         return self.path.suffix.lower() in RAW_SUFFIXES
 
+    @property
+    def has_exif(self) -> bool:
+        """Whether camera or focal length are known."""
+        return bool(self.camera) or self.focal_px is not None or self.focal_mm is not None
+
 
 def inspect_photo(path: Path) -> Photo:
     """Returns a photo's size, camera and focal length from its header.
@@ -93,7 +99,7 @@ def inspect_photo(path: Path) -> Photo:
                 width, height = height, width
     except BROKEN as error:
         raise unreadable_error(path, error) from error
-    return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm)
+    return Photo(path, width, height, *lens)
 
 
 def read_photo(photo: Photo) -> NDArray[np.uint8]:
@@ -115,10 +121,15 @@ def read_alpha(photo: Photo) -> NDArray[np.uint8] | None:
     Raises:
         InputError: see `read_photo`.
     """
-    if photo.is_raw or not _has_alpha(photo.path):
+    if photo.is_raw:
         return None
-    image = _decode(photo.path, upright=True)
-    alpha = np.array(image.convert("RGBA").getchannel("A"))
+    try:
+        with open_image(photo.path) as header:
+            if not header.has_transparency_data:
+                return None
+    except BROKEN as error:
+        raise unreadable_error(photo.path, error) from error
+    alpha = _alpha(_decode(photo.path, upright=True))
     check_size(photo, alpha)
     return alpha
 
@@ -141,10 +152,11 @@ def read_as_stored(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | N
         InputError: see `read_rgb`.
     """
     image = _decode(path, upright=False)
-    alpha = None
-    if image.has_transparency_data:
-        alpha = np.array(image.convert("RGBA").getchannel("A"))
-    return _on_black(image), alpha
+    return _on_black(image), _alpha(image) if image.has_transparency_data else None
+
+
+def _alpha(image: Image.Image) -> NDArray[np.uint8]:
+    return np.array(image.convert("RGBA").getchannel("A"))
 
 
 def _on_black(image: Image.Image) -> NDArray[np.uint8]:
@@ -198,15 +210,6 @@ def _formats() -> tuple[str, ...]:
     Image.init()
     pillow_heif.register_heif_opener()
     return tuple(name for name in FORMATS if name in Image.OPEN)
-
-
-def _has_alpha(path: Path) -> bool:
-    """Returns from its header whether a picture holds opacity."""
-    try:
-        with open_image(path) as image:
-            return image.has_transparency_data
-    except BROKEN as error:
-        raise unreadable_error(path, error) from error
 
 
 def _size_in_file(image: Image.Image) -> tuple[int, int]:
@@ -275,34 +278,22 @@ def _inspect_raw(path: Path) -> Photo:
             sizes, focal = raw.sizes, raw.other.focal_length
     except rawpy.LibRawError as error:
         raise unreadable_error(path, error) from error
-    width, height = sizes.iwidth, sizes.iheight
-    lens = _raw_lens(path, width, height)
+    width, height, lens, exif = sizes.iwidth, sizes.iheight, ExifLens(), Image.Exif()
+    # rawpy gives neither the 35 mm equivalent nor the camera. Most files are built like a TIFF.
+    with suppress(*BROKEN), path.open("rb") as file:
+        exif.load_from_fp(file)
+        lens = read_lens(exif, width, height)
     if sizes.flip in RAW_QUARTER_TURNS:
         width, height = height, width
     return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm or focal or None)
 
 
-def _raw_lens(path: Path, width: int, height: int) -> ExifLens:
-    """Returns the EXIF of a RAW file that is built like a TIFF, as most are; else nothing.
+class ExifLens(NamedTuple):
+    """The optics by EXIF, in the order of the fields of `Photo`."""
 
-    rawpy gives neither the 35 mm equivalent nor the camera.
-    """
-    exif = Image.Exif()
-    try:
-        with path.open("rb") as file:
-            exif.load_from_fp(file)
-            return read_lens(exif, width, height)
-    except BROKEN:
-        return ExifLens()
-
-
-@dataclass(frozen=True)
-class ExifLens:
-    """The optics by EXIF."""
-
+    focal_px: float | None = None
     camera: str = ""  # maker and model
     focal_mm: float | None = None
-    focal_px: float | None = None
 
 
 def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
@@ -321,7 +312,10 @@ def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
     elif focal is not None:
         sensor = _sensor_mm(detail)
         pixels = None if sensor is None else max(width, height) * focal / sensor
-    return ExifLens(_camera(exif), focal, pixels)
+    maker, model = (
+        str(exif.get(tag) or "").strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
+    camera = model if model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
+    return ExifLens(pixels, camera, focal)
 
 
 def _sensor_mm(detail: dict[int, Any]) -> float | None:
@@ -336,13 +330,6 @@ def _sensor_mm(detail: dict[int, Any]) -> float | None:
         return None
     size = longer / density * unit
     return size if SENSOR_MM[0] <= size <= SENSOR_MM[1] else None
-
-
-def _camera(exif: Image.Exif) -> str:
-    """Returns maker and model, the maker once."""
-    maker, model = (
-        str(exif.get(tag) or "").strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
-    return model if model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
 
 
 def _positive(value: Any) -> float | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from recon_cli.capture.contact_sheet import SHEET, ContactSheet
-from recon_cli.capture.selection_record import CHOICE, FrameCandidate, write_choice
+from recon_cli.capture.frame_selection import CHOICE, FrameCandidate, write_choice
 from recon_cli.io.records import Frame, Group, KnownPoses
 from recon_cli.progress import Progress
 
@@ -33,17 +33,11 @@ class IngestContext(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What the frames of a source were selected from.
+    """The candidates that the frames of a source were selected from."""
 
-    Attributes:
-        candidates: every frame or photo, in order.
-        sheet: with its thumbnails.
-        prefix: of the names of the frames and of the two files.
-    """
-
-    candidates: tuple[FrameCandidate, ...]
-    sheet: ContactSheet
-    prefix: str
+    candidates: tuple[FrameCandidate, ...]  # every frame or photo, in order
+    sheet: ContactSheet  # with their thumbnails
+    prefix: str  # of the names of the frames and of the two files
 
     def write(self, stage: Path, held_out: Collection[str]) -> None:
         """Writes the record and the contact sheet into ingest's folder `stage`."""
@@ -53,33 +47,19 @@ class Selection:
 
 @dataclass(frozen=True)
 class IngestedSource:
-    """The stored frames of one source.
+    """The stored frames of one source."""
 
-    Attributes:
-        kind: "video", "photos", or the layout of a data set.
-        groups: of frames that share intrinsics.
-        frames: sorted by name; their groups count within this source.
-        declared: images that the source claims to hold, 0 where it does not say.
-        decoded: whole ones that it gave.
-        lost: broken or missing ones.
-        blurred: those that were too blurred or badly exposed.
-        skipped: names of files that were left out.
-        splits: the source itself says which frames are held out.
-        poses: known poses, by the names of the frames.
-        selection: what the frames were selected from, None without a selection.
-    """
-
-    kind: str
-    groups: tuple[Group, ...]
-    frames: tuple[Frame, ...]
-    declared: int
-    decoded: int
-    lost: int
-    blurred: int = 0
-    skipped: tuple[str, ...] = ()
-    splits: bool = False
-    poses: KnownPoses | None = None
-    selection: Selection | None = None
+    kind: str  # "video", "photos", or the layout of a data set
+    groups: tuple[Group, ...]  # of frames that share intrinsics
+    frames: tuple[Frame, ...]  # sorted by name; their groups count within this source
+    declared: int  # images that the source claims to hold, 0 where it does not say
+    decoded: int  # whole ones that it gave
+    lost: int  # broken or missing ones
+    blurred: int = 0  # those that were too blurred or badly exposed
+    skipped: tuple[str, ...] = ()  # names of files that were left out
+    splits: bool = False  # the source itself says which frames are held out
+    poses: KnownPoses | None = None  # by the names of the frames
+    selection: Selection | None = None  # None where all frames are used
 
 
 def merge_sources(parts: Sequence[IngestedSource]) -> IngestedSource:
@@ -93,12 +73,10 @@ def merge_sources(parts: Sequence[IngestedSource]) -> IngestedSource:
         groups += part.groups
     kinds = {part.kind for part in parts}
     return IngestedSource(
-        kind=kinds.pop() if len(kinds) == 1 else "mixed",
-        groups=tuple(groups),
+        kind=kinds.pop() if len(kinds) == 1 else "mixed", groups=tuple(groups),
         frames=tuple(sorted(frames, key=lambda frame: frame.name)),
         declared=sum(part.declared for part in parts),
         decoded=sum(part.decoded for part in parts),
         lost=sum(part.lost for part in parts),
         blurred=sum(part.blurred for part in parts),
-        skipped=tuple(name for part in parts for name in part.skipped),
-    )
+        skipped=tuple(name for part in parts for name in part.skipped))

@@ -26,7 +26,7 @@ HALF = 128  # from this value on a pixel is white, or opaque
 
 
 @dataclass(frozen=True)
-class FoundMasks:
+class FolderMasks:
     """The masks of a folder of photos."""
 
     by_photo: dict[str, Path]  # by the photo's file name
@@ -34,18 +34,12 @@ class FoundMasks:
     outside: Path | None = None  # a folder of masks beside the given one
 
 
-def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FoundMasks:
-    """Returns the masks of photos; none where there is no masks/.
-
-    Args:
-        given: the folder that the user named.
-        home: the folder that holds the photos: that one, or one in it.
-        photos: in `home`.
-    """
+def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FolderMasks:
+    """Returns the masks of the photos in `home`: the `given` folder, or one in it."""
     folder = next((path / FOLDER for path in (home, given) if (path / FOLDER).is_dir()), None)
     if folder is None:
         beside = given.resolve().parent / FOLDER
-        return FoundMasks({}, (), beside if beside.is_dir() else None)
+        return FolderMasks({}, (), beside if beside.is_dir() else None)
     files = sorted(
         path for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and path.is_file() and path.name[0] != ".")
@@ -56,7 +50,7 @@ def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FoundMasks:
         if mask is not None:
             by_photo[photo.path.name] = mask
     used = set(by_photo.values())
-    return FoundMasks(by_photo, tuple(path.name for path in files if path not in used))
+    return FolderMasks(by_photo, tuple(path.name for path in files if path not in used))
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
@@ -68,8 +62,13 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     Raises:
         InputError: it cannot be read, has another shape, or ignores every pixel.
     """
-    gray = _gray(path)
-    if not _same_shape(gray.shape[1], gray.shape[0], width, height):
+    try:
+        gray = np.asarray(read_rgb(path).max(axis=2), np.uint8)  # its brightest channel
+    except InputError as error:
+        raise InputError(
+            f"The mask {error.message}", hint="Write it again, or remove it.") from error
+    small, large = sorted([gray.shape[::-1], (width, height)])
+    if abs(large[1] * small[0] / large[0] - small[1]) > 1:  # more than rounding to whole pixels
         raise InputError(
             f"The mask {path.name} has {gray.shape[1]}x{gray.shape[0]} pixels, but {width}x{height}"
             " or the same shape in another size is needed.",
@@ -81,15 +80,6 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
             "255 marks what counts.",
             hint="Write masks with 0 and 255, or remove the photo.")
     return mask
-
-
-def _gray(path: Path) -> NDArray[np.uint8]:
-    """Returns the brightest channel of a mask, [H, W]."""
-    try:
-        return np.asarray(read_rgb(path).max(axis=2), np.uint8)
-    except InputError as error:
-        raise InputError(
-            f"The mask {error.message}", hint="Write it again, or remove it.") from error
 
 
 def opaque(
@@ -117,12 +107,12 @@ def photo_mask(
     Raises:
         InputError: see `read_mask` and `opaque`; or the two together leave nothing.
     """
-    own = opaque(read_alpha(photo), photo.path.name, width, height)
-    given = None if path is None else read_mask(path, width, height)
-    if own is None or given is None:
-        mask = given if own is None else own
-    else:
-        mask = np.minimum(own, given)
+    opacity = opaque(read_alpha(photo), photo.path.name, width, height)
+    mask = None if path is None else read_mask(path, width, height)
+    if mask is None:
+        mask = opacity
+    elif opacity is not None:
+        mask = np.minimum(opacity, mask)
     if mask is None or mask.all():
         return None
     if not mask.any():
@@ -135,12 +125,6 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(".png", mask)
     atomic.write_bytes(path, data.tobytes())
-
-
-def _same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
-    """Returns whether two sizes have the same shape, up to rounding to whole pixels."""
-    small, large = sorted([(width, height), (other_width, other_height)])
-    return abs(large[1] * small[0] / large[0] - small[1]) <= 1
 
 
 def _resample(values: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

@@ -60,22 +60,14 @@ def estimate_noise(
     It is a low percentile over tiles of Donoho's median of the finest diagonal wavelet coefficients
     (scikit-image).
     """
-    height, width = rgb.shape[:2]
-    rows, columns = _edges(height), _edges(width)
-    sigmas, clipped = [], []
-    for top, bottom in pairwise(rows):
-        for left, right in pairwise(columns):
-            tile = rgb[top:bottom, left:right]
-            sigmas.append(_tile_noise(tile))
-            clipped.append(np.mean((tile == 0) | (tile == 255)) > CLIPPED_SHARE)
-    usable = np.array(sigmas)[~np.array(clipped)] if not all(clipped) else np.array(sigmas)
-    return float(np.percentile(usable, FLAT_PERCENTILE)) * 255
-
-
-def _edges(length: int) -> NDArray[np.int64]:
-    """Returns where the tiles along one side begin and end."""
-    count = max(1, min(GRID, length // SMALLEST_TILE))
-    return np.linspace(0, length, count + 1).astype(np.int64)
+    rows, columns = (
+        np.linspace(0, length, max(1, min(GRID, length // SMALLEST_TILE)) + 1).astype(np.int64)
+        for length in rgb.shape[:2])
+    tiles = [rgb[top:bottom, left:right]
+             for top, bottom in pairwise(rows) for left, right in pairwise(columns)]
+    usable = [tile for tile in tiles
+              if np.mean((tile == 0) | (tile == 255)) <= CLIPPED_SHARE] or tiles
+    return float(np.percentile([_tile_noise(tile) for tile in usable], FLAT_PERCENTILE)) * 255
 
 
 def _tile_noise(tile: NDArray[np.uint8]) -> float:
@@ -94,37 +86,27 @@ class Filter(Protocol):
 
 def bilateral(
     rgb: NDArray[np.uint8],  # [H, W, 3]
-    noise: float,
-    strength: float,
+    noise: float,  # its standard deviation in 1/255
+    strength: float,  # range sigma as a multiple of the noise
 ) -> NDArray[np.uint8]:  # [H, W, 3]
     """Returns a frame after a bilateral filter (Tomasi and Manduchi 1998).
 
     OpenCV compares colours by the sum of the three channels' differences, which for pure noise is
     3.4 times its sigma; a range of about four times the noise is therefore narrow.
-
-    Args:
-        rgb: the frame.
-        noise: its standard deviation in 1/255.
-        strength: range sigma as a multiple of the noise.
     """
     return np.asarray(cv2.bilateralFilter(rgb, DIAMETER, strength * noise, SIGMA_SPACE), np.uint8)
 
 
 def joint(
     rgb: NDArray[np.uint8],  # [H, W, 3]
-    noise: float,
-    strength: float,
+    noise: float,  # its standard deviation in 1/255
+    strength: float,  # range sigma as a multiple of the noise that is left in the blurred guide
 ) -> NDArray[np.uint8]:  # [H, W, 3]
     """Returns a frame after two joint bilateral filters, each with a less noisy guide.
 
     The weights come from a guide instead of the frame (Petschnigg et al. 2004, Eisemann and Durand
     2004): first the frame slightly blurred, then the result of that (Zhang et al. 2014, rolling
     guidance). Less noise in the weights lets the range be half as wide, which keeps edges.
-
-    Args:
-        rgb: the frame.
-        noise: its standard deviation in 1/255.
-        strength: range sigma as a multiple of the noise that is left in the blurred guide.
     """
     # Filtering with a kernel leaves this share of white noise: the root of its sum of squares,
     # which for a kernel that is the same along rows and columns is the sum along one of them.

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
 from recon_cli.errors import InputError
 
-MIN_FRAMES = 3  # two views leave nothing to check a reconstruction with
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 NO_PHOTOS = frozenset({"masks"})  # subfolders that hold pictures, but none of the scene
 # Focal lengths that agree this well are one setting of the lens: EXIF rounds to a tenth of a mm.
@@ -79,35 +79,26 @@ def _is_photo(path: Path) -> bool:
 
 def _natural_key(stem: str) -> list[tuple[int, str]]:
     """Returns a sort key by which 2 comes before 10."""
-    parts = re.split(r"(\d+)", stem)
-    return [(int(part) if part.isdecimal() else -1, part) for part in parts]
+    return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", stem)]
 
 
 def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
     """Raises InputError for too few readable photos; `broken` says why others are not."""
     if readable >= MIN_FRAMES:
         return
+    photos = f"{readable or 'no'} photo{'s' * (readable != 1)}"
     if not broken:
         raise InputError(
-            f"{folder} holds {_photos(readable)}, but at least {MIN_FRAMES} are needed.",
+            f"{folder} holds {photos}, but at least {MIN_FRAMES} are needed.",
             hint="Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, "
             "HEIC, camera RAW).")
     raise InputError(
-        f"{folder} holds {_photos(readable)} that can be used and {len(broken)} that cannot, but "
+        f"{folder} holds {photos} that can be used and {len(broken)} that cannot, but "
         f"at least {MIN_FRAMES} are needed. The first: {next(iter(broken.values()))}",
         hint="Fix the files listed above, or copy the photos from the camera again.")
 
 
-def _photos(count: int) -> str:
-    return f"{count or 'no'} photo{'s' * (count != 1)}"
-
-
-def frame_names(photos: Sequence[Photo]) -> list[str]:
-    """Returns a PNG name for each photo, sorted as the photos are; see `names_in_order`."""
-    return names_in_order([photo.path.stem for photo in photos])
-
-
-def names_in_order(stems: Sequence[str]) -> list[str]:
+def make_frame_names(stems: Sequence[str]) -> list[str]:
     """Returns a PNG name for each stem, so that the names sort in the order of the stems.
 
     The stems stay where they are plain, unique (ignoring case) and sorted; else all are numbered.
@@ -128,19 +119,9 @@ class PhotoGroup:
     photos: tuple[Photo, ...]  # at least one, in their given order
 
     @property
-    def width(self) -> int:
-        """Width in pixels, upright."""
-        return self.photos[0].width
-
-    @property
-    def height(self) -> int:
-        """Height in pixels, upright."""
-        return self.photos[0].height
-
-    @property
-    def focal_px(self) -> float | None:
-        """Focal length in pixels by EXIF, None where unknown."""
-        return self.photos[0].focal_px
+    def first(self) -> Photo:
+        """The photo that gives the size and the focal length of all of them."""
+        return self.photos[0]
 
 
 def group_photos(photos: Sequence[Photo]) -> list[PhotoGroup]:
@@ -161,11 +142,11 @@ def group_photos(photos: Sequence[Photo]) -> list[PhotoGroup]:
 
 def odd_photos(groups: Sequence[PhotoGroup]) -> list[Photo]:
     """Returns photos alone in their group, without EXIF and of a unique size: perhaps mistakes."""
-    sizes = Counter((group.width, group.height) for group in groups)
+    sizes = Counter((group.first.width, group.first.height) for group in groups)
     return [
-        group.photos[0] for group in groups
-        if len(groups) > 1 and len(group.photos) == 1 and not _has_exif(group.photos[0])
-        and sizes[group.width, group.height] == 1]
+        group.first for group in groups
+        if len(groups) > 1 and len(group.photos) == 1 and not group.first.has_exif
+        and sizes[group.first.width, group.first.height] == 1]
 
 
 def group_notices(groups: Sequence[PhotoGroup]) -> list[str]:
@@ -190,10 +171,6 @@ def _same_focal(first: float | None, other: float | None) -> bool:
     if first is None or other is None:
         return first is other
     return max(first, other) <= min(first, other) * (1 + SAME_FOCAL)
-
-
-def _has_exif(photo: Photo) -> bool:
-    return bool(photo.camera) or photo.focal_px is not None or photo.focal_mm is not None
 
 
 def _names(firsts: Sequence[Photo]) -> list[str]:

@@ -7,9 +7,8 @@ maximum) is switched off.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from recon_cli.capture.images import Photo, check_size, unreadable_error
 from recon_cli.capture.raw_exposure import RawMeasures, exposures, measure_view, nominal_ev
 from recon_cli.errors import InputError
+from recon_cli.workspace.summaries import JsonRecord
 
 SRGB = (2.4, 12.92)  # IEC 61966-2-1: power and slope of the straight part
 LOOK_PIXELS = 800  # longer side of the small views that exposures are measured on
@@ -43,7 +43,7 @@ CameraSettings = tuple[tuple[float, ...], int]  # multipliers and saturation of 
 
 
 @dataclass(frozen=True)
-class RawShot:
+class RawShot(JsonRecord):
     """How one photo is developed."""
 
     multipliers: tuple[float, ...]  # red, green, blue, second green
@@ -52,28 +52,16 @@ class RawShot:
 
 
 @dataclass(frozen=True)
-class RawPlan:
+class RawPlan(JsonRecord):
     """How the RAW photos of a folder are developed, by their file names."""
 
-    shots: dict[str, RawShot]
-    broken: dict[str, str]  # why a photo cannot be developed
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns JSON values."""
-        return dataclasses.asdict(self)
-
-    @staticmethod
-    def from_json(value: dict[str, Any]) -> RawPlan:
-        """Returns the plan that `to_json` wrote."""
-        shots = {
-            name: RawShot(tuple(shot["multipliers"]), shot["saturation"], shot["gain_ev"])
-            for name, shot in value["shots"].items()}
-        return RawPlan(shots, dict(value["broken"]))
+    shots: Mapping[str, RawShot]
+    broken: Mapping[str, str]  # why a photo cannot be developed
 
 
 @dataclass(frozen=True)
 class _Header:
-    """What planning needs from the header of a photo."""
+    """The values of a photo's header that planning needs."""
 
     path: Path
     camera: tuple[object, ...]
@@ -118,7 +106,7 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     try:
         with rawpy.imread(str(photo.path)) as raw:
             rgb = np.asarray(raw.postprocess(
-                **_fixed_options(shot.multipliers, shot.saturation), bright=2.0 ** shot.gain_ev,
+                **_develop_options(shot.multipliers, shot.saturation), bright=2.0 ** shot.gain_ev,
                 gamma=SRGB, output_color=rawpy.ColorSpace.sRGB, output_bps=8), np.uint8)
     except rawpy.LibRawError as error:
         raise unreadable_error(photo.path, error) from error
@@ -126,7 +114,7 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     return rgb
 
 
-def _fixed_options(multipliers: Sequence[float], saturation: int) -> dict[str, Any]:
+def _develop_options(multipliers: Sequence[float], saturation: int) -> dict[str, Any]:
     """Returns the options that LibRaw would otherwise choose per photo."""
     return {
         "user_wb": list(multipliers), "user_sat": saturation, "no_auto_bright": True,
@@ -154,11 +142,11 @@ def _read_header(path: Path) -> _Header:
         # Per camera and bit depth: a maximum of 4095 says nothing about 16383.
         camera = (raw.rgb_xyz_matrix.tobytes(), raw.color_desc, round(math.log2(max(white, 1))))
         return _Header(
-            path, camera, _multipliers(raw), white, highest,
-            nominal_ev(shot.shutter_speed, shot.iso_speed, None), f_number)
+            path, camera, _read_white_balance(raw), white, highest,
+            nominal_ev(shot.shutter_speed, shot.iso_speed), f_number)
 
 
-def _multipliers(raw: rawpy.RawPy) -> tuple[float, ...]:
+def _read_white_balance(raw: rawpy.RawPy) -> tuple[float, ...]:
     """Returns the white balance as shot, else that of daylight, with green as 1."""
     for balance in (raw.camera_whitebalance, raw.daylight_whitebalance):
         red, green, blue, second = (float(value) for value in balance)
@@ -183,7 +171,7 @@ def _by_camera(headers: Sequence[_Header]) -> dict[tuple[object, ...], CameraSet
 def _measure(path: Path, shared: CameraSettings) -> RawMeasures:
     with rawpy.imread(str(path)) as raw:
         wide = raw.postprocess(
-            **_fixed_options(*shared), half_size=True, gamma=(1, 1),
+            **_develop_options(*shared), half_size=True, gamma=(1, 1),
             output_color=rawpy.ColorSpace.raw, output_bps=16)
     linear = wide.astype(np.float32) / 65535
     clipped = (linear.max(axis=2) >= SATURATED).astype(np.float32)
@@ -200,8 +188,7 @@ def _nominal(headers: Sequence[_Header]) -> list[float | None]:
         return [header.ev for header in headers]
     return [
         None if header.ev is None or header.f_number is None
-        else header.ev - 2 * math.log2(header.f_number)
-        for header in headers]
+        else header.ev - 2 * math.log2(header.f_number) for header in headers]
 
 
 def _white(measures: Sequence[RawMeasures], ev: NDArray[np.float64]) -> float:

@@ -41,19 +41,12 @@ Pairs = Mapping[tuple[int, int], float]  # by how many EV the second photo is br
 
 @dataclass(frozen=True)
 class RawMeasures:
-    """Measures of a small linear view of a photo; the views themselves would fill the memory.
+    """Measures of a small linear view of a photo; the views themselves would fill the memory."""
 
-    Attributes:
-        points: its K key points in pixels of the view, [K, 2].
-        descriptors: their SIFT, whole numbers, [K, 128].
-        levels: log2 of the mean green around each, [K], NaN where clipped or too dark.
-        brightest: the highest channel of each pixel, 1 for saturation, infinite where clipped, [P].
-    """
-
-    points: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-    levels: NDArray[np.float64]
-    brightest: NDArray[np.float32]
+    points: NDArray[np.float32]  # [K, 2], its key points in pixels of the view
+    descriptors: NDArray[np.uint8]  # [K, 128], SIFT in whole numbers
+    levels: NDArray[np.float64]  # [K], log2 of the mean green around, NaN if clipped or too dark
+    brightest: NDArray[np.float32]  # [P], highest channel, 1 for saturation, infinite if clipped
 
     @property
     def clipped_share(self) -> float:
@@ -61,13 +54,11 @@ class RawMeasures:
         return float(np.isinf(self.brightest).mean())
 
 
-def measure_view(linear: NDArray[np.float32], clipped: NDArray[np.bool_]) -> RawMeasures:
-    """Returns the measures of a view.
-
-    Args:
-        linear: white-balanced sensor values, 1 for saturation, [h, w, 3].
-        clipped: where a channel is saturated, [h, w].
-    """
+def measure_view(
+    linear: NDArray[np.float32],  # [h, w, 3], white-balanced sensor values, 1 for saturation
+    clipped: NDArray[np.bool_],  # [h, w], where a channel is saturated
+) -> RawMeasures:
+    """Returns the measures of a view."""
     keys, sift = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(_visible(linear), None)
     descriptors = np.empty((0, 128), np.uint8) if sift is None else sift.astype(np.uint8)
     brightest = np.where(clipped, np.inf, linear.max(axis=2)).astype(np.float32).ravel()
@@ -76,12 +67,11 @@ def measure_view(linear: NDArray[np.float32], clipped: NDArray[np.bool_]) -> Raw
     return RawMeasures(points, descriptors, _levels(linear, clipped, points), brightest[sample])
 
 
-def nominal_ev(seconds: float, iso: float, f_number: float | None) -> float | None:
-    """Returns log2 of seconds x ISO / f-number^2, the exposure; None where unknown."""
-    values = (seconds, iso, 1.0 if f_number is None else f_number)
-    if not all(math.isfinite(value) and value > 0 for value in values):
+def nominal_ev(seconds: float, iso: float) -> float | None:
+    """Returns log2 of seconds x ISO, the exposure at one f-number; None where unknown."""
+    if not all(math.isfinite(value) and value > 0 for value in (seconds, iso)):
         return None
-    return math.log2(values[0] * values[1] / values[2] ** 2)
+    return math.log2(seconds * iso)
 
 
 def exposures(
@@ -89,11 +79,10 @@ def exposures(
 ) -> NDArray[np.float64]:
     """Returns the exposure of each photo in EV, [N], 0 for the median photo.
 
-    Args:
-        photos: in the order of taking, so that neighbours overlap.
-        nominal: exposures by EXIF in EV, None where unknown.
+    The photos are in the order of taking, so that neighbours overlap; `nominal` are the exposures
+    by EXIF in EV, None where unknown.
     """
-    pairs = _pairs(photos)
+    pairs = _compare_pairs(photos)
     ev = complete_exposures(drop_contradicted(nominal, pairs), pairs)
     return ev - np.median(ev)
 
@@ -128,9 +117,8 @@ def complete_exposures(known: Sequence[float | None], pairs: Pairs) -> NDArray[n
     The loss is quadratic up to `PAIR_EV` and linear above, so that one wrong pair is outvoted.
     """
     values = [ev for ev in known if ev is not None]
-    ev = np.array([np.median(values) if values else 0.0] * len(known))
-    for photo, own in enumerate(known):
-        ev[photo] = ev[photo] if own is None else own
+    middle = np.median(values) if values else 0.0
+    ev = np.array([middle if own is None else own for own in known], np.float64)
     column = {photo: k for k, photo in enumerate(p for p, own in enumerate(known) if own is None)}
     if not column:
         return ev
@@ -151,7 +139,7 @@ def complete_exposures(known: Sequence[float | None], pairs: Pairs) -> NDArray[n
     return ev
 
 
-def _pairs(photos: Sequence[RawMeasures]) -> Pairs:
+def _compare_pairs(photos: Sequence[RawMeasures]) -> Pairs:
     """Returns by how many EV the second photo of a pair is brighter, where both overlap."""
     differences: dict[tuple[int, int], float] = {}
     for a in range(len(photos)):

@@ -15,10 +15,10 @@ from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.capture.video import (
     convert_hint,
-    declared_length,
     decode,
     moving_pictures,
     open_video,
+    read_declared_length,
 )
 from recon_cli.errors import InputError
 
@@ -29,32 +29,20 @@ MAX_B_RUN = 8
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The measures of F frames in presentation order, which gives a frame its index.
+    """The measures of F frames in presentation order, which gives a frame its index."""
 
-    Attributes:
-        width: of an upright frame in pixels, as is the height.
-        declared: frames that the file claims to hold, by its duration where it has no count; 0
-            where unknown.
-        gaps: packets that gave no frame.
-        sharpness: [F] float64 `measure_sharpness`.
-        motion: [F] float64 `MotionMeter.advance`.
-        exposure: [F, 3] float64 rows of `measure_exposure`.
-        seconds: presentation time of each frame, None where unknown.
-        whole: [F] bool; False from a lost or damaged packet to the next key frame, because all
-            frames between are predicted from what was lost.
-        notices: what is done to the video that its owner may not expect.
-    """
-
-    width: int
+    width: int  # of an upright frame in pixels
     height: int
-    declared: int
-    gaps: int
-    sharpness: NDArray[np.float64]
-    motion: NDArray[np.float64]
-    exposure: NDArray[np.float64]
-    seconds: tuple[float | None, ...]
+    declared: int  # frames by the container's count or duration; 0 where unknown
+    gaps: int  # packets that gave no frame
+    sharpness: NDArray[np.float64]  # [F], `measure_sharpness`
+    motion: NDArray[np.float64]  # [F], `MotionMeter.advance`
+    exposure: NDArray[np.float64]  # [F, 3], rows of `measure_exposure`
+    seconds: tuple[float | None, ...]  # presentation times, None where unknown
+    # [F], False from a lost or damaged packet to the next key frame: all frames between are
+    # predicted from what was lost.
     whole: NDArray[np.bool_]
-    notices: tuple[str, ...]
+    notices: tuple[str, ...]  # about conversions that the owner of the video may not expect
 
     @property
     def expected(self) -> int:
@@ -83,14 +71,12 @@ class Scan:
             "motion": np.array(value["motion"], np.float64),  # null becomes NaN
             "exposure": np.array(value["exposure"], np.float64).reshape(-1, 3),
             "seconds": tuple(value["seconds"]),
-            "whole": np.array(value["whole"], np.bool_),
-            "notices": tuple(value["notices"]),
-        })
+            "whole": np.array(value["whole"], np.bool_), "notices": tuple(value["notices"])})
 
 
 @dataclass(frozen=True)
 class _FrameMeasures:
-    """What one frame contributes to a scan."""
+    """The part of a scan that is about one frame."""
 
     sharpness: float
     motion: float
@@ -136,47 +122,34 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         measures.append(_measure(item, meter))
         step()
     if first is None:
-        raise _undecodable(path)
+        with open_video(path) as (_, stream):
+            codec = stream.codec_context.name
+        raise InputError(
+            f"No frame of {path} can be decoded; its codec is {codec}.",
+            hint=f"Copy it from the camera again. {convert_hint(path)}")
     width, height = first.size
-    claim = declared_length(path)
+    claim = read_declared_length(path)
     return Scan(
-        width=width,
-        height=height,
-        declared=claim.count(_rate(measures) or claim.rate),
-        gaps=len(gaps),
+        width=width, height=height, gaps=len(gaps),
+        declared=claim.count(_frame_rate(measures) or claim.rate),
         sharpness=np.array([frame.sharpness for frame in measures], np.float64),
         motion=np.array([frame.motion for frame in measures], np.float64),
         exposure=np.round([frame.exposure for frame in measures], 4),
         seconds=tuple(frame.seconds for frame in measures),
-        whole=_whole(measures, gaps),
-        notices=conversion_notices(path, first, sum(frame.interlaced for frame in measures)),
-    )
-
-
-def _undecodable(path: Path) -> InputError:
-    with open_video(path) as (_, stream):
-        codec = stream.codec_context.name
-    return InputError(
-        f"No frame of {path} can be decoded; its codec is {codec}.",
-        hint=f"Copy it from the camera again. {convert_hint(path)}")
+        whole=_find_whole(measures, gaps),
+        notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))
 
 
 def _measure(picture: DecodedPicture, meter: MotionMeter) -> _FrameMeasures:
     gray, frame = picture.gray(), picture.frame
     return _FrameMeasures(
-        sharpness=measure_sharpness(gray),
-        motion=meter.advance(gray),
-        exposure=measure_exposure(gray),
-        seconds=frame.time,
-        pts=frame.pts,
-        key=bool(frame.key_frame),
-        bidirectional=frame.pict_type == PictureType.B,
-        corrupt=bool(frame.is_corrupt),
-        interlaced=picture.interlaced,
-    )
+        sharpness=measure_sharpness(gray), motion=meter.advance(gray),
+        exposure=measure_exposure(gray), seconds=frame.time, pts=frame.pts,
+        key=bool(frame.key_frame), bidirectional=frame.pict_type == PictureType.B,
+        corrupt=bool(frame.is_corrupt), interlaced=picture.interlaced)
 
 
-def _rate(measures: Sequence[_FrameMeasures]) -> float:
+def _frame_rate(measures: Sequence[_FrameMeasures]) -> float:
     """Returns the mean frames per second, 0 where times are unknown."""
     first, last = measures[0].seconds, measures[-1].seconds
     if first is None or last is None or last <= first:
@@ -184,7 +157,7 @@ def _rate(measures: Sequence[_FrameMeasures]) -> float:
     return (len(measures) - 1) / (last - first)
 
 
-def _whole(
+def _find_whole(
     measures: Sequence[_FrameMeasures], gaps: Sequence[tuple[int, int | None]]
 ) -> NDArray[np.bool_]:  # [F]
     """Returns False for each frame that depends, directly or not, on lost data."""
@@ -218,8 +191,8 @@ def _spoil(
     whole[first:end] = False
 
 
-def conversion_notices(path: Path, first: DecodedPicture, interlaced: int) -> tuple[str, ...]:
-    """Returns what is done to a video that its owner may not expect, a sentence each.
+def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> tuple[str, ...]:
+    """Returns a sentence on each conversion that the owner of a video may not expect.
 
     A varying frame rate needs no notice: frames are chosen by their times and the camera's path.
     """
@@ -233,13 +206,9 @@ def conversion_notices(path: Path, first: DecodedPicture, interlaced: int) -> tu
             f"{path.name} is {first.tags.transfer.value} video: tone-mapped to SDR by one curve.")
     if interlaced:
         notices.append(f"{path.name} is interlaced: {interlaced} frames are deinterlaced.")
-    stored = first.frame.width, first.frame.height
-    if first.square_size != stored:
+    width, height = first.square_size
+    if (width, height) != (first.frame.width, first.frame.height):
         notices.append(
-            f"{path.name} has pixels of aspect {first.tags.aspect}: its frames of {_by(stored)} "
-            f"are stretched to {_by(first.square_size)}.")
+            f"{path.name} has pixels of aspect {first.tags.aspect}: its frames of "
+            f"{first.frame.width}x{first.frame.height} are stretched to {width}x{height}.")
     return tuple(notices)
-
-
-def _by(size: tuple[int, int]) -> str:
-    return "x".join(map(str, size))

@@ -22,7 +22,7 @@ from av.stream import Disposition
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from recon_cli.capture.decoded_picture import DecodedPicture, Gap, Tags, progressive, tags_of
+from recon_cli.capture.decoded_picture import DecodedPicture, Gap, Tags, deinterlace, read_tags
 from recon_cli.errors import InputError
 
 # FFmpeg renders text and text art as video; no capture is that.
@@ -73,13 +73,13 @@ def _unreadable(path: Path, reason: str) -> InputError:
     if path.is_file() and path.stat().st_size == 0:
         return InputError(f"{path} is empty (0 bytes).", hint="Copy it from the camera again.")
     if path.is_file() and lacks_index(path):
-        return _cut_off(path)
+        return _truncated(path)
     return InputError(
         f"{path} cannot be read as a video: {reason}.",
         hint="Give a video, or a folder of photos; if a player shows it, try a fresh copy.")
 
 
-def _cut_off(path: Path) -> InputError:
+def _truncated(path: Path) -> InputError:
     return InputError(
         f"{path} is truncated: its index (the moov box) is incomplete.",
         hint="Copy it from the camera again, or record once more.")
@@ -97,7 +97,7 @@ def _video_stream(path: Path, container: InputContainer) -> VideoStream:
             "decoded here.",
             hint=convert_hint(path))
     if lacks_index(path):
-        raise _cut_off(path)
+        raise _truncated(path)
     kinds = {"video": "a still picture or text"}
     types = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
     only = f", only {', '.join(types)}" if types else ": it is empty"
@@ -111,8 +111,7 @@ def moving_pictures(container: InputContainer) -> list[VideoStream]:
     return [
         stream for stream in container.streams.video
         if not stream.disposition & Disposition.attached_pic
-        and (stream.codec_context is None or stream.codec_context.name not in TEXT_CODECS)
-    ]
+        and (stream.codec_context is None or stream.codec_context.name not in TEXT_CODECS)]
 
 
 def convert_hint(path: Path) -> str:
@@ -135,7 +134,7 @@ class DeclaredLength:
         return self.frames or round(self.seconds * rate)
 
 
-def declared_length(path: Path) -> DeclaredLength:
+def read_declared_length(path: Path) -> DeclaredLength:
     """Returns what a video's container says about its length.
 
     Raises:
@@ -162,12 +161,12 @@ def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         tags: Tags | None = None
-        for item in progressive(_of_one_size(_frames(container, stream))):
+        for item in deinterlace(_of_one_size(_frames(container, stream))):
             if isinstance(item, Gap):
                 yield item
                 continue
             # Not before the first frame: some cameras signal HLG only within the stream.
-            tags = tags or tags_of(stream)
+            tags = tags or read_tags(stream)
             yield DecodedPicture(item[0], tags, item[1])
 
 

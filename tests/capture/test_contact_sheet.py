@@ -7,7 +7,7 @@ from PIL import Image
 
 from recon_cli.capture import contact_sheet
 from recon_cli.capture.contact_sheet import COLOURS, HELD_OUT, MAX_BYTES, ContactSheet
-from recon_cli.capture.selection_record import FrameCandidate, Reason
+from recon_cli.capture.frame_selection import FrameCandidate, Reason
 
 
 def capture(reasons):

@@ -346,7 +346,7 @@ def test_without_it_the_sensor_follows_from_the_resolution_of_the_focal_plane(de
 
 def test_an_impossible_sensor_gives_no_focal_length():
     detail = {FOCAL: 50.0, PLANE_X: 72.0, PLANE_UNIT: INCH, WIDE: 6000}  # of 2 metres
-    assert lens_of(detail) == ExifLens("", 50.0, None)
+    assert lens_of(detail) == ExifLens(None, "", 50.0)
 
 
 @pytest.mark.parametrize("unknown", [0, 0.0, float("nan")])

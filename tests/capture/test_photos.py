@@ -11,10 +11,10 @@ from PIL import Image
 from recon_cli.capture.images import Photo
 from recon_cli.capture.photos import (
     check_count,
-    frame_names,
     group_notices,
     group_photos,
     list_photos,
+    make_frame_names,
     odd_photos,
     photo_folder,
 )
@@ -48,19 +48,19 @@ def test_photos_are_listed_as_a_person_counts(tmp_path):
 
 
 def test_plain_names_are_kept():
-    photos = [photo("IMG_0001.jpg"), photo("IMG_0002.JPG"), photo("a.b-c.tif")]
-    assert frame_names(photos) == ["IMG_0001.png", "IMG_0002.png", "a.b-c.png"]
+    assert make_frame_names(["IMG_0001", "IMG_0002", "a.b-c"]) == [
+        "IMG_0001.png", "IMG_0002.png", "a.b-c.png"]
 
 
-@pytest.mark.parametrize("names", [
-    ["a.jpg", "a.tif", "b.jpg"],  # one stem twice
-    ["A.jpg", "a.tif", "b.jpg"],  # one file twice where case does not count
-    ["a b.jpg", "c.jpg", "d.jpg"],
-    ["Küche.jpg", "c.jpg", "d.jpg"],
-    ["IMG_9.jpg", "IMG_10.jpg", "IMG_11.jpg"],  # would sort in another order
+@pytest.mark.parametrize("stems", [
+    ["a", "a", "b"],  # one stem twice
+    ["A", "a", "b"],  # one file twice where case does not count
+    ["a b", "c", "d"],
+    ["Küche", "c", "d"],
+    ["IMG_9", "IMG_10", "IMG_11"],  # would sort in another order
 ])
-def test_other_names_are_numbered(names):
-    assert frame_names([photo(name) for name in names]) == [
+def test_other_names_are_numbered(stems):
+    assert make_frame_names(stems) == [
         "000000.png", "000001.png", "000002.png"]
 
 

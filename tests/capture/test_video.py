@@ -10,11 +10,11 @@ from PIL import Image
 from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.video import (
     codec_name,
-    declared_length,
     decode,
     frames_at,
     lacks_index,
     open_video,
+    read_declared_length,
 )
 from recon_cli.errors import InputError
 
@@ -101,7 +101,7 @@ def test_text_is_no_video_whatever_its_name(tmp_path, name):
     path = tmp_path / name
     path.write_text("no frames in here\n" * 100)
     with pytest.raises(InputError, match=r"cannot be read as a video|holds no video"):
-        declared_length(path)
+        read_declared_length(path)
 
 
 def test_a_video_without_frames_is_refused(tmp_path):
@@ -110,43 +110,43 @@ def test_a_video_without_frames_is_refused(tmp_path):
         stream.height, stream.width, stream.pix_fmt = 64, 64, "yuv420p"
         container.start_encoding()
     with pytest.raises(InputError, match=r"holds no video that can be decoded: it is empty\."):
-        declared_length(tmp_path / "empty.mp4")
+        read_declared_length(tmp_path / "empty.mp4")
 
 
 def test_sound_is_no_video(tmp_path):
     with pytest.raises(InputError, match="holds no video that can be decoded, only audio"):
-        declared_length(write_sound(tmp_path / "sound.mp4"))
+        read_declared_length(write_sound(tmp_path / "sound.mp4"))
 
 
 def test_an_empty_file_is_named_as_such(tmp_path):
     (tmp_path / "empty.mp4").touch()
     with pytest.raises(InputError, match="is empty"):
-        declared_length(tmp_path / "empty.mp4")
+        read_declared_length(tmp_path / "empty.mp4")
 
 
 def test_a_missing_file_is_named_as_such(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
-        declared_length(tmp_path / "none.mp4")
+        read_declared_length(tmp_path / "none.mp4")
 
 
 def test_a_single_picture_is_refused_even_if_named_like_a_video(tmp_path):
     Image.fromarray(quadrants()).save(tmp_path / "a.jpg")
     (tmp_path / "a.jpg").rename(tmp_path / "a.mp4")
     with pytest.raises(InputError, match="single picture"):
-        declared_length(tmp_path / "a.mp4")
+        read_declared_length(tmp_path / "a.mp4")
 
 
 def test_a_video_is_known_by_its_content_not_by_its_name(tmp_path):
     path = write_video(tmp_path / "video.mp4", [quadrants()] * 5)
     path = path.rename(tmp_path / "room: take 1.txt")
-    assert declared_length(path).frames == 5
+    assert read_declared_length(path).frames == 5
     with open_video(path) as (_, stream):
         assert stream.width == 96
 
 
 def test_the_count_is_taken_from_the_duration_where_the_container_names_none(tmp_path):
     path = write_video(tmp_path / "video.mkv", [quadrants()] * 12)
-    claim = declared_length(path)
+    claim = read_declared_length(path)
     assert claim.frames == 0
     assert claim.count(claim.rate) == 12
 
@@ -232,7 +232,7 @@ def test_noise_is_no_video(tmp_path):
     path = tmp_path / "noise.mp4"
     path.write_bytes(np.random.default_rng(0).bytes(20000))
     with pytest.raises(InputError, match="cannot be read as a video"):
-        declared_length(path)
+        read_declared_length(path)
 
 
 @pytest.mark.parametrize("faststart", [False, True])
@@ -246,7 +246,7 @@ def test_an_mp4_whose_index_is_cut_off_is_named_as_such(tmp_path, faststart):
     for kept in (data.index(b"moov") + 10, data.index(b"moov") + 300):
         path.write_bytes(data[:kept])
         with pytest.raises(InputError, match="is truncated: its index") as told:
-            declared_length(path)
+            read_declared_length(path)
         assert "Copy it from the camera again" in told.value.hint
 
 
