@@ -11,7 +11,9 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +24,7 @@ from recon_cli.workspace import atomic
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
+POLL_SECONDS = 0.25  # between looks at what native code has done
 LOG_FILE = "steps.json"  # in the stage's folder: the finished steps
 STEPS = ("features", "matches", "model", "sparse", "undistorted")
 
@@ -206,6 +209,25 @@ class Reporter:
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
+        self._sending = threading.Lock()
+
+    @contextmanager
+    def polling(self, count: Callable[[], int]) -> Iterator[None]:
+        """Reports `count()`, called in a thread, at intervals and at the end."""
+        ended = threading.Event()
+
+        def report() -> None:
+            while not ended.wait(POLL_SECONDS):
+                self.done(count())
+
+        thread = threading.Thread(target=report, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+        self.done(count())
 
     def phase(self, name: str, total: int, *, done: int = 0) -> None:
         """Reports that a phase begins; see `Phase`."""
@@ -224,8 +246,9 @@ class Reporter:
                 {"error": type(error).__name__, "message": error.message, "hint": error.hint})
 
     def _send(self, value: dict[str, object]) -> None:
-        self._stream.write(json.dumps(value).encode() + b"\n")
-        self._stream.flush()
+        with self._sending:
+            self._stream.write(json.dumps(value).encode() + b"\n")
+            self._stream.flush()
 
 
 def parse(line: bytes) -> Event:

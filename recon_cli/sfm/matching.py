@@ -51,20 +51,36 @@ def extract_features(job: MappingJob, report: Reporter) -> Result:
         SfmError: too few frames hold any texture.
     """
     report.phase("features", len(job.names), done=database.progress(job.database, "features"))
-    for group in job.groups:
-        masked = [name for name in group.names if job.masks and (job.masks / name).exists()]
-        rest = sorted(set(group.names).difference(masked))
-        # COLMAP takes no image that has no mask where it is given a folder of masks.
-        for names, masks in ((masked, job.masks), (rest, None)):
-            if names:  # an empty list would mean all
-                pycolmap.extract_features(
-                    job.database, job.frames, names, pycolmap.CameraMode.SINGLE,
-                    _reader_options(group, masks), _extraction_options(job), pycolmap.Device.cpu)
+    with _open_for_polling(job) as opened:
+        ids = [image.image_id for image in opened.read_all_images()]
+        with report.polling(lambda: sum(map(opened.exists_descriptors, ids))):
+            for group in job.groups:
+                _extract_group(job, group)
     database.keep_coarsest(job.database, job.max_features)
     counts = database.keypoint_counts(job.database)
     _check_readable(job, counts)
     checks.check_texture(counts)
     return {"rows": len(counts), "keypoints": sum(counts.values())}
+
+
+def _extract_group(job: MappingJob, group: CameraGroup) -> None:
+    masked = [name for name in group.names if job.masks and (job.masks / name).exists()]
+    rest = sorted(set(group.names).difference(masked))
+    # COLMAP takes no image that has no mask where it is given a folder of masks.
+    for names, masks in ((masked, job.masks), (rest, None)):
+        if names:  # an empty list would mean all
+            pycolmap.extract_features(
+                job.database, job.frames, names, pycolmap.CameraMode.SINGLE,
+                _reader_options(group, masks), _extraction_options(job), pycolmap.Device.cpu)
+
+
+def _open_for_polling(job: MappingJob) -> pycolmap.Database:
+    """Returns a connection that shows how far pycolmap is; to be open longer than its own.
+
+    SQLite locks the file for a moment when its last connection closes. Another process that looked
+    at it could do so just when pycolmap opens the file, which gives up on a lock at once.
+    """
+    return pycolmap.Database.open(job.database)
 
 
 def create_database(job: MappingJob) -> None:
@@ -238,8 +254,9 @@ def match_pairs(job: MappingJob, pairs: Iterable[Pair], report: Reporter) -> Non
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = job.seed
         verification.ransac.max_num_trials = MAX_TRIALS
-        pycolmap.match_image_pairs(
-            job.database, matching, pairing, verification, pycolmap.Device.cpu)
+        with _open_for_polling(job) as opened, report.polling(opened.num_verified_image_pairs):
+            pycolmap.match_image_pairs(
+                job.database, matching, pairing, verification, pycolmap.Device.cpu)
     listed.unlink()
 
 

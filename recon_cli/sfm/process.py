@@ -19,8 +19,7 @@ from pathlib import Path
 
 from recon_cli.errors import ReconError, SfmError
 from recon_cli.progress import Bar, Progress
-from recon_cli.sfm import database
-from recon_cli.sfm.job import LOCK, Event, MappingJob, Phase, parse
+from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, parse
 
 _DOING = {
     "features": ("finding features", "frame"),
@@ -30,7 +29,6 @@ _DOING = {
 }
 _STEP = {"mapping": "model"}  # the step that a phase belongs to, where the names differ
 LOG = "log.txt"
-POLL_SECONDS = 0.25
 _LOG_TAIL = 64 * 1024  # bytes
 _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
 
@@ -81,8 +79,6 @@ class Monitor:
                 self._record_durable(self._phase)
 
     def _count_on_disk(self, phase: Phase) -> int:
-        if phase.name in ("features", "matches"):
-            return database.progress(self._job.database, phase.name)
         if phase.name == "undistorted":
             # os.walk, not rglob: the process removes folders as it goes, and walk passes over them.
             files = sum(

@@ -15,11 +15,13 @@ from recon_cli.errors import FormatError
 from recon_cli.io.images import write_png
 from recon_cli.scene.camera import Lens
 from recon_cli.sfm import database
-from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm import job as sfm_job
+from recon_cli.sfm.job import CameraGroup, MappingJob, Phase, Reporter, parse
 from recon_cli.sfm.matching import (
     create_database,
     exhaustive_pairs,
     extract_features,
+    match_pairs,
     sequential_pairs,
     similar_pairs,
 )
@@ -158,6 +160,29 @@ def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
     for name, every in keypoints(job).items():
         coarsest = np.sort(database.scales(every))[-100:]
         np.testing.assert_array_equal(np.sort(database.scales(few[name])), coarsest)
+
+
+def counts_of(stream):
+    """Returns the counts that a reporter sent after it had begun a phase."""
+    phase, *counts = map(parse, stream.getvalue().splitlines())
+    assert isinstance(phase, Phase)
+    return phase, counts
+
+
+def test_progress_is_reported_up_to_the_last_image_and_pair(job, monkeypatch):
+    monkeypatch.setattr(sfm_job, "POLL_SECONDS", 0.001)
+    job, stream = textured(job), io.BytesIO()
+    extract_features(job, Reporter(stream))
+    phase, counts = counts_of(stream)
+    assert (phase.done, phase.total) == (0, 3)
+    assert counts == sorted(counts)
+    assert counts[-1] == 3
+    stream = io.BytesIO()
+    match_pairs(job, exhaustive_pairs(job.names), Reporter(stream))
+    phase, counts = counts_of(stream)
+    assert (phase.done, phase.total) == (0, 3)
+    assert counts == sorted(counts)
+    assert counts[-1] == 3
 
 
 def test_descriptors_stay_with_their_keypoints(job):
