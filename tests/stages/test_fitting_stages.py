@@ -140,7 +140,7 @@ def test_a_config_of_the_same_ratio_by_chance_keeps_other_gaussians(inputs, tmp_
         config = PruneConfig(ratio=0.5, at="end", recovery=0, score=score)
         results.append(run(prune, config, inputs, tmp_path / score))
     assert results[0].gaussians == results[1].gaussians
-    assert results[0]["validation_psnr_db"] > results[1]["validation_psnr_db"]
+    assert results[0].validation_psnr_db > results[1].validation_psnr_db
 
 
 def test_nothing_to_train_on_is_an_error(inputs, tmp_path):
