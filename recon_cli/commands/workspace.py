@@ -15,8 +15,7 @@ from recon_cli.commands.jobs import open_job, summary_text
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.lazy import load
 from recon_cli.pipeline import plan
-from recon_cli.pipeline.clean import free_space
-from recon_cli.pipeline.plan import Job, StageStatus
+from recon_cli.pipeline.plan import Job, StageStatus, free_space
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.stages import STAGES
 from recon_cli.workspace.layout import Workspace

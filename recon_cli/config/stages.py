@@ -133,7 +133,7 @@ DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 class TrainConfig(StageConfig):
     """How Gaussians are fitted: a recipe, scaled to the number of iterations.
 
-    `train.planning` decides what is left automatic, once the scene is known.
+    `train.plan` decides what is left automatic, once the scene is known.
     """
 
     quality: str = option(
@@ -220,7 +220,7 @@ class TrainConfig(StageConfig):
 
 @dataclass(frozen=True)
 class RunConfig(TrainConfig):
-    """TrainConfig with numbers in place of what was automatic, as `train.planning` makes it.
+    """TrainConfig with numbers in place of what was automatic, as `train.plan` makes it.
 
     The defaults are those of a run that nobody planned.
     """

@@ -36,8 +36,7 @@ from recon_cli.render.contract import Renderer, RenderOutput
 from recon_cli.render.numba.loss import C1, C2, MAPS, RADIUS, photometric, taps
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.losses import photometric_loss
+from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 
 SCHEMA = "recon-bench"

@@ -27,7 +27,7 @@ from recon_cli.pipeline.plan import Job, Target
 from recon_cli.progress import Progress
 from recon_cli.scene.scene import Scene
 from recon_cli.train.feature_trials import PARTS
-from recon_cli.train.planning import model_parts, parts_needed
+from recon_cli.train.plan import choose_parts, model_parts
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task
@@ -124,7 +124,7 @@ class LoadedScene:
     def parts(self) -> dict[str, Any]:
         """The parts of the model that the scene needs, as `recon train` finds them by trials."""
         task = self._load_task(self.base)
-        return model_parts(parts_needed(task, self.scene, self.ctx, harmonics=True).config)
+        return model_parts(choose_parts(task, self.scene, self.ctx, harmonics=True).config)
 
     def task(self, run: TrainingRun) -> Task:
         """Returns the task of a run, without validation views: training uses only what it fits."""

@@ -33,7 +33,7 @@ from recon_cli.flythrough.request import DEPTH, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render import render
-from recon_cli.workspace import lock
+from recon_cli.workspace import layout
 from recon_cli.workspace.atomic import (
     LEFTOVERS,
     clear_leftovers,
@@ -42,8 +42,7 @@ from recon_cli.workspace.atomic import (
     write_json,
 )
 from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.layout import disk_errors
-from recon_cli.workspace.lock import HOLDER, LOCK
+from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
 
 FOLDER = "render"  # in the workspace
 RECORD = "render.json"
@@ -145,7 +144,7 @@ def render_frames(request: RenderRequest, job: Job) -> str:
     encoding = _check(request, plan)
     ctx = render_context(job.compute, job.progress)
     folder = _make_folders(request, plan, job.workspace.root)
-    with disk_errors(folder, "rendering"), lock.hold(
+    with disk_errors(folder, "rendering"), layout.hold(
             folder, "render", other="another folder with --out"):
         frames = FrameFolder(folder, list(plan.cameras), request.outputs)
         scale = depth_scale(trained.scene, metres=trained.metres)

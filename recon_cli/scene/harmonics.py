@@ -42,7 +42,6 @@ _DEGREE = 3
 # The 2l+1 functions of degree l are determined by their values in 2l+1 general directions. 64 of a
 # Fibonacci lattice keep the least squares at a condition number under 1.03 for every degree.
 _DIRECTIONS = 64
-_ROUNDING = 1e-9  # entries of a generator are 0 or at least 1
 
 
 def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
@@ -76,6 +75,8 @@ def generators() -> Tensor:
     A turn by the small rotation vector w changes coefficients c of degrees 1 to 3 by
     sum_i w_i (G_i c): with Y the row of basis functions, Y(R d) (c + w_i G_i c) = Y(d) c demands
     Y(d) G_i = -dY(R d)/dw_i, solved as in `rotation_blocks`. Antisymmetric; 48 entries are not 0.
+    Those are half the square roots of whole numbers, as of every angular momentum, and are rounded
+    to that: the last bits of a least-squares solution depend on the number of threads.
     """
     directions, matrices = _lattice(_DIRECTIONS).requires_grad_(), []
     basis = basis_rest(directions, _DEGREE)
@@ -85,8 +86,7 @@ def generators() -> Tensor:
     for axis in torch.eye(3, dtype=torch.float64):
         turn = torch.linalg.cross(axis.expand_as(directions), directions.detach())
         solved = torch.linalg.lstsq(basis.detach(), -(slopes * turn).sum(dim=2).T).solution
-        solved[solved.abs() < _ROUNDING] = 0
-        matrices.append((solved - solved.T) / 2)
+        matrices.append(solved.sign() * (4 * solved.square()).round().sqrt() / 2)
     return torch.stack(matrices)
 
 

@@ -56,8 +56,7 @@ from recon_cli.io.images import to_uint8, write_png
 from recon_cli.io.ply import read_ply
 from recon_cli.io.records import ImportRecord
 from recon_cli.scene.scene import Scene
-from recon_cli.train.callbacks import seconds_at
-from recon_cli.train.runner import LOG
+from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_bytes, write_json
 from recon_cli.workspace.summaries import EvaluateSummary

@@ -15,7 +15,7 @@ from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_scene, size_summary
 from recon_cli.io.ply import write_ply
-from recon_cli.train.planning import first_or_saved, model_parts, planned_task
+from recon_cli.train.plan import first_or_saved, model_parts, plan_task
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
@@ -25,7 +25,7 @@ from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs, validation=config.validation)
-    task = planned_task(config, scene, out, ctx)
+    task = plan_task(config, scene, out, ctx)
     ctx.notice_idle(task.schedule.config.batch_views)
     state = first_or_saved(task, scene, out / CHECKPOINT)
     until = task.schedule.config.iterations

@@ -18,11 +18,10 @@ from torch import Tensor
 
 from recon_cli.render import Statistics
 from recon_cli.scene.camera import Camera
-from recon_cli.train.densification_stats import DensificationStats
-from recon_cli.train.densify import STRATEGIES
+from recon_cli.train.densification import STRATEGIES
 from recon_cli.train.gradient import DeferredStep, gradient_step
 from recon_cli.train.importance import Importance
-from recon_cli.train.state import TrainState
+from recon_cli.train.state import DensificationStats, TrainState
 from recon_cli.train.stepper import Stepper, next_view, skip
 from recon_cli.train.task import Task
 

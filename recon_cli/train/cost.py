@@ -17,12 +17,18 @@ from numpy.typing import NDArray
 
 from recon_cli.context import ProcessGroup, TrainCallback
 from recon_cli.scene.splats import TERMS, Splats
-from recon_cli.train.densification_stats import DensificationStats
-from recon_cli.train.densify import budget
+from recon_cli.train import densification
 from recon_cli.train.fit import fit, report_every, validation_psnr
 from recon_cli.train.initialize import splats_from_points
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, new_state, save_state
+from recon_cli.train.state import (
+    LONG_SAVE,
+    SAVE_SHARE,
+    DensificationStats,
+    TrainState,
+    new_state,
+    save_state,
+)
 from recon_cli.train.task import Task
 
 # Of the Gaussians that stand for trained ones. With .3 a step takes what a real one of the same
@@ -268,9 +274,9 @@ def _grown(
 ) -> Splats:
     """Returns `count` Gaussians that cost what trained ones do: the points', split at random."""
     splats = splats_from_points(points, colors, most=max(count, 1), seed=0, sh_degree=sh_degree)
-    rule, generator = budget.BudgetRule(count, 0.0, 1.0), torch.Generator().manual_seed(0)
+    rule, generator = densification.BudgetRule(count, 0.0, 1.0), torch.Generator().manual_seed(0)
     while 1 < len(splats) < count:
-        splats, _ = budget.densify(splats, torch.ones(len(splats)), rule, generator)
+        splats, _ = densification.densify_budget(splats, torch.ones(len(splats)), rule, generator)
     splats.logit_opacities = torch.logit(torch.full((len(splats),), _OPACITY))
     return splats
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.sparse_adam import SparseAdam
+from recon_cli.train.optimizer import SparseAdam
 
 # Falling to a tenth as in INRIA 3DGS (exposure_lr_init .01, exposure_lr_final .001), but lower: in
 # 2,000 steps on two phone videos, from gains that were estimated, held-out views gained .72 and

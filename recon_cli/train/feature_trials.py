@@ -117,8 +117,6 @@ def split(training: int, validation: int) -> Split | None:
     return Split(train, held_out, own=True)
 
 
-
-
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
 _STEPS = 400

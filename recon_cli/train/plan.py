@@ -1,23 +1,36 @@
-"""How long a run is and how many Gaussians it may have, where the user left that open.
+"""What training decides before its first step: parts of the model, steps, cap of the count.
 
-A plan is made once, before the first step. It is recorded, and a run that was interrupted goes on
-by the record: whatever a clock said, the same three numbers give the same bytes.
+The plan is recorded, and an interrupted run goes on by the record: whatever a clock or a trial
+would say now, the same numbers give the same bytes.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import filecmp
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig, TrainConfig
+from recon_cli.context import StageContext
+from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.cost import CostModel
+from recon_cli.train.cost import CostModel, calibrate, with_exchange
+from recon_cli.train.feature_trials import PARTS, Candidate, Needs, examine
+from recon_cli.train.initialize import first_state, saved_state
+from recon_cli.train.memory import gaussians_that_fit
 from recon_cli.train.schedule import RECIPES, Schedule
+from recon_cli.train.state import TrainState
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import load_task, load_views, read_config, write_config
+from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import TrainPlan
 
 CALIBRATION_SHARE = 0.05  # of the minutes, at most
@@ -34,7 +47,9 @@ _FEWEST = 5000
 # Real Gaussians cover more tiles than those that are timed: ten runs on living, office and fox took
 # 1% less to 17% more than was told without this, 9% more on the mean.
 _LONGER = 1.09
-_ROUND = 100  # counts are told in hundreds
+_ROUND = 100  # counts are multiples of this
+
+logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True)
@@ -61,7 +76,7 @@ class Facts:
     """What a plan needs to know about a scene.
 
     Attributes:
-        detail: of `detail`.
+        detail: of `count_detail`.
         views: to train on.
         points: sparse ones, from which the Gaussians begin.
         room: the most Gaussians that memory has room for.
@@ -79,14 +94,14 @@ def first_config(asked: TrainConfig) -> RunConfig:
     Iterations and cap are those of the quality and of the smallest run where they are open.
     """
     quality = QUALITIES[asked.quality]
-    return _resolved(
+    return _fill_in(
         asked, asked.iterations or quality.iterations, asked.max_gaussians or _FEWEST,
         asked.max_size or quality.max_size)
 
 
 def run_config(asked: TrainConfig, plan: TrainPlan) -> RunConfig:
     """Returns the options of the run: what was asked for, and the plan's numbers for the rest."""
-    return _resolved(asked, plan.iterations, plan.max_gaussians, plan.max_size)
+    return _fill_in(asked, plan.iterations, plan.max_gaussians, plan.max_size)
 
 
 def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
@@ -108,7 +123,7 @@ def make_plan(
     """
     def at(iterations: int) -> TrainPlan:
         most = cap(asked, facts, iterations)
-        config = _resolved(asked, iterations, most, first_config(asked).max_size)
+        config = _fill_in(asked, iterations, most, first_config(asked).max_size)
         first = first_count(config, facts.points)
         return TrainPlan(
             iterations=iterations, max_gaussians=most, max_size=config.max_size,
@@ -119,7 +134,7 @@ def make_plan(
     if asked.minutes is None:
         return at(first_config(asked).iterations)
     left = 60 * asked.minutes - cost.seconds - spent
-    return at(_most(lambda steps: at(steps).seconds <= left, _SMALLEST_RUN, _LONGEST_RUN))
+    return at(_largest(lambda steps: at(steps).seconds <= left, _SMALLEST_RUN, _LONGEST_RUN))
 
 
 def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
@@ -135,7 +150,7 @@ def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
     """
     if asked.max_gaussians is not None:
         return asked.max_gaussians
-    return min(wanted(facts, iterations), max(MIN_GAUSSIANS, facts.room))
+    return min(useful_cap(facts, iterations), max(MIN_GAUSSIANS, facts.room))
 
 
 def first_count(config: RunConfig, points: int) -> int:
@@ -149,29 +164,29 @@ def first_count(config: RunConfig, points: int) -> int:
     return min(points, config.max_gaussians, max(_FEWEST, int(share * config.max_gaussians)))
 
 
-def wanted(facts: Facts, iterations: int) -> int:
+def useful_cap(facts: Facts, iterations: int) -> int:
     """Returns the cap that `cap` describes, memory aside."""
     share = min(math.sqrt(iterations / _FULL_AT), facts.views / _VIEWS_EACH)
     return max(_FEWEST, round(facts.detail * share / _ROUND) * _ROUND)
 
 
-def detail(views: Sequence[TrainView]) -> int:
+def count_detail(views: Sequence[TrainView]) -> int:
     """Returns how many pixels of a mean view hold detail: a gradient above 4 grey levels.
 
     Pixels that a mask ignores do not count.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, _DETAIL_VIEWS).round().astype(int))
-    return round(float(np.mean([_detailed_pixels(views[i]) for i in chosen])))
+    return round(float(np.mean([_count_detailed_pixels(views[i]) for i in chosen])))
 
 
-def _detailed_pixels(view: TrainView) -> int:
+def _count_detailed_pixels(view: TrainView) -> int:
     grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    found = np.hypot(across, down) > _DETAIL
-    return int((found if view.mask is None else found & view.mask).sum())
+    detailed = np.hypot(across, down) > _DETAIL
+    return int((detailed if view.mask is None else detailed & view.mask).sum())
 
 
-def _resolved(
+def _fill_in(
     asked: TrainConfig, iterations: int, max_gaussians: int, max_size: int
 ) -> RunConfig:
     values = {item.name: getattr(asked, item.name) for item in dataclasses.fields(asked)}
@@ -181,9 +196,96 @@ def _resolved(
         "max_gaussians": max_gaussians, "max_size": max_size})
 
 
-def _most(fits: Callable[[int], bool], low: int, high: int) -> int:
+def _largest(fits: Callable[[int], bool], low: int, high: int) -> int:
     """Returns the largest whole number in [low, high] that fits; `low` where none does."""
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if fits(middle) else (low, middle - 1)
     return low
+
+
+def plan_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext) -> Task:
+    """Returns the task of a run by its plan: a recorded one, or one that is made and recorded."""
+    if (out / TrainPlan.FILE).exists():
+        recorded = dataclasses.replace(
+            read_config(out), checkpoint_every=config.checkpoint_every)
+        return load_task(scene, recorded, ctx)
+    first = first_config(config)
+    fit_memory = gaussians_that_fit(scene, first, ctx)
+    task = load_task(scene, first, ctx)
+    needs = choose_parts(task, scene, ctx, harmonics=config.sh_degree is None)
+    if needs.config.images == "denoised" and first.images != "denoised":
+        task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
+    asked = dataclasses.replace(config, **model_parts(needs.config))
+    facts = Facts(count_detail(task.train), len(task.train), len(scene.points), fit_memory)
+    cost = _measure_cost(asked, facts, task, scene, out, ctx)
+    plan = make_plan(asked, facts, cost, spent=needs.seconds)
+    _report_plan(plan, asked, facts, ctx)
+    config = run_config(asked, plan)
+    write_config(out, config)
+    write_json(
+        out / TrainPlan.FILE, dataclasses.replace(plan, needs=needs.decisions).to_json())
+    return dataclasses.replace(task, schedule=Schedule(config))
+
+
+def model_parts(config: RunConfig) -> dict[str, Any]:
+    """Returns the parts of the model that trials decide on, by the names of their options."""
+    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
+
+
+def choose_parts(
+    task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False
+) -> Needs:
+    """Returns which parts of the model the scene needs, and logs the reasons."""
+    config = task.schedule.config
+
+    def twins() -> tuple[list[TrainView], list[TrainView]]:
+        denoised = dataclasses.replace(config, images="denoised")
+        return load_views(scene.train, denoised, ctx), load_views(scene.validation, denoised, ctx)
+
+    changed = config.images == "auto" and any(
+        not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
+    needs = examine(Candidate(
+        task, scene.points, scene.colors, twins if changed else None, harmonics))
+    for decision in needs.decisions:
+        logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
+    return needs
+
+
+def _measure_cost(
+    config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, ctx: StageContext
+) -> CostModel:
+    """Returns the cost of a run, from timed steps.
+
+    With several processes each step is timed with the views of one, and with what they exchange.
+    """
+    seconds = CALIBRATION_SECONDS
+    if config.minutes is not None:
+        seconds = CALIBRATION_SHARE * 60 * config.minutes
+    probe = dataclasses.replace(
+        probe_config(config, facts), batch_views=ctx.ranks.most_of(config.batch_views))
+    cost = calibrate(
+        dataclasses.replace(task, schedule=Schedule(probe)), scene.points, scene.colors,
+        scratch=out / "calibration.safetensors", seconds=seconds)
+    return with_exchange(cost, ctx.ranks, probe.max_gaussians, probe.sh_degree, task.device)
+
+
+def _report_plan(plan: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageContext) -> None:
+    logger.info(
+        "training takes about %.0f s: %s steps, up to %s Gaussians, images of up to %d pixels",
+        plan.seconds, f"{plan.iterations:,}", f"{plan.max_gaussians:,}", plan.max_size)
+    useful = useful_cap(facts, plan.iterations)
+    if config.max_gaussians is None and plan.max_gaussians < useful:
+        ctx.notice(f"memory has room for {plan.max_gaussians:,} Gaussians; {useful:,} would suit "
+                   "the images")
+    if config.minutes is not None and plan.seconds > 60 * config.minutes:
+        ctx.notice(f"{config.minutes:g} minutes are too short: the smallest run of "
+                   f"{plan.iterations} steps takes about {plan.seconds:.1f} s")
+
+
+def first_or_saved(task: Task, scene: Scene, checkpoint: Path) -> TrainState:
+    """Returns the state that a checkpoint holds, or the first one."""
+    if checkpoint.exists():
+        return saved_state(checkpoint, task)
+    most = first_count(task.schedule.config, len(scene.points))
+    return first_state(task, scene.points, scene.colors, most=most)

@@ -22,7 +22,7 @@ from torch import Tensor
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
-from recon_cli.train.sparse_adam import SparseAdam
+from recon_cli.train.optimizer import SparseAdam
 
 # First rate times steps of a camera, in units of the expected error; over the run a camera can go
 # .39 of that. Measured on a room of 100 views, 10 to 12 steps each: of 1 degree .005 (3.4) left .21

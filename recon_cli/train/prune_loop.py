@@ -16,10 +16,9 @@ from torch import Tensor
 
 from recon_cli.context import TrainCallback
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.densification_stats import DensificationStats
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance, add_views
-from recon_cli.train.state import TrainState
+from recon_cli.train.state import DensificationStats, TrainState
 from recon_cli.train.task import Task
 
 RATIO = 0.5  # that is removed where no limit is given

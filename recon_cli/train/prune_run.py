@@ -23,12 +23,11 @@ from recon_cli.errors import ConfigError
 from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.io.ply import read_ply
 from recon_cli.io.records import ImportRecord
-from recon_cli.train.callbacks import TrainLog, seconds_at
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import finished_state, saved_state
 from recon_cli.train.prune_loop import PruneRun, remaining, rounds_within
-from recon_cli.train.runner import LOG, Segment, run_fit
+from recon_cli.train.runner import LOG, Segment, TrainLog, run_fit, seconds_at
 from recon_cli.train.schedule import RecoverySchedule
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import logging
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from recon_cli.context import StageContext
-from recon_cli.train.callbacks import Checkpointer, ProgressCallback, TrainLog
+from recon_cli.context import StageContext, TrainCallback, TrainReport
+from recon_cli.progress import Bar
+from recon_cli.scene.splats import Splats
 from recon_cli.train.distributed.data_parallel import fit_together
 from recon_cli.train.importance import Importance
-from recon_cli.train.state import TrainState
+from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
 from recon_cli.train.task import Task
+from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.summaries import LogRow
 
 LOG = "log.jsonl"
 CHECKPOINT = "checkpoint.safetensors"
@@ -103,3 +109,146 @@ def run_fit(
                 segment.label, segment.until, [view.camera for view in task.train], state.splats)
         fit_together(state, dataclasses.replace(task, ranks=ctx.ranks), until, callbacks,
                      importance, ctx.threads)
+
+
+logger = logging.getLogger("recon")
+
+
+def seconds_at(log: Path, iteration: int, *, clock: str = "seconds") -> float:
+    """Returns the training seconds that a log counts up to an iteration, by one of its clocks."""
+    seconds = 0.0
+    for row in LogRow.read_all(log):
+        if row.iteration <= iteration:
+            seconds = float(getattr(row, clock))
+    return seconds
+
+
+class TrainLog(TrainCallback):
+    """Writes one JSON line a report; what a crash left behind the checkpoint is cut off.
+
+    Args:
+        path: of the log.
+        iteration: at which the run goes on.
+        earlier_seconds: of training before the first line.
+    """
+
+    def __init__(self, path: Path, iteration: int, earlier_seconds: float) -> None:
+        self._path = path
+        lines = path.read_text(encoding="utf-8").splitlines(True) if path.exists() else []
+        # a kill in mid-write leaves a last line without its end
+        whole = [line for line in lines if line.endswith("\n")]
+        valid = [line for line in whole if json.loads(line)["iteration"] <= iteration]
+        if not valid:  # a branch starts where the other run stood
+            first = {"iteration": iteration, "seconds": earlier_seconds, "cpu_seconds": 0.0}
+            valid = [json.dumps(first) + "\n"]
+        write_bytes(path, "".join(valid).encode())
+        self._earlier = seconds_at(path, iteration)
+        self._earlier_cpu = seconds_at(path, iteration, clock="cpu_seconds")
+
+    def on_report(self, report: TrainReport) -> None:
+        """Appends a report; its seconds count from the very start of training."""
+        self._write(dataclasses.asdict(report), report.seconds, report.cpu_seconds)
+
+    def add_idle(self, iteration: int, seconds: float, cpu_seconds: float) -> None:
+        """Counts time in which no step was taken."""
+        self._write({"iteration": iteration}, seconds, cpu_seconds)
+
+    def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
+        row["seconds"] = round(self._earlier + seconds, 3)
+        row["cpu_seconds"] = round(self._earlier_cpu + cpu_seconds, 3)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+class ProgressCallback(TrainCallback):
+    """Draws a training as a progress bar.
+
+    Args:
+        bar: counts steps.
+        iteration: at which the run goes on.
+    """
+
+    def __init__(self, bar: Bar, iteration: int) -> None:
+        self._bar, self._counted = bar, iteration
+
+    def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
+        """Advances the bar."""
+        self._bar.advance(iteration - self._counted)
+        self._counted = iteration
+
+    def on_report(self, report: TrainReport) -> None:
+        """Shows loss, PSNR and count beside the bar."""
+        psnr = report.validation_psnr_db
+        validation = "" if psnr is None else f", validation {psnr:.2f} dB"
+        self._bar.note(f"loss {report.loss:.4f}{validation}, {report.gaussians:,} Gaussians")
+        if report.goes_on_at is not None:
+            logger.info("the validation views gain nothing more after step %d: the run goes on at "
+                        "step %d, with falling rates", report.iteration, report.goes_on_at)
+
+
+class CheckpointThrottle:
+    """Keeps large checkpoints of fast steps from taking the time that the steps should have.
+
+    It changes when a state is saved, and never what is.
+
+    Args:
+        clock: seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock, self._last, self._took = clock, clock(), 0.0
+
+    def allows(self) -> bool:
+        """Tells whether another checkpoint keeps to its share of the time."""
+        return self._took <= LONG_SAVE or (
+            SAVE_SHARE * (self._clock() - self._last) >= self._took)
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Times a checkpoint."""
+        begin = self._clock()
+        yield
+        self._last = self._clock()
+        self._took = self._last - begin
+
+
+class Checkpointer(TrainCallback):
+    """Saves the state now and then, at certain steps for good, and when Ctrl-C was pressed.
+
+    Args:
+        state: that is trained.
+        path: of the checkpoint; None writes none, as while scores are gathered.
+        every: steps between two checkpoints, at least.
+        keep: files that hold the state after certain steps.
+        interrupted: tells whether Ctrl-C was pressed.
+        record: called with the steps done after each checkpoint.
+    """
+
+    def __init__(
+        self, state: TrainState, path: Path | None, every: int, keep: Mapping[int, Path],
+        interrupted: Callable[[], bool], record: Callable[[int], None],
+    ) -> None:
+        self._state, self._path, self._every, self._keep = state, path, every, keep
+        self._interrupted, self._record = interrupted, record
+        self._throttle = CheckpointThrottle()
+
+    def needs_step(self, iteration: int) -> bool:
+        """Returns whether a state is saved after this step."""
+        return iteration % self._every == 0 or iteration in self._keep
+
+    def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
+        """Saves the state where that is due.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
+        """
+        interrupted = self._interrupted()
+        if iteration in self._keep:
+            save_state(self._keep[iteration], self._state)
+        due = iteration % self._every == 0 and self._throttle.allows()
+        if self._path is not None and (due or interrupted):
+            with self._throttle.saving():
+                save_state(self._path, self._state)
+            self._record(iteration)
+        if interrupted:
+            raise KeyboardInterrupt

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from recon_cli.errors import TrainingError
 from recon_cli.render import Statistics
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.densification_stats import DensificationStats
-from recon_cli.train.densify import STRATEGIES
+from recon_cli.train.densification import STRATEGIES
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.importance import Importance
-from recon_cli.train.state import TrainState
+from recon_cli.train.state import DensificationStats, TrainState
 from recon_cli.train.task import Task
 
 _SKIPPED = 0.02  # share of the run's steps that may come to nothing

@@ -8,17 +8,22 @@ result and completes what was begun.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
 import shutil
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 
-from recon_cli.errors import ManifestError, ReconError, WorkspaceError
-from recon_cli.workspace import lock, manifest
-from recon_cli.workspace.atomic import clear_leftovers, sync_folder
+from filelock import FileLock, Timeout
+
+from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
+from recon_cli.workspace import manifest
+from recon_cli.workspace.atomic import clear_leftovers, read_json, sync_folder, write_json
 from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, describe_progress
 
@@ -70,7 +75,7 @@ class Workspace:
             raise WorkspaceError(
                 f"The workspace {self.root} cannot be made: {error.strerror}.",
                 hint="Give another folder with -w.") from error
-        with lock.hold(self.root, verb):
+        with hold(self.root, verb):
             self.recover()
             yield
 
@@ -194,12 +199,6 @@ class Workspace:
                 hint="Move or delete it, or give another workspace with -w.")
 
 
-
-
-
-
-
-
 def size_of(path: Path) -> int:
     """Returns the bytes in a file or in all files below a folder."""
     files = path.rglob("*") if path.is_dir() else [path]
@@ -264,3 +263,49 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+LOCK = ".lock"
+
+
+HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
+
+
+@contextmanager
+def hold(root: Path, verb: str, *, other: str = "another workspace with -w") -> Iterator[None]:
+    """Holds the lock of the workspace at `root` for as long as the block runs.
+
+    Args:
+        root: an existing folder.
+        verb: what the user typed, for the message to a second process.
+        other: what to give instead, for its hint.
+
+    Raises:
+        WorkspaceError: another process holds the lock; the message says which.
+    """
+    lock = FileLock(root / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise WorkspaceError(
+            f"{root} is in use by {_describe_holder(root)}.",
+            hint=f"Wait until it is done, or give {other}.") from error
+    try:
+        write_json(root / HOLDER, {
+            "pid": os.getpid(), "host": socket.gethostname(), "verb": verb,
+            "since": datetime.now().astimezone().isoformat(timespec="seconds"),
+        })
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # the error that led here says more
+            (root / HOLDER).unlink(missing_ok=True)
+        lock.release()
+
+
+def _describe_holder(root: Path) -> str:
+    try:
+        holder = read_json(root / HOLDER)
+        return (f"`recon {holder['verb']}`, process {holder['pid']} on {holder['host']} "
+                f"since {holder['since']}")
+    except (FormatError, KeyError, TypeError):
+        return "another process"

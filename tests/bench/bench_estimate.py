@@ -37,7 +37,7 @@ def row(workspace: Path, config: TrainConfig, ctx: StageContext, clock: str) -> 
     scene = load_scene(inputs, validation=config.validation)
     first = plan.first_config(config)
     task = load_task(scene, first, ctx)
-    facts = plan.Facts(plan.detail(task.train), len(task.train), len(scene.points),
+    facts = plan.Facts(plan.count_detail(task.train), len(task.train), len(scene.points),
                        gaussians_that_fit(scene, first, ctx))
     seconds = (plan.CALIBRATION_SECONDS if config.minutes is None
                else plan.CALIBRATION_SHARE * 60 * config.minutes)

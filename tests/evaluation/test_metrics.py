@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 
 from recon_cli.evaluation.metrics import leaves_enough, load_lpips, psnr, ssim
 from recon_cli.io.images import to_uint8
-from recon_cli.train.losses import photometric_loss
+from recon_cli.train.gradient import photometric_loss
 
 TRUTH = np.random.default_rng(0).integers(0, 256, (32, 40, 3), dtype=np.uint8)
 

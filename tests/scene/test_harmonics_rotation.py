@@ -114,3 +114,20 @@ def test_generators_are_antisymmetric_and_keep_degrees_apart():
         others = [i for i in range(15) if i not in range(15)[rows]]
         assert not held[:, rows][:, :, others].any(), degree
     assert int((held != 0).sum()) == 48
+
+
+def test_generators_are_exact_and_the_same_for_any_number_of_threads():
+    threads = torch.get_num_threads()
+    found = []
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            generators.cache_clear()
+            found.append(generators())
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(found[0], other) for other in found)
+    turn = np.array([0.3, -0.5, 0.7])
+    expected = torch.block_diag(*rotation_blocks(Rotation.from_rotvec(turn).as_matrix()))
+    small = torch.einsum("i,ikm->km", torch.from_numpy(turn), generators())
+    assert torch.allclose(torch.matrix_exp(small), expected, rtol=0, atol=EXACT)

@@ -188,7 +188,7 @@ def test_a_checkpoint_cut_short_is_refused_with_what_to_type(inputs, tmp_path, m
 
 def test_large_checkpoints_take_no_more_than_a_tenth_of_the_time():
     now = [0.0]
-    throttle = callbacks.CheckpointThrottle(lambda: now[0])
+    throttle = runner.CheckpointThrottle(lambda: now[0])
 
     def save(seconds):
         with throttle.saving():

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import joined, one_splat
 
-from recon_cli.train.densify.budget import BudgetRule, decayed, densify, drawn
+from recon_cli.train.densification import BudgetRule, decay_opacities, densify_budget, draw_rows
 
 RULE = BudgetRule(target=4, min_opacity=0.005, decay=1.0)
 
@@ -23,7 +23,8 @@ def seeded():
 
 
 def test_a_split_gives_two_halves_along_the_longest_axis():
-    result, source = densify(joined(splat(), splat()), torch.tensor([1.0, 0.0]), RULE, seeded())
+    result, source = densify_budget(
+        joined(splat(), splat()), torch.tensor([1.0, 0.0]), RULE, seeded())
     assert source.tolist() == [1, -1, -1]
     offset = 0.5 * math.exp(-1.0)
     assert result.means[1:].tolist() == [
@@ -36,36 +37,36 @@ def test_a_split_gives_two_halves_along_the_longest_axis():
 def test_the_long_axis_turns_with_the_gaussian():
     one = splat()
     one.quats = torch.tensor([[math.cos(math.pi / 4), 0, 0, math.sin(math.pi / 4)]])  # y to -x
-    result, _ = densify(joined(splat(), one), torch.tensor([0.0, 1.0]), RULE, seeded())
+    result, _ = densify_budget(joined(splat(), one), torch.tensor([0.0, 1.0]), RULE, seeded())
     assert (result.means[2] - result.means[1]).abs().tolist() == pytest.approx(
         [math.exp(-1.0), 0, 0], abs=1e-6)
 
 
 def test_transparent_gaussians_are_deleted_and_never_split():
     splats = joined(splat(0.004), splat(), splat(0.004))
-    result, source = densify(splats, torch.tensor([9.0, 0.0, 9.0]), RULE, seeded())
+    result, source = densify_budget(splats, torch.tensor([9.0, 0.0, 9.0]), RULE, seeded())
     assert source.tolist() == [1]
     assert len(result) == 1
 
 
 def test_the_decay_comes_before_the_threshold():
     rule = BudgetRule(target=1, min_opacity=0.005, decay=0.5)
-    assert decayed(splat(0.5), 0.5).opacities.item() == pytest.approx(0.25)
-    assert len(densify(splat(0.008), torch.ones(1), rule, seeded())[0]) == 0
+    assert decay_opacities(splat(0.5), 0.5).opacities.item() == pytest.approx(0.25)
+    assert len(densify_budget(splat(0.008), torch.ones(1), rule, seeded())[0]) == 0
 
 
 @pytest.mark.parametrize("target", [0, 1, 7, 8, 9, 100])
 def test_the_count_never_exceeds_the_target_nor_grows_by_more_than_half(target):
     splats = joined(*[splat() for _ in range(8)])
     rule = BudgetRule(target=target, min_opacity=0.005, decay=1.0)
-    result, _ = densify(splats, torch.ones(8), rule, seeded())
+    result, _ = densify_budget(splats, torch.ones(8), rule, seeded())
     assert len(result) == max(8, min(target, 12))
 
 
 def test_a_gaussian_that_was_never_seen_is_never_split():
     splats = joined(*[splat() for _ in range(4)])
     rule = BudgetRule(target=6, min_opacity=0.005, decay=1.0)
-    _, source = densify(splats, torch.tensor([0.0, 1.0, 0.0, 0.0]), rule, seeded())
+    _, source = densify_budget(splats, torch.tensor([0.0, 1.0, 0.0, 0.0]), rule, seeded())
     assert source.tolist() == [0, 2, 3, -1, -1]
 
 
@@ -73,16 +74,16 @@ def test_equal_scores_are_drawn_alike_and_the_draw_follows_the_weights():
     generator = seeded()
     counts = torch.zeros(4)
     for _ in range(4000):
-        counts[drawn(torch.tensor([1.0, 1.0, 2.0, 0.0]), 1, generator)] += 1
+        counts[draw_rows(torch.tensor([1.0, 1.0, 2.0, 0.0]), 1, generator)] += 1
     # three standard deviations of a share of .25 among 4,000 are .02
     assert (counts / 4000).tolist() == pytest.approx([0.25, 0.25, 0.5, 0.0], abs=0.025)
 
 
 def test_a_draw_of_all_takes_each_once():
-    assert drawn(torch.rand(50) + 0.1, 50, seeded()).tolist() == list(range(50))
+    assert draw_rows(torch.rand(50) + 0.1, 50, seeded()).tolist() == list(range(50))
 
 
 def test_scores_of_any_size_can_be_drawn():
     weight = torch.tensor([1e-38, 1e-38, 0.0])
-    assert drawn(weight, 5, seeded()).tolist() == [0, 1]
-    assert drawn(torch.zeros(3), 2, seeded()).tolist() == []
+    assert draw_rows(weight, 5, seeded()).tolist() == [0, 1]
+    assert draw_rows(torch.zeros(3), 2, seeded()).tolist() == []

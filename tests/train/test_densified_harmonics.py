@@ -8,9 +8,9 @@ from scenes import random_splats, with_harmonics
 from tiny_task import STRATEGIES, first_state, tiny_task
 
 from recon_cli.scene.splats import with_rows
-from recon_cli.train.densification_stats import DensificationStats
-from recon_cli.train.densify import budget, reference
+from recon_cli.train import densification
 from recon_cli.train.fit import fit
+from recon_cli.train.state import DensificationStats
 
 N, COLORED = 40, 13
 
@@ -23,13 +23,14 @@ def by_reference(splats):
     gathered = DensificationStats.zeros(N, torch.device("cpu"))
     gathered.pull[::3] = 2.0
     gathered.count[:] = 1
-    rule = reference.DensifyRule(1.0, 100.0, 0.05, None, 60)  # all are small: cloned
-    return reference.densify(splats, gathered, rule, generator())
+    rule = densification.DensifyRule(1.0, 100.0, 0.05, None, 60)  # all are small: cloned
+    return densification.densify_reference(splats, gathered, rule, generator())
 
 
 def by_budget(splats):
     score = torch.rand(N, generator=generator())
-    return budget.densify(splats, score, budget.BudgetRule(55, 0.05, 0.99), generator())
+    rule = densification.BudgetRule(55, 0.05, 0.99)
+    return densification.densify_budget(splats, score, rule, generator())
 
 
 @pytest.mark.parametrize("densify", [by_reference, by_budget])
@@ -58,8 +59,8 @@ def test_halves_of_a_split_have_what_their_parent_has():
     gathered.pull[:] = 2.0
     gathered.count[:] = 1
     few.logit_opacities[:] = 1.0
-    rule = reference.DensifyRule(1.0, 0.0, 0.005, None, 200)  # all are large: split
-    result, source = reference.densify(few, gathered, rule, generator())
+    rule = densification.DensifyRule(1.0, 0.0, 0.005, None, 200)  # all are large: split
+    result, source = densification.densify_reference(few, gathered, rule, generator())
     assert source.tolist() == [-1] * 2 * N
     assert torch.equal(result.sh_rest, few.sh_rest.repeat(2, 1, 1))
     assert torch.equal(result.sh_dc[: 2 * COLORED], few.sh_dc[:COLORED].repeat(2, 1))

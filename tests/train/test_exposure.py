@@ -11,8 +11,7 @@ from recon_cli.render import render
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import Exposure
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.losses import photometric_loss
+from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.state import new_state
 
 # Gradients of float32 against float64, relative in the 2-norm, as in test_step.

@@ -7,7 +7,7 @@ import torch
 from tiny_task import CONFIG, first_state, same, tiny_task
 
 from recon_cli.context import ProcessGroup
-from recon_cli.train.distributed.serialize import Fit, pack_fit, unpack_fit
+from recon_cli.train.distributed.data_parallel import Fit, pack_fit, unpack_fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import _parts
 from recon_cli.train.schedule import RecoverySchedule

@@ -99,14 +99,14 @@ def test_detail_counts_the_pixels_at_edges():
     flat = np.full((20, 30, 3), 90, np.uint8)
     edge = flat.copy()
     edge[:, 15:] = 190
-    assert plan.detail([view(flat)]) == 0
-    assert plan.detail([view(edge)]) == 2 * 20  # a column on either side
-    assert plan.detail([view(flat), view(edge)]) == 20
+    assert plan.count_detail([view(flat)]) == 0
+    assert plan.count_detail([view(edge)]) == 2 * 20  # a column on either side
+    assert plan.count_detail([view(flat), view(edge)]) == 20
     hidden = np.ones((20, 30), bool)
     hidden[:10] = False
-    assert plan.detail([view(edge, hidden)]) == 20
+    assert plan.count_detail([view(edge, hidden)]) == 20
 
 
 def test_faint_noise_is_no_detail():
     noise = np.random.default_rng(0).normal(100, 2, (40, 60, 1)).repeat(3, 2)
-    assert plan.detail([view(noise.round().astype(np.uint8))]) < 0.01 * 2400
+    assert plan.count_detail([view(noise.round().astype(np.uint8))]) < 0.01 * 2400

@@ -10,8 +10,7 @@ from recon_cli.render import render
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.losses import photometric_loss
+from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.poses import Poses, camera_gradient, moved, worth_a_trial
 from recon_cli.train.state import new_state
 

@@ -7,8 +7,8 @@ import torch
 from scenes import joined, one_splat
 
 from recon_cli.render import Statistics
-from recon_cli.train.densification_stats import DensificationStats
-from recon_cli.train.densify.reference import DensifyRule, densify, lowered_opacities
+from recon_cli.train.densification import DensifyRule, cap_opacities, densify_reference
+from recon_cli.train.state import DensificationStats
 
 RULE = DensifyRule(gradient=1.0, clone_scale=0.1, min_opacity=0.005, large_scale=1.0, most=100)
 
@@ -26,13 +26,14 @@ def pulled(*means):
 
 
 def test_a_small_gaussian_that_is_pulled_hard_is_cloned():
-    result, source = densify(splat(), pulled(2.0), RULE, torch.Generator())
+    result, source = densify_reference(splat(), pulled(2.0), RULE, torch.Generator())
     assert source.tolist() == [0, -1]
     assert torch.equal(result.means[0], result.means[1])
 
 
 def test_a_large_one_is_replaced_by_two_smaller_ones_near_it():
-    result, source = densify(splat(0.5), pulled(2.0), RULE, torch.Generator().manual_seed(0))
+    result, source = densify_reference(
+        splat(0.5), pulled(2.0), RULE, torch.Generator().manual_seed(0))
     assert source.tolist() == [-1, -1]
     assert torch.allclose(result.scales, torch.full((2, 3), 0.5 / 1.6))
     assert (result.means - torch.tensor([1.0, 2.0, 3.0])).norm(dim=1).max() < 5 * 0.5
@@ -40,14 +41,14 @@ def test_a_large_one_is_replaced_by_two_smaller_ones_near_it():
 
 
 def test_one_below_the_threshold_stays_as_it_is():
-    result, source = densify(splat(), pulled(0.9), RULE, torch.Generator())
+    result, source = densify_reference(splat(), pulled(0.9), RULE, torch.Generator())
     assert source.tolist() == [0]
     assert torch.equal(result.means, splat().means)
 
 
 def test_transparent_and_oversized_ones_are_deleted():
     splats = joined(splat(), splat(opacity=0.004), splat(scale=1.5))
-    _, source = densify(splats, pulled(0.0, 0.0, 0.0), RULE, torch.Generator())
+    _, source = densify_reference(splats, pulled(0.0, 0.0, 0.0), RULE, torch.Generator())
     assert source.tolist() == [0]
 
 
@@ -55,14 +56,15 @@ def test_one_that_covers_too_much_of_the_screen_is_deleted_only_when_asked():
     gathered = pulled(0.0)
     gathered.radius[:] = 21.0
     kept = DensifyRule(1.0, 0.1, 0.005, None, 100)
-    assert len(densify(splat(), gathered, RULE, torch.Generator())[0]) == 0
-    assert len(densify(splat(), gathered, kept, torch.Generator())[0]) == 1
+    assert len(densify_reference(splat(), gathered, RULE, torch.Generator())[0]) == 0
+    assert len(densify_reference(splat(), gathered, kept, torch.Generator())[0]) == 1
 
 
 def test_the_count_never_exceeds_its_cap_and_the_hardest_pulled_come_first():
     splats = joined(*[splat() for _ in range(5)])
     rule = DensifyRule(1.0, 0.1, 0.005, None, most=7)
-    result, source = densify(splats, pulled(2.0, 9.0, 3.0, 8.0, 4.0), rule, torch.Generator())
+    result, source = densify_reference(
+        splats, pulled(2.0, 9.0, 3.0, 8.0, 4.0), rule, torch.Generator())
     assert len(result) == 7
     assert source.tolist() == [0, 1, 2, 3, 4, -1, -1]
 
@@ -79,6 +81,6 @@ def test_the_pull_is_measured_in_normalised_device_coordinates_over_seen_steps()
 
 
 def test_a_reset_lowers_high_opacities_and_leaves_low_ones():
-    lowered = lowered_opacities(joined(splat(opacity=0.9), splat(opacity=0.006)))
+    lowered = cap_opacities(joined(splat(opacity=0.9), splat(opacity=0.006)))
     assert lowered.opacities.tolist() == pytest.approx([0.01, 0.006], rel=1e-5)
     assert math.isclose(splat().opacities.item(), 0.5)

@@ -9,8 +9,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.io.images import fill_masked
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.losses import photometric_loss
+from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.state import new_state
 
 # Gradients of float32 against float64, relative in the 2-norm. Measured 3e-6 (torch), 8e-7 (numba).

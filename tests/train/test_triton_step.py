@@ -9,8 +9,7 @@ from scenes import camera_at, random_splats
 
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.losses import photometric_loss
+from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import camera_gradient
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from recon_cli.errors import InputError, ManifestError, WorkspaceError
-from recon_cli.workspace import lock
+from recon_cli.workspace import layout
 from recon_cli.workspace.digests import digest_file, digest_outputs, read_source
 from recon_cli.workspace.layout import Workspace, disk_errors
 from recon_cli.workspace.manifest import (
@@ -256,7 +256,7 @@ def test_a_folder_that_recon_did_not_make_is_not_replaced(workspace: Workspace) 
 
 def test_the_second_writer_is_told_who_the_first_is(workspace: Workspace) -> None:
     first = workspace.writing("train --prune")
-    with first, pytest.raises(WorkspaceError) as caught, lock.hold(workspace.root, "sfm"):
+    with first, pytest.raises(WorkspaceError) as caught, layout.hold(workspace.root, "sfm"):
         pass
     assert f"process {os.getpid()}" in caught.value.message
     assert "recon train --prune" in caught.value.message
@@ -264,11 +264,11 @@ def test_the_second_writer_is_told_who_the_first_is(workspace: Workspace) -> Non
 
 def test_what_a_dead_holder_left_does_not_lock(workspace: Workspace) -> None:
     workspace.root.mkdir()
-    (workspace.root / lock.LOCK).touch()
-    (workspace.root / lock.HOLDER).write_text('{"pid": 1}')
+    (workspace.root / layout.LOCK).touch()
+    (workspace.root / layout.HOLDER).write_text('{"pid": 1}')
     with workspace.writing("train"):
-        assert json.loads((workspace.root / lock.HOLDER).read_text())["pid"] == os.getpid()
-    assert not (workspace.root / lock.HOLDER).exists()
+        assert json.loads((workspace.root / layout.HOLDER).read_text())["pid"] == os.getpid()
+    assert not (workspace.root / layout.HOLDER).exists()
 
 
 def test_a_full_disk_is_said_with_the_space_left(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """(1 - w) L1 + w (1 - SSIM) and its gradient in four kernels (Kerbl et al. 2023, eq. 7).
 
-SSIM as in `train.losses`: 11 taps, sigma 1.5, zeros beyond the border, mean over pixels and
+SSIM as in `train.gradient`: 11 taps, sigma 1.5, zeros beyond the border, mean over pixels and
 channels (Wang et al. 2004, eq. 13). The window is separable: two kernels go along rows, two down
 columns. The truth is read as bytes. Each program sums its own part, and torch adds the parts.
 """
