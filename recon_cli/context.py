@@ -20,24 +20,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainReport:
-    """How the run stands.
+    """How the run stands."""
 
-    Attributes:
-        iteration: steps done.
-        loss: of this step.
-        validation_psnr_db: mean over the validation views; None where there are none.
-        gaussians: count.
-        seconds: of this call, so far.
-        cpu_seconds: of all threads of this process in this call, so far.
-        goes_on_at: the iteration to which the run jumps now; None where it just goes on.
-    """
-
-    iteration: int
-    loss: float
-    validation_psnr_db: float | None
-    gaussians: int
-    seconds: float
-    cpu_seconds: float = 0.0
+    iteration: int  # steps done
+    loss: float  # of this step
+    validation_psnr_db: float | None  # mean over the validation views; None where there are none
+    gaussians: int  # count
+    seconds: float  # of this call, so far
+    cpu_seconds: float = 0.0  # of all threads of this process in this call, so far
+    # the iteration to which the run jumps now; None where it just goes on
     goes_on_at: int | None = None
 
 
@@ -76,20 +67,13 @@ class TrainCallback:
 
 @dataclass(eq=False)
 class ProcessGroup:
-    """This process among those that train together; by itself there is but one.
+    """This process among those that train together; by itself there is but one."""
 
-    Attributes:
-        rank: of this process, 0 to count - 1. The first one leads: it writes and decides.
-        count: of the processes.
-        local: how many of them share this machine.
-        lacks_gpu: some have a GPU of their own, and some have none.
-        views: the training views that all of them hold by now.
-    """
-
-    rank: int = 0
-    count: int = 1
-    local: int = 1
-    lacks_gpu: bool = False
+    rank: int = 0  # of this process, 0 to count - 1. The first one leads: it writes and decides
+    count: int = 1  # of the processes
+    local: int = 1  # how many of them share this machine
+    lacks_gpu: bool = False  # some have a GPU of their own, and some have none
+    # the training views that all of them hold by now
     views: Sequence[TrainView] = field(default=(), repr=False)
 
     @property
@@ -139,40 +123,27 @@ def _ignore(done: int, total: int) -> None:
 
 @dataclass(frozen=True)
 class StageInputs:
-    """What a stage may read.
+    """What a stage may read."""
 
-    Attributes:
-        folders: finished folder of each stage named in `needs`, and of those in `uses` that are
-            fresh, by stage name.
-        sources: the user's own files; only ingest has any.
-    """
-
+    # finished folder of each stage named in `needs`, and of those in `uses` that are fresh, by
+    # stage name
     folders: Mapping[str, Path] = field(default_factory=dict)
-    sources: tuple[Path, ...] = ()
+    sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
 
 
 @dataclass(frozen=True)
 class StageContext:
-    """How a stage reports and where it computes.
+    """How a stage reports and where it computes."""
 
-    Attributes:
-        progress: opens progress bars.
-        device: "cpu" or "cuda", already resolved.
-        backend: name of a rasterizer, already resolved.
-        threads: CPU threads to use.
-        record: called with (done, total) whenever that much would survive a crash;
-            `recon status` shows it as partial (412/600).
-        callbacks: called while Gaussians are trained.
-        ranks: the processes that train together, which this one leads.
-    """
-
-    progress: Progress = field(default_factory=NullProgress)
-    device: str = "cpu"
-    backend: str = "torch"
-    threads: int = 1
+    progress: Progress = field(default_factory=NullProgress)  # opens progress bars
+    device: str = "cpu"  # "cpu" or "cuda", already resolved
+    backend: str = "torch"  # name of a rasterizer, already resolved
+    threads: int = 1  # CPU threads to use
+    # called with (done, total) whenever that much would survive a crash; `recon status` shows it as
+    # partial (412/600)
     record: Callable[[int, int], None] = _ignore
-    callbacks: tuple[TrainCallback, ...] = ()
-    ranks: ProcessGroup = SINGLE_PROCESS
+    callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
+    ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
 
     def notice(self, text: str) -> None:
         """Tells the user something that is no error but must not be missed, in one line.

@@ -46,27 +46,19 @@ def _ignore(_outcome: Outcome) -> None:
 
 @dataclass(frozen=True)
 class Job:
-    """Where to work and on what terms.
+    """Where to work and on what terms."""
 
-    Attributes:
-        workspace: holds the results.
-        settings: what recon.toml, --config and --set set.
-        compute: device, backend and threads as typed.
-        progress: opens progress bars.
-        report: called with every stage that was run or is up to date.
-        table: the stages.
-        callbacks: called while Gaussians are trained; they do not affect the result.
-        ranks: the processes that train together, which this one leads.
-    """
-
-    workspace: Workspace
-    settings: Settings = field(default_factory=dict)
+    workspace: Workspace  # holds the results
+    settings: Settings = field(default_factory=dict)  # what recon.toml, --config and --set set
+    # device, backend and threads as typed
     compute: ComputeConfig = field(default_factory=ComputeConfig)
-    progress: Progress = field(default_factory=NullProgress)
+    progress: Progress = field(default_factory=NullProgress)  # opens progress bars
+    # called with every stage that was run or is up to date
     report: Callable[[Outcome], None] = _ignore
-    table: Sequence[Stage] = STAGES
+    table: Sequence[Stage] = STAGES  # the stages
+    # called while Gaussians are trained; they do not affect the result
     callbacks: tuple[TrainCallback, ...] = ()
-    ranks: ProcessGroup = SINGLE_PROCESS
+    ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
 
     def inspect(self) -> WorkspaceCheck:
         """Returns the checks of the workspace as it is now."""
@@ -79,12 +71,7 @@ def run_stage(
 ) -> Manifest:
     """Runs one stage whose needs are fresh, commits its result and returns the manifest.
 
-    Args:
-        job: where and how.
-        checks: of the workspace as it is now.
-        row: the stage.
-        config: its options.
-        sources: the user's files; None for those of the previous run.
+    `sources` are the user's files; None stands for those of the previous run.
 
     Raises:
         ReconError: whatever the stage raises; what it had finished is kept for the next run.
@@ -190,10 +177,7 @@ def render_context(
 ) -> StageContext:
     """Returns where to train and render, once the rasterizer is ready.
 
-    Args:
-        compute: device, backend and threads as typed.
-        progress: opens progress bars.
-        ranks: that train together; each takes its share of the cores.
+    Each of `ranks` takes its share of the cores.
 
     Raises:
         BackendError: what was asked for is not available.

@@ -33,21 +33,14 @@ from recon_cli.workspace.manifest import (
 
 @dataclass(frozen=True)
 class StageCheck:
-    """What is known of one stage's result.
+    """What is known of one stage's result."""
 
-    Attributes:
-        row: the stage.
-        manifest: of the finished result; None where there is none.
-        reasons: why the result is stale, in words; empty where it is fresh or missing.
-        gone: inputs that no longer exist; that alone makes nothing stale.
-        partial_run: an interrupted run that the next one would resume.
-    """
-
-    row: Stage
-    manifest: Manifest | None
+    row: Stage  # the stage
+    manifest: Manifest | None  # of the finished result; None where there is none
+    # why the result is stale, in words; empty where it is fresh or missing
     reasons: tuple[str, ...] = ()
-    gone: tuple[str, ...] = ()
-    partial_run: PartialRun | None = None
+    gone: tuple[str, ...] = ()  # inputs that no longer exist; that alone makes nothing stale
+    partial_run: PartialRun | None = None  # an interrupted run that the next one would resume
 
     @property
     def fresh(self) -> bool:
@@ -81,11 +74,6 @@ class WorkspaceCheck:
 
     A stage behind a stale one is stale too. One behind a missing one is not: whether its input
     changed shows once that has been made again.
-
-    Args:
-        workspace: holds the results.
-        settings: what recon.toml, --config and --set set.
-        table: the stages.
     """
 
     def __init__(self, workspace: Workspace, settings: Settings, table: Sequence[Stage]) -> None:

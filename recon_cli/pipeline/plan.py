@@ -46,27 +46,16 @@ class Target:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """How a stage stands; `recon status --json` prints these fields under these names.
+    """How a stage stands; `recon status --json` prints these fields under these names."""
 
-    Attributes:
-        name: of the stage and of its folder.
-        state: fresh, stale, partial or missing.
-        reasons: why it is stale, in words.
-        done: how much of an interrupted run would be resumed; 0 where there is none.
-        total: of how much; 0 where there is no interrupted run.
-        seconds: that the finished result took; None where there is none.
-        summary: of the finished result.
-        notices: what the user should know but makes nothing stale.
-    """
-
-    name: str
-    state: str
-    reasons: tuple[str, ...]
-    done: int
-    total: int
-    seconds: float | None
-    summary: dict[str, Any]
-    notices: tuple[str, ...]
+    name: str  # of the stage and of its folder
+    state: str  # fresh, stale, partial or missing
+    reasons: tuple[str, ...]  # why it is stale, in words
+    done: int  # how much of an interrupted run would be resumed; 0 where there is none
+    total: int  # of how much; 0 where there is no interrupted run
+    seconds: float | None  # that the finished result took; None where there is none
+    summary: dict[str, Any]  # of the finished result
+    notices: tuple[str, ...]  # what the user should know but makes nothing stale
 
 
 def status(job: Job) -> tuple[StageStatus, ...]:
@@ -99,11 +88,8 @@ def run(
 ) -> tuple[Outcome, ...]:
     """Brings every target up to date, in order, and returns what was done for each.
 
-    Args:
-        job: where and how.
-        verb: what the user typed; named to other processes that want the workspace.
-        targets: stages in the order of the table.
-        again: run the targets even if they are fresh.
+    Targets that are fresh run only with `again`. `verb` is shown to other processes that want the
+    workspace.
 
     Raises:
         StageError: something that a target needs is missing or stale and is not made implicitly, or
@@ -297,10 +283,7 @@ def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tu
     Without `stages` that is unfinished work, replaced results, and large volatile files: what is
     fresh stays fresh. With `stages` it is the results of those stages.
 
-    Args:
-        job: whose workspace is cleaned.
-        stages: names of stages whose results go.
-        dry: remove nothing, only tell.
+    With `dry` nothing is removed.
 
     Raises:
         WorkspaceError: another process holds the workspace, or it cannot be written.

@@ -25,19 +25,13 @@ MODELS: dict[str, tuple[int, int]] = {
 
 @dataclass(frozen=True)
 class Lens:
-    """Known intrinsics of an image that may be distorted.
+    """Known intrinsics of an image that may be distorted."""
 
-    Attributes:
-        model: one of `MODELS`.
-        width: image width in pixels.
-        height: image height in pixels.
-        params: in COLMAP's order: focal lengths and principal point in pixels (the centre of the
-            first pixel lies at 0.5), then distortion coefficients without a unit.
-    """
-
-    model: str
-    width: int
-    height: int
+    model: str  # one of `MODELS`
+    width: int  # image width in pixels
+    height: int  # image height in pixels
+    # in COLMAP's order: focal lengths and principal point in pixels (the centre of the first pixel
+    # lies at 0.5), then distortion coefficients without a unit
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
@@ -62,25 +56,15 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera at a place.
+    """A pinhole camera at a place."""
 
-    Attributes:
-        width: image width in pixels.
-        height: image height in pixels.
-        fx: focal length in pixels along x.
-        fy: focal length in pixels along y.
-        cx: principal point in pixels; the centre of the first pixel lies at 0.5.
-        cy: principal point in pixels.
-        viewmat: [4, 4] float64, world to camera; x right, y down, z forward.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    viewmat: NDArray[np.float64]
+    width: int  # image width in pixels
+    height: int  # image height in pixels
+    fx: float  # focal length in pixels along x
+    fy: float  # focal length in pixels along y
+    cx: float  # principal point in pixels; the centre of the first pixel lies at 0.5
+    cy: float  # principal point in pixels
+    viewmat: NDArray[np.float64]  # [4, 4] float64, world to camera; x right, y down, z forward
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:

@@ -23,15 +23,10 @@ _MEAN_MIN = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Axes:
-    """A frame for a scene whose up is known.
+    """A frame for a scene whose up is known."""
 
-    Attributes:
-        similarity: from the scene's coordinates to that frame; its scale is 1.
-        walls: what gave the x axis where `walls.found`, else the cameras' mean right did.
-    """
-
-    similarity: Similarity
-    walls: Walls
+    similarity: Similarity  # from the scene's coordinates to that frame; its scale is 1
+    walls: Walls  # what gave the x axis where `walls.found`, else the cameras' mean right did
 
 
 def turn_onto(
@@ -63,10 +58,7 @@ def upright_axes(
     z is 0 on the floor; where there is none, at the mean height of the cameras. x is the one of the
     four directions along and across the walls that is nearest to the cameras' mean right.
 
-    Args:
-        gravity: with `up` known.
-        points: [P, 3] sparse points.
-        viewmats: [C, 4, 4] world to camera.
+    `gravity.up` must be known; `points` are [P, 3], `viewmats` [C, 4, 4] world to camera.
     """
     assert gravity.up is not None, "the frame of a scene whose up is not known"
     up = gravity.up
@@ -114,49 +106,32 @@ _FLOOR_WEIGHT = np.radians(0.5)  # rolls below this count alike: no single frame
 
 @dataclass(frozen=True, eq=False)
 class CameraUp:
-    """What the axes of the cameras say about up.
+    """What the axes of the cameras say about up."""
 
-    Attributes:
-        up: [3] unit vector.
-        roll_deg: median angle between a camera's x axis and the horizontal plane.
-        spread_deg: how far the x axes turn within that plane, as a standard deviation across their
-            main direction; at most 45. Where it is small, up is free to turn about that direction.
-        error_deg: standard error of `up`, from both.
-        upright: share of the cameras whose image is not upside down.
-        sideways: the y axes would be the better witness, as if the phone were held on its side.
-    """
-
-    up: NDArray[np.float64]
-    roll_deg: float
+    up: NDArray[np.float64]  # [3] unit vector
+    roll_deg: float  # median angle between a camera's x axis and the horizontal plane
+    # how far the x axes turn within that plane, as a standard deviation across their main
+    # direction; at most 45. Where it is small, up is free to turn about that direction
     spread_deg: float
-    error_deg: float
-    upright: float
-    sideways: bool
+    error_deg: float  # standard error of `up`, from both
+    upright: float  # share of the cameras whose image is not upside down
+    sideways: bool  # the y axes would be the better witness, as if the phone were held on its side
 
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """Whether it is known where up is.
+    """Whether it is known where up is."""
 
-    Attributes:
-        up: [3] unit vector, or None.
-        floor: the floor at right angles to it, or None.
-        cameras: what the axes of the cameras say, or None where there are too few.
-        reason: why it is not known, for people; empty where it is.
-    """
-
-    up: NDArray[np.float64] | None
-    floor: Floor | None
-    cameras: CameraUp | None
-    reason: str = ""
+    up: NDArray[np.float64] | None  # [3] unit vector, or None
+    floor: Floor | None  # the floor at right angles to it, or None
+    cameras: CameraUp | None  # what the axes of the cameras say, or None where there are too few
+    reason: str = ""  # why it is not known, for people; empty where it is
 
 
 def find_gravity(points: NDArray[np.float64], viewmats: NDArray[np.float64]) -> Gravity:
     """Returns where up is, as far as cameras and points show it.
 
-    Args:
-        points: [P, 3] sparse points, world units.
-        viewmats: [C, 4, 4] world to camera.
+    From `points` [P, 3] and `viewmats` [C, 4, 4] world to camera, in world units.
     """
     if len(viewmats) < MIN_CAMERAS:
         return Gravity(None, None, None, f"there are only {len(viewmats)} cameras")
@@ -198,8 +173,7 @@ def _loose(held: CameraUp) -> str:
 def camera_up(viewmats: NDArray[np.float64]) -> CameraUp:
     """Returns what the axes of cameras say about up.
 
-    Args:
-        viewmats: [C, 4, 4] world to camera, at least three.
+    `viewmats` are [C, 4, 4] world to camera, at least three.
     """
     right, down = viewmats[:, 0, :3], viewmats[:, 1, :3]
     up, spread, error = _normal(right)

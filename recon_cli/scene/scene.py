@@ -18,44 +18,28 @@ _SAMPLES = 2000  # points looked at
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One registered image.
+    """One registered image."""
 
-    Attributes:
-        name: file name of its frame.
-        camera: pinhole camera at the size of the undistorted image.
-        original: the undistorted image; scores are against these pixels.
-        denoised: the undistorted denoised twin; equal to `original` where nothing was denoised.
-        mask: the undistorted mask, 255 where a pixel counts; None where all of them do.
-    """
-
-    name: str
-    camera: Camera
-    original: Path
-    denoised: Path
+    name: str  # file name of its frame
+    camera: Camera  # pinhole camera at the size of the undistorted image
+    original: Path  # the undistorted image; scores are against these pixels
+    denoised: Path  # the undistorted denoised twin; equal to `original` where nothing was denoised
+    # the undistorted mask, 255 where a pixel counts; None where all of them do
     mask: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Registered views and sparse points.
+    """Registered views and sparse points."""
 
-    Attributes:
-        train: views that gradients may come from.
-        validation: views that steer decisions (progress, tuning), never trained on.
-        test: held-out views that only scores may look at.
-        unregistered_test: names of held-out frames that have no camera.
-        points: [P, 3] float64 sparse points in world units.
-        colors: [P, 3] uint8 their RGB colours.
-        error_px: mean reprojection error of the points in pixels of the undistorted images; None
-            where it is not known, as of points that come from depth maps.
-    """
-
-    train: tuple[View, ...]
-    validation: tuple[View, ...]
-    test: tuple[View, ...]
-    unregistered_test: tuple[str, ...]
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
+    train: tuple[View, ...]  # views that gradients may come from
+    validation: tuple[View, ...]  # views that steer decisions (progress, tuning), never trained on
+    test: tuple[View, ...]  # held-out views that only scores may look at
+    unregistered_test: tuple[str, ...]  # names of held-out frames that have no camera
+    points: NDArray[np.float64]  # [P, 3] float64 sparse points in world units
+    colors: NDArray[np.uint8]  # [P, 3] uint8 their RGB colours
+    # mean reprojection error of the points in pixels of the undistorted images; None where it is
+    # not known, as of points that come from depth maps
     error_px: float | None = None
 
     @property

@@ -25,16 +25,12 @@ def _no_translation() -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Takes old world coordinates to new ones: x' = scale * rotation @ x + translation.
+    """Takes old world coordinates to new ones: x' = scale * rotation @ x + translation."""
 
-    Attributes:
-        scale: new units in one old unit, above 0.
-        rotation: [3, 3] float64, from old to new axes.
-        translation: [3] float64, the old origin in new coordinates.
-    """
-
-    scale: float = 1.0
+    scale: float = 1.0  # new units in one old unit, above 0
+    # [3, 3] float64, from old to new axes
     rotation: NDArray[np.float64] = field(default_factory=_no_rotation)
+    # [3] float64, the old origin in new coordinates
     translation: NDArray[np.float64] = field(default_factory=_no_translation)
 
     def __post_init__(self) -> None:

@@ -24,22 +24,16 @@ class Splats:
 
     Only what colours use is stored: the scene's degree sets T, and the first M Gaussians are those
     that have coefficients of degrees 1 and up. The others are of degree 0.
-
-    Attributes:
-        means: [N, 3] centres in world units.
-        quats: [N, 4] rotations, wxyz, of any length; zeros stand for no rotation.
-        log_scales: [N, 3] natural logarithm of the standard deviations along the own axes.
-        logit_opacities: [N] opacity before the sigmoid.
-        sh_dc: [N, 3] spherical-harmonics coefficients of degree 0; colour = SH_C0 * sh_dc + 0.5.
-        sh_rest: [M, T, 3] coefficients of degrees 1 and up of the first M Gaussians, 0 <= M <= N
-            and T one of 0, 3, 8, 15.
     """
 
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    logit_opacities: Tensor
+    means: Tensor  # [N, 3] centres in world units
+    quats: Tensor  # [N, 4] rotations, wxyz, of any length; zeros stand for no rotation
+    log_scales: Tensor  # [N, 3] natural logarithm of the standard deviations along the own axes
+    logit_opacities: Tensor  # [N] opacity before the sigmoid
+    # [N, 3] spherical-harmonics coefficients of degree 0; colour = SH_C0 * sh_dc + 0.5
     sh_dc: Tensor
+    # [M, T, 3] coefficients of degrees 1 and up of the first M Gaussians, 0 <= M <= N and T one of
+    # 0, 3, 8, 15
     sh_rest: Tensor
 
     def __post_init__(self) -> None:
@@ -134,9 +128,6 @@ def with_rows(sh_rest: Tensor, rows: int) -> Tensor:
 def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
     """Returns the Gaussians of all parts, those with coefficients first, and their order.
 
-    Args:
-        parts: of one degree.
-
     Returns:
         The Gaussians, and for each its row [N] in the plain concatenation of the parts. Where all
         Gaussians have coefficients, or none has, that is their order.
@@ -160,10 +151,6 @@ def transformed(splats: Splats, similarity: Similarity) -> Splats:
 
     Computed in float64. Parameters that the similarity leaves alone keep their bits: a change of
     scale touches neither rotations nor colours.
-
-    Args:
-        splats: raw parameters of any float dtype.
-        similarity: from the old world to the new one.
 
     Returns:
         Gaussians of the same dtype and device. Quaternions keep their length, except zeros, which

@@ -32,36 +32,22 @@ _MIN_WALLS = 1.3
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """The lowest large horizontal surface.
+    """The lowest large horizontal surface."""
 
-    Attributes:
-        up: [3] unit normal, away from what lies below.
-        height: of the surface along `up`, in world units.
-        share: of the points that lie in it.
-        below: share of the points under it.
-        contrast: density of points in it over that right above it.
-    """
-
-    up: NDArray[np.float64]
-    height: float
-    share: float
-    below: float
-    contrast: float
+    up: NDArray[np.float64]  # [3] unit normal, away from what lies below
+    height: float  # of the surface along `up`, in world units
+    share: float  # of the points that lie in it
+    below: float  # share of the points under it
+    contrast: float  # density of points in it over that right above it
 
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """The direction that walls and furniture share.
+    """The direction that walls and furniture share."""
 
-    Attributes:
-        along: [3] horizontal unit vector; the other one is at right angles.
-        strength: how much sharper the points line up along it than along a middling direction.
-        found: whether that is enough to be no accident.
-    """
-
-    along: NDArray[np.float64]
-    strength: float
-    found: bool
+    along: NDArray[np.float64]  # [3] horizontal unit vector; the other one is at right angles
+    strength: float  # how much sharper the points line up along it than along a middling direction
+    found: bool  # whether that is enough to be no accident
 
 
 def find_floor(
@@ -70,11 +56,8 @@ def find_floor(
 ) -> Floor | None:
     """Returns the lowest large plane below the cameras, or None where there is none.
 
-    Args:
-        points: [P, 3] sparse points.
-        centers: [C, 3] of the cameras.
-        up: [3] unit vector, roughly up.
-        cone_deg: the normal is sought up to this angle from `up`.
+    From sparse points [P, 3] and camera centres [C, 3]. Its normal lies within `cone_deg` of the
+    unit vector `up`.
     """
     near, size = _near(points)
     if len(near) < _FEWEST:
@@ -102,12 +85,7 @@ def find_floor(
 
 
 def find_walls(points: NDArray[np.float64], up: NDArray[np.float64]) -> Walls:
-    """Returns the horizontal direction along which the points line up best.
-
-    Args:
-        points: [P, 3] sparse points.
-        up: [3] unit vector.
-    """
+    """Returns the horizontal direction along which the points line up best."""
     near, size = _near(points)
     near = near[:: max(1, len(near) // _WALL_SAMPLE)]
     first = np.linalg.svd(up[None])[2][1]

@@ -14,18 +14,13 @@ from recon_cli.scene.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class TrainView:
-    """One view in the form that training reads.
+    """One view in the form that training reads."""
 
-    Attributes:
-        camera: at the size of the image.
-        image: [H, W, 3] uint8; a fourth of the memory of float32. Under the mask it holds one
-            colour that stands for nothing (`io.images.fill_masked`).
-        mask: [H, W], True where a pixel counts; None where all do.
-    """
-
-    camera: Camera
+    camera: Camera  # at the size of the image
+    # [H, W, 3] uint8; a fourth of the memory of float32. Under the mask it holds one colour that
+    # stands for nothing (`io.images.fill_masked`)
     image: NDArray[np.uint8]
-    mask: NDArray[np.bool_] | None = None
+    mask: NDArray[np.bool_] | None = None  # [H, W], True where a pixel counts; None where all do
 
     def __post_init__(self) -> None:
         if self.mask is not None and self.mask.shape != self.image.shape[:2]:

@@ -34,11 +34,7 @@ class _Outcome:
 def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> DenoiseSummary:
     """Writes frames/*.png, twins of ingest's, and noise.json into `out`.
 
-    Args:
-        config: see `DenoiseConfig`.
-        inputs: the finished folder of ingest.
-        out: the stage's partial folder; frames already in it are kept.
-        ctx: for progress; the result does not depend on its threads.
+    Frames that are already in `out` are kept; the result does not depend on the threads.
 
     Raises:
         FormatError: ingest's folder does not hold what its list says.

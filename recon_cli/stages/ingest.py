@@ -28,12 +28,8 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
 
     choice.json and contact.png show what was kept and dropped of each source.
 
-    Args:
-        config: see `IngestConfig`.
-        inputs: the sources: video files and folders of photos, recognised by content, or one data
-            set with poses, by its layout. The frames of each get their own intrinsics.
-        out: the stage's partial folder; frames already in it are kept.
-        ctx: for notices and progress.
+    The sources are video files and folders of photos, recognised by content, or one data set with
+    poses. Each gets its own intrinsics. Frames that are already in `out` are kept.
 
     Raises:
         InputError: a source is missing, unreadable, or holds too little.

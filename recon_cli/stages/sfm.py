@@ -26,11 +26,7 @@ APART = 1e6  # seconds from clip to clip: the camera may have gone anywhere mean
 def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> SfmSummary:
     """Writes sparse/ and undistorted/{images,denoised,sparse} into `out`.
 
-    Args:
-        config: see `SfmConfig`.
-        inputs: the finished folders of ingest and denoise.
-        out: the stage's partial folder; the database and finished steps in it are kept.
-        ctx: for notices, progress and threads; the model does not depend on the threads.
+    The database and finished steps in `out` are kept; the model does not depend on the threads.
 
     Raises:
         SfmError: there are too few cameras, the model cannot be trusted, the time is up, or the

@@ -30,17 +30,11 @@ _FARTHEST = 100  # steps between two meetings, so that Ctrl-C and a progress bar
 
 @dataclass(frozen=True, eq=False)
 class _Before:
-    """What the host knew before a step.
+    """What the host knew before a step."""
 
-    Attributes:
-        iteration: steps done.
-        queue: views to come.
-        generator: state of the source of random choices.
-    """
-
-    iteration: int
-    queue: list[int]
-    generator: torch.Tensor
+    iteration: int  # steps done
+    queue: list[int]  # views to come
+    generator: torch.Tensor  # state of the source of random choices
 
 
 def choose_trainer(
@@ -48,11 +42,7 @@ def choose_trainer(
 ) -> Callable[[], float]:
     """Returns a function that takes a step or several and returns the loss of the last one.
 
-    Args:
-        state: changed in place.
-        task: views and plan.
-        importance: as in `Stepper`.
-        looks: whether somebody wants to see the state after a step.
+    `looks` tells whether somebody wants to see the state after a step.
     """
     plain = importance is None and state.exposure is None and state.poses is None
     if task.backend == "triton" and task.ranks.alone and plain:
@@ -61,13 +51,7 @@ def choose_trainer(
 
 
 class AsyncTrainer:
-    """Takes the steps of one call of `fit.fit` ahead of the device.
-
-    Args:
-        state: changed in place.
-        task: views and plan.
-        looks: whether somebody wants to see the state after a step.
-    """
+    """Takes the steps of one call of `fit.fit` ahead of the device."""
 
     def __init__(self, state: TrainState, task: Task, looks: Callable[[int], bool]) -> None:
         self._state, self._task, self._looks = state, task, looks
@@ -133,12 +117,7 @@ class AsyncTrainer:
 
 
 class _Batch:
-    """The views of one step taken together on the device, as `Stepper` does on the host.
-
-    Args:
-        compute: of the views.
-        views: of a step.
-    """
+    """The views of one step taken together on the device, as `Stepper` does on the host."""
 
     def __init__(self, compute: DeferredStep, views: int) -> None:
         self._compute, self._views = compute, views

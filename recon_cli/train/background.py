@@ -40,19 +40,12 @@ _SPACING = 0.6  # of the distance between directions: the standard deviation
 
 @dataclass(frozen=True, eq=False)
 class FarContent:
-    """Directions in which nothing near was found.
+    """Directions in which nothing near was found."""
 
-    Attributes:
-        positions: [K, 3] float64 on the sphere, world units.
-        colors: [K, 3] float64 in [0, 1].
-        scale: standard deviation that closes the gaps between them, world units.
-        share: of all looked-at pixels' directions that are far, 0 to 1.
-    """
-
-    positions: NDArray[np.float64]
-    colors: NDArray[np.float64]
-    scale: float
-    share: float
+    positions: NDArray[np.float64]  # [K, 3] float64 on the sphere, world units
+    colors: NDArray[np.float64]  # [K, 3] float64 in [0, 1]
+    scale: float  # standard deviation that closes the gaps between them, world units
+    share: float  # of all looked-at pixels' directions that are far, 0 to 1
 
 
 def far_content(
@@ -60,10 +53,7 @@ def far_content(
 ) -> FarContent:
     """Returns the directions in which the views see no point of the scene.
 
-    Args:
-        views: training views.
-        points: [P, 3] of the scene, world units; the more, the better they cover its surfaces.
-        extent: of the scene, world units.
+    `points` are [P, 3]; the more, the better they cover the surfaces of the scene.
     """
     centers = np.stack([view.camera.center for view in views])
     directions = fibonacci_sphere(_DIRECTIONS)

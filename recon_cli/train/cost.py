@@ -48,17 +48,11 @@ Clock = Callable[[], float]
 
 @dataclass(frozen=True)
 class LevelCost:
-    """Milliseconds of one step at one resolution: fixed + each x thousands of Gaussians.
+    """Milliseconds of one step at one resolution: fixed + each x thousands of Gaussians."""
 
-    Attributes:
-        level: factor by which images are reduced.
-        fixed_ms: for the pixels.
-        each_ms: for every thousand Gaussians.
-    """
-
-    level: int
-    fixed_ms: float
-    each_ms: float
+    level: int  # factor by which images are reduced
+    fixed_ms: float  # for the pixels
+    each_ms: float  # for every thousand Gaussians
 
     def ms(self, count: float) -> float:
         """Returns the milliseconds of a step with so many Gaussians."""
@@ -67,19 +61,12 @@ class LevelCost:
 
 @dataclass(frozen=True)
 class CostModel:
-    """What the parts of a run take on this machine.
+    """What the parts of a run take on this machine."""
 
-    Attributes:
-        levels: of the steps, finest first.
-        report: of one look at all validation views.
-        save_ms: of one checkpoint, for every thousand Gaussians.
-        seconds: that the calibration took.
-    """
-
-    levels: tuple[LevelCost, ...]
-    report: LevelCost
-    save_ms: float
-    seconds: float
+    levels: tuple[LevelCost, ...]  # of the steps, finest first
+    report: LevelCost  # of one look at all validation views
+    save_ms: float  # of one checkpoint, for every thousand Gaussians
+    seconds: float  # that the calibration took
 
     def run_seconds(self, schedule: Schedule, first: int) -> float:
         """Returns the seconds of a whole run that begins with `first` Gaussians."""
@@ -125,13 +112,8 @@ def calibrate(
     Coarse levels come first, each with its share of the time and a timed step at least. Once
     twice the time is used up, those that are left are told from the level before them.
 
-    Args:
-        task: of the run; its schedule's cap is the larger count that is timed.
-        points: sparse points.
-        colors: of the points.
-        scratch: file that a checkpoint may be written to; it is deleted again.
-        clock: seconds.
-        seconds: that should be spent.
+    The cap of the schedule is the larger count that is timed, and about `seconds` are spent.
+    `scratch` is a file for a checkpoint, which is deleted again.
     """
     start = clock()
     wanted = sorted({1, *_levels(task.schedule)}, reverse=True)
@@ -290,15 +272,7 @@ _WIDTHS = 3, 4, 3, 1, 3  # numbers of a Gaussian, parameter by parameter, higher
 def with_exchange(
     cost: CostModel, ranks: ProcessGroup, most: int, sh_degree: int, device: torch.device
 ) -> CostModel:
-    """Returns the cost of steps that `ranks` take together, from that of one process's share.
-
-    Args:
-        cost: of steps with the views of one process.
-        ranks: led by this process; the others wait for a word.
-        most: Gaussians of the run.
-        sh_degree: of the run.
-        device: where the tensors live.
-    """
+    """Returns the cost of steps that `ranks` take together, from that of one process's share."""
     if ranks.alone:
         return cost
     begin = time.perf_counter()

@@ -40,21 +40,14 @@ _RANGE = 1e-4, 0.999  # of a child's opacity: the logit stays finite
 
 @dataclass(frozen=True)
 class DensifyRule:
-    """Thresholds of one densification.
+    """Thresholds of one densification."""
 
-    Attributes:
-        gradient: mean gradient from which a Gaussian is cloned or split.
-        clone_scale: largest scale, world units, up to which it is cloned and not split.
-        min_opacity: below this a Gaussian is deleted.
-        large_scale: scale in world units from which it is deleted; None keeps large ones.
-        most: count that is never exceeded; the largest gradients come first.
-    """
-
-    gradient: float
-    clone_scale: float
-    min_opacity: float
+    gradient: float  # mean gradient from which a Gaussian is cloned or split
+    clone_scale: float  # largest scale, world units, up to which it is cloned and not split
+    min_opacity: float  # below this a Gaussian is deleted
+    # scale in world units from which it is deleted; None keeps large ones
     large_scale: float | None
-    most: int
+    most: int  # count that is never exceeded; the largest gradients come first
 
 
 def densify_reference(
@@ -115,17 +108,11 @@ def cap_opacities(splats: Splats) -> Splats:
 
 @dataclass(frozen=True)
 class BudgetRule:
-    """Limits of one densification.
+    """Limits of one densification."""
 
-    Attributes:
-        target: count that it aims at and never exceeds.
-        min_opacity: below this a Gaussian is deleted.
-        decay: all opacities are multiplied by this first; what the views need comes back.
-    """
-
-    target: int
-    min_opacity: float
-    decay: float
+    target: int  # count that it aims at and never exceeds
+    min_opacity: float  # below this a Gaussian is deleted
+    decay: float  # all opacities are multiplied by this first; what the views need comes back
 
 
 def densify_budget(
@@ -133,11 +120,7 @@ def densify_budget(
 ) -> tuple[Splats, Tensor]:
     """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones.
 
-    Args:
-        splats: N Gaussians.
-        score: [N] the error that each is to blame for; the chance of a split is proportional.
-        rule: count and thresholds.
-        generator: on the CPU; decides the draw.
+    `score` [N] is the error that each is to blame for; the probability of a split is proportional.
     """
     splats = decay_opacities(splats, rule.decay)
     alive = splats.opacities >= rule.min_opacity
@@ -192,15 +175,11 @@ def _axis_halves(parent: Splats) -> Splats:
 
 @dataclass(frozen=True)
 class Strategy:
-    """How the count changes during a run.
+    """How the count changes during a run."""
 
-    Attributes:
-        control: called after each step; adds and deletes Gaussians when the schedule says so.
-        variance: it needs the variance of the gradient over each Gaussian's pixels.
-    """
-
+    # called after each step; adds and deletes Gaussians when the schedule says so
     control: Callable[[TrainState, Task], None]
-    variance: bool = False
+    variance: bool = False  # it needs the variance of the gradient over each Gaussian's pixels
 
 
 def replace_splats(state: TrainState, splats: Splats, source: Tensor) -> None:

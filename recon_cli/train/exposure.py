@@ -31,10 +31,7 @@ class Exposure:
 
     An image that is never seen keeps the gain that it started with.
 
-    Args:
-        images: F, how many there are.
-        start: [F, 3] log-gains to begin with, such as `estimated` gives, whose mean is taken off;
-            None for zeros.
+    `start` are log-gains [F, 3], whose mean is subtracted; None stands for zeros.
     """
 
     def __init__(self, images: int, *, start: NDArray[np.float64] | None = None) -> None:
@@ -55,10 +52,8 @@ class Exposure:
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
         """Moves the gains of one image, and all that were ever moved back to a mean of 0.
 
-        Args:
-            image: its index.
-            gradient: [3] of its log-gains.
-            done: share of the run, 0 to 1; the rate falls geometrically with it.
+        `gradient` [3] is that of its log-gains. The rate falls geometrically with the share of the
+        run that is `done`.
         """
         self._rows.step(image, gradient, _RATE * (_FINAL_RATE / _RATE) ** done)
         self._rows.center()
@@ -85,18 +80,14 @@ _FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known be
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Log-gains of views as their sparse points show them.
+    """Log-gains of views as their sparse points show them."""
 
-    Attributes:
-        log_gains: [F, 3] RGB, natural logarithm, of mean 0; zeros for a view without evidence.
-        spread: standard deviation of the log-gains over the views that have evidence, of the
-            channel where it is largest; 0 where no two views can be compared.
-        compared: pairs of views that share enough points.
-    """
-
+    # [F, 3] RGB, natural logarithm, of mean 0; zeros for a view without evidence
     log_gains: NDArray[np.float64]
+    # standard deviation of the log-gains over the views that have evidence, of the channel where it
+    # is largest; 0 where no two views can be compared
     spread: float
-    compared: int
+    compared: int  # pairs of views that share enough points
 
     @property
     def drifts(self) -> bool:
@@ -115,10 +106,7 @@ def estimated(
     Weighted least squares over pairs: the median log-ratio of the points that two views share
     should be the difference of their log-gains.
 
-    Args:
-        views: F of them, of any size.
-        points: in the world of their cameras; of more than 4,000 a seeded draw is taken.
-        seed: of that draw.
+    Of more than 4,000 points a seeded draw is taken.
     """
     if len(points) > _POINTS:
         chosen = np.random.default_rng(seed).permutation(len(points))[:_POINTS]

@@ -55,12 +55,7 @@ def decide(
     On, if the mean gain is above the threshold and above 1.65 standard errors of it. The standard
     error is that of paired differences: views differ by decibels, arms on one view by tenths.
 
-    Args:
-        name: of the part.
-        arms: without and with it; each trains and returns the scores of the same views in the same
-            order, in dB.
-        threshold_db: smallest gain that counts.
-        clock: tells seconds.
+    Each arm, without and with the part, trains and returns the scores of the same views in dB.
 
     Raises:
         ValueError: the arms score different numbers of views, or fewer than two.
@@ -83,17 +78,11 @@ def decide(
 
 @dataclass(frozen=True)
 class Split:
-    """Which views a trial trains on and which it scores, as indices.
+    """Which views a trial trains on and which it scores, as indices."""
 
-    Attributes:
-        train: into the training views.
-        held_out: into the validation views, or into the training views where `own`.
-        own: the validation views were too few; the final run trains on the held-out ones again.
-    """
-
-    train: tuple[int, ...]
-    held_out: tuple[int, ...]
-    own: bool
+    train: tuple[int, ...]  # into the training views
+    held_out: tuple[int, ...]  # into the validation views, or into the training views where `own`
+    own: bool  # the validation views were too few; the final run trains on the held-out ones again
 
 
 def split(training: int, validation: int) -> Split | None:
@@ -103,9 +92,7 @@ def split(training: int, validation: int) -> Split | None:
     (down to each third, where they would be fewer than LEAST_VIEWS), from the middle of the first
     interval on; the final run then trains on all of them.
 
-    Args:
-        training: number of training views, in the order of the capture.
-        validation: number of validation views.
+    Training views are in the order of the capture.
     """
     if validation >= LEAST_VIEWS:
         return Split(tuple(range(training)), tuple(range(validation)), own=False)
@@ -132,15 +119,10 @@ _HARMONICS_DB = 0.15
 
 @dataclass(frozen=True)
 class Needs:
-    """What a scene needs beyond plain Gaussians.
+    """What a scene needs beyond plain Gaussians."""
 
-    Attributes:
-        config: with every optional part on or off.
-        decisions: why, one for each part that was left automatic.
-    """
-
-    config: RunConfig
-    decisions: tuple[TrialDecision, ...]
+    config: RunConfig  # with every optional part on or off
+    decisions: tuple[TrialDecision, ...]  # why, one for each part that was left automatic
 
     @property
     def seconds(self) -> float:
@@ -150,22 +132,15 @@ class Needs:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A scene as gates look at it.
+    """A scene as gates look at it."""
 
-    Attributes:
-        task: views at the training size, and the plan.
-        points: [P, 3] sparse points in world units.
-        colors: [P, 3] uint8.
-        harmonics: the degree of the colours is left to a trial.
-        twins: reads the training and validation views from the denoised images, where the task
-            holds the originals; None where both are the same.
-    """
-
-    task: Task
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
+    task: Task  # views at the training size, and the plan
+    points: NDArray[np.float64]  # [P, 3] sparse points in world units
+    colors: NDArray[np.uint8]  # [P, 3] uint8
+    # reads the training and validation views from the denoised images, where the task holds the
+    # originals; None where both are the same
     twins: Callable[[], tuple[list[TrainView], list[TrainView]]] | None
-    harmonics: bool = False
+    harmonics: bool = False  # the degree of the colours is left to a trial
 
 
 def examine(scene: Candidate) -> Needs:

@@ -26,13 +26,9 @@ def fit(
 ) -> None:
     """Runs `state` on until it has done `until` steps.
 
-    Args:
-        state: changed in place.
-        task: views and plan.
-        until: total number of steps, those already done included.
-        callbacks: called in this order after each step and every hundred steps. Where none needs a
-            step, the host may run ahead of the device.
-        importance: gets the scores of every step's view, from the very passes that train.
+    Steps already done count. Callbacks are called in order after each step and every hundred steps;
+    where none needs a step, the host may run ahead of the device. `importance` gets the scores of
+    every step's view from the passes that train.
 
     Raises:
         TrainingError: the loss is not finite, or no Gaussian is left.

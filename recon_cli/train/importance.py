@@ -27,25 +27,15 @@ _BETA_SHIPPED = 0.1  # LightGaussian's --v_pow
 
 @dataclass(eq=False)
 class Importance:
-    """What the training views say about N Gaussians, added up; see `Statistics`.
+    """What the training views say about N Gaussians, added up; see `Statistics`."""
 
-    Attributes:
-        hits: [N] int64, pixels that the Gaussian contributes to.
-        blend_sum: [N] float64, sum of alpha T.
-        blend_max: [N] float64, greatest alpha T.
-        loo: [N] float64, squared error that removing it alone causes.
-        views: how many were added.
-        weighs: hits and blend weights are gathered.
-        leaves_out: loo is gathered.
-    """
-
-    hits: Tensor
-    blend_sum: Tensor
-    blend_max: Tensor
-    loo: Tensor
-    views: int = 0
-    weighs: bool = True
-    leaves_out: bool = True
+    hits: Tensor  # [N] int64, pixels that the Gaussian contributes to
+    blend_sum: Tensor  # [N] float64, sum of alpha T
+    blend_max: Tensor  # [N] float64, greatest alpha T
+    loo: Tensor  # [N] float64, squared error that removing it alone causes
+    views: int = 0  # how many were added
+    weighs: bool = True  # hits and blend weights are gathered
+    leaves_out: bool = True  # loo is gathered
 
     @staticmethod
     def zeros(n: int, device: torch.device) -> Importance:
@@ -89,11 +79,7 @@ class Importance:
     ) -> Tensor:
         """Returns the score [N] float64 by which Gaussians are ranked; the lowest go first.
 
-        Args:
-            name: one of SCORES.
-            splats: the N Gaussians as they are now.
-            beta: exponent of the volume in the paper's score.
-            generator: draws the random score, and nothing else.
+        `generator` draws the random score and nothing else.
         """
         if name == "paper":
             return paper_score(self.hits, splats, beta)
@@ -113,11 +99,6 @@ def paper_score(hits: Tensor, splats: Splats, beta: float) -> Tensor:
     ("3D Reconstruction of Indoor Scenes Based on 3DGS Models", equations 3 to 5; the form is
     LightGaussian's.) The indicator of equation 3, summed over all pixels of all training views,
     is the count of hits. gamma = V_norm^beta with V_norm = min(max(V / V_max90, 0), 1).
-
-    Args:
-        hits: [N] pixels over all training views that each Gaussian contributes to.
-        splats: N Gaussians.
-        beta: exponent of the volume.
     """
     log_volumes = _log_volumes(splats)
     rank = math.ceil(_PERCENTILE * len(splats)) - 1
@@ -131,10 +112,6 @@ def lightgaussian_score(hits: Tensor, splats: Splats) -> Tensor:
 
     There the volume is not clamped, so V_k (the volume at the 90th percentile) divides every score
     by the same number V_k^0.1 and cannot change the ranking; it is kept for the scale.
-
-    Args:
-        hits: [N] pixels over all training views that each Gaussian contributes to.
-        splats: N Gaussians.
     """
     log_volumes = _log_volumes(splats)
     reference = log_volumes.sort(descending=True).values[int(_PERCENTILE * len(splats))]
@@ -155,12 +132,7 @@ def add_views(
 ) -> None:
     """Adds what a pass over views finds, each with its mask.
 
-    Args:
-        found: changed in place.
-        splats: N Gaussians.
-        views: training views; never validation or test views.
-        sh_degree: degree in use.
-        backend: rasterizer.
+    Never give it validation or test views.
     """
     device = splats.means.device
     background = torch.zeros(3, dtype=splats.means.dtype, device=device)

@@ -70,12 +70,8 @@ def first_state(
 ) -> TrainState:
     """Returns the state of a run before its first step; the same for the same task and points.
 
-    Args:
-        task: views and plan.
-        points: sparse points in world units.
-        colors: of them.
-        most: Gaussians that begin at points; fewer where the cap must hold what lies far outside.
-        far: what lies there, where it is known already; taken only if that part is on.
+    `most` Gaussians begin at points, fewer where the cap must hold the background as well. `far` is
+    that background where it is known already.
     """
     config = task.schedule.config
     if config.far != "on":

@@ -35,21 +35,13 @@ _TORCH_FACTOR = 4  # autograd keeps what the fused kernels compute again
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """The bytes that a run needs at its peak.
+    """The bytes that a run needs at its peak."""
 
-    Attributes:
-        images: all views as uint8, and their masks.
-        pixel_buffers: of one step, for each pixel of a view.
-        gaussians: parameters, gradients, moments at the largest count.
-        gaussian_buffers: of one step, for each Gaussian.
-        program: everything else.
-    """
-
-    images: int
-    pixel_buffers: int
-    gaussians: int
-    gaussian_buffers: int
-    program: int
+    images: int  # all views as uint8, and their masks
+    pixel_buffers: int  # of one step, for each pixel of a view
+    gaussians: int  # parameters, gradients, moments at the largest count
+    gaussian_buffers: int  # of one step, for each Gaussian
+    program: int  # everything else
 
     @property
     def total(self) -> int:
@@ -70,14 +62,8 @@ def estimate(
 ) -> MemoryEstimate:
     """Returns the memory that training takes.
 
-    Args:
-        views: held in memory.
-        width: of the largest view in pixels.
-        height: of the largest view in pixels.
-        gaussians: the most that there will be.
-        fused: the backend computes gradients without autograd.
-        sh_degree: highest of the colours; every Gaussian may have its coefficients.
-        masks: held in memory.
+    Of views and masks held in memory, the size in pixels of the largest. `fused`: the backend
+    computes gradients without autograd.
     """
     pixels = width * height
     rest = 3 * TERMS[sh_degree]
@@ -93,9 +79,7 @@ def estimate(
 def room(one: MemoryEstimate, free: int) -> int:
     """Returns the most Gaussians that fit into `free` bytes; 0 where not even the rest does.
 
-    Args:
-        one: estimate with a single Gaussian.
-        free: bytes.
+    `one` is an estimate with a single Gaussian.
     """
     each = one.gaussians + one.gaussian_buffers
     return max(0, (free - one.total + each) // each)

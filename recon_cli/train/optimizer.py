@@ -156,11 +156,9 @@ class SplatOptimizer:
     ) -> None:
         """Moves the parameters against their gradients, which are then used up.
 
-        Args:
-            means_rate: learning rate of the means in units of the scene extent.
-            sh_rest: the higher SH degrees are moved; otherwise they stay as they are.
-            factor: of all learning rates but that of the means.
-            counted: [1] int32 on the device, zero where nothing is to be moved; with triton alone.
+        `means_rate` is in units of the scene extent; `factor` scales all other rates. Without
+        `sh_rest` the higher SH degrees stay. `counted` [1] int32 is zero on the device where
+        nothing is to be moved (triton only).
         """
         self._factor = factor
         self._rates["means"] = means_rate * self._extent / factor
@@ -243,10 +241,9 @@ class SplatOptimizer:
 def _followed(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
     """Returns the old rows of a moment in their new places, zeros where there was none.
 
-    Args:
-        moment: [rows before, ...].
-        source: [K] old row of each; -1, or one that has no such parameter, stands for none.
-        like: [K, ...] the parameter now; of coefficients there may be more or fewer than before.
+    `moment` is [rows before, ...], `like` [K, ...] the parameter now, with more or fewer
+    coefficients. `source` [K] is the old row of each; -1, or one that has no such parameter, stands
+    for none.
     """
     if moment.shape[1:] != like.shape[1:]:
         moment = with_terms(moment, like.shape[1])
@@ -265,9 +262,6 @@ class SparseAdam:
 
     A row that was stepped for the first time moves by its rate, however late that is. On the CPU
     and in float64: the table is small, and the same whatever the device.
-
-    Args:
-        start: [F, D] values before the first step; copied.
 
     Attributes:
         value: [F, D] float64.

@@ -54,15 +54,10 @@ logger = logging.getLogger("recon")
 
 @dataclass(frozen=True)
 class Quality:
-    """What --quality stands for; the same on every machine, so that results are, too.
+    """What --quality stands for; the same on every machine, so that results are, too."""
 
-    Attributes:
-        iterations: steps.
-        max_size: longest side of a training image in pixels.
-    """
-
-    iterations: int
-    max_size: int
+    iterations: int  # steps
+    max_size: int  # longest side of a training image in pixels
 
 
 # A draft takes 11 to 15 CPU seconds of one thread on living, office and fox (docs/benchmarks.md,
@@ -73,19 +68,12 @@ QUALITIES = {
 
 @dataclass(frozen=True)
 class Facts:
-    """What a plan needs to know about a scene.
+    """What a plan needs to know about a scene."""
 
-    Attributes:
-        detail: of `count_detail`.
-        views: to train on.
-        points: sparse ones, from which the Gaussians begin.
-        room: the most Gaussians that memory has room for.
-    """
-
-    detail: int
-    views: int
-    points: int
-    room: int
+    detail: int  # of `count_detail`
+    views: int  # to train on
+    points: int  # sparse ones, from which the Gaussians begin
+    room: int  # the most Gaussians that memory has room for
 
 
 def first_config(asked: TrainConfig) -> RunConfig:
@@ -115,11 +103,7 @@ def make_plan(
 ) -> TrainPlan:
     """Returns the plan: the steps asked for, those of the quality, or as many as fill the time.
 
-    Args:
-        asked: what the user asked for.
-        facts: about the scene.
-        cost: what steps take here; with --minutes its own seconds count as well.
-        spent: seconds of the time given that went before, on trials.
+    With --minutes, the seconds of the calibration and those `spent` on trials count.
     """
     def at(iterations: int) -> TrainPlan:
         most = cap(asked, facts, iterations)

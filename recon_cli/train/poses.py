@@ -49,11 +49,8 @@ class Poses:
     twist is held at 0, and moves do not widen or narrow the path. A camera that is never seen keeps
     its place.
 
-    Args:
-        centers: [F, 3] of the cameras as they were found, world units.
-        extent: of the scene in world units; scales the rate of the moves.
-        visits: steps that the run takes for each image.
-        error: how far a camera may be off, in rad; a reprojection error over the focal length.
+    `centers` [F, 3] are those of the cameras as found, in world units; `visits` the steps of each
+    image; `error` how far a camera may be off, in rad.
     """
 
     def __init__(
@@ -71,22 +68,15 @@ class Poses:
         return np.asarray(self._rows.value.numpy() * scales)
 
     def camera(self, image: int, camera: Camera) -> Camera:
-        """Returns an image's camera as it is refined so far.
-
-        Args:
-            image: its index.
-            camera: as it was found, at any size.
-        """
+        """Returns an image's camera as it is refined so far."""
         twist = self.twists[image]
         return moved(camera, twist[:3], twist[3:]) if twist.any() else camera
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
         """Moves one camera, and all that were ever moved back to a mean of 0.
 
-        Args:
-            image: its index.
-            gradient: [6] as `camera_gradient` gives it.
-            done: share of the run, 0 to 1; the rate falls geometrically with it.
+        `gradient` [6] is that of `camera_gradient`. The rate falls geometrically with the share of
+        the run that is `done`.
         """
         self._rows.step(image, gradient, self._rate * _FINAL**done)
         self._rows.center()
@@ -106,9 +96,7 @@ class Poses:
 def worth_a_trial(error_px: float | None) -> bool:
     """Returns whether cameras may be off far enough for a refinement to help.
 
-    Args:
-        error_px: mean reprojection error of the sparse points in pixels of the training images;
-            None where nothing is known, as for cameras without points.
+    `error_px` is the mean reprojection error in pixels of the training images; None if unknown.
     """
     return error_px is not None and error_px > WORTH_PX
 
@@ -145,11 +133,7 @@ def camera_gradient(
 
     Sums over Gaussians are taken in float64 and in a fixed order, whatever the number of threads.
 
-    Args:
-        splats: as they were rendered.
-        gradients: of them, of the same shapes; sh_rest is not looked at.
-        camera: that they were rendered with.
-        sh_degree: in use.
+    `gradients` are those of `splats` as rendered with `camera`; sh_rest is not read.
     """
     seen = torch.nonzero(gradients.sh_dc.any(dim=1) | gradients.means.any(dim=1))[:, 0]
     offsets = splats.means.detach()[seen].double() - torch.from_numpy(camera.center).to(
@@ -177,11 +161,7 @@ def _quat_torque(quats: Tensor, pull: Tensor) -> Tensor:
 def _color_torque(offsets: Tensor, sh_rest: Tensor, pull: Tensor, degree: int) -> Tensor:
     """Returns the gradients [N, 3] of turning the directions that colours are seen along.
 
-    Args:
-        offsets: [N, 3] from the camera to the Gaussians.
-        sh_rest: [N, T, 3].
-        pull: [N, 3] gradient of the colours.
-        degree: in use, at least 1.
+    `offsets` [N, 3] begin at the camera; `pull` [N, 3] is the gradient of the colours.
     """
     directions = torch.nn.functional.normalize(offsets, dim=1).requires_grad_()
     basis = basis_rest(directions, degree)

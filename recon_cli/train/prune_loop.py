@@ -29,15 +29,10 @@ _LEAST_ROUNDS, _MOST_ROUNDS = 3, 8  # more gained nothing. docs/pruning.md
 
 @dataclass(frozen=True)
 class Removal:
-    """One round of a plan.
+    """One round of a plan."""
 
-    Attributes:
-        after: recovery steps before it.
-        count: Gaussians that stay.
-    """
-
-    after: int
-    count: int
+    after: int  # recovery steps before it
+    count: int  # Gaussians that stay
 
 
 def remaining(n: int, ratio: float) -> int:
@@ -59,12 +54,6 @@ def plan_removals(n: int, target: int, rounds: int, recovery: int) -> tuple[Remo
     Each round removes the same share of what is there. They are evenly spread up to LAST_ROUND of
     the recovery, so that training steps come before the first one and score it; a single round
     comes at once. Rounds that would remove nothing are left out.
-
-    Args:
-        n: Gaussians now.
-        target: Gaussians at the end, 1 to n.
-        rounds: at most this many.
-        recovery: steps in all.
     """
     plan: list[Removal] = []
     for k in range(rounds):
@@ -94,15 +83,7 @@ def remove(state: TrainState, rows: Tensor) -> None:
 class PruneRun:
     """A model in memory that is pruned in rounds and trained in between.
 
-    Args:
-        state: changed in place.
-        task: views, and the schedule of the steps after `first`.
-        first: steps done before the first removal.
-        until: steps done at the end.
-        rounds: at most this many.
-        score: one of `importance.SCORES`, by which Gaussians are ranked.
-        beta: exponent of the volume in the paper's score.
-        callbacks: of the training.
+    `score` is one of `importance.SCORES`, `beta` the exponent of the volume in the paper's score.
     """
 
     def __init__(

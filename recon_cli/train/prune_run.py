@@ -49,50 +49,29 @@ _LEAST_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Round(JsonRecord):
-    """One removal and what became of it. PSNR is None where there are no validation views.
+    """One removal and what became of it. PSNR is None where there are no validation views."""
 
-    Attributes:
-        iteration: steps done before it.
-        gaussians_before: count.
-        gaussians: count after it.
-        removed: share of `gaussians_before`.
-        validation_psnr_db_before: PSNR in dB right before it.
-        validation_psnr_db_removed: right after it.
-        validation_psnr_db: after the steps that followed; None while they are under way.
-        kept: False where it cost more than --max-psnr-drop and was taken back.
-    """
-
-    iteration: int
-    gaussians_before: int
-    gaussians: int
-    removed: float
-    validation_psnr_db_before: float | None
-    validation_psnr_db_removed: float | None
-    validation_psnr_db: float | None
-    kept: bool
+    iteration: int  # steps done before it
+    gaussians_before: int  # count
+    gaussians: int  # count after it
+    removed: float  # share of `gaussians_before`
+    validation_psnr_db_before: float | None  # PSNR in dB right before it
+    validation_psnr_db_removed: float | None  # right after it
+    validation_psnr_db: float | None  # after the steps that followed; None while they are under way
+    kept: bool  # False where it cost more than --max-psnr-drop and was taken back
 
 
 @dataclass(frozen=True, eq=False)
 class PruneSource:
-    """The trained model that is pruned.
+    """The trained model that is pruned."""
 
-    Attributes:
-        config: options of the stage.
-        task: views and the plan of the training run.
-        begin: loads the state to be pruned.
-        first: steps done before the first removal.
-        until: steps done at the end, if the count is known beforehand.
-        rounds: of removal, at most.
-        earlier_seconds: of training before that.
-    """
-
-    config: PruneConfig
-    task: Task
-    begin: Callable[[], TrainState]
-    first: int
-    until: int
-    rounds: int
-    earlier_seconds: float
+    config: PruneConfig  # options of the stage
+    task: Task  # views and the plan of the training run
+    begin: Callable[[], TrainState]  # loads the state to be pruned
+    first: int  # steps done before the first removal
+    until: int  # steps done at the end, if the count is known beforehand
+    rounds: int  # of removal, at most
+    earlier_seconds: float  # of training before that
 
     def recovery(self, first: int, until: int) -> Task:
         """Returns the task with the learning rates of a recovery between two steps."""
@@ -145,13 +124,7 @@ def _recovery_steps(config: PruneConfig, train: RunConfig, epoch: int, rest: int
 
 
 class StoredPruneRun(PruneRun):
-    """A pruning run whose rounds and state are kept in a folder; it begins where that left off.
-
-    Args:
-        source: the model to be pruned.
-        out: partial folder of the stage.
-        ctx: progress and record.
-    """
+    """A pruning run whose rounds and state are kept in a folder; it begins where that left off."""
 
     def __init__(self, source: PruneSource, out: Path, ctx: StageContext) -> None:
         self.source, self._out, self._ctx = source, out, ctx

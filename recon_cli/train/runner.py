@@ -28,24 +28,15 @@ CHECKPOINT = "checkpoint.safetensors"
 
 @dataclass(frozen=True)
 class Segment:
-    """The steps of a run that one stage takes, and the files that they leave.
+    """The steps of a run that one stage takes, and the files that they leave."""
 
-    Attributes:
-        out: partial folder of the stage.
-        label: of the progress bar.
-        until: step at its end.
-        first: step at which it begins.
-        earlier_seconds: training seconds before that.
-        checkpoint: file name of the state that a later run goes on from.
-        keep: file names under which the state after certain steps is kept.
-    """
-
-    out: Path
-    label: str
-    until: int
-    first: int = 0
-    earlier_seconds: float = 0.0
-    checkpoint: str = CHECKPOINT
+    out: Path  # partial folder of the stage
+    label: str  # of the progress bar
+    until: int  # step at its end
+    first: int = 0  # step at which it begins
+    earlier_seconds: float = 0.0  # training seconds before that
+    checkpoint: str = CHECKPOINT  # file name of the state that a later run goes on from
+    # file names under which the state after certain steps is kept
     keep: Mapping[int, str] = field(default_factory=dict)
 
 
@@ -79,14 +70,8 @@ def run_fit(
 ) -> None:
     """Fits until `until` steps with all of `ctx.ranks`, saving the state as it goes.
 
-    Args:
-        state: changed in place.
-        task: views and plan.
-        until: total number of steps.
-        segment: that these steps are part of.
-        ctx: progress, record and callbacks.
-        importance: gets the scores of these steps. They are in no checkpoint, so none is written
-            while they are gathered.
+    `importance` gets the scores of these steps. They are in no checkpoint, so none is written
+    meanwhile.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
@@ -124,13 +109,7 @@ def seconds_at(log: Path, iteration: int, *, clock: str = "seconds") -> float:
 
 
 class TrainLog(TrainCallback):
-    """Writes one JSON line a report; what a crash left behind the checkpoint is cut off.
-
-    Args:
-        path: of the log.
-        iteration: at which the run goes on.
-        earlier_seconds: of training before the first line.
-    """
+    """Writes one JSON line a report; what a crash left behind the checkpoint is cut off."""
 
     def __init__(self, path: Path, iteration: int, earlier_seconds: float) -> None:
         self._path = path
@@ -161,12 +140,7 @@ class TrainLog(TrainCallback):
 
 
 class ProgressCallback(TrainCallback):
-    """Draws a training as a progress bar.
-
-    Args:
-        bar: counts steps.
-        iteration: at which the run goes on.
-    """
+    """Draws a training as a progress bar."""
 
     def __init__(self, bar: Bar, iteration: int) -> None:
         self._bar, self._counted = bar, iteration
@@ -190,9 +164,6 @@ class CheckpointThrottle:
     """Keeps large checkpoints of fast steps from taking the time that the steps should have.
 
     It changes when a state is saved, and never what is.
-
-    Args:
-        clock: seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -215,13 +186,8 @@ class CheckpointThrottle:
 class Checkpointer(TrainCallback):
     """Saves the state now and then, at certain steps for good, and when Ctrl-C was pressed.
 
-    Args:
-        state: that is trained.
-        path: of the checkpoint; None writes none, as while scores are gathered.
-        every: steps between two checkpoints, at least.
-        keep: files that hold the state after certain steps.
-        interrupted: tells whether Ctrl-C was pressed.
-        record: called with the steps done after each checkpoint.
+    `keep` holds files by step, `every` is the least distance of checkpoints in steps. Without
+    `path` there are none, as while scores are gathered. `record` gets the steps done after each.
     """
 
     def __init__(

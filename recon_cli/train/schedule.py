@@ -26,10 +26,7 @@ def next_iteration(
     the best one before: never before densification has ended and the state for pruning is kept,
     and never in the final phase.
 
-    Args:
-        schedule: of the run.
-        iteration: steps done.
-        looks: (iteration, validation PSNR in dB) so far, ascending.
+    `looks` are (iteration, validation PSNR in dB) so far, ascending.
     """
     steps, recipe = schedule.config.iterations, schedule.recipe
     final = round(min(recipe.final_from, _LAST_FIFTH) * steps)
@@ -46,40 +43,26 @@ def next_iteration(
 
 @dataclass(frozen=True)
 class Recipe:
-    """The plan of one strategy; shares are of the run's steps.
+    """The plan of one strategy; shares are of the run's steps."""
 
-    Attributes:
-        densify_from: share from which Gaussians are added and deleted.
-        densify_until: share up to which.
-        full_at: share at which the count reaches its cap.
-        levels: (share, factor): up to that share images are reduced by the factor.
-        sh_at: shares at which the degree of the colours rises by one.
-        sh_every: the higher degrees are moved every so many steps.
-        opacity_decay: opacities are multiplied by this at each densification.
-        resets: opacities are lowered to .01 now and then, as in the reference.
-        means_rate: factor of the option of that name, and so on: a run of some thousand steps has
-            to go as far as the reference's 30,000.
-        scales_rate: likewise.
-        sh_rate: likewise.
-        means_final: rate of the means at the end, of that at the start; exponential between.
-        final_from: share from which all other rates fall.
-        final_rate: to which they fall at the end, of their own; exponential.
-    """
-
-    densify_from: float
-    densify_until: float
-    full_at: float
+    densify_from: float  # share from which Gaussians are added and deleted
+    densify_until: float  # share up to which
+    full_at: float  # share at which the count reaches its cap
+    # (share, factor): up to that share images are reduced by the factor
     levels: tuple[tuple[float, int], ...]
-    sh_at: tuple[float, float, float]
-    sh_every: int
-    opacity_decay: float
-    resets: bool
+    sh_at: tuple[float, float, float]  # shares at which the degree of the colours rises by one
+    sh_every: int  # the higher degrees are moved every so many steps
+    opacity_decay: float  # opacities are multiplied by this at each densification
+    resets: bool  # opacities are lowered to .01 now and then, as in the reference
+    # factor of the option of that name, and so on: a run of some thousand steps has to go as far as
+    # the reference's 30,000
     means_rate: float = 1.0
-    scales_rate: float = 1.0
-    sh_rate: float = 1.0
+    scales_rate: float = 1.0  # likewise
+    sh_rate: float = 1.0  # likewise
+    # rate of the means at the end, of that at the start; exponential between
     means_final: float = 0.01
-    final_from: float = 1.0
-    final_rate: float = 1.0
+    final_from: float = 1.0  # share from which all other rates fall
+    final_rate: float = 1.0  # to which they fall at the end, of their own; exponential
 
 
 # Kerbl et al. 2023 and INRIA's defaults: 500, 15,000 and 1,000 of 30,000 iterations
@@ -105,15 +88,10 @@ _SH_EVERY = 1000  # steps of the reference between two degrees, in a run of any 
 
 @dataclass(frozen=True)
 class Schedule:
-    """The plan of one run; iterations count from 1.
+    """The plan of one run; iterations count from 1."""
 
-    Attributes:
-        config: the run's options.
-        recipe: of the strategy that the options name.
-    """
-
-    config: RunConfig
-    recipe: Recipe = None  # type: ignore[assignment]  # filled in below
+    config: RunConfig  # the run's options
+    recipe: Recipe = None  # type: ignore[assignment]  # that of the strategy, filled in below
 
     def __post_init__(self) -> None:
         if self.recipe is None:
@@ -201,14 +179,10 @@ class RecoverySchedule(Schedule):
     """A run of its own, but for its coarse beginning: all learning rates start anew.
 
     The rates at which training ended let no Gaussian move into the gap that its neighbour left.
-
-    Attributes:
-        first: step at which the recovery begins.
-        until: step at which it ends.
     """
 
-    first: int
-    until: int
+    first: int  # step at which the recovery begins
+    until: int  # step at which it ends
 
     def share(self, iteration: int) -> float:
         """Returns how much of the recovery is done after a step, 0 to 1."""

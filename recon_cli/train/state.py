@@ -32,34 +32,23 @@ _VERSION = 5
 
 @dataclass(eq=False)
 class TrainState:
-    """A run after `iteration` steps.
+    """A run after `iteration` steps."""
 
-    Attributes:
-        optimizer: holds the splats and their moments.
-        gathered: what steps left behind for densification.
-        generator: source of every random choice; on the CPU whatever the device.
-        iteration: steps done.
-        queue: indices of the views still to come in this epoch, last first.
-        first_count: Gaussians before the first step; budgets grow from there.
-        skipped: steps whose loss was not finite, and that changed nothing.
-        looks: (iteration, validation PSNR in dB) at each regular report so far.
-        jump: (iteration, iteration at which it went on) of an early stop; None where there was
-            none. The steps between were never taken.
-        exposure: gains of the training images; None where that part is off.
-        poses: refinement of their cameras; None where that part is off.
-    """
-
-    optimizer: SplatOptimizer
-    gathered: DensificationStats
-    generator: torch.Generator
-    iteration: int = 0
+    optimizer: SplatOptimizer  # holds the splats and their moments
+    gathered: DensificationStats  # what steps left behind for densification
+    generator: torch.Generator  # source of every random choice; on the CPU whatever the device
+    iteration: int = 0  # steps done
+    # indices of the views still to come in this epoch, last first
     queue: list[int] = field(default_factory=list)
-    first_count: int = 0
-    skipped: int = 0
+    first_count: int = 0  # Gaussians before the first step; budgets grow from there
+    skipped: int = 0  # steps whose loss was not finite, and that changed nothing
+    # (iteration, validation PSNR in dB) at each regular report so far
     looks: list[tuple[int, float]] = field(default_factory=list)
+    # (iteration, iteration at which it went on) of an early stop; None where there was none. The
+    # steps between were never taken
     jump: tuple[int, int] | None = None
-    exposure: Exposure | None = None
-    poses: Poses | None = None
+    exposure: Exposure | None = None  # gains of the training images; None where that part is off
+    poses: Poses | None = None  # refinement of their cameras; None where that part is off
 
     @property
     def steps(self) -> int:
@@ -76,16 +65,7 @@ def new_state(
     splats: Splats, config: RunConfig, extent: float, *, backend: str = "torch",
     exposure: Exposure | None = None, poses: Poses | None = None,
 ) -> TrainState:
-    """Returns the state before the first step.
-
-    Args:
-        splats: to begin with.
-        config: of the run.
-        extent: of the scene, world units.
-        backend: as in `SplatOptimizer`.
-        exposure: gains of the training images, where they are part of the model.
-        poses: refinement of their cameras, likewise.
-    """
+    """Returns the state before the first step."""
     generator = torch.Generator().manual_seed(config.seed)
     gathered = DensificationStats.zeros(len(splats), splats.means.device)
     return TrainState(
@@ -176,20 +156,15 @@ def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 @dataclass(eq=False)
 class DensificationStats:
-    """How the loss pulled at each Gaussian since the last densification.
+    """How the loss pulled at each Gaussian since the last densification."""
 
-    Attributes:
-        pull: [N] sum over steps of the length of the projected mean's gradient, in normalised
-            device coordinates.
-        count: [N] steps in which the Gaussian was seen.
-        radius: [N] largest radius on the screen, pixels.
-        variance: [N] sum over steps of sum ds^2 - (sum ds)^2 / n over the n pixels of the
-            Gaussian, with ds = o dL/do: how much its pixels disagree about what it should be.
-    """
-
+    # [N] sum over steps of the length of the projected mean's gradient, in normalised device
+    # coordinates
     pull: Tensor
-    count: Tensor
-    radius: Tensor
+    count: Tensor  # [N] steps in which the Gaussian was seen
+    radius: Tensor  # [N] largest radius on the screen, pixels
+    # [N] sum over steps of sum ds^2 - (sum ds)^2 / n over the n pixels of the Gaussian, with ds = o
+    # dL/do: how much its pixels disagree about what it should be
     variance: Tensor
 
     @staticmethod

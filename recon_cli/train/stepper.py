@@ -23,19 +23,12 @@ _SKIPPED_FLOOR = 5
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What the B views of a step say beside their gradients.
+    """What the B views of a step say beside their gradients."""
 
-    Attributes:
-        loss: [B].
-        seen: [B] 1 where the view saw a Gaussian.
-        turn: [B, 6] gradients of the cameras.
-        gain: [B, 3] gradients of the log-gains.
-    """
-
-    loss: NDArray[np.float64]
-    seen: NDArray[np.float64]
-    turn: NDArray[np.float64]
-    gain: NDArray[np.float64]
+    loss: NDArray[np.float64]  # [B]
+    seen: NDArray[np.float64]  # [B] 1 where the view saw a Gaussian
+    turn: NDArray[np.float64]  # [B, 6] gradients of the cameras
+    gain: NDArray[np.float64]  # [B, 3] gradients of the log-gains
 
     @staticmethod
     def nothing(views: int) -> _Found:
@@ -46,10 +39,7 @@ class _Found:
 class Stepper:
     """Takes the steps of one call of `fit.fit`.
 
-    Args:
-        state: changed in place.
-        task: views and plan.
-        importance: gets the scores of the views that this process looks at; None for nobody.
+    `importance` gets the scores of the views that this process looks at.
     """
 
     def __init__(self, state: TrainState, task: Task, importance: Importance | None) -> None:

@@ -17,30 +17,19 @@ from recon_cli.train.schedule import Schedule
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is fitted and by which plan.
+    """What is fitted and by which plan."""
 
-    Attributes:
-        train: views that gradients come from.
-        validation: views that are only looked at.
-        schedule: when things happen.
-        extent: of the scene, world units.
-        backend: name of the rasterizer.
-        device: where the tensors live.
-        jump: (iteration, iteration at which it goes on) of the run that this one branches off;
-            this one does the same.
-        camera_error: how far cameras may be off, in rad; for their refinement.
-        ranks: this process among those that take the steps together.
-    """
-
-    train: list[TrainView]
-    validation: list[TrainView]
-    schedule: Schedule
-    extent: float
-    backend: str
-    device: torch.device
+    train: list[TrainView]  # views that gradients come from
+    validation: list[TrainView]  # views that are only looked at
+    schedule: Schedule  # when things happen
+    extent: float  # of the scene, world units
+    backend: str  # name of the rasterizer
+    device: torch.device  # where the tensors live
+    # (iteration, iteration at which it goes on) of the run that this one branches off; this one
+    # does the same
     jump: tuple[int, int] | None = None
-    camera_error: float | None = None
-    ranks: ProcessGroup = SINGLE_PROCESS
+    camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
+    ranks: ProcessGroup = SINGLE_PROCESS  # this process among those that take the steps together
 
     @cached_property
     def pyramid(self) -> Pyramid:
@@ -70,12 +59,7 @@ def reduced(view: TrainView, factor: int) -> TrainView:
 
 
 class Pyramid:
-    """The training views at every size that a run asks for, made when it does.
-
-    Args:
-        views: at full size.
-        page_locked: those that are made lie in memory that a GPU reads by itself.
-    """
+    """The training views at every size that a run asks for, made when it does."""
 
     def __init__(self, views: Sequence[TrainView], *, page_locked: bool = False) -> None:
         self._views, self._page_locked = views, page_locked

@@ -24,14 +24,10 @@ class FileDigest:
 
 @dataclass(frozen=True)
 class Source:
-    """One file or folder that the user handed in.
+    """One file or folder that the user handed in."""
 
-    Attributes:
-        path: absolute.
-        files: digests by path relative to the folder; a single file goes by its name.
-    """
-
-    path: str
+    path: str  # absolute
+    # digests by path relative to the folder; a single file goes by its name
     files: Mapping[str, FileDigest]
 
     def contents(self) -> list[str]:
@@ -64,10 +60,8 @@ def digest_file(path: Path, known: FileDigest | None = None) -> FileDigest:
 def read_source(path: Path, *, known: Source | None = None, without: Path) -> Source:
     """Returns what a file, or every file below a folder, holds.
 
-    Args:
-        path: file or folder. Hidden files and folders below it are skipped.
-        known: an earlier reading of the same path, to save time.
-        without: a folder that is skipped: the workspace may lie beside the photos.
+    Hidden files and folders are skipped, and so is `without`, as the workspace may lie beside the
+    photos. `known`, an earlier reading of the same path, saves time.
 
     Raises:
         InputError: the path is missing or cannot be read.

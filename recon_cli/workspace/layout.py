@@ -34,11 +34,7 @@ logger = logging.getLogger("recon")
 
 
 class Workspace:
-    """Results by stage name below one folder.
-
-    Args:
-        root: need not exist; `writing` makes it.
-    """
+    """Results by stage name below one folder."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
@@ -274,11 +270,6 @@ HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read e
 @contextmanager
 def hold(root: Path, verb: str, *, other: str = "another workspace with -w") -> Iterator[None]:
     """Holds the lock of the workspace at `root` for as long as the block runs.
-
-    Args:
-        root: an existing folder.
-        verb: what the user typed, for the message to a second process.
-        other: what to give instead, for its hint.
 
     Raises:
         WorkspaceError: another process holds the lock; the message says which.

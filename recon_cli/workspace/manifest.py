@@ -23,20 +23,13 @@ _MAX_REASONS = 3  # changes of one kind that are named; the rest is counted
 
 @dataclass(frozen=True)
 class ResultKey:
-    """Everything that decides what comes out of a stage.
+    """Everything that decides what comes out of a stage."""
 
-    Attributes:
-        stage: its name.
-        version: of the stage's code.
-        config: the hashed options.
-        sources: the user's own files; only ingest has any.
-        upstream: digest of what each earlier stage wrote; None where a stage is left out.
-    """
-
-    stage: str
-    version: int
-    config: Mapping[str, Any]
-    sources: tuple[Source, ...]
+    stage: str  # its name
+    version: int  # of the stage's code
+    config: Mapping[str, Any]  # the hashed options
+    sources: tuple[Source, ...]  # the user's own files; only ingest has any
+    # digest of what each earlier stage wrote; None where a stage is left out
     upstream: Mapping[str, str | None]
 
     @property
@@ -71,44 +64,27 @@ class ResultKey:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """How a result came about. Recorded for people, never hashed.
+    """How a result came about. Recorded for people, never hashed."""
 
-    Attributes:
-        seconds: of work, resumed runs added up.
-        peak_memory_bytes: of the process and its children together.
-        summary: what the stage says about its result.
-        versions: of Python, recon and the packages that matter.
-        device: "cpu" or "cuda"; None for stages that do not render.
-        backend: rasterizer; None for stages that do not render.
-        threads: CPU threads.
-        finished: ISO 8601 with time zone.
-    """
-
-    seconds: float
-    peak_memory_bytes: int
-    summary: Mapping[str, Any]
-    versions: Mapping[str, str]
-    device: str | None
-    backend: str | None
-    threads: int
-    finished: str
+    seconds: float  # of work, resumed runs added up
+    peak_memory_bytes: int  # of the process and its children together
+    summary: Mapping[str, Any]  # what the stage says about its result
+    versions: Mapping[str, str]  # of Python, recon and the packages that matter
+    device: str | None  # "cpu" or "cuda"; None for stages that do not render
+    backend: str | None  # rasterizer; None for stages that do not render
+    threads: int  # CPU threads
+    finished: str  # ISO 8601 with time zone
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """A finished result.
+    """A finished result."""
 
-    Attributes:
-        key: what it was made from.
-        outputs: digest of every file, by path relative to the stage's folder.
-        digest: of the outputs that later stages may depend on.
-        run: how it came about.
-    """
-
-    key: ResultKey
+    key: ResultKey  # what it was made from
+    # digest of every file, by path relative to the stage's folder
     outputs: Mapping[str, FileDigest]
-    digest: str
-    run: RunRecord
+    digest: str  # of the outputs that later stages may depend on
+    run: RunRecord  # how it came about
 
     def write(self, folder: Path) -> None:
         """Writes the manifest into a stage's folder, whole or not at all."""
@@ -181,13 +157,7 @@ class PartialRun:
 
 
 def differences(old: ResultKey, new: ResultKey, *, section: str) -> list[str]:
-    """Returns in words how the key of a result differs from the one that a run would have now.
-
-    Args:
-        old: of the result.
-        new: of a run.
-        section: of recon.toml that sets the options.
-    """
+    """Returns in words how the key of a result differs from the one that a run would have now."""
     reasons = []
     if old.version != new.version:
         reasons.append(f"stage version {old.version} -> {new.version}")

@@ -51,13 +51,7 @@ def fit_together(
 ) -> None:
     """Runs `state` on like `fit`, with the help of all processes that `task.ranks` leads.
 
-    Args:
-        state: changed in place.
-        task: views and plan.
-        until: total number of steps.
-        callbacks: as `fit` has it; several processes call them after every step.
-        importance: as `fit` has it; gets the scores of all processes.
-        threads: of each process.
+    Several processes call `callbacks` after every step; `importance` gets the scores of all.
 
     Raises:
         TrainingError: as `fit`, or the processes no longer hold the same Gaussians.
@@ -205,19 +199,12 @@ _STATE = "state.safetensors"
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a process needs to take part in a fit.
+    """What a process needs to take part in a fit."""
 
-    Attributes:
-        state: to begin with.
-        task: views and plan; the validation views and the jump are the leader's alone.
-        importance: where scores are gathered, None where they are not.
-        threads: of the CPU.
-    """
-
-    state: TrainState
-    task: Task
-    importance: Importance | None
-    threads: int
+    state: TrainState  # to begin with
+    task: Task  # views and plan; the validation views and the jump are the leader's alone
+    importance: Importance | None  # where scores are gathered, None where they are not
+    threads: int  # of the CPU
 
 
 def pack_fit(fit: Fit) -> dict[str, NDArray[Any]]:
