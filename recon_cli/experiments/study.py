@@ -40,9 +40,9 @@ from recon_cli.experiments.variants import (
 )
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
-from recon_cli.workspace import atomic, lock
+from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.layout import disk_errors
+from recon_cli.workspace.layout import disk_errors, hold_lock
 
 # The paper compares the first two; the others are what `recon train` does without and with --prune.
 VARIANTS: tuple[Variant, ...] = (REFERENCE, PAPER, BUDGET, BUDGET_PRUNED)
@@ -186,7 +186,7 @@ def run(request: StudyRequest, progress: Progress) -> str:
             f"The folder {out} cannot be created: {error.strerror}.",
             hint="Give another folder with --out.") from error
     with (disk_errors(out, "running study"),
-          lock.hold(out, "study", other="another folder with --out")):
+          hold_lock(out, "study", other="another folder with --out")):
         ctx = render_context(request.compute, progress)
         host = examine(ctx.threads, ctx.device)
         records = Records(out)

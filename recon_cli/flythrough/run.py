@@ -144,7 +144,7 @@ def render_frames(request: RenderRequest, job: Job) -> str:
     encoding = _check(request, plan)
     ctx = render_context(job.compute, job.progress)
     folder = _make_folders(request, plan, job.workspace.root)
-    with disk_errors(folder, "rendering"), layout.hold(
+    with disk_errors(folder, "rendering"), layout.hold_lock(
             folder, "render", other="another folder with --out"):
         frames = FrameFolder(folder, list(plan.cameras), request.outputs)
         scale = depth_scale(trained.scene, metres=trained.metres)

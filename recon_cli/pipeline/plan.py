@@ -32,6 +32,9 @@ from recon_cli.workspace.manifest import Manifest
 
 __all__ = ["Job", "Outcome", "StageStatus", "Target", "plan", "run", "run_stage", "status"]
 
+# Logs are volatile too, but later stages read times from them and they free next to nothing.
+_WORTH_BYTES = 1 << 20
+
 logger = logging.getLogger("recon")
 
 
@@ -263,10 +266,6 @@ def _log_to(path: Path) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         handler.close()
-
-
-# Logs are volatile too, but later stages read times from them and they free next to nothing.
-_WORTH_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Adam over the raw parameters, whose rows follow added and removed Gaussians in place."""
+"""Adam over the raw parameters, whose rows follow added and removed Gaussians; Adam by image."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from recon_cli.lazy import load
 from recon_cli.scene.splats import Splats, with_terms
 from recon_cli.train.schedule import RECIPES
 
-_BETAS = 0.9, 0.999
+_BETAS = 0.9, 0.999  # of the paper, and of INRIA 3DGS for its exposures
 _EPSILON = 1e-15  # of the reference: gradients of single Gaussians are tiny
 _REST_FACTOR = 1 / 20  # learning rate of higher SH degrees against the base colour
 _ROLES = ("value", "gradient", "exp_avg", "exp_avg_sq")
 _MOMENTS = ("exp_avg", "exp_avg_sq")
+_ROW_ROLES = ("value", "exp_avg", "exp_avg_sq", "count")
 
 
 class SplatOptimizer:
@@ -252,9 +253,6 @@ def _followed(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
     known = ((source >= 0) & (source < len(moment))).reshape(-1, *[1] * (like.dim() - 1))
     # no mask as an index: a GPU would be waited for
     return torch.where(known, moment[source.clamp(0, len(moment) - 1)], 0.0)
-
-
-_ROW_ROLES = ("value", "exp_avg", "exp_avg_sq", "count")
 
 
 class SparseAdam:

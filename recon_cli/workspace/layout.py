@@ -28,6 +28,8 @@ from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, describe_progress
 
 LOG = "recon.log"
+LOCK = ".lock"  # dropped by the system when its holder dies
+HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
 
 logger = logging.getLogger("recon")
@@ -71,7 +73,7 @@ class Workspace:
             raise WorkspaceError(
                 f"The workspace {self.root} cannot be made: {error.strerror}.",
                 hint="Give another folder with -w.") from error
-        with hold(self.root, verb):
+        with hold_lock(self.root, verb):
             self.recover()
             yield
 
@@ -261,14 +263,8 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-LOCK = ".lock"
-
-
-HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
-
-
 @contextmanager
-def hold(root: Path, verb: str, *, other: str = "another workspace with -w") -> Iterator[None]:
+def hold_lock(root: Path, verb: str, *, other: str = "another workspace with -w") -> Iterator[None]:
     """Holds the lock of the workspace at `root` for as long as the block runs.
 
     Raises:

@@ -256,7 +256,7 @@ def test_a_folder_that_recon_did_not_make_is_not_replaced(workspace: Workspace) 
 
 def test_the_second_writer_is_told_who_the_first_is(workspace: Workspace) -> None:
     first = workspace.writing("train --prune")
-    with first, pytest.raises(WorkspaceError) as caught, layout.hold(workspace.root, "sfm"):
+    with first, pytest.raises(WorkspaceError) as caught, layout.hold_lock(workspace.root, "sfm"):
         pass
     assert f"process {os.getpid()}" in caught.value.message
     assert "recon train --prune" in caught.value.message

@@ -1,8 +1,10 @@
-"""A fit by several processes: what the leader says, and what the others do.
+"""A fit by several processes: what the leader sends, and what the others do.
 
-The leader says before every step at which iteration it begins, which also tells of a jump. Words
-that are no iteration are below zero. Whatever ends the fit between two steps, the leader says so,
-and the others wait for the next fit; in the middle of a step nothing can be said, and it leaves.
+The leader sends a fit (JSON, plain bytes for arrays, and the state as the checkpoint that it would
+be saved as, so that the others resume with the same bits). Before every step it sends the iteration
+at which it begins, which also tells of a jump; other words are below zero. Whatever ends the fit
+between two steps, the leader says so and the others wait for the next fit; in the middle of a step
+nothing can be said, and it leaves.
 """
 
 from __future__ import annotations
@@ -39,6 +41,8 @@ from recon_cli.train.task import Task
 
 _DONE, _FIT = 0, 1  # between fits, and EXCHANGE
 _STOP, _END, _COMPARE = -1, -2, -3  # in a fit
+_LENS = ("width", "height", "fx", "fy", "cx", "cy")
+_STATE = "state.safetensors"
 
 
 def fit_together(
@@ -189,12 +193,6 @@ def _digest(tensor: Tensor) -> int:
     """Returns the sum of a tensor's bits, in words: cheap, and what differs soon differs widely."""
     flat = tensor.contiguous().reshape(-1)
     return int((flat if flat.dtype == torch.uint8 else flat.view(torch.int32)).sum())
-
-
-_LENS = ("width", "height", "fx", "fy", "cx", "cy")
-
-
-_STATE = "state.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
