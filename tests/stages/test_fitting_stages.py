@@ -16,7 +16,7 @@ from recon_cli.context import TrainCallback
 from recon_cli.errors import FormatError, StageError, TrainingError
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.stages import export, prune, train
-from recon_cli.train import callbacks, prune_run, runner
+from recon_cli.train import prune_run, runner
 from recon_cli.train.state import save_state
 
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
@@ -39,7 +39,7 @@ def stopping_after(steps, monkeypatch):
         if state.iteration >= steps:
             raise Killed
 
-    monkeypatch.setattr(callbacks, "save_state", save_then_die)
+    monkeypatch.setattr(runner, "save_state", save_then_die)
 
 
 def test_training_leaves_a_scene_its_states_and_a_log(inputs):

@@ -13,7 +13,7 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.export import verify
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.stages import evaluate, export, prune, train
-from recon_cli.train import callbacks
+from recon_cli.train import runner
 from recon_cli.train.state import save_state
 
 CONTEXT = StageContext()
@@ -61,7 +61,7 @@ def test_a_killed_training_of_a_low_degree_ends_with_the_same_bytes(
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(callbacks, "save_state", save_then_die)
+        patch.setattr(runner, "save_state", save_then_die)
         with pytest.raises(Killed):
             train.run(config_of(degree), inputs, tmp_path, CONTEXT)
     train.run(config_of(degree), inputs, tmp_path, CONTEXT)

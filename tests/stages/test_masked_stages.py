@@ -15,7 +15,7 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconstructionError, TrainingError
 from recon_cli.io.images import read_image, write_png
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import callbacks
+from recon_cli.train import runner
 from recon_cli.train.state import save_state
 
 CONFIG = TrainConfig(
@@ -117,7 +117,7 @@ def test_a_killed_training_with_masks_ends_with_the_bytes_of_an_uninterrupted_on
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(callbacks, "save_state", save_then_die)
+        patch.setattr(runner, "save_state", save_then_die)
         with pytest.raises(Killed):
             run(train, CONFIG, inputs, tmp_path / "out", backend)
     run(train, CONFIG, inputs, tmp_path / "out", backend)

@@ -14,7 +14,8 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.stages import prune, train
-from recon_cli.train import callbacks, fit, memory, planning
+from recon_cli.train import fit, memory, runner
+from recon_cli.train import plan as planning
 from recon_cli.train.memory import estimate
 from recon_cli.train.state import save_state
 
@@ -49,7 +50,7 @@ def killed_after(steps, monkeypatch):
         if state.iteration >= steps:
             raise Killed
 
-    monkeypatch.setattr(callbacks, "save_state", save_then_die)
+    monkeypatch.setattr(runner, "save_state", save_then_die)
 
 
 def same_bytes(one, other):
@@ -102,7 +103,7 @@ def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monke
 def test_memory_that_is_short_lowers_the_cap_and_says_so(inputs, tmp_path, monkeypatch, caplog):
     needed = estimate(views=9, width=48, height=36, gaussians=5500, fused=True)
     monkeypatch.setattr(memory, "free_memory_bytes", lambda: needed.total)
-    monkeypatch.setattr(planning.plan, "wanted", lambda *_: 9000)
+    monkeypatch.setattr(planning, "useful_cap", lambda *_: 9000)
     summary = run(TrainConfig(iterations=2), inputs, tmp_path / "out")
     assert summary.max_gaussians == pytest.approx(5500, abs=10)
     assert "9,000 would suit" in caplog.text

@@ -15,7 +15,7 @@ from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import use_threads
 from recon_cli.stages import prune, train
-from recon_cli.train import callbacks, prune_run, runner
+from recon_cli.train import prune_run, runner
 from recon_cli.train.state import save_state
 from recon_cli.workspace.atomic import write_bytes
 
@@ -95,7 +95,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
                 raise Killed
 
         with monkeypatch.context() as patch:
-            for module in (prune_run, callbacks):
+            for module in (prune_run, runner):
                 patch.setattr(module, "save_state", lambda *a: count_and_die(save_state, *a))
             patch.setattr(
                 prune_run, "write_bytes", lambda *a: count_and_die(write_bytes, *a))

@@ -17,7 +17,7 @@ from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
 from recon_cli.context import StageInputs
 from recon_cli.io.ply import read_ply
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import callbacks, runner
+from recon_cli.train import runner
 from recon_cli.train.state import save_state
 
 pytest.importorskip("triton", reason="triton is not installed")
@@ -47,7 +47,7 @@ def test_every_stage_runs_and_a_killed_training_ends_with_the_same_bytes(tmp_pat
     for name in ("plan.json", "config.json"):
         (tmp_path / "again" / name).write_bytes((tmp_path / "train" / name).read_bytes())
     with monkeypatch.context() as patch:
-        patch.setattr(callbacks, "save_state", save_then_die)
+        patch.setattr(runner, "save_state", save_then_die)
         with pytest.raises(Killed):
             run(train, CONFIG, inputs, tmp_path / "again", ON_TRITON)
     assert (tmp_path / "again" / runner.CHECKPOINT).exists()
