@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from recon_cli.context import StageContext
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import CONVENTION_LINES, CONVENTIONS, MASK_CONVENTION
 from recon_cli.evaluation.reference_views import (
@@ -21,9 +21,9 @@ from recon_cli.evaluation.reference_views import (
     score_views,
 )
 from recon_cli.evaluation.scores import (
-    ModelScore,
+    Metrics,
+    ModelMetrics,
     Table,
-    ViewScore,
     csv_table,
     model_table,
     paper_table,
@@ -34,6 +34,9 @@ from recon_cli.scene.splats import Splats, transformed
 from recon_cli.workspace.atomic import read_json
 
 _TRANSFORM = "transform.json"  # that an export leaves beside its files
+_NOTE = CONVENTION_LINES + (
+    "Differences: paired, bootstrap over the views; only between models that were scored on the "
+    "same views.")
 
 logger = logging.getLogger("recon")
 
@@ -44,47 +47,34 @@ class ScoredModel:
 
     group: str  # the workspace, or the folder whose views a file is scored on, as in tables
     model: str  # base, pruned, or the name of a file
-    score: ModelScore  # on the held-out views
+    label: str  # in tables
+    score: ModelMetrics  # on the held-out views
     digest: str  # of these views; scores can be paired where it is equal
 
 
 def read_workspace_scores(name: str, folder: Path) -> list[ScoredModel]:
-    """Returns the models of an evaluate folder, which is fresh, of the workspace `name`.
+    """Returns the models of a fresh evaluate folder of the workspace `name`.
 
     Raises:
         FormatError: metrics.json is damaged.
     """
-    path = folder / "metrics.json"
     try:
-        record = read_json(path)
-        return [ScoredModel(name, model, _model_score(f"{name}, {LABELS[model]}", values),
-                            record["truth_digest"])
-                for model, values in record["models"].items()]
-    except (KeyError, TypeError, ValueError) as error:
+        metrics = Metrics.read(folder)
+    except ManifestError as error:
         raise FormatError(
-            f"{path} does not hold scores: {error!r}.",
+            f"{folder / Metrics.FILE} does not hold scores: {error.message}.",
             hint="Run `recon eval --again` in that workspace.") from error
-
-
-def _model_score(label: str, values: Mapping[str, Any]) -> ModelScore:
-    views = tuple(ViewScore(**view) for view in values["views"])
-    return ModelScore(label, views, values["gaussians"], values["bytes"], values["render_ms"],
-                      values["train_seconds"])
+    return [ScoredModel(name, model, f"{name}, {LABELS[model]}", score, metrics.truth_digest)
+            for model, score in metrics.models.items()]
 
 
 def score_file(
     path: Path, name: str, group: str, views: Sequence[ReferenceView], ctx: StageContext
 ) -> ScoredModel:
-    """Returns a file of Gaussians, scored on the views of a workspace, in whose world it must lie.
+    """Returns a file of Gaussians, scored on the views of the workspace `group`.
 
-    A file beside which an export left transform.json is brought back into that world.
-
-    Args:
-        path: of the file.
-        name: for the tables.
-        group: the name of the workspace.
-        views: of the workspace, at the size they are scored at.
-        ctx: backend and device.
+    It must lie in the world of that workspace; a file beside which an export left transform.json
+    is transformed back into it.
 
     Raises:
         FormatError: it holds no Gaussians that can be read.
@@ -92,17 +82,13 @@ def score_file(
     splats = _undo_export(read_splats(path), path.with_name(_TRANSFORM))
     splats = splats.map(lambda tensor: tensor.to(ctx.device))
     scores = score_views(splats, views, splats.sh_degree, ctx.backend)
-    score = ModelScore(
-        name, scores.views, len(splats), path.stat().st_size, scores.render_ms, None)
-    return ScoredModel(group, name, score, reference_digest(views))
+    score = ModelMetrics.of(
+        scores.views, gaussians=len(splats), bytes=path.stat().st_size, render_ms=scores.render_ms)
+    return ScoredModel(group, name, name, score, reference_digest(views))
 
 
 def _undo_export(splats: Splats, record: Path) -> Splats:
-    """Returns the Gaussians in the world that an export took them from, where it says so.
-
-    Raises:
-        FormatError: the record cannot be read.
-    """
+    """Returns the Gaussians in the world before the export; FormatError for a damaged record."""
     if not record.is_file():
         return splats
     try:
@@ -122,11 +108,11 @@ def format_comparison(models: Sequence[ScoredModel], form: str) -> str:
     """Returns the models, at least one, as text, markdown, csv, latex or json."""
     if form == "json":
         return json.dumps(_record(models), indent=1)
+    scores = {scored.label: scored.score for scored in models}
     if form == "csv":
-        return csv_table({scored.score.label: scored.score for scored in models}).rstrip()
+        return csv_table(scores).rstrip()
     tables = [table for table in (
-        model_table([scored.score for scored in models]), difference_table(models),
-        _paper_rows(models)) if table.rows]
+        model_table(scores), difference_table(models), _paper_rows(models)) if table.rows]
     if form == "latex":
         return "\n".join(table.latex() for table in tables).rstrip()
     if form == "markdown":
@@ -137,8 +123,7 @@ def format_comparison(models: Sequence[ScoredModel], form: str) -> str:
 def difference_table(models: Sequence[ScoredModel]) -> Table:
     """Returns how each model differs from the first one with the same views, with intervals."""
     return Table(("difference, 95%", "PSNR dB", "SSIM"), tuple(
-        (f"{ours.score.label} minus {theirs.score.label}",
-         _difference(ours, theirs, "psnr_db").text("+.2f"),
+        (f"{ours.label} minus {theirs.label}", _difference(ours, theirs, "psnr_db").text("+.2f"),
          _difference(ours, theirs, "ssim").text("+.4f"))
         for ours, theirs in _pairs(models)))
 
@@ -146,12 +131,8 @@ def difference_table(models: Sequence[ScoredModel]) -> Table:
 def _pairs(models: Sequence[ScoredModel]) -> list[tuple[ScoredModel, ScoredModel]]:
     """Returns each model with the first one that was scored on the same views."""
     first: dict[str, ScoredModel] = {}
-    pairs = []
-    for scored in models:
-        if scored.digest in first:
-            pairs.append((scored, first[scored.digest]))
-        first.setdefault(scored.digest, scored)
-    return pairs
+    return [(scored, first[scored.digest]) for scored in models
+            if first.setdefault(scored.digest, scored) is not scored]
 
 
 def _difference(ours: ScoredModel, theirs: ScoredModel, key: str) -> Interval:
@@ -174,15 +155,12 @@ def _record(models: Sequence[ScoredModel]) -> dict[str, Any]:
             "workspace": scored.group, "model": scored.model, "truth_digest": scored.digest,
             **{key: getattr(scored.score, key) for key in (
                 "psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips")},
-            **dataclasses.asdict(scored.score)} for scored in models],
+            "label": scored.label,
+            "views": [dataclasses.asdict(view) for view in scored.score.views],
+            **{key: getattr(scored.score, key) for key in (
+                "gaussians", "bytes", "render_ms", "train_seconds")}} for scored in models],
         "differences": [{
-            "ours": ours.score.label, "theirs": theirs.score.label,
-            **{key: dataclasses.asdict(_difference(ours, theirs, key))
-               for key in ("psnr_db", "ssim")}}
+            "ours": ours.label, "theirs": theirs.label,
+            **{key: _difference(ours, theirs, key).to_json() for key in ("psnr_db", "ssim")}}
             for ours, theirs in _pairs(models)],
         **CONVENTIONS, "mask_convention": MASK_CONVENTION}
-
-
-_NOTE = CONVENTION_LINES + (
-    "Differences: paired, bootstrap over the views; only between models that were scored on the "
-    "same views.")

@@ -1,11 +1,11 @@
-"""Scores of views and models, and tables of them: models side by side, views, data sets."""
+"""Scores of views and models as JSON files hold them, and tables of them."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -14,6 +14,11 @@ import numpy as np
 from recon_cli.evaluation.intervals import Interval
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.summaries import JsonRecord
+
+_TEX = str.maketrans({
+    "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"})
+_VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips")
 
 
 @dataclass(frozen=True)
@@ -37,96 +42,38 @@ class MeanScore(JsonRecord):
     ssim: float
 
 
-@dataclass(frozen=True)
-class ModelScore:
-    """The scores of one model over all held-out views; its own scores are means over these."""
-
-    label: str  # in tables
-    views: tuple[ViewScore, ...]
-    gaussians: int
-    bytes: int  # of its file
-    render_ms: float  # median milliseconds a view
-    train_seconds: float | None  # of training that led to it; None where unknown
-
-    @property
-    def psnr_db(self) -> float:
-        """Mean over the views."""
-        return _mean(self.views, "psnr_db")
-
-    @property
-    def psnr_8bit_db(self) -> float:
-        """Mean over the views."""
-        return _mean(self.views, "psnr_8bit_db")
-
-    @property
-    def ssim(self) -> float:
-        """Mean over the views."""
-        return _mean(self.views, "ssim")
-
-    @property
-    def ssim_padded(self) -> float:
-        """Mean over the views."""
-        return _mean(self.views, "ssim_padded")
-
-    @property
-    def lpips(self) -> float | None:
-        """Mean over the views; None where it was not measured."""
-        measured = all(view.lpips is not None for view in self.views)
-        return _mean(self.views, "lpips") if measured else None
-
-
-def _mean(views: Sequence[ViewScore], key: str) -> float:
-    return float(np.mean([getattr(view, key) for view in views]))
-
-
-@dataclass(frozen=True)
-class SweepTrial(JsonRecord):
-    """One way to prune a model, and the result."""
-
-    score: str  # its name; Sweep.CONTROL for the controls
-    # Fraction that was removed; of a control with equal seconds that of the trial whose seconds it
-    # takes, None for the one with equal steps.
-    ratio: float | None
-    gaussians: int  # that are left
-    steps: int  # of recovery
-    seconds: float  # of recovery and scoring
-    removed: MeanScore | None  # right after the last removal; None where nothing was removed
-    recovered: MeanScore  # at the end
-
-
-@dataclass(frozen=True)
-class Sweep(JsonRecord):
-    """The content of sweep.json, which `recon prune --sweep` writes."""
-
-    FILE: ClassVar[str] = "sweep.json"
-    CONTROL: ClassVar[str] = "none"  # the score of trials that remove nothing
-
-    of_train: str | None  # digest of the training it started from; None in files of older versions
-    validation_views: int
-    at: str
-    rounds: int
-    recovery_steps: int
-    equal_seconds_of: str  # the score whose seconds the controls take
-    before: MeanScore
-    trials: tuple[SweepTrial, ...]
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModelMetrics(JsonRecord):
-    """The scores of one model in metrics.json."""
+    """The scores of one model in metrics.json: means over the held-out views, and the views."""
 
     psnr_db: float
     psnr_8bit_db: float
     ssim: float
     ssim_padded: float
-    lpips: float | None = None  # None where it was not measured
+    lpips: float | None = None  # None where a view has none
     gaussians: int
-    bytes: int
-    render_ms: float
-    train_seconds: float | None  # None for an imported scene
+    bytes: int  # of its file
+    render_ms: float  # median milliseconds a view
+    train_seconds: float | None  # of training that led to it; None where unknown
     gain_psnr_db: float | None = None  # after the best gain of each view, with --exposure
-    seen_psnr_db: Mapping[str, float]  # on some views of training, by split
+    seen_psnr_db: Mapping[str, float] = field(default_factory=dict)  # on training views, by split
     views: tuple[ViewScore, ...]
+
+    @classmethod
+    def of(
+        cls, views: tuple[ViewScore, ...], *, gaussians: int, bytes: int, render_ms: float,
+        train_seconds: float | None = None, gain_psnr_db: float | None = None,
+        seen_psnr_db: Mapping[str, float] | None = None,
+    ) -> Self:
+        """Returns the scores of a model from those of its views."""
+        psnr_db, psnr_8bit_db, ssim, ssim_padded = (
+            float(np.mean([getattr(view, name) for view in views])) for name in _VIEW_FIELDS[:4])
+        lpips = [view.lpips for view in views if view.lpips is not None]
+        return cls(
+            psnr_db=psnr_db, psnr_8bit_db=psnr_8bit_db, ssim=ssim, ssim_padded=ssim_padded,
+            lpips=float(np.mean(lpips)) if len(lpips) == len(views) else None,
+            gaussians=gaussians, bytes=bytes, render_ms=render_ms, train_seconds=train_seconds,
+            gain_psnr_db=gain_psnr_db, seen_psnr_db=seen_psnr_db or {}, views=views)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,64 +110,36 @@ class Metrics(JsonRecord):
         return cls.from_json(read_json(evaluate / cls.FILE))
 
 
-_VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips")
+@dataclass(frozen=True)
+class SweepTrial(JsonRecord):
+    """One way to prune a model, and the result."""
+
+    score: str  # its name; Sweep.CONTROL for the controls
+    # Fraction that was removed; of a control with equal seconds that of the trial whose seconds it
+    # takes, None for the one with equal steps.
+    ratio: float | None
+    gaussians: int  # that are left
+    steps: int  # of recovery
+    seconds: float  # of recovery and scoring
+    removed: MeanScore | None  # right after the last removal; None where nothing was removed
+    recovered: MeanScore  # at the end
 
 
-def model_table(scores: Sequence[ModelScore]) -> Table:
-    """Returns the models side by side; LPIPS has a column where one has it."""
-    perceptual = any(score.lpips is not None for score in scores)
-    headings = ("model", "PSNR dB", "8-bit", "SSIM", "SSIM 0-pad", *["LPIPS"] * perceptual,
-                "Gaussians", "MB", "ms/view", "train s")
-    return Table(headings, tuple((
-        score.label, f"{score.psnr_db:.2f}", f"{score.psnr_8bit_db:.2f}", f"{score.ssim:.4f}",
-        f"{score.ssim_padded:.4f}", *[_or_dash(score.lpips, ".4f")] * perceptual,
-        f"{score.gaussians:,}", f"{score.bytes / 1e6:.1f}", f"{score.render_ms:.0f}",
-        _or_dash(score.train_seconds, ".0f")) for score in scores))
+@dataclass(frozen=True)
+class Sweep(JsonRecord):
+    """The content of sweep.json, which `recon prune --sweep` writes."""
 
+    FILE: ClassVar[str] = "sweep.json"
+    CONTROL: ClassVar[str] = "none"  # the score of trials that remove nothing
 
-def view_table(scores: Sequence[ModelScore]) -> Table:
-    """Returns each view with the scores of all models, which have the same views."""
-    labels = [score.label for score in scores]
-    headings = ("view", *(
-        f"{metric} {label}" for metric in ("PSNR dB", "SSIM") for label in labels))
-    return Table(headings, tuple((
-        views[0].name, *(f"{view.psnr_db:.2f}" for view in views),
-        *(f"{view.ssim:.4f}" for view in views))
-        for views in zip(*(score.views for score in scores), strict=True)))
-
-
-def paper_table(sets: Mapping[str, tuple[ModelScore, ModelScore]]) -> Table:
-    """Returns a row for each data set: 3DGS against ours, as the paper's tables I and II have it.
-
-    Args:
-        sets: (3DGS, ours) by the name of the data set.
-    """
-    return Table(
-        ("data set", "PSNR 3DGS", "PSNR ours", "SSIM 3DGS", "SSIM ours"),
-        tuple((name, f"{base.psnr_db:.2f}", f"{ours.psnr_db:.2f}", f"{base.ssim:.4f}",
-               f"{ours.ssim:.4f}") for name, (base, ours) in sets.items()))
-
-
-def csv_table(scores: Mapping[str, ModelScore]) -> str:
-    """Returns one row for each model and view, and one with the mean, as CSV."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["model", "view", *_VIEW_FIELDS])
-    for key, score in scores.items():
-        for name, source in [*((view.name, view) for view in score.views), ("mean", score)]:
-            writer.writerow([key, name, *(
-                "" if value is None else f"{value:.6f}"
-                for value in (getattr(source, field) for field in _VIEW_FIELDS))])
-    return file.getvalue()
-
-
-def _or_dash(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
-_TEX = str.maketrans({
-    "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"})
+    of_train: str | None  # digest of the training it started from; None in files of older versions
+    validation_views: int
+    at: str
+    rounds: int
+    recovery_steps: int
+    equal_seconds_of: str  # the score whose seconds the controls take
+    before: MeanScore
+    trials: tuple[SweepTrial, ...]
 
 
 @dataclass(frozen=True)
@@ -236,8 +155,8 @@ class Table:
         rows = [self.headings, *self.rows]
         widths = [max(len(row[i]) for row in rows) for i in range(len(self.headings))]
         lines = ["  ".join(
-            cell.rjust(width) if place else cell.ljust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))).rstrip()
+            cell.rjust(width) if column else cell.ljust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))).rstrip()
             for row in rows]
         if rule:
             lines.insert(1, "-" * max(map(len, lines)))
@@ -260,7 +179,7 @@ class Table:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Returns a figure with that many significant digits, "-" for one that is not known."""
+    """Returns a number with that many significant digits, "-" for None."""
     if value is None:
         return "-"
     if value == 0 or 1e-3 <= abs(value) < 10.0**digits:
@@ -269,7 +188,53 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def percent(value: float | None) -> str:
-    """Returns a fraction in percent, "-" for one that is not known."""
+    """Returns a fraction in percent, "-" for None."""
     return "-" if value is None else f"{100 * value:.3g}%"
 
 
+def or_dash(value: float | None, form: str) -> str:
+    """Returns a number in a format such as ".2f", "-" for None."""
+    return "-" if value is None else format(value, form)
+
+
+def model_table(models: Mapping[str, ModelMetrics]) -> Table:
+    """Returns the models side by side, by label; LPIPS has a column where one has it."""
+    perceptual = any(model.lpips is not None for model in models.values())
+    headings = ("model", "PSNR dB", "8-bit", "SSIM", "SSIM 0-pad", *["LPIPS"] * perceptual,
+                "Gaussians", "MB", "ms/view", "train s")
+    return Table(headings, tuple((
+        label, f"{model.psnr_db:.2f}", f"{model.psnr_8bit_db:.2f}", f"{model.ssim:.4f}",
+        f"{model.ssim_padded:.4f}", *[or_dash(model.lpips, ".4f")] * perceptual,
+        f"{model.gaussians:,}", f"{model.bytes / 1e6:.1f}", f"{model.render_ms:.0f}",
+        or_dash(model.train_seconds, ".0f")) for label, model in models.items()))
+
+
+def view_table(models: Mapping[str, ModelMetrics]) -> Table:
+    """Returns each view with the scores of all models, which have the same views."""
+    headings = ("view", *(
+        f"{metric} {label}" for metric in ("PSNR dB", "SSIM") for label in models))
+    return Table(headings, tuple((
+        views[0].name, *(f"{view.psnr_db:.2f}" for view in views),
+        *(f"{view.ssim:.4f}" for view in views))
+        for views in zip(*(model.views for model in models.values()), strict=True)))
+
+
+def paper_table(sets: Mapping[str, tuple[ModelMetrics, ModelMetrics]]) -> Table:
+    """Returns a row for each data set, of (3DGS, ours), as in the paper's tables I and II."""
+    return Table(
+        ("data set", "PSNR 3DGS", "PSNR ours", "SSIM 3DGS", "SSIM ours"),
+        tuple((name, f"{base.psnr_db:.2f}", f"{ours.psnr_db:.2f}", f"{base.ssim:.4f}",
+               f"{ours.ssim:.4f}") for name, (base, ours) in sets.items()))
+
+
+def csv_table(models: Mapping[str, ModelMetrics]) -> str:
+    """Returns one row for each model and view, and one with the mean, as CSV."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["model", "view", *_VIEW_FIELDS])
+    for key, model in models.items():
+        for name, source in [*((view.name, view) for view in model.views), ("mean", model)]:
+            writer.writerow([key, name, *(
+                "" if value is None else f"{value:.6f}"
+                for value in (getattr(source, field) for field in _VIEW_FIELDS))])
+    return file.getvalue()

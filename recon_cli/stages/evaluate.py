@@ -46,7 +46,6 @@ from recon_cli.evaluation.reference_views import (
 from recon_cli.evaluation.scores import (
     Metrics,
     ModelMetrics,
-    ModelScore,
     csv_table,
     model_table,
     paper_table,
@@ -65,17 +64,6 @@ _GAIN = 4  # of the difference images
 _ANY_ITERATION = 1 << 62  # beyond the last
 _SEEN_VIEWS = 20  # training and validation views that are also scored, at most
 _STAGES = {"base": "train", "pruned": "prune"}  # by model
-
-
-@dataclass(frozen=True)
-class _Model:
-    """One model's scores."""
-
-    score: ModelScore  # on the held-out views
-    corrected_db: float  # mean PSNR there after the best gain per channel of each view
-    # mean PSNR on some training and validation views, by the name of the split, after the best gain
-    # where training had gains
-    seen_db: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -98,7 +86,7 @@ class _Evaluation:
 
     def score(
         self, model: str, perceptual: Perceptual | None, on_view: Callable[[], None]
-    ) -> _Model:
+    ) -> ModelMetrics:
         """Renders and scores one model, and saves its pictures."""
         path, backend = self.folders[model] / "splats.ply", self.ctx.backend
         splats = read_ply(path).map(lambda tensor: tensor.to(self.ctx.device))
@@ -115,10 +103,10 @@ class _Evaluation:
             for name, views in self.seen.items()}
         log = self.folders[model] / LOG
         seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
-        score = ModelScore(
-            LABELS[model], scores.views, len(splats), path.stat().st_size, scores.render_ms,
-            seconds)
-        return _Model(score, scores.corrected_db, seen_db)
+        return ModelMetrics.of(
+            scores.views, gaussians=len(splats), bytes=path.stat().st_size,
+            render_ms=scores.render_ms, train_seconds=seconds,
+            gain_psnr_db=scores.corrected_db if self.gains else None, seen_psnr_db=seen_db)
 
     def counts(self) -> dict[str, Any]:
         """Returns how many views are scored, and the names of those that are not, for records."""
@@ -165,9 +153,9 @@ def run(
     means = evaluation.counts()
     for name, model in models.items():
         for key in ("psnr_db", "ssim", "gaussians"):
-            means[f"{name}_{key}"] = round(getattr(model.score, key), 4)
-        if evaluation.gains:
-            means[f"{name}_gain_psnr_db"] = round(model.corrected_db, 4)
+            means[f"{name}_{key}"] = round(getattr(model, key), 4)
+        if model.gain_psnr_db is not None:
+            means[f"{name}_gain_psnr_db"] = round(model.gain_psnr_db, 4)
     return EvaluateSummary(**means)
 
 
@@ -208,18 +196,17 @@ def _save(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 def _write(
-    evaluation: _Evaluation, models: Mapping[str, _Model], workspace: str, lacking: str
+    evaluation: _Evaluation, models: Mapping[str, ModelMetrics], workspace: str, lacking: str
 ) -> None:
     """Writes the scores as JSON and as tables; `lacking` is why LPIPS cannot be measured."""
-    out, held_out, gains = evaluation.out, evaluation.held_out, evaluation.gains
-    scores = {name: model.score for name, model in models.items()}
-    measured = next(iter(scores.values())).lpips is not None
+    out, held_out = evaluation.out, evaluation.held_out
+    measured = next(iter(models.values())).lpips is not None
     lacking = "" if measured else lacking or "views with a mask have none"
-    differences = {key: _difference(scores, key) for key in ("psnr_db", "ssim")} if len(
-        scores) == 2 else {}
+    differences = {key: _difference(models, key) for key in ("psnr_db", "ssim")} if len(
+        models) == 2 else {}
     masked = any(view.mask is not None for view in held_out)
     write_json(out / Metrics.FILE, Metrics(
-        models={name: _model_metrics(model, gains=gains) for name, model in models.items()},
+        models=models,
         pruned_minus_base=differences or None,
         psnr_convention=PSNR_CONVENTION, psnr_8bit_convention=PSNR_8BIT_CONVENTION,
         ssim_convention=SSIM_CONVENTION, ssim_padded_convention=SSIM_PADDED_CONVENTION,
@@ -229,48 +216,40 @@ def _write(
         **size_summary([view.camera for view in held_out]), **evaluation.counts(),
         imported_from=evaluation.import_record.file if evaluation.import_record else None,
     ).to_json())
-    table = list(scores.values())
+    by_label = {LABELS[name]: model for name, model in models.items()}
     note = evaluation.note(lacking)
-    for name, model in models.items():
-        if gains:
-            note += (f"{LABELS[name]}, after the best gain per channel of each view: "
-                     f"{model.corrected_db:.2f} dB\n")
-        note += f"{LABELS[name]}, {_gap(model, gains=gains)}\n"
+    for label, model in by_label.items():
+        if model.gain_psnr_db is not None:
+            note += (f"{label}, after the best gain per channel of each view: "
+                     f"{model.gain_psnr_db:.2f} dB\n")
+        note += f"{label}, {_gap(model)}\n"
     if differences:
         note += (f"pruned minus base: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
                  f"{differences['ssim'].text('+.4f')} (95% by bootstrap over the views)\n")
-    first = model_table(table)
+    first = model_table(by_label)
     write_bytes(out / "table.txt", f"{first.text(rule=True)}\n{note}".encode())
+    views = view_table(by_label)
     write_bytes(
-        out / "metrics.md", f"{first.markdown()}\n{view_table(table).markdown()}\n{note}".encode())
-    write_bytes(out / "metrics.csv", csv_table(scores).encode())
+        out / "metrics.md", f"{first.markdown()}\n{views.markdown()}\n{note}".encode())
+    write_bytes(out / "metrics.csv", csv_table(models).encode())
     tex = first.latex()
-    if len(scores) == 2:
-        tex += "\n" + paper_table({workspace: (scores["base"], scores["pruned"])}).latex()
+    if len(models) == 2:
+        tex += "\n" + paper_table({workspace: (models["base"], models["pruned"])}).latex()
     write_bytes(out / "metrics.tex", tex.encode())
 
 
-def _model_metrics(model: _Model, *, gains: bool) -> ModelMetrics:
-    score = model.score
-    return ModelMetrics(
-        psnr_db=score.psnr_db, psnr_8bit_db=score.psnr_8bit_db, ssim=score.ssim,
-        ssim_padded=score.ssim_padded, lpips=score.lpips, gaussians=score.gaussians,
-        bytes=score.bytes, render_ms=score.render_ms, train_seconds=score.train_seconds,
-        gain_psnr_db=model.corrected_db if gains else None, seen_psnr_db=model.seen_db,
-        views=score.views)
-
-
-def _difference(scores: Mapping[str, ModelScore], key: str) -> Interval:
+def _difference(models: Mapping[str, ModelMetrics], key: str) -> Interval:
     """Returns a score of pruned minus base, view by view, with an interval."""
-    return paired_bootstrap(*([getattr(view, key) for view in scores[model].views]
+    return paired_bootstrap(*([getattr(view, key) for view in models[model].views]
                               for model in ("pruned", "base")))
 
 
-def _gap(model: _Model, *, gains: bool) -> str:
+def _gap(model: ModelMetrics) -> str:
     """Returns how much better the views are that training saw."""
-    held_out = model.corrected_db if gains else model.score.psnr_db
-    splits = {**model.seen_db, "held out": held_out}
+    held_out = model.psnr_db if model.gain_psnr_db is None else model.gain_psnr_db
+    splits = {**model.seen_psnr_db, "held out": held_out}
     text = f"PSNR of {', '.join(f'{name} {value:.2f}' for name, value in splits.items())} dB"
-    if "training" not in model.seen_db:
+    if "training" not in model.seen_psnr_db:
         return text
-    return f"{text}: a gap of {model.seen_db['training'] - held_out:.2f} dB to the training views"
+    gap = model.seen_psnr_db["training"] - held_out
+    return f"{text}: a gap of {gap:.2f} dB to the training views"

@@ -5,7 +5,7 @@ import csv
 import pytest
 
 from recon_cli.evaluation.scores import (
-    ModelScore,
+    ModelMetrics,
     Table,
     ViewScore,
     csv_table,
@@ -21,32 +21,34 @@ def view(name, psnr_db, ssim, lpips=None):
 
 def scores():
     views = (view("a.png", 30.0, 0.9), view("b.png", 32.0, 0.8))
-    return {"base": ModelScore("3DGS", views, 1234, 5_000_000, 12.0, 60.0),
-            "pruned": ModelScore("ours", views, 600, 2_000_000, 6.0, None)}
+    return {"3DGS": ModelMetrics.of(views, gaussians=1234, bytes=5_000_000, render_ms=12.0,
+                                    train_seconds=60.0),
+            "ours": ModelMetrics.of(views, gaussians=600, bytes=2_000_000, render_ms=6.0)}
 
 
 def test_means_are_over_views():
-    assert scores()["base"].psnr_db == 31.0
-    assert scores()["base"].psnr_8bit_db == 30.99
-    assert scores()["base"].ssim == pytest.approx(0.85)
-    assert scores()["base"].ssim_padded == pytest.approx(0.86)
+    assert scores()["3DGS"].psnr_db == 31.0
+    assert scores()["3DGS"].psnr_8bit_db == 30.99
+    assert scores()["3DGS"].ssim == pytest.approx(0.85)
+    assert scores()["3DGS"].ssim_padded == pytest.approx(0.86)
 
 
 def test_lpips_has_no_mean_where_a_view_has_none():
-    half = ModelScore("x", (view("a", 30, 0.9, 0.1), view("b", 30, 0.9)), 1, 1, 1, 1)
-    whole = ModelScore("x", (view("a", 30, 0.9, 0.1), view("b", 30, 0.9, 0.3)), 1, 1, 1, 1)
+    half, whole = (
+        ModelMetrics.of((view("a", 30, 0.9, 0.1), view("b", 30, 0.9, lpips)), gaussians=1, bytes=1,
+                        render_ms=1) for lpips in (None, 0.3))
     assert half.lpips is None
     assert whole.lpips == pytest.approx(0.2)
-    assert "LPIPS" in model_table([half, whole]).headings
-    assert "LPIPS" not in model_table([half]).headings
+    assert "LPIPS" in model_table({"x": half, "y": whole}).headings
+    assert "LPIPS" not in model_table({"x": half}).headings
 
 
 def test_every_table_holds_the_same_figures():
-    table = model_table(list(scores().values()))
+    table = model_table(scores())
     assert table.rows[0] == (
         "3DGS", "31.00", "30.99", "0.8500", "0.8600", "1,234", "5.0", "12", "60")
     assert table.rows[1][-1] == "-"
-    assert view_table(list(scores().values())).rows[0] == (
+    assert view_table(scores()).rows[0] == (
         "a.png", "30.00", "30.00", "0.9000", "0.9000")
     rows = list(csv.DictReader(csv_table(scores()).splitlines()))
     assert [row["view"] for row in rows] == ["a.png", "b.png", "mean"] * 2
