@@ -26,7 +26,7 @@ class Interval(JsonRecord):
 
     @property
     def verdict(self) -> str:
-        """What an interval over seeds shows: higher, lower, no difference shown, or one seed."""
+        """The result of an interval over seeds: higher, lower, no difference shown, one seed."""
         if self.low is None or self.high is None:
             return "one seed"
         if self.low > 0:
@@ -61,11 +61,10 @@ class Spread:
 
 
 def paired_bootstrap(ours: Sequence[float], theirs: Sequence[float], *, seed: int = 0) -> Interval:
-    """Returns the mean of ours - theirs with its percentile interval.
+    """Returns the mean of ours - theirs with its percentile interval (bootstrap, Efron 1979).
 
-    Views are drawn with replacement, both models' scores of a view together (Efron 1979). The
-    interval speaks of other views of the same scene, and not of other scenes or other seeds; views
-    of one walk resemble each other, so it is rather too narrow.
+    Views are drawn with replacement, both models' scores of a view together. The interval is about
+    other views of the same scene, not other scenes or seeds; similar views make it too narrow.
     """
     pairs = np.array(ours, np.float64) - np.array(theirs, np.float64)
     mean = float(pairs.mean())
@@ -78,10 +77,9 @@ def paired_bootstrap(ours: Sequence[float], theirs: Sequence[float], *, seed: in
 
 
 def paired_t(ours: Sequence[float], theirs: Sequence[float]) -> Interval:
-    """Returns the mean of ours - theirs with its t interval.
+    """Returns the mean of ours - theirs with its t interval (Student 1908), paired by seed.
 
-    The differences are paired: the same seed on both sides. (Student 1908, "The probable error of
-    a mean".) The interval speaks of other seeds on the same scenes, not of other scenes.
+    The interval is about other seeds on the same scenes, not about other scenes.
     """
     pairs = [a - b for a, b in zip(ours, theirs, strict=True)]
     mean = statistics.fmean(pairs)

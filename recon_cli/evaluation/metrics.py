@@ -24,7 +24,7 @@ SSIM_PADDED_CONVENTION = (
 MASK_CONVENTION = (
     "ignored pixels have no part in the squared error; the map of SSIM is averaged over the others")
 LPIPS_CONVENTION = "LPIPS 0.1 with AlexNet, of the float render, lower is better"
-CONVENTIONS = {  # as JSON files hold them
+CONVENTIONS: dict[str, Any] = {  # as JSON files hold them
     "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
     "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION}
 CONVENTION_LINES = (  # below tables
@@ -41,18 +41,16 @@ Perceptual = Callable[[NDArray[np.float32], NDArray[np.uint8]], float]
 
 def leaves_enough(mask: NDArray[np.bool_] | None) -> bool:
     """Returns whether a mask [H, W] leaves MIN_PIXELS pixels off the border; None leaves all."""
-    return mask is None or int(np.count_nonzero(_cropped(mask))) >= MIN_PIXELS
+    return mask is None or int(np.count_nonzero(_crop(mask))) >= MIN_PIXELS
 
 
 def psnr(
     image: NDArray[Any], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
 ) -> float:
-    """Returns 10 log10(1 / MSE) in dB of an image clamped to [0, 1]; at most 100 dB.
+    """Returns 10 log10(1 / MSE) in dB of an image [H, W, 3], at most 100 dB.
 
-    Args:
-        image: [H, W, 3], in [0, 1] or of 8 bits.
-        truth: [H, W, 3].
-        mask: [H, W], True where a pixel counts; None where all do.
+    The image is of 8 bits, or float and clamped to [0, 1]; `mask` [H, W] is True where a pixel
+    counts.
     """
     error = _unit(image) - truth / 255.0
     if mask is not None:
@@ -77,18 +75,11 @@ def ssim(
     image: NDArray[np.float32], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None,
     *, padded: bool = False,
 ) -> float:
-    """Returns the structural similarity of an image clamped to [0, 1].
+    """Returns the structural similarity of an image [H, W, 3] clamped to [0, 1].
 
-    With a mask: the mean of the map over the pixels that count, of an image that is the truth
-    elsewhere. The truth under the mask lies in their windows; `io.images.fill_masked` makes it
-    neutral.
-
-    Args:
-        image: [H, W, 3].
-        truth: [H, W, 3].
-        mask: [H, W], True where a pixel counts; None where all do.
-        padded: zeros lie around both images and every pixel counts, as INRIA's scripts score it;
-            otherwise the border that windows reach over is left out.
+    With a mask [H, W]: the mean of the map over the pixels that count, of an image that is the
+    truth elsewhere. `padded` puts zeros around both images and scores every pixel, as INRIA's
+    scripts do; otherwise a border of half a window is left out.
 
     Raises:
         ValueError: the image is smaller than the 11-pixel window, or the mask leaves nothing.
@@ -97,7 +88,7 @@ def ssim(
         raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
     rendered, true = _unit(image), truth / 255.0
     if mask is not None:
-        if not _cropped(mask).any():
+        if not _crop(mask).any():
             raise ValueError("SSIM of a mask that leaves no pixel off the border")
         rendered = np.where(mask[..., None], rendered, true)
     if padded:  # what is cropped below is then the padding
@@ -107,13 +98,13 @@ def ssim(
     value, similarity = structural_similarity(
         rendered, true, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         data_range=1.0, channel_axis=-1, full=True)
-    return float(value if mask is None else _cropped(similarity)[_cropped(mask)].mean())
+    return float(value if mask is None else _crop(similarity)[_crop(mask)].mean())
 
 
 def load_lpips() -> tuple[Perceptual | None, str]:
     """Returns LPIPS of an image [H, W, 3] in [0, 1] and a truth, or None and why there is none.
 
-    (Zhang et al. 2018.) The weights of its backbone must already lie where torchvision keeps them.
+    (Zhang et al. 2018.) The weights of its backbone must be in torchvision's cache.
     """
     try:
         lpips: Any = importlib.import_module("lpips")
@@ -126,16 +117,12 @@ def load_lpips() -> tuple[Perceptual | None, str]:
     network = lpips.LPIPS(net="alex", verbose=False).eval()
 
     def distance(image: NDArray[np.float32], truth: NDArray[np.uint8]) -> float:
-        with torch.no_grad():
-            pair = [_centred(pixels) for pixels in (np.clip(image, 0, 1), truth / 255.0)]
-            return float(network(*pair))
+        with torch.no_grad():  # of [1, 3, H, W] in [-1, 1]
+            return float(network(*(
+                torch.from_numpy(pixels.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1
+                for pixels in (np.clip(image, 0, 1), truth / 255.0))))
 
     return distance, ""
-
-
-def _centred(image: NDArray[Any]) -> torch.Tensor:
-    """Returns an image in [0, 1] as [1, 3, H, W] in [-1, 1], which the network was trained on."""
-    return torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1
 
 
 def _unit(image: NDArray[Any]) -> NDArray[np.float64]:
@@ -144,6 +131,6 @@ def _unit(image: NDArray[Any]) -> NDArray[np.float64]:
     return np.asarray(unit, np.float64)
 
 
-def _cropped(pixels: NDArray[Any]) -> NDArray[Any]:
+def _crop(pixels: NDArray[Any]) -> NDArray[Any]:
     """Returns [H, W, ...] without the border that SSIM leaves out."""
     return pixels[_BORDER:-_BORDER, _BORDER:-_BORDER]

@@ -1,7 +1,6 @@
 """Reference views: photos at the size they are scored at, with masks, and scores against them.
 
-Everything is rendered on black. Views whose mask leaves too little to score are left out by
-whoever loads them here.
+Everything is rendered on black.
 """
 
 from __future__ import annotations
@@ -56,8 +55,8 @@ class RenderScores:
     """The scores of one model on reference views."""
 
     views: tuple[ViewScore, ...]
-    # Mean PSNR after the best gain per channel of each view: a model with exposures renders the
-    # mean one, and cannot know that of a view that it was not trained on.
+    # Mean PSNR after the best gain per channel of each view: a model with exposures does not know
+    # the exposure of a view that it was not trained on.
     corrected_db: float
     render_ms: float  # median milliseconds a view
 
@@ -86,10 +85,7 @@ def load_reference_views(
 ) -> list[ReferenceView]:
     """Returns views with their original pixels, without those whose mask leaves too little.
 
-    Args:
-        views: of a scene.
-        max_size: longest side in pixels.
-        ctx: gets a notice that names the views left out; None for no notice.
+    `max_size` is the longest side in pixels; `ctx`, if any, gets a notice of views left out.
 
     Raises:
         ConfigError: they are smaller than the window of SSIM.
@@ -132,15 +128,13 @@ def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[
 
 
 def notice_hidden(names: Sequence[str], consequence: str, ctx: StageContext) -> None:
-    """Tells which views are left out because of their masks, and what that means for them."""
+    """Gives notice of the views that are left out because of their masks."""
     if names:
         ctx.notice(f"{len(names)} views are {consequence}: their masks leave fewer than "
                    f"{MIN_PIXELS} pixels: {', '.join(names)}")
 
 
-def render_on_black(
-    splats: Splats, camera: Camera, sh_degree: int, backend: str
-) -> RenderOutput:
+def render_on_black(splats: Splats, camera: Camera, sh_degree: int, backend: str) -> RenderOutput:
     """Returns a view of a model on black, without gradients, on the device of the model."""
     with torch.no_grad():
         black = torch.zeros(3, device=splats.means.device)
@@ -152,23 +146,23 @@ def score_views(
     *, perceptual: Perceptual | None = None,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _image: None,
 ) -> RenderScores:
-    """Renders every view of one model and returns its scores.
+    """Renders every view, at least one, of a model and returns its scores.
 
-    Args:
-        splats: the model.
-        views: to score, at least one.
-        sh_degree: in use.
-        backend: name of a rasterizer.
-        perceptual: LPIPS, where it is available.
-        on_view: gets each view and its render [H, W, 3], not clamped.
+    `perceptual` is LPIPS, where available; `on_view` gets each view and its render [H, W, 3], not
+    clamped.
     """
     scores, milliseconds, corrected = [], [], []
     for view in views:
         start = time.perf_counter()
         image = _pixels(splats, view, sh_degree, backend)
         milliseconds.append(1e3 * (time.perf_counter() - start))
-        scores.append(_view_score(view, image, perceptual))
-        corrected.append(corrected_psnr(image, view.image, view.mask))
+        photo, mask = view.image, view.mask
+        scores.append(ViewScore(
+            view.name, psnr(image, photo, mask), psnr(to_uint8(image), photo, mask),
+            ssim(image, photo, mask), ssim(image, photo, mask, padded=True),
+            perceptual(image, photo) if perceptual is not None and mask is None else None,
+            None if mask is None else float(mask.mean())))
+        corrected.append(corrected_psnr(image, photo, mask))
         on_view(view, image)
     return RenderScores(
         tuple(scores), statistics.fmean(corrected), statistics.median(milliseconds))
@@ -202,10 +196,7 @@ def mean_score(
 def mean_psnr_on_device(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str
 ) -> float:
-    """Returns the mean PSNR in dB over views, at least one, computed where the model lies.
-
-    In float32, which is what a running training can afford; `mean_psnr` computes in float64.
-    """
+    """Returns the mean PSNR in dB over views, at least one, in float32 on the model's device."""
     device = splats.means.device
     values = []
     with torch.no_grad():
@@ -218,34 +209,14 @@ def mean_psnr_on_device(
     return float(np.mean(values))
 
 
-def _pixels(
-    splats: Splats, view: TrainView, sh_degree: int, backend: str
-) -> NDArray[np.float32]:
+def _pixels(splats: Splats, view: TrainView, sh_degree: int, backend: str) -> NDArray[np.float32]:
     """Returns the render [H, W, 3] of a view; waits for the device."""
-    image: NDArray[np.float32] = render_on_black(
-        splats, view.camera, sh_degree, backend).rgb.cpu().numpy()
-    return image
-
-
-def _view_score(
-    view: ReferenceView, image: NDArray[np.float32], perceptual: Perceptual | None
-) -> ViewScore:
-    """Returns the scores of a render [H, W, 3]; LPIPS only of views without a mask."""
-    mask = view.mask
-    distance = None
-    if perceptual is not None and mask is None:
-        distance = perceptual(image, view.image)
-    return ViewScore(
-        view.name, psnr(image, view.image, mask), psnr(to_uint8(image), view.image, mask),
-        ssim(image, view.image, mask), ssim(image, view.image, mask, padded=True), distance,
-        None if mask is None else float(mask.mean()))
+    output = render_on_black(splats, view.camera, sh_degree, backend)
+    return np.asarray(output.rgb.cpu().numpy(), np.float32)
 
 
 def reference_digest(views: Sequence[ReferenceView]) -> str:
-    """Returns a digest of all that models are compared with: names, lenses, pixels, masks.
-
-    Scores of two models can be paired where theirs are equal.
-    """
+    """Returns a digest of names, lenses, pixels and masks; scores with equal ones can be paired."""
     digest = hashlib.sha256()
     for view in views:
         camera = view.camera

@@ -125,14 +125,14 @@ class SweepTrial(JsonRecord):
     recovered: MeanScore  # at the end
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sweep(JsonRecord):
     """The content of sweep.json, which `recon prune --sweep` writes."""
 
     FILE: ClassVar[str] = "sweep.json"
     CONTROL: ClassVar[str] = "none"  # the score of trials that remove nothing
 
-    of_train: str | None  # digest of the training it started from; None in files of older versions
+    of_train: str | None = None  # digest of the training; None in files of older versions
     validation_views: int
     at: str
     rounds: int

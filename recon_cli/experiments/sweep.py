@@ -64,8 +64,9 @@ def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
             trials = sweep(source, ratios, on_trial=bar.advance)
         train = job.workspace.manifest("train")
         atomic.write_json(root / Sweep.FILE, Sweep(
-            train.digest if train else None, views, config.at, source.rounds, steps, config.score,
-            before, tuple(trials)).to_json())
+            of_train=train.digest if train else None, validation_views=views, at=config.at,
+            rounds=source.rounds, recovery_steps=steps, equal_seconds_of=config.score,
+            before=before, trials=tuple(trials)).to_json())
         draw_if_possible(lambda path: draw(trials, before.psnr_db, path), root / PICTURE)
     return (
         f"PSNR in dB and SSIM on {views} validation views, right after the last removal and after "

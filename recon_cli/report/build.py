@@ -14,6 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
+from recon_cli.evaluation.scores import Metrics
 from recon_cli.pipeline.execute import Job, last_sources
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.capture import read_capture
@@ -28,10 +29,9 @@ from recon_cli.report.gallery import (
     legend_stops,
 )
 from recon_cli.report.headline import build_headline, format_facts
-from recon_cli.report.records import LABELS, Metrics, build_scores, read_metrics
+from recon_cli.report.records import LABELS, build_scores, read_metrics
 from recon_cli.report.stage_status import (
-    StageStatus,
-    Statuses,
+    StageReports,
     inspect_stages,
     read_decisions,
     read_provenance,
@@ -47,10 +47,10 @@ _TEXT_PER_VIEW = 1_000  # bytes around a view's pictures, at most
 
 
 def write_report(job: Job, out: Path | None) -> str:
-    """Writes the report of a workspace and returns its path and size, in words.
+    """Writes the report of a workspace, which is only read, and returns its path and size.
 
     Args:
-        job: its workspace is only read; no stage runs.
+        job: its workspace.
         out: the file; None is report.html in the workspace.
 
     Raises:
@@ -97,29 +97,24 @@ def _check_path(job: Job, path: Path) -> None:
 def build_report(job: Job) -> bytes:
     """Returns the page of a workspace in UTF-8, at most MAX_FILE_BYTES long."""
     stages = inspect_stages(job)
-    metrics, damaged = _read_metrics(stages["evaluate"])
+    metrics, damaged = None, ""
+    if stages["evaluate"].there:
+        try:
+            metrics = read_metrics(stages["evaluate"].folder)
+        except FormatError as error:
+            damaged = f"The scores are not shown: {error.message}"
     values = _template_values(job, stages, metrics, damaged)
     views = sum(len(model.views) for model in metrics.models.values()) if metrics else 0
     if not views or metrics is None:
         return _render_page(values, Gallery())
-    # the text is rendered once without pictures to know exactly how much room it leaves
+    # rendered once without pictures to know how much room the text leaves
     text = len(_render_page(values, Gallery())) + _TEXT_PER_VIEW * views
     return _render_page(values, build_gallery(
         stages["evaluate"].folder, metrics, MAX_FILE_BYTES - text, job.progress))
 
 
-def _read_metrics(evaluate: StageStatus) -> tuple[Metrics | None, str]:
-    """Returns the scores, or None and why they cannot be read; no reason if there are none."""
-    if not evaluate.there:
-        return None, ""
-    try:
-        return read_metrics(evaluate.folder), ""
-    except FormatError as error:
-        return None, f"The scores are not shown: {error.message}"
-
-
 def _template_values(
-    job: Job, stages: Statuses, metrics: Metrics | None, damaged: str
+    job: Job, stages: StageReports, metrics: Metrics | None, damaged: str
 ) -> dict[str, Any]:
     """Returns what the template shows, except for the views."""
     root = job.workspace.root

@@ -1,4 +1,8 @@
-"""The capture on the page: contact sheets or thumbnails, the strip of frames, the floor plan."""
+"""The capture on the page: contact sheets or thumbnails, the strip of frames, the floor plan.
+
+On the plan, points are one density image, whose size does not depend on their number; a camera is a
+mark with a line in its viewing direction.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,7 +24,7 @@ from recon_cli.io.images import fit_image, read_png
 from recon_cli.io.records import FOLDER, Frame, read_frame_list
 from recon_cli.report.chart import draw_mark, legend_item
 from recon_cli.report.gallery import data_uri, encode_sheet
-from recon_cli.report.stage_status import Statuses
+from recon_cli.report.stage_status import StageReports
 from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene, View
 from recon_cli.workspace.summaries import SfmSummary
@@ -29,6 +32,17 @@ from recon_cli.workspace.summaries import SfmSummary
 _SHEETS = 4  # contact sheets on the page; a capture may have many sources
 _THUMBS, _THUMB_SIDE, _THUMB_QUALITY = 24, 220, 72
 _STRIP_HEIGHT = 34  # pixels of the strip of frames
+WIDTH = 640  # pixels of plan and strip; the page scales them
+_MAX_HEIGHT = 560
+_MARGIN = 26  # pixels around the plan
+_CELL = 2  # pixels of the plan in a cell of the density image
+_PERCENTILES = (2.0, 98.0)  # of the points that fit in; outliers may lie far away
+_GRAY = 128  # of the points: visible on white and on black
+_MANY_CAMERAS = 150  # from which on marks are smaller
+_BAR = 0.25  # of the width that the scale bar takes at most
+# (color, mark) of the page's charts; green and blue are those of the contact sheet
+PARTS = {"training": (2, "circle"), "validation": (5, "square"), "held out": (0, "diamond")}
+LOST = (3, "cross")
 
 
 @dataclass(frozen=True)
@@ -45,7 +59,7 @@ class Capture:
     damaged: tuple[str, ...]  # why something is not shown
 
 
-def read_capture(stages: Statuses) -> Capture:
+def read_capture(stages: StageReports) -> Capture:
     """Returns the capture of a workspace, as far as its files can be read."""
     ingest = stages["ingest"]
     damaged: list[str] = []
@@ -56,7 +70,10 @@ def read_capture(stages: Statuses) -> Capture:
         paths = sorted(ingest.folder.glob("*contact.png"))
         sheets = [encode_sheet(read_png(path)) for path in paths[:_SHEETS]]
         more = len(paths) - len(sheets)
-        thumbs = [] if sheets else _read_thumbs(ingest.folder, frames)
+        some = () if sheets else frames[:: max(1, -(-len(frames) // _THUMBS))]
+        thumbs = [(frame.name, data_uri(fit_image(
+            read_png(ingest.folder / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY))
+            for frame in some]
     except (FormatError, OSError) as error:
         damaged.append(f"The frames are not shown: {error}")
     scene = None
@@ -66,22 +83,18 @@ def read_capture(stages: Statuses) -> Capture:
         except (FormatError, OSError) as error:
             damaged.append(f"The plan is not shown: {error}")
     plan, notes = _draw_plan(scene, stages["sfm"].read_summary(SfmSummary)) if scene else (None, ())
-    parts = _part_of_each(frames, scene)
+    by_name = {view.name: part for part, views in by_part(scene).items()
+               for view in views} if scene else {
+        frame.name: "held out" if frame.held_out else "training" for frame in frames}
+    parts = [by_name.get(frame.name, "lost") for frame in frames]
     return Capture(
         tuple(sheets), more, tuple(thumbs), plan, notes,
         _draw_strip(frames, parts) if frames else None, _draw_legend(parts) if frames else None,
         tuple(damaged))
 
 
-def _read_thumbs(folder: Path, frames: Sequence[Frame]) -> list[tuple[str, Markup]]:
-    some = frames[:: max(1, -(-len(frames) // _THUMBS))]
-    return [(frame.name, data_uri(
-        fit_image(read_png(folder / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY))
-        for frame in some]
-
-
-def _read_scene(stages: Statuses, frames: Sequence[Frame]) -> Scene:
-    """Returns cameras and points, split as training splits them."""
+def _read_scene(stages: StageReports, frames: Sequence[Frame]) -> Scene:
+    """Returns cameras and points, with the split of the training."""
     train = stages["train"].manifest
     share = train.key.config.get("validation") if train else None
     return read_scene(
@@ -103,26 +116,17 @@ def _draw_plan(scene: Scene, sfm: SfmSummary | None) -> tuple[Markup, tuple[str,
     return draw_plan(scene, axes, metres=metres), tuple(notes)
 
 
-def _part_of_each(frames: Sequence[Frame], scene: Scene | None) -> list[str]:
-    """Returns the part that each frame belongs to; without a mapping only what is held out."""
-    if scene is None:
-        return ["held out" if frame.held_out else "training" for frame in frames]
-    parts = {view.name: part for part, views in by_part(scene).items()
-             for view in views}
-    return [parts.get(frame.name, "lost") for frame in frames]
-
-
 def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
     """Returns one bar for each frame in order; held-out and lost frames are taller."""
     step, bars = WIDTH / len(frames), []
     heights = {"training": 14, "validation": 20, "held out": 28, "lost": 28}
-    for at, (frame, part) in enumerate(zip(frames, parts, strict=True)):
+    for i, (frame, part) in enumerate(zip(frames, parts, strict=True)):
         color = (PARTS.get(part) or LOST)[0]
         time = "" if frame.time_seconds is None else f", {frame.time_seconds:g} s"
         bars.append(Markup(
             '<rect class="part c{}{}" x="{:.2f}" y="{}" width="{:.2f}" height="{}">'
             "<title>{}</title></rect>").format(
-                color, " hollow" if part == "lost" else "", at * step,
+                color, " hollow" if part == "lost" else "", i * step,
                 _STRIP_HEIGHT - heights[part], max(0.6, 0.8 * step), heights[part],
                 f"{frame.name} ({part}{time})"))
     return Markup(
@@ -139,37 +143,6 @@ def _draw_legend(parts: Sequence[str]) -> Markup:
     return Markup('<ul class="legend">{}</ul>').format(Markup("").join(
         legend_item(f"{counts[part]:,} {texts[part]}", draw_mark(shape, 13, 7, 4.5, color))
         for part, (color, shape) in marks.items() if part in counts))
-
-
-WIDTH = 640  # pixels of the drawing; the page scales it
-
-
-_MOST_HEIGHT = 560
-
-
-_MARGIN = 26  # pixels around the content
-
-
-_CELL = 2  # pixels of the drawing in a cell of the density image
-
-
-_SHARE = (2.0, 98.0)  # percentiles of the points that fit in; outliers may lie far away
-
-
-_GRAY = 128  # of the points: visible on white and on black
-
-
-_MANY = 150  # cameras from which on marks are smaller
-
-
-_BAR = 0.25  # of the width that the scale bar takes at most
-
-
-# (color, mark) of the page's charts; green and blue are those of the contact sheet
-PARTS = {"training": (2, "circle"), "validation": (5, "square"), "held out": (0, "diamond")}
-
-
-LOST = (3, "cross")
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +172,8 @@ def draw_plan(scene: Scene, axes: PlanAxes, *, metres: bool) -> Markup:
     parts = by_part(scene)
     centers = np.stack([view.camera.center for views in parts.values() for view in views])
     points, places = scene.points @ axes.axes.T, centers @ axes.axes.T
-    layout = _fit_layout(*_bounds(points, places))
-    size = 3.0 if len(centers) > _MANY else 4.5
+    layout = _fit_layout(points, places)
+    size = 3.0 if len(centers) > _MANY_CAMERAS else 4.5
     marks = [_draw_camera(view, axes, layout, part, size)
              for part, views in parts.items() for view in views]
     bar = _draw_scale_bar(layout) if metres else Markup("")
@@ -215,18 +188,8 @@ def by_part(scene: Scene) -> Mapping[str, Sequence[View]]:
     return dict(zip(PARTS, (scene.train, scene.validation, scene.test), strict=True))
 
 
-def _bounds(
-    points: NDArray[np.float64], places: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the corners [2] of the plan: every camera and nearly all points lie within."""
-    most = np.percentile(points, _SHARE, axis=0) if len(points) else places
-    low, high = (np.minimum(most.min(0), places.min(0)), np.maximum(most.max(0), places.max(0)))
-    room = np.maximum(0.02 * (high - low), 1e-6 + 0.02 * float((high - low).max()))
-    return low - room, high + room
-
-
 @dataclass(frozen=True, eq=False)
-class _Layout:
+class _PlanLayout:
     """Maps plan coordinates to the drawing."""
 
     scale: float  # pixels a unit
@@ -239,16 +202,20 @@ class _Layout:
         return np.stack([pixels[..., 0], self.height - pixels[..., 1]], axis=-1)
 
 
-def _fit_layout(low: NDArray[np.float64], high: NDArray[np.float64]) -> _Layout:
-    """Returns the layout that centres a box and draws it as large as possible."""
-    size, room = high - low, np.array([WIDTH, _MOST_HEIGHT]) - 2 * _MARGIN
-    scale = float((room / size).min())
+def _fit_layout(points: NDArray[np.float64], places: NDArray[np.float64]) -> _PlanLayout:
+    """Returns the largest centred layout of every camera [C, 2] and nearly all points [N, 2]."""
+    most = np.percentile(points, _PERCENTILES, axis=0) if len(points) else places
+    low, high = np.minimum(most.min(0), places.min(0)), np.maximum(most.max(0), places.max(0))
+    room = np.maximum(0.02 * (high - low), 1e-6 + 0.02 * float((high - low).max()))
+    low, high = low - room, high + room
+    size = high - low
+    scale = float(((np.array([WIDTH, _MAX_HEIGHT]) - 2 * _MARGIN) / size).min())
     height = round(float(size[1]) * scale) + 2 * _MARGIN
     middle = np.array([WIDTH, height]) / 2
-    return _Layout(scale, (low + high) / 2 - middle / scale, height)
+    return _PlanLayout(scale, (low + high) / 2 - middle / scale, height)
 
 
-def _draw_density(points: NDArray[np.float64], layout: _Layout) -> Markup:
+def _draw_density(points: NDArray[np.float64], layout: _PlanLayout) -> Markup:
     """Returns the points as an image whose opacity grows with the logarithm of their number."""
     rows, columns = math.ceil(layout.height / _CELL), math.ceil(WIDTH / _CELL)
     pixels = layout.at(points)
@@ -264,7 +231,7 @@ def _draw_density(points: NDArray[np.float64], layout: _Layout) -> Markup:
         columns * _CELL, rows * _CELL, base64.b64encode(data.tobytes()).decode())
 
 
-def _draw_camera(view: View, axes: PlanAxes, layout: _Layout, part: str, size: float) -> Markup:
+def _draw_camera(view: View, axes: PlanAxes, layout: _PlanLayout, part: str, size: float) -> Markup:
     color, shape = PARTS[part]
     camera = view.camera
     x, y = map(float, layout.at(axes.axes @ camera.center))
@@ -276,7 +243,7 @@ def _draw_camera(view: View, axes: PlanAxes, layout: _Layout, part: str, size: f
     return line + draw_mark(shape, x, y, radius, color, f"{view.name} ({part})")
 
 
-def _draw_scale_bar(layout: _Layout) -> Markup:
+def _draw_scale_bar(layout: _PlanLayout) -> Markup:
     """Returns a bar of 1, 2 or 5 times a power of ten of metres."""
     most = _BAR * WIDTH / layout.scale
     power = 10.0 ** math.floor(math.log10(most))

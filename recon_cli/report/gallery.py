@@ -1,7 +1,7 @@
 """The held-out views for the slider: truth, render and difference, within a budget of bytes.
 
-One HTML file holds all pictures and must stay small enough to be mailed. Pictures are WebP in data
-URIs; where they do not fit, sizes and then qualities go down until they do.
+Pictures are WebP in data URIs of one HTML file that is small enough for e-mail; sizes and then
+qualities are reduced until they fit.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.io.images import fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
-from recon_cli.report.records import Metrics, ViewRow
 
 MAX_FILE_BYTES = 15_000_000
 GAIN = 4  # of a difference, as in evaluate/difference
@@ -35,8 +35,8 @@ class Encoding:
     quality: int
 
 
-# Tried in this order until the budget holds. At 86 no difference is seen at arm's length; sizes go
-# down before qualities do, since what a slider compares is blur, not pixels.
+# Tried in this order until the budget holds. Quality 86 looks lossless; sizes are reduced before
+# qualities, because a slider compares blur, not pixels.
 ENCODINGS = (
     Encoding(1600, 86), Encoding(1200, 84), Encoding(900, 82), Encoding(680, 80),
     Encoding(560, 78), Encoding(480, 75), Encoding(420, 73), Encoding(360, 70), Encoding(300, 66),
@@ -46,7 +46,7 @@ _SHEET_BYTES = 900_000
 _SAMPLE = 3  # views whose size is taken for that of all
 _SAFE = 0.92  # of the budget that an estimate may fill
 
-_ViewScores = Mapping[str, ViewRow]  # of one view, by model
+_ViewScores = Mapping[str, ViewScore]  # of one view, by model
 
 
 @dataclass(frozen=True)
@@ -96,15 +96,15 @@ class _ViewPixels:
 def build_gallery(
     folder: Path, metrics: Metrics, budget: int, progress: Progress | None = None
 ) -> Gallery:
-    """Returns the held-out views as large as the budget allows; if need be, fewer of them.
+    """Returns the held-out views in evaluate's folder as large as `budget` bytes allow.
 
-    Args:
-        folder: of evaluate.
-        metrics: its scores.
-        budget: bytes of the file that pictures of views may take.
-        progress: shows a bar; None for none.
+    The best views are left out where not all fit at the lowest quality.
     """
-    order = _sort_worst_first(metrics)
+    by_name: dict[str, dict[str, ViewScore]] = {}
+    for key, model in metrics.models.items():
+        for view in model.views:
+            by_name.setdefault(view.name, {})[key] = view
+    order = sorted(by_name.values(), key=lambda scores: next(iter(scores.values())).psnr_db)
     sample = [pixels for _, pixels in _iterate(folder, order[:: max(1, len(order) // _SAMPLE)])]
     for encoding in ENCODINGS:
         last = encoding == ENCODINGS[-1]
@@ -139,14 +139,6 @@ def _encode_all(
     return Gallery(tuple(views), full, encoding if views else None, left_out, tuple(damaged))
 
 
-def _sort_worst_first(metrics: Metrics) -> list[_ViewScores]:
-    by_name: dict[str, dict[str, ViewRow]] = {}
-    for key, model in metrics.models.items():
-        for view in model.views:
-            by_name.setdefault(view.name, {})[key] = view
-    return sorted(by_name.values(), key=lambda scores: next(iter(scores.values())).psnr_db)
-
-
 def _name(scores: _ViewScores) -> str:
     return next(iter(scores.values())).name
 
@@ -154,7 +146,7 @@ def _name(scores: _ViewScores) -> str:
 def _iterate(
     folder: Path, order: Sequence[_ViewScores], damaged: list[str] | None = None
 ) -> Iterator[tuple[_ViewScores, _ViewPixels]]:
-    """Yields the views whose pictures can be read; appends why others cannot to `damaged`."""
+    """Yields the readable views; appends why others cannot be read to `damaged`."""
     for scores in order:
         try:
             yield scores, _read_pixels(folder, scores)
@@ -164,7 +156,7 @@ def _iterate(
 
 
 def _read_pixels(folder: Path, scores: _ViewScores) -> _ViewPixels:
-    # only the last part of a name counts: metrics.json may have been changed by hand
+    # only the last part of a name: metrics.json may have been edited by hand
     file = f"{Path(_name(scores)).stem}.png"
     truth = read_png(folder / "truth" / file)
     renders = {key: read_png(folder / "renders" / key / file) for key in scores}
@@ -225,16 +217,10 @@ def draw_difference(
     truth: NDArray[np.uint8], render: NDArray[np.uint8], hidden: NDArray[np.bool_] | None,
     longest: int,
 ) -> NDArray[np.uint8]:
-    """Returns the error of a render in colours, RGB [h, w, 3].
+    """Returns the error of a render in colours, RGB [h, w, 3], with a longest side of `longest`.
 
-    The mean absolute difference of the channels is taken at full size, then reduced by area, so
-    that a picture of any size shows the same error.
-
-    Args:
-        truth: [H, W, 3].
-        render: [H, W, 3].
-        hidden: [H, W], True where a mask ignores the pixel.
-        longest: longest side of the picture.
+    The mean absolute difference of the channels is computed at full size, then reduced by area, so
+    that a picture of any size shows the same error. `hidden` [H, W] are the masked pixels.
     """
     difference = cv2.absdiff(truth, render)
     # channel by channel: a mean over the last axis takes six times as long

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from recon_cli.evaluation.scores import Metrics
 from recon_cli.progress import format_duration, format_megabytes
-from recon_cli.report.records import BASE, PRUNED, Metrics
-from recon_cli.report.stage_status import StageStatus, Statuses
-from recon_cli.workspace.summaries import IngestSummary, SfmSummary
+from recon_cli.report.records import BASE, PRUNED
+from recon_cli.report.stage_status import StageReport, StageReports
+from recon_cli.workspace.summaries import IngestSummary, PruneSummary, SfmSummary, TrainSummary
 
 _KINDS = {
     "video": "a video", "photos": "photos", "mixed": "videos and photos",
@@ -33,7 +34,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class PosesVerdict:
     """Whether the camera poses can be trusted."""
 
     level: str  # good, warn or unknown
@@ -48,11 +49,11 @@ class Headline:
     kind: str  # of the capture, in words
     sources: tuple[str, ...]  # names of the inputs
     tiles: tuple[Tile, ...]
-    verdict: Verdict
+    verdict: PosesVerdict
     gone: tuple[str, ...]  # inputs that no longer exist
 
 
-def build_headline(stages: Statuses, metrics: Metrics | None) -> Headline:
+def build_headline(stages: StageReports, metrics: Metrics | None) -> Headline:
     """Returns the top of the page of a workspace that has an ingest."""
     ingest = stages["ingest"]
     sources = ingest.manifest.key.sources if ingest.manifest else ()
@@ -60,102 +61,79 @@ def build_headline(stages: Statuses, metrics: Metrics | None) -> Headline:
     kind = summary.kind if summary else ""
     return Headline(
         _KINDS.get(kind, kind), tuple(Path(source.path).name for source in sources),
-        tuple(_tiles(stages, metrics)), judge_poses(stages["sfm"]), ingest.gone)
+        tuple(_build_tiles(stages, metrics)), judge_poses(stages["sfm"]), ingest.gone)
 
 
-def judge_poses(sfm: StageStatus) -> Verdict:
+def judge_poses(sfm: StageReport) -> PosesVerdict:
     """Returns the verdict of sfm on its own result."""
     if not sfm.there:
-        return Verdict("unknown", "There are no camera poses yet.")
+        return PosesVerdict("unknown", "There are no camera poses yet.")
     summary = sfm.read_summary(SfmSummary)
     if summary is None:
-        return Verdict("unknown", "The camera poses are from another version of recon.")
+        return PosesVerdict("unknown", "The camera poses are from another version of recon.")
     count = f"{summary.registered:,} of {summary.frames:,} frames have a camera"
-    lines = (*summary.lines, *_left_out(summary), *summary.world.sentences)
+    lines = (*summary.lines, *(f"{name} was removed from the model: {reason}."
+                               for name, reason in summary.rejected.items()))
+    if summary.apart:
+        counts = ", ".join(str(len(part)) for part in summary.apart)
+        lines += (f"The capture has disconnected parts; left out are parts of {counts} frames.",)
+    lines += summary.world.sentences
     if summary.trusted is None:
         whose = "; the poses came with the data set" if summary.poses else ""
-        return Verdict("unknown", f"{count}{whose}.", lines)
+        return PosesVerdict("unknown", f"{count}{whose}.", lines)
     if summary.trusted:
-        return Verdict("good", f"The camera poses can be trusted: {count}.", lines[1:])
-    return Verdict("warn", f"The camera poses cannot be trusted, although {count}.", lines[1:])
+        return PosesVerdict("good", f"The camera poses can be trusted: {count}.", lines[1:])
+    return PosesVerdict("warn", f"The camera poses cannot be trusted, although {count}.", lines[1:])
 
 
-def _left_out(summary: SfmSummary) -> list[str]:
-    lines = [f"{name} was removed from the model: {reason}."
-             for name, reason in summary.rejected.items()]
-    if summary.apart:
-        lines.append("The capture has disconnected parts; left out are parts of "
-                     f"{', '.join(str(len(part)) for part in summary.apart)} frames.")
-    return lines
-
-
-def _tiles(stages: Statuses, metrics: Metrics | None) -> list[Tile]:
+def _build_tiles(stages: StageReports, metrics: Metrics | None) -> Iterator[Tile]:
     ingest, sfm, train, prune = (stages[name] for name in ("ingest", "sfm", "train", "prune"))
+    frames = ingest.read_summary(IngestSummary)
+    yield Tile("frames", f"{frames.frames:,}" if frames else _LACKING, (
+        f"{frames.width}x{frames.height}, {frames.held_out:,} held out" if frames
+        else "cannot be read"), not ingest.fresh)
+    cameras = sfm.read_summary(SfmSummary)
+    share = (f"{cameras.registered / cameras.frames:.0%} of the frames"
+             if cameras and cameras.frames else "")
+    yield _stage_tile(
+        sfm, "registered", f"{cameras.registered:,}" if cameras else _LACKING, share)
+    pruned = f"pruned {_count(prune, PruneSummary)}" if prune.there else ""
+    if pruned and train.fresh:  # if training is stale too, its tile says so already
+        pruned += prune.stale_suffix
+    yield _stage_tile(train, "Gaussians", _count(train, TrainSummary), pruned)
+    yield from _score_tiles(stages["evaluate"], metrics)
     run = train.manifest.run if train.manifest else None
-    return [
-        _frame_tile(ingest), _camera_tile(sfm),
-        _stage_tile(
-            train, "Gaussians", _count(train.summary, "gaussians"), _pruned_count(train, prune)),
-        *_score_tiles(stages["evaluate"], metrics),
-        _stage_tile(
-            train, "training", format_duration(run.seconds) if run else "",
-            f"peak {format_megabytes(run.peak_memory_bytes)}" if run else "")]
+    yield _stage_tile(
+        train, "training", format_duration(run.seconds) if run else "",
+        f"peak {format_megabytes(run.peak_memory_bytes)}" if run else "")
 
 
-def _frame_tile(ingest: StageStatus) -> Tile:
-    summary = ingest.read_summary(IngestSummary)
-    if summary is None:
-        return Tile("frames", _LACKING, "cannot be read", not ingest.fresh)
-    size = f"{summary.width}x{summary.height}, {summary.held_out:,} held out"
-    return Tile("frames", f"{summary.frames:,}", size, not ingest.fresh)
-
-
-def _camera_tile(sfm: StageStatus) -> Tile:
-    summary = sfm.read_summary(SfmSummary)
-    if summary is None:
-        return _stage_tile(sfm, "registered", _LACKING, "")
-    share = f"{summary.registered / summary.frames:.0%} of the frames" if summary.frames else ""
-    return _stage_tile(sfm, "registered", f"{summary.registered:,}", share)
-
-
-def _stage_tile(stage: StageStatus, label: str, value: str, detail: str) -> Tile:
+def _stage_tile(stage: StageReport, label: str, value: str, detail: str) -> Tile:
     if not stage.there:
         return Tile(label, _LACKING, f"{stage.name} is {stage.state}")
     return Tile(label, value, detail, not stage.fresh)
 
 
-def _pruned_count(train: StageStatus, prune: StageStatus) -> str:
-    """Returns the count of the pruned model; empty where there is none."""
-    if not prune.there:
-        return ""
-    # if training is stale too, its tile says so already
-    suffix = prune.stale_suffix if train.fresh else ""
-    return f"pruned {_count(prune.summary, 'gaussians')}{suffix}"
+def _count(stage: StageReport, kind: type[TrainSummary] | type[PruneSummary]) -> str:
+    summary = stage.read_summary(kind)
+    return f"{summary.gaussians:,}" if summary else _LACKING
 
 
-def _score_tiles(evaluate: StageStatus, metrics: Metrics | None) -> list[Tile]:
+def _score_tiles(evaluate: StageReport, metrics: Metrics | None) -> Iterator[Tile]:
     if metrics is None or not metrics.models:
-        text = f"evaluate is {evaluate.state}" if not evaluate.there else "cannot be read"
-        return [Tile("held-out PSNR", _LACKING, text), Tile("held-out SSIM", _LACKING, text)]
+        text = "cannot be read" if evaluate.there else f"evaluate is {evaluate.state}"
+        yield from (Tile(f"held-out {name}", _LACKING, text) for name in ("PSNR", "SSIM"))
+        return
     first = next(iter(metrics.models.values()))
     pruned = metrics.models.get(PRUNED) if BASE in metrics.models else None
-    return [
-        Tile("held-out PSNR", f"{first.psnr_db:.2f} dB",
-             f"pruned {pruned.psnr_db:.2f} dB" if pruned else "", not evaluate.fresh),
-        Tile("held-out SSIM", f"{first.ssim:.4f}",
-             f"pruned {pruned.ssim:.4f}" if pruned else "", not evaluate.fresh)]
-
-
-def _count(summary: Mapping[str, Any], key: str) -> str:
-    value = summary.get(key)
-    return f"{value:,}" if isinstance(value, int) else _LACKING
+    yield Tile("held-out PSNR", f"{first.psnr_db:.2f} dB",
+               f"pruned {pruned.psnr_db:.2f} dB" if pruned else "", not evaluate.fresh)
+    yield Tile("held-out SSIM", f"{first.ssim:.4f}",
+               f"pruned {pruned.ssim:.4f}" if pruned else "", not evaluate.fresh)
 
 
 def format_facts(summary: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Returns (label, figure) for everything in a summary that is one number or word.
-
-    Memory that was not used is left out: a CPU has no GPU peak.
-    """
+    """Returns (label, figure) for each number or word of a summary, without unused memory."""
     return tuple(
         _format_fact(name, value) for name, value in summary.items()
         if value is not None and value != "" and not isinstance(value, (list, dict))

@@ -1,4 +1,4 @@
-"""The status of each stage as the report shows it: state, reasons, the command to type."""
+"""The stages as the report shows them: status, command to type, options, decisions, versions."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
 from recon_cli.stages import Stage
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.manifest import Manifest
-from recon_cli.workspace.summaries import JsonRecord
+from recon_cli.workspace.summaries import JsonRecord, TrainPlan, TrialDecision
 
 Record = TypeVar("Record", bound=JsonRecord)
 
 
 @dataclass(frozen=True)
-class StageStatus:
-    """The status of one stage."""
+class StageReport:
+    """The status of one stage on the page."""
 
     name: str
     folder: Path  # of its result
@@ -38,7 +38,7 @@ class StageStatus:
 
     @property
     def fresh(self) -> bool:
-        """Whether its figures hold."""
+        """Whether its figures are up to date."""
         return self.state == "fresh"
 
     @property
@@ -48,7 +48,7 @@ class StageStatus:
 
     @property
     def summary(self) -> Mapping[str, Any]:
-        """The summary that the stage left in its manifest; empty without a result."""
+        """The summary in its manifest; empty without a result."""
         return self.manifest.run.summary if self.manifest else {}
 
     def read_summary(self, kind: type[Record]) -> Record | None:
@@ -64,10 +64,10 @@ class StageStatus:
         return "" if self.fresh else " (stale)"
 
 
-Statuses = Mapping[str, StageStatus]  # by the name of the stage
+StageReports = Mapping[str, StageReport]  # by the name of the stage
 
 
-def inspect_stages(job: Job) -> dict[str, StageStatus]:
+def inspect_stages(job: Job) -> dict[str, StageReport]:
     """Returns the status of every stage by name.
 
     Raises:
@@ -84,21 +84,19 @@ def inspect_stages(job: Job) -> dict[str, StageStatus]:
     return {row.name: _inspect_stage(inspection, row, job) for row in job.table}
 
 
-def _inspect_stage(inspection: WorkspaceCheck, row: Stage, job: Job) -> StageStatus:
+def _inspect_stage(inspection: WorkspaceCheck, row: Stage, job: Job) -> StageReport:
     folder, root = job.workspace.folder(row.name), job.workspace.root
     try:
         check = inspection.check(row.name)
     except ManifestError as error:
         again = f"recon {row.verb} --again -w {shlex.quote(str(root))}"
-        return StageStatus(row.name, folder, "damaged", error.message, again)
-    why = "; ".join(check.reasons)
-    partial = check.partial_run
+        return StageReport(row.name, folder, "damaged", error.message, again)
+    reasons, partial = list(check.reasons), check.partial_run
     if check.state == "partial" and partial:
-        why = "; ".join(filter(None, [
-            f"a run was interrupted at {partial.done} of {partial.total}", why]))
-    return StageStatus(
-        row.name, folder, check.state, why, _command(inspection, check, root), check.manifest,
-        check.gone)
+        reasons.insert(0, f"a run was interrupted at {partial.done} of {partial.total}")
+    return StageReport(
+        row.name, folder, check.state, "; ".join(filter(None, reasons)),
+        _command(inspection, check, root), check.manifest, check.gone)
 
 
 def _command(inspection: WorkspaceCheck, check: StageCheck, root: Path) -> str:
@@ -121,7 +119,7 @@ class StageSettings:
 
 @dataclass(frozen=True)
 class Provenance:
-    """The section on settings."""
+    """Where the results come from: the section on settings."""
 
     settings: tuple[StageSettings, ...]  # of each stage that has a result
     stages: tuple[str, ...]  # their names, the headings of `versions`
@@ -131,7 +129,7 @@ class Provenance:
     machine: tuple[tuple[str, str], ...]  # (label, value) of the machine that wrote the page
 
 
-def read_provenance(stages: Statuses) -> Provenance:
+def read_provenance(stages: StageReports) -> Provenance:
     """Returns where the results of a workspace come from."""
     runs = {name: stage.manifest.run for name, stage in stages.items() if stage.manifest}
     programs = dict.fromkeys(program for run in runs.values() for program in run.versions)
@@ -148,28 +146,24 @@ def read_provenance(stages: Statuses) -> Provenance:
          ("memory", f"{psutil.virtual_memory().total / 1e9:.1f} GB")))
 
 
-def read_decisions(train: StageStatus) -> tuple[Mapping[str, Any], ...]:
-    """Returns name, on and reason of each part that training decided on; empty if unreadable."""
-    if not train.there:
-        return ()
+def read_decisions(train: StageReport) -> tuple[TrialDecision, ...]:
+    """Returns what training decided about each optional part; empty if unreadable."""
     try:
-        needs = read_json(train.folder / "plan.json")["needs"]
-        return tuple({"name": str(need["name"]), "on": bool(need["on"]),
-                      "reason": str(need["reason"])} for need in needs)
-    except (FormatError, KeyError, TypeError):
-        return ()  # a log that nothing depends on
+        return TrainPlan.read(train.folder).needs if train.there else ()
+    except (FormatError, ManifestError):
+        return ()  # no other stage depends on plan.json
 
 
-def _read_settings(stage: StageStatus) -> StageSettings:
+def _read_settings(stage: StageReport) -> StageSettings:
     assert stage.manifest is not None
     config, damaged = stage.manifest.key.config, ""
     chosen: Mapping[str, Any] = {}
     if stage.name == "train":
         try:
             value = read_json(stage.folder / "config.json")
+            chosen = value if isinstance(value, dict) else {}
         except FormatError as error:
-            value, damaged = None, f"What training decided by itself is not shown: {error.message}"
-        chosen = value if isinstance(value, dict) else {}
+            damaged = f"What training decided by itself is not shown: {error.message}"
     rows = tuple((
         name, _format_option(value),
         _format_option(chosen[name]) if name in chosen and chosen[name] != value else "")

@@ -21,12 +21,9 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
     CONVENTION_LINES,
+    CONVENTIONS,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
-    PSNR_8BIT_CONVENTION,
-    PSNR_CONVENTION,
-    SSIM_CONVENTION,
-    SSIM_PADDED_CONVENTION,
     Perceptual,
     load_lpips,
 )
@@ -208,8 +205,7 @@ def _write(
     write_json(out / Metrics.FILE, Metrics(
         models=models,
         pruned_minus_base=differences or None,
-        psnr_convention=PSNR_CONVENTION, psnr_8bit_convention=PSNR_8BIT_CONVENTION,
-        ssim_convention=SSIM_CONVENTION, ssim_padded_convention=SSIM_PADDED_CONVENTION,
+        **CONVENTIONS,
         lpips_convention=f"not measured: {lacking}" if lacking else LPIPS_CONVENTION,
         mask_convention=MASK_CONVENTION if masked else None,
         truth_digest=reference_digest(held_out),

@@ -10,7 +10,6 @@ frames of the first workspace, some of which are taken for the truth and, blurre
 
 from __future__ import annotations
 
-import json
 import statistics
 import sys
 import tempfile
@@ -20,13 +19,14 @@ from pathlib import Path
 import click
 import cv2
 
-from recon_cli.evaluation.scores import Table
+from recon_cli.evaluation.metrics import CONVENTIONS
+from recon_cli.evaluation.scores import Metrics, ModelMetrics, Table, ViewScore
 from recon_cli.io.images import read_png, write_png
 from recon_cli.io.records import FOLDER
 from recon_cli.pipeline.execute import Job
 from recon_cli.report.build import write_report
 from recon_cli.report.gallery import MAX_FILE_BYTES, build_gallery
-from recon_cli.report.records import MODELS, read_metrics
+from recon_cli.report.records import MODELS
 from recon_cli.workspace.layout import Workspace
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -79,13 +79,14 @@ def large(workspace: Path, views: int) -> str:
             for index in range(len(frames), views):
                 (root / place / f"{index}.png").symlink_to(
                     root / place / f"{index % len(frames)}.png")
-        model = {
-            **dict.fromkeys(("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "render_ms"), 1.0),
-            "gaussians": 1, "bytes": 1, "train_seconds": None, "seen_psnr_db": {},
-            "views": [{"name": f"{i}.png", "psnr_db": i, "ssim": 1.0} for i in range(views)]}
-        (root / "metrics.json").write_text(json.dumps({"models": dict.fromkeys(MODELS, model)}))
+        model = ModelMetrics.of(
+            tuple(ViewScore(f"{i}.png", i, i, 1.0, 1.0) for i in range(views)), gaussians=1,
+            bytes=1, render_ms=1.0)
+        metrics = Metrics(
+            models=dict.fromkeys(MODELS, model), truth_digest="", lpips_convention="", width=1,
+            height=1, test_views=views, unregistered_test=(), **CONVENTIONS)
         begin = time.process_time()
-        gallery = build_gallery(root, read_metrics(root), MAX_FILE_BYTES - RESERVED)
+        gallery = build_gallery(root, metrics, MAX_FILE_BYTES - RESERVED)
         seconds = time.process_time() - begin
     size = sum(view.size for view in gallery.views) / 1e6
     width, height = gallery.full

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from recon_cli.evaluation.scores import Metrics, ModelMetrics, ViewScore
 from recon_cli.io.images import write_png
 from recon_cli.report.gallery import (
     ENCODINGS,
@@ -51,24 +52,30 @@ def test_what_a_mask_hides_has_no_colour():
     assert (colors[:, 4:] == level(255)).all()
 
 
+def write_metrics(folder, models):
+    """Writes metrics.json of views with a name and a PSNR each, by model."""
+    (folder / Metrics.FILE).write_text(json.dumps(Metrics(
+        models={model: ModelMetrics.of(
+            tuple(ViewScore(name, psnr_db, psnr_db, 0.9, 0.9) for name, psnr_db in views),
+            gaussians=9, bytes=9, render_ms=1.0) for model, views in models.items()},
+        psnr_convention="", psnr_8bit_convention="", ssim_convention="", ssim_padded_convention="",
+        lpips_convention="", truth_digest="", width=300, height=220, test_views=6,
+        unregistered_test=()).to_json()))
+
+
 @pytest.fixture
 def noisy(tmp_path):
     """evaluate's folder with pictures that no codec makes small: 6 views of 300x220 noise."""
     rng = np.random.default_rng(0)
     for folder in ("truth", "renders/base", "renders/pruned"):
         (tmp_path / folder).mkdir(parents=True)
-    models = {}
-    for model, worst in (("base", 5), ("pruned", 3)):
-        models[model] = {
-            "psnr_db": 30.0, "psnr_8bit_db": 30.0, "ssim": 0.9, "ssim_padded": 0.9, "gaussians": 9,
-            "bytes": 9, "render_ms": 1.0, "train_seconds": 1.0, "seen_psnr_db": {},
-            "views": [{"name": f"{i:02d}.png", "psnr_db": 20.0 + (i - worst) % 6, "ssim": 0.9}
-                      for i in range(6)]}
+    write_metrics(tmp_path, {
+        model: tuple((f"{i:02d}.png", 20.0 + (i - worst) % 6) for i in range(6))
+        for model, worst in (("base", 5), ("pruned", 3))})
     for i in range(6):
         for folder in ("truth", "renders/base", "renders/pruned"):
             image = rng.integers(0, 256, (220, 300, 3)).astype(np.uint8)
             write_png(tmp_path / folder / f"{i:02d}.png", image)
-    (tmp_path / "metrics.json").write_text(json.dumps({"models": models}))
     return tmp_path
 
 
@@ -106,10 +113,7 @@ def test_a_view_larger_than_a_screen_is_scaled_down(tmp_path):
         small = rng.integers(0, 256, (27, 48, 3)).astype(np.uint8)
         write_png(tmp_path / folder / "a.png",
                   cv2.resize(small, (1920, 1080), interpolation=cv2.INTER_LINEAR))
-    (tmp_path / "metrics.json").write_text(json.dumps({"models": {"base": {
-        "psnr_db": 30.0, "psnr_8bit_db": 30.0, "ssim": 0.9, "ssim_padded": 0.9, "gaussians": 9,
-        "bytes": 9, "render_ms": 1.0, "train_seconds": None, "seen_psnr_db": {},
-        "views": [{"name": "a.png", "psnr_db": 20.0, "ssim": 0.9}]}}}))
+    write_metrics(tmp_path, {"base": (("a.png", 20.0),)})
     gallery = build_gallery(tmp_path, read_metrics(tmp_path), 12_000_000)
     assert (gallery.views[0].width, gallery.views[0].height) == (1600, 900)
     assert gallery.scaled

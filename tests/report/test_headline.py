@@ -6,13 +6,13 @@ import pytest
 import summaries
 
 from recon_cli.report.headline import format_facts, judge_poses
-from recon_cli.report.stage_status import StageStatus
+from recon_cli.report.stage_status import StageReport
 from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord
 
 
 def sfm(**summary):
     run = RunRecord(1.0, 1, {**summaries.SFM.to_json(), **summary}, {}, None, None, 1, "")
-    return StageStatus("sfm", Path("sfm"), "fresh", "", "recon sfm",
+    return StageReport("sfm", Path("sfm"), "fresh", "", "recon sfm",
                     Manifest(ResultKey("sfm", 3, {}, (), {}), {}, "", run))
 
 
