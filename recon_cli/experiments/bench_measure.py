@@ -358,7 +358,7 @@ class _Measurement:
 
     def _time_passes(self, backend: str) -> dict[str, float]:
         """Returns the milliseconds of both passes and of their parts."""
-        probe = instruments.probe_for(backend, self._plan.device)
+        probe = instruments.Probe(backend, self._plan.device)
         with probe.watch():
             watch = Stopwatch(self._plan.device)
             output = _render(self._scene, registry.renderer(backend))
@@ -373,7 +373,7 @@ class _Measurement:
 
     def _time_step(self, step: Callable[[Mark], None], backend: str) -> dict[str, float]:
         """Returns the milliseconds of an optimization step and of its parts."""
-        probe = instruments.probe_for(backend, self._plan.device)
+        probe = instruments.Probe(backend, self._plan.device)
         with probe.watch():
             watch = Stopwatch(self._plan.device)
             step(watch.mark)

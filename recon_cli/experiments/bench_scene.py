@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ _ROOM = np.array([6.0, 4.0, 3.0])  # metres; z is up
 _BOXES = 12  # pieces of furniture
 _AREA = 2 * (24 + 18 + 12) + _BOXES * 2.4  # square metres of walls and furniture, about
 _COVERAGE = 0.45  # standard deviation over spacing: what trained scenes have, within a factor of 2
+FLIP = 1e-5  # a larger error of a pixel means a fragment more or less, not rounding
 _THINNESS = 0.15  # of the axis across the wall: trained Gaussians lie flat on surfaces
 
 
@@ -86,11 +88,7 @@ def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Cam
         "sh_dc": np.sin(means * [3, 5, 7]), "sh_rest": rng.normal(0, 0.05, (n, 15, 3)),
     }
     splats = Splats(**{k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()})
-    return splats, _camera(width, height)
-
-
-def _camera(width: int, height: int) -> Camera:
-    """Returns a camera at eye height that looks into the far corner, slightly down."""
+    # at eye height, looking into the far corner, slightly down
     forward = np.array([3.5, 2.0, -0.4]) / np.linalg.norm([3.5, 2.0, -0.4])
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right)
@@ -98,7 +96,7 @@ def _camera(width: int, height: int) -> Camera:
     viewmat[:3, :3] = [right, np.cross(forward, right), forward]
     viewmat[:3, 3] = -viewmat[:3, :3] @ [1.0, 1.0, 1.6]
     focal = 0.85 * width
-    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
+    return splats, Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
 
 
 @dataclass(frozen=True)
@@ -140,39 +138,21 @@ def variants_for(backend: str, sh_degree: int) -> list[RendererVariant]:
 
 def renderer_of(variant: RendererVariant, backend: str) -> Renderer:
     """Returns a backend's render function with the variant's approximation built in."""
-    if variant.approximation == EXACT:
-        draw = registry.renderer(backend)
-    else:
-        def draw(
-            splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
-            mask: Tensor | None = None,
-        ) -> RenderOutput:
-            return numba_backend.render(
-                splats, camera, background, sh_degree, scores, mask, variant.approximation)
+    draw: Renderer = registry.renderer(backend) if variant.approximation == EXACT else partial(
+        numba_backend.render, approximation=variant.approximation)
 
     def render(
         splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
         mask: Tensor | None = None,
     ) -> RenderOutput:
-        if variant.half_colors:
-            splats = _round_colors(splats)
+        if variant.half_colors:  # gradients pass as through the identity
+            sh_dc, sh_rest = (sh + (sh.detach().half().to(sh.dtype) - sh.detach())
+                              for sh in (splats.sh_dc, splats.sh_rest))
+            splats = replace(splats, sh_dc=sh_dc, sh_rest=sh_rest)
         degree = sh_degree if variant.sh_degree is None else variant.sh_degree
         return draw(splats, camera, background, degree, scores, mask)
 
     return render
-
-
-def _round_colors(splats: Splats) -> Splats:
-    """Returns splats with colours rounded to float16; gradients pass as through the identity."""
-    def through(sh: Tensor) -> Tensor:
-        return sh + (sh.detach().half().to(sh.dtype) - sh.detach())
-
-    return Splats(
-        splats.means, splats.quats, splats.log_scales, splats.logit_opacities,
-        through(splats.sh_dc), through(splats.sh_rest))
-
-
-FLIP = 1e-5  # a larger error of a pixel means a fragment more or less, not rounding
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,17 +159,18 @@ def score_filters(
         on_run()
         return cv2.PSNR(truths[number], result), edges_kept(truths[number], result), seconds
 
-    def mean(variant: FilterVariant, level: float) -> FilterScore:
-        psnr_db, edges, seconds = zip(*(
-            values for noisy, values in zip(grid, results[variant.key], strict=True)
-            if noisy[0] == level), strict=True)
-        return FilterScore(
-            variant.filter, variant.strength, variant.offered, level, float(np.mean(psnr_db)),
-            float(np.mean(edges)), 0.0 if variant.filter == "none" else sum(seconds) / megapixels)
-
     grid = [(level, number) for level in levels for number in range(len(truths))]
     results = run_grid({variant.key: variant for variant in VARIANTS}, grid, measure)
-    return tuple(mean(variant, level) for variant in VARIANTS for level in levels)
+    scores = []
+    for variant in VARIANTS:
+        values = np.array(results[variant.key]).reshape(len(levels), len(truths), 3)
+        for level, of_level in zip(levels, values, strict=True):
+            psnr_db, edges, seconds = of_level.T
+            scores.append(FilterScore(
+                variant.filter, variant.strength, variant.offered, level, float(np.mean(psnr_db)),
+                float(np.mean(edges)),
+                0.0 if variant.filter == "none" else float(sum(seconds)) / megapixels))
+    return tuple(scores)
 
 
 def with_noise(rgb: Pixels, noise: float, *, seed: int) -> Pixels:

@@ -239,79 +239,56 @@ _STAGES = {"composite_backward": DECOMPOSE, "project_backward": "unproject"}
 
 
 class Probe:
-    """Measures a backend while `watch`; this one, of any backend, measures nothing."""
+    """Measures a backend while `watch`; of backends other than numba and torch, nothing."""
 
-    def __init__(self) -> None:
-        self.ms: dict[str, float] = {}  # by stage, since the last `collect`
+    def __init__(self, backend: str, device: str) -> None:
+        self._backend, self._device = backend, device
+        self._ms: dict[str, float] = {}  # by stage, since the last `collect`
+        self._pairs = [0, 0]  # forward, backward; of torch
+        self._in_backward = False
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        """Measures within the block."""
-        yield
+        """Measures within the block: numba's parallel kernels, or the functions of torch."""
+        with ExitStack() as stack:
+            if self._backend == "numba":
+                pool.observer = lambda name, seconds: self._add(
+                    _STAGES.get(name, name), 1e3 * seconds)
+                stack.callback(setattr, pool, "observer", None)
+            elif self._backend == "torch":
+                for place, name, label in (
+                    (tiles, "project", "project"), (tiles, "bin_to_tiles", "bin_to_tiles"),
+                    (tiles._Rasterize, "forward", COMPOSITE),
+                    (tiles._Rasterize, "backward", DECOMPOSE),
+                ):
+                    stack.enter_context(_replace(
+                        place, name, self._time_calls(label, getattr(place, name))))
+                stack.enter_context(_replace(tiles, "alphas", self._count_pairs))
+            yield
 
     def collect(self) -> dict[str, float]:
         """Returns the milliseconds since the last call and starts anew."""
-        collected, self.ms = self.ms, {}
+        collected, self._ms = self._ms, {}
         return collected
 
-    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:  # noqa: ARG002
-        """Returns pairs forward and backward of an output that has been through both passes."""
-        return None
+    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:
+        """Returns pairs forward and backward of an output that has been through both passes.
+
+        numba counts all pixels of a row of a tile, torch all pixels of a tile.
+        """
+        if self._backend == "numba":
+            view_pass = output.rgb.grad_fn.lease.view_pass  # type: ignore[union-attr]
+            return view_pass.pairs_forward, view_pass.pairs_backward
+        return (self._pairs[0], self._pairs[1]) if self._backend == "torch" else None
 
     def _add(self, name: str, ms: float) -> None:
-        self.ms[name] = self.ms.get(name, 0.0) + ms
-
-
-class NumbaProbe(Probe):
-    """Observes the thread pool, which runs every parallel kernel."""
-
-    @contextmanager
-    def watch(self) -> Iterator[None]:
-        """Measures kernels within the block."""
-        pool.observer = lambda name, seconds: self._add(_STAGES.get(name, name), 1e3 * seconds)
-        try:
-            yield
-        finally:
-            pool.observer = None
-
-    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:
-        """Returns what the kernels counted: a row of a tile counts all its pixels."""
-        view_pass = output.rgb.grad_fn.lease.view_pass  # type: ignore[union-attr]
-        return view_pass.pairs_forward, view_pass.pairs_backward
-
-
-class TorchProbe(Probe):
-    """Wraps the functions of the torch backend."""
-
-    def __init__(self, device: str) -> None:
-        super().__init__()
-        self._device = device
-        self._pairs = [0, 0]  # forward, backward
-        self._backward = False
-
-    @contextmanager
-    def watch(self) -> Iterator[None]:
-        """Measures projection, binning and compositing within the block."""
-        with ExitStack() as stack:
-            for place, name, label in (
-                (tiles, "project", "project"), (tiles, "bin_to_tiles", "bin_to_tiles"),
-                (tiles._Rasterize, "forward", COMPOSITE),
-                (tiles._Rasterize, "backward", DECOMPOSE),
-            ):
-                stack.enter_context(_replace(
-                    place, name, self._time_calls(label, getattr(place, name))))
-            stack.enter_context(_replace(tiles, "alphas", self._count_pairs))
-            yield
-
-    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:  # noqa: ARG002
-        """Returns the pairs in the blocks: every pixel of a tile for every instance."""
-        return self._pairs[0], self._pairs[1]
+        self._ms[name] = self._ms.get(name, 0.0) + ms
 
     def _time_calls(self, label: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def run(*args: Any) -> Any:
             if label in (COMPOSITE, DECOMPOSE):
-                self._backward = label == DECOMPOSE
-                self._pairs[self._backward] = 0
+                self._in_backward = label == DECOMPOSE
+                self._pairs[self._in_backward] = 0
             watch = Stopwatch(self._device)
             result = work(*args)
             watch.mark(label)
@@ -321,7 +298,7 @@ class TorchProbe(Probe):
         return run
 
     def _count_pairs(self, table: Any, block: Any, *rest: Any) -> Any:
-        self._pairs[self._backward] += block.rows.numel() * blocks.PIXELS
+        self._pairs[self._in_backward] += block.rows.numel() * blocks.PIXELS
         return blocks.alphas(table, block, *rest)
 
 
@@ -334,10 +311,3 @@ def _replace(place: Any, name: str, function: Callable[..., Any]) -> Iterator[No
         yield
     finally:
         setattr(place, name, original)
-
-
-def probe_for(backend: str, device: str) -> Probe:
-    """Returns the probe of a backend; one without a probe is timed from outside only."""
-    if backend == "numba":
-        return NumbaProbe()
-    return TorchProbe(device) if backend == "torch" else Probe()

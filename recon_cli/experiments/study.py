@@ -449,7 +449,7 @@ def notes(result: StudyResult) -> list[str]:
         "Each arm is trained on " + "; ".join(
             f"{scene}: {list_parts(scene)}" for scene in result.scenes)
         + ". The trials that decide so are not timed.",
-        "Intervals: 95% by Student's t over the differences seed by seed. They speak of other "
+        "Intervals: 95% by Student's t over the differences seed by seed. They are about other "
         f"seeds on these scenes, not of other scenes. Of {count} intervals about "
         f"{max(1, round(0.05 * count))} would leave out 0 by chance if no arm differed.",
         f"PSNR: {PSNR_CONVENTION}. SSIM: {SSIM_CONVENTION}. Scored on held-out test views, which "

@@ -154,7 +154,7 @@ class PlanAxes:
 
 
 def find_axes(scene: Scene, *, z_up: bool) -> PlanAxes:
-    """Returns the axes of a plan: x and y if z is known to be up, else as level as can be told."""
+    """Returns the axes of a plan: x and y where z is up, otherwise approximately level."""
     if z_up:
         return PlanAxes(np.eye(3)[:2], known=True)
     viewmats = np.stack([view.camera.viewmat for views in by_part(scene).values()

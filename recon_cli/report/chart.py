@@ -1,7 +1,6 @@
 """Charts as inline SVG: linear or logarithmic axes with units, lines, marks, a legend.
 
-matplotlib is an optional dependency, and its figures do not follow the page's light and dark
-colours, so the few things that the report needs are drawn here.
+matplotlib is optional, and its figures do not follow the page's light and dark colours.
 """
 
 from __future__ import annotations
@@ -71,14 +70,15 @@ def draw_chart(
 ) -> Markup:
     """Returns a figure with caption and legend, or a sentence where there is nothing to draw.
 
-    Args:
-        title: of the figure.
-        x: axis.
-        y: axis.
-        series: later ones are drawn over earlier ones.
-        above: label of a second x axis, and how many of its units one of `x` is.
+    Later series are drawn over earlier ones. `above` is the label of a second x axis, and the
+    number of its units in one of `x`.
     """
-    lines = [line for line in (_drop_undrawable(line, x, y) for line in series) if line.points]
+    lines = []
+    for line in series:  # without the points that the axes cannot show
+        points = tuple(point for point in line.points if all(map(math.isfinite, point))
+                       and not (x.log and point[0] <= 0) and not (y.log and point[1] <= 0))
+        if points:
+            lines.append(dataclasses.replace(line, points=points))
     if not lines:
         return Markup('<figure class="chart"><figcaption>{}</figcaption>'
                       '<p class="empty">Nothing was recorded.</p></figure>').format(title)
@@ -92,7 +92,9 @@ def draw_chart(
     parts = _draw_axes(x, y, across, up, top)
     if above:
         parts += _draw_top_axis(above, across, x, top)
-    parts += [_draw_line(line, place) for line in lines if line.line]
+    parts += [
+        _line_path(line, "L".join(f"{x:.1f},{y:.1f}" for x, y in map(place, line.points)))
+        for line in lines if line.line]
     parts += [mark for line in lines if line.mark for mark in _draw_marks(line, place, x, y)]
     return Markup(
         '<figure class="chart"><figcaption>{}</figcaption>'
@@ -167,13 +169,6 @@ def tick_label(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.6g}"
 
 
-def _drop_undrawable(series: Series, x: Axis, y: Axis) -> Series:
-    """Returns a series without the points that its axes cannot show."""
-    return dataclasses.replace(series, points=tuple(
-        point for point in series.points if all(map(math.isfinite, point))
-        and not (x.log and point[0] <= 0) and not (y.log and point[1] <= 0)))
-
-
 def _fit_scale(values: Sequence[float], axis: Axis, length: float) -> Scale:
     low, high = axis_limits(values, log=axis.log)
     return Scale(low, high, axis.log, length)
@@ -214,13 +209,6 @@ def _draw_top_axis(above: tuple[str, float], across: Scale, x: Axis, top: int) -
 def _draw_text(x: float, y: float, text: str, anchor: str) -> Markup:
     return Markup('<text class="label" x="{}" y="{}" text-anchor="{}">{}</text>').format(
         round(x, 1), round(y, 1), anchor, text)
-
-
-def _draw_line(
-    series: Series, place: Callable[[tuple[float, float]], tuple[float, float]]
-) -> Markup:
-    path = "L".join(f"{x:.1f},{y:.1f}" for x, y in map(place, series.points))
-    return _line_path(series, path)
 
 
 def _line_path(series: Series, path: str) -> Markup:

@@ -22,7 +22,7 @@ from recon_cli.experiments.bench_scene import (
     renderer_of,
     variants_for,
 )
-from recon_cli.experiments.instruments import probe_for
+from recon_cli.experiments.instruments import Probe
 from recon_cli.render import registry
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import tiles
@@ -97,7 +97,7 @@ def test_a_probe_changes_nothing_and_leaves_nothing_behind(backend: str) -> None
     draw = registry.renderer(backend)
     before = tiles.alphas, tiles.project, vars(tiles._Rasterize)["forward"]
     plain = answer(scene, draw)
-    probe = probe_for(backend, "cpu")
+    probe = Probe(backend, "cpu")
     with probe.watch():
         seen = answer(scene, draw)
     assert torch.equal(plain.image, seen.image)
