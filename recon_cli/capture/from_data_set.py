@@ -22,7 +22,6 @@ from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.io.layouts import describe, read_posed
 from recon_cli.io.posed import PosedImage, PosedSet
 from recon_cli.io.records import Frame, Group, KnownPoses
-from recon_cli.scene.camera import Lens
 
 
 def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> IngestedSource:
@@ -41,7 +40,7 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
         ctx.notice(f"{notice[0].upper()}{notice[1:]}.")
     images = _choose_images(config, posed, ctx)
     names = make_frame_names([Path(image.name).stem for image in images])
-    broken = _write_images(images, names, posed.lenses, config.max_size, out, ctx)
+    broken = _write_images(images, names, config.max_size, out, ctx)
     for reason in broken.values():
         ctx.notice(f"An image is left out: {reason}")
     readable = [
@@ -52,13 +51,13 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
             hint="Check that the images are where the data set says.")
     poses = _make_known_poses(posed, readable)
     poses.write(out)
-    masks = out / store.MASKS
-    sizes = [fit_size(lens.width, lens.height, config.max_size) for lens in posed.lenses]
+    masks, lenses = out / store.MASKS, posed.lenses
+    sizes = [fit_size(lens.width, lens.height, config.max_size) for lens in lenses]
     return IngestedSource(
         posed.layout,
         tuple(Group(path.name, *size, lens=lens.resized(*size))
-              for lens, size in zip(posed.lenses, sizes, strict=True)),
-        tuple(Frame(name, None, image.path.name, None, image.held_out, image.lens,
+              for lens, size in zip(lenses, sizes, strict=True)),
+        tuple(Frame(name, None, image.path.name, None, image.held_out, lenses.index(image.lens),
                     (masks / name).exists()) for name, image in readable),
         declared=len(posed.images) + len(posed.missing), decoded=len(readable),
         lost=len(broken) + len(posed.missing),
@@ -79,8 +78,7 @@ def _choose_images(config: IngestConfig, posed: PosedSet, ctx: IngestContext) ->
 
 
 def _write_images(
-    images: Sequence[PosedImage], names: Sequence[str], lenses: Sequence[Lens], max_size: int,
-    out: Path, ctx: IngestContext,
+    images: Sequence[PosedImage], names: Sequence[str], max_size: int, out: Path, ctx: IngestContext,
 ) -> dict[str, str]:
     """Writes frames and masks; returns why some images could not be read, by frame name."""
     broken: dict[str, str] = {}
@@ -89,7 +87,7 @@ def _write_images(
             target = out / store.FOLDER / name
             if not target.exists():
                 try:
-                    rgb, mask = _read_pixels(image, lenses[image.lens], max_size)
+                    rgb, mask = _read_pixels(image, max_size)
                 except InputError as error:
                     broken[name] = error.message
                 else:
@@ -102,10 +100,11 @@ def _write_images(
 
 
 def _read_pixels(
-    image: PosedImage, lens: Lens, max_size: int
+    image: PosedImage, max_size: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
     """Returns RGB and mask at the stored size, ignoring EXIF orientation as the poses do."""
     rgb, opacity = read_as_stored(image.path)
+    lens = image.lens
     height, width = rgb.shape[:2]
     if (width, height) != (lens.width, lens.height):
         raise InputError(

@@ -43,18 +43,15 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
     if config.up is not None:
         similarity = Similarity(rotation=turn_onto(up, np.array(_UP[config.up]))).after(similarity)
     if config.transform is not None:
-        similarity = _parse_transform(config.transform).after(similarity)
+        try:
+            transform = Similarity.from_matrix(np.array(config.transform).reshape(4, 4))
+        except ValueError as error:
+            raise ConfigError(
+                f"The matrix of --transform cannot be used: {error}.",
+                hint="It must be a rotation times one scale above 0, with a translation in its "
+                "last column.") from error
+        similarity = transform.after(similarity)
     return ExportFrame(similarity, similarity.rotation @ up, measurement)
-
-
-def _parse_transform(values: tuple[float, ...]) -> Similarity:
-    try:
-        return Similarity.from_matrix(np.array(values).reshape(4, 4))
-    except ValueError as error:
-        raise ConfigError(
-            f"The matrix of --transform cannot be used: {error}.",
-            hint="It must be a rotation times one scale above 0, with a translation in its last "
-            "column.") from error
 
 
 def _measure_scale(config: ExportConfig, inputs: StageInputs) -> Measurement | None:

@@ -6,7 +6,7 @@ import dataclasses
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from recon_cli.io.splats.html import write_html
 from recon_cli.io.splats.registry import FORMATS
 from recon_cli.io.splats.spz import write_spz
 from recon_cli.io.transforms import write_transforms
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
@@ -124,9 +125,8 @@ class Exporter:
         elif name == "spz":
             write_spz(path, splats, version=self._config.spz_version)
         elif name == "html":
-            write_html(path, splats, title=self._title, up=self._up, views=[
-                (view.name, self._similarity.camera(view.camera))
-                for view in sorted(self._scene.train, key=lambda view: view.name)])
+            write_html(path, splats, title=self._title, up=self._up,
+                       views=self._place(self._scene.train))
         else:
             FORMATS[name].write(path, splats)
 
@@ -175,27 +175,30 @@ class Exporter:
     def _write_colmap(self, _: Splats) -> Path:
         path, scene = self._out / "colmap", self._scene
         shutil.rmtree(path, ignore_errors=True)  # of a run that was killed
-        write_colmap(
-            path, [(view.name, self._similarity.camera(view.camera)) for view in _all(scene)],
-            self._similarity.points(scene.points), scene.colors)
-        self._copy_images()
+        write_colmap(path, self._copy_images(), self._similarity.points(scene.points), scene.colors)
         return path
 
     def _write_transforms(self, _: Splats) -> Path:
-        path, scene = self._out / "transforms.json", self._scene
+        path = self._out / "transforms.json"
+        views = [(f"{_IMAGES}/{name}", camera) for name, camera in self._copy_images()]
         write_transforms(
-            path, [(f"{_IMAGES}/{view.name}", self._similarity.camera(view.camera))
-                   for view in _all(scene)],
-            held_out={f"{_IMAGES}/{view.name}" for view in scene.test})
-        self._copy_images()
+            path, views, held_out={f"{_IMAGES}/{view.name}" for view in self._scene.test})
         return path
 
-    def _copy_images(self) -> None:
-        """Copies the undistorted images, without which cameras are of no use elsewhere."""
-        for view in _all(self._scene):
+    def _copy_images(self) -> list[tuple[str, Camera]]:
+        """Copies the undistorted images, and returns all cameras, which are useless without."""
+        scene = self._scene
+        views = (*scene.train, *scene.validation, *scene.test)
+        for view in views:
             target = self._out / _IMAGES / view.name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(view.original, target)
+        return self._place(views)
+
+    def _place(self, views: Sequence[View]) -> list[tuple[str, Camera]]:
+        """Returns views by name, with their cameras in the world of the files."""
+        return [(view.name, self._similarity.camera(view.camera))
+                for view in sorted(views, key=lambda view: view.name)]
 
     @property
     def _has_views(self) -> bool:
@@ -236,7 +239,3 @@ class Exporter:
         if record and not self._has_views:
             return record.file
         return read_frame_list(self._inputs.folders["ingest"]).groups[0].name
-
-
-def _all(scene: Scene) -> list[View]:
-    return sorted((*scene.train, *scene.validation, *scene.test), key=lambda view: view.name)

@@ -84,11 +84,16 @@ def read_camera_path(path: Path) -> CameraPath:
             hint="Export the path again with perspective cameras.")
     if value.get("crop") is not None:
         logger.warning("%s: its crop is ignored, the whole scene is rendered", path)
-    width, height = (_read_pixels(value, key, path) for key in ("render_width", "render_height"))
+    sides = {key: _read_number(value, key, str(path)) for key in ("render_width", "render_height")}
+    for key, pixels in sides.items():
+        if pixels < 1 or pixels != round(pixels):
+            raise FormatError(
+                f"{path} has {key} = {pixels:g}; it must be a whole number of pixels.", hint=_HINT)
     frames = [_read_frame(entry, f"{path}, camera {at},") for at, entry in enumerate(entries)]
     return CameraPath(
         np.stack([viewmat for viewmat, _ in frames]), np.array([fov for _, fov in frames]),
-        width, height, _read_fps(value, len(entries), path))
+        round(sides["render_width"]), round(sides["render_height"]),
+        _read_fps(value, len(entries), path))
 
 
 def _read_frame(entry: Any, where: str) -> tuple[NDArray[np.float64], float]:
@@ -104,14 +109,6 @@ def _read_frame(entry: Any, where: str) -> tuple[NDArray[np.float64], float]:
             f"{where} has a fov of {fov:g} degrees; it must be {_FOV_DEG[0]:g} to "
             f"{_FOV_DEG[1]:g}.", hint=_HINT)
     return viewmat, fov
-
-
-def _read_pixels(value: Mapping[str, Any], key: str, path: Path) -> int:
-    pixels = _read_number(value, key, str(path))
-    if pixels < 1 or pixels != round(pixels):
-        raise FormatError(
-            f"{path} has {key} = {pixels:g}; it must be a whole number of pixels.", hint=_HINT)
-    return round(pixels)
 
 
 def _read_fps(value: Mapping[str, Any], frames: int, path: Path) -> float | None:

@@ -156,7 +156,10 @@ def render_frames(request: RenderRequest, job: Job) -> str:
         _render_missing(frames, missing, request, plan, trained, scale, ctx)
         files = _encode_videos(frames, encoding, ctx) if encoding else []
     if request.out_file is not None:
-        files = [_copy_out(request.out_file, files, frames)]
+        with disk_errors(request.out_file.absolute().parent, f"writing {request.out_file.name}"):
+            source = files[0] if files else frames.frame_path(frames.outputs[0], frames.names[0])
+            write_bytes(request.out_file, source.read_bytes())
+        files = [request.out_file]
     total = len(frames.names)
     return "\n".join([
         f"{total} frame{'s' * (total != 1)} in {frames.root}, {len(missing)} of them rendered now",
@@ -251,11 +254,3 @@ def _encode_videos(frames: FrameFolder, encoding: VideoEncoding, ctx: StageConte
             encode_video(pictures, path, encoding, threads=ctx.threads, on_frame=bar.advance)
     frames.video = asdict(encoding)
     return list(videos.values())
-
-
-def _copy_out(file: Path, videos: Sequence[Path], frames: FrameFolder) -> Path:
-    """Copies the one video or picture to the file of --out."""
-    with disk_errors(file.absolute().parent, f"writing {file.name}"):
-        source = videos[0] if videos else frames.frame_path(frames.outputs[0], frames.names[0])
-        write_bytes(file, source.read_bytes())
-    return file

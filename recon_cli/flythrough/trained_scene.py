@@ -64,35 +64,29 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
     `model` is auto, base or pruned; auto is the pruned one if it is fresh. `verb` is the command,
     for messages. StageError if the model is missing or stale.
     """
-    inspection = job.inspect()
-    origin = ImportRecord.read(job.workspace.folder("train"))
-    if origin and not origin.views:
-        _require_fresh(inspection, "train", verb)
-        return _open_viewless(job, model, origin)
-    manifests = {name: _require_fresh(inspection, name, verb) for name in _NEEDS}
-    pruned = _use_pruned(inspection, model, verb)
-    folders = {name: job.workspace.folder(name) for name in _NEEDS}
-    config = read_config(folders["train"])
-    splats = read_ply(job.workspace.folder("prune" if pruned else "train") / "splats.ply")
-    world = SfmSummary.from_json(manifests["sfm"].run.summary).world
-    return TrainedScene(
-        "pruned" if pruned else "base", splats, _digest(splats), config.sh_degree, config.max_size,
-        load_scene(StageInputs(folders), validation=config.validation),
-        world.evidence.up_found, world.evidence.metres)
-
-
-def _open_viewless(job: Job, model: str, origin: ImportRecord) -> TrainedScene:
-    """Returns an imported scene with synthetic cameras."""
-    if model == "pruned":
+    inspection, folder = job.inspect(), job.workspace.folder
+    origin = ImportRecord.read(folder("train"))
+    viewless = origin is not None and not origin.views
+    needs = ("train",) if viewless else _NEEDS
+    manifests = {name: _require_fresh(inspection, name, verb) for name in needs}
+    if viewless and model == "pruned":
         raise StageError(
             "There is no pruned model: a scene without views cannot be pruned.",
             hint=NEEDS_VIEWS_HINT)
-    folder = job.workspace.folder("train")
-    config, splats = read_config(folder), read_ply(folder / "splats.ply")
+    pruned = not viewless and _use_pruned(inspection, model, verb)
+    config = read_config(folder("train"))
+    splats = read_ply(folder("prune" if pruned else "train") / "splats.ply")
+    if origin is not None and viewless:
+        scene = synthetic_scene(splats, z_up=origin.z_up, max_size=config.max_size)
+        z_up, metres = origin.z_up, False
+    else:
+        inputs = StageInputs({name: folder(name) for name in _NEEDS})
+        scene = load_scene(inputs, validation=config.validation)
+        evidence = SfmSummary.from_json(manifests["sfm"].run.summary).world.evidence
+        z_up, metres = evidence.up_found, evidence.metres
     return TrainedScene(
-        "base", splats, _digest(splats), config.sh_degree, config.max_size,
-        synthetic_scene(splats, z_up=origin.z_up, max_size=config.max_size), origin.z_up, False,
-        has_views=False)
+        "pruned" if pruned else "base", splats, _digest(splats), config.sh_degree, config.max_size,
+        scene, z_up, metres, has_views=not viewless)
 
 
 def _require_fresh(inspection: WorkspaceCheck, name: str, verb: str) -> Manifest:

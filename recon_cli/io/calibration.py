@@ -122,9 +122,7 @@ def make_lens(model: str, width: float, height: float, params: Sequence[float], 
     return Lens(model, round(width), round(height), tuple(float(value) for value in params))
 
 
-def lens_from_matrix(
-    matrix: NDArray[np.float64], width: int, height: int, where: str
-) -> Lens:
+def lens_from_matrix(matrix: NDArray[np.float64], width: int, height: int, where: str) -> Lens:
     """Returns the PINHOLE intrinsics of a [3, 3] or [4, 4] matrix K.
 
     In K the centre of the first pixel is at 0, here at 0.5. FormatError if K is skewed or no

@@ -82,9 +82,9 @@ def read_model(folder: Path) -> Model:
         raise model_error(folder, f"images of the unknown camera {unknown[0]}", _HINT)
     if not used:
         raise model_error(folder, "no image has a pose", _HINT)
-    if not points.is_file():
-        return Model(lenses, named, unnamed, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    positions, colors = (read_points(points, hint=_HINT) if binary else read_points_text(points))
+    positions, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if points.is_file():
+        positions, colors = read_points(points, hint=_HINT) if binary else read_points_text(points)
     return Model(lenses, named, unnamed, positions, colors)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, NamedImage, model_suffix, read_model
-from recon_cli.io.posed import SUFFIXES, ListedImage, PosedSet, find_images, is_file, resolve_inside
+from recon_cli.io.posed import SUFFIXES, PosedImage, PosedSet, find_images, is_file, resolve_inside
 from recon_cli.scene.camera import MODELS, Lens
 
 _CHECKED = 5  # images, evenly spread
@@ -131,7 +131,7 @@ def read_colmap(folder: Path) -> PosedSet:
                    "order of the files, and their colours agree with it",)
     listed = []
     for name, camera, viewmat in sorted(named, key=lambda image: image[0]):
-        image = ListedImage(name, images / name, model.lenses[camera], viewmat)
+        image = PosedImage(name, images / name, model.lenses[camera], viewmat)
         mask = folder / "masks" / f"{name}.png"  # as COLMAP's --ImageReader.mask_path names them
         listed.append(replace(image, mask=mask) if is_file(mask) else image)
     posed = find_images("colmap", listed, model_at)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import undistort_pixels
 from recon_cli.io.posed import PosedImage, PosedSet
-from recon_cli.scene.camera import Lens
 
 MAX_POINTS = 100_000  # as many as INRIA's 3DGS draws if a data set has no points
 # Frames that are read, evenly spread: at two a second 100 s of walking, enough for a room.
@@ -31,10 +30,9 @@ def points_from_depth(
     images = [image for image in posed.images if image.depth is not None and not image.held_out]
     count = min(len(images), MAX_FRAMES)
     images = [images[int((at + 0.5) * len(images) / count)] for at in range(count)]
-    pixels = sum(posed.lenses[image.lens].width * posed.lenses[image.lens].height
-                 for image in images)
+    pixels = sum(image.lens.width * image.lens.height for image in images)
     step = max(1, math.ceil(math.sqrt(pixels / (_SAMPLES * max_points))))
-    clouds = [_unproject(image, posed.lenses[image.lens], step) for image in images]
+    clouds = [_unproject(image, step) for image in images]
     points = np.concatenate([cloud for cloud, _ in clouds]) if clouds else np.zeros((0, 3))
     if not len(points):
         raise InputError(
@@ -45,16 +43,14 @@ def points_from_depth(
     return points[rows], colors[rows]
 
 
-def _unproject(
-    image: PosedImage, lens: Lens, step: int
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _unproject(image: PosedImage, step: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Returns the world points and colours of every step-th pixel of a frame that has depth."""
     assert image.depth is not None
     depth = image.depth()[step // 2::step, step // 2::step]
-    rgb = _read_rgb(image, lens)[step // 2::step, step // 2::step]
+    rgb = _read_rgb(image)[step // 2::step, step // 2::step]
     rows, columns = np.nonzero(depth)
     at = np.stack([columns, rows], axis=1).astype(np.float64) * step + (step // 2 + 0.5)
-    rays = undistort_pixels(lens, at)
+    rays = undistort_pixels(image.lens, at)
     z = depth[rows, columns].astype(np.float64)
     camera = np.column_stack([rays * z[:, None], z])
     rotation, shift = image.viewmat[:3, :3], image.viewmat[:3, 3]
@@ -63,7 +59,8 @@ def _unproject(
     return world[good], rgb[rows, columns][good]
 
 
-def _read_rgb(image: PosedImage, lens: Lens) -> NDArray[np.uint8]:
+def _read_rgb(image: PosedImage) -> NDArray[np.uint8]:
+    lens = image.lens
     # Poses and depth belong to the pixels as they lie in the file.
     data = cv2.imread(str(image.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if data is None or data.shape[:2] != (lens.height, lens.width):

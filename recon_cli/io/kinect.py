@@ -21,7 +21,7 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import lens_from_matrix, make_lens, viewmat_from_pose
 from recon_cli.io.posed import (
     DepthFile,
-    ListedImage,
+    PosedImage,
     PosedSet,
     image_size,
     is_file,
@@ -66,10 +66,7 @@ def is_tum(folder: Path) -> bool:
 
 
 def find_unposed(folder: Path) -> tuple[str, Path] | None:
-    """Returns what a folder lacks that has colours and depth as these sequences do, but no poses.
-
-    With it comes what to give in place of the folder.
-    """
+    """Returns what a folder of colours and depth without poses lacks, and what to give instead."""
     if not is_seven_scenes(folder) and folder.is_dir() and all(
             next(folder.glob(f"frame-*.{kind}.*"), None) for kind in ("color", "depth")):
         return "7-Scenes frames without their .pose.txt", folder / "frame-*.color.*"
@@ -82,9 +79,8 @@ def find_unposed(folder: Path) -> tuple[str, Path] | None:
 def read_seven_scenes(folder: Path) -> PosedSet:
     """Returns a sequence of 7-Scenes without the frames whose tracking was lost.
 
-    Raises:
-        InputError: no frame has an image and a pose.
-        FormatError: a pose or the intrinsics are damaged, or missing at another size than 640x480.
+    InputError if no frame has an image and a pose; FormatError if a pose or the intrinsics are
+    damaged, or missing at another size than 640x480.
     """
     colors = {int(match[1]): path for path in sorted(folder.iterdir())
               if (match := _COLOR.fullmatch(path.name))}
@@ -102,7 +98,7 @@ def read_seven_scenes(folder: Path) -> PosedSet:
             continue
         path = folder / f"frame-{number:06d}.depth.png"
         depth = DepthFile(path, _MILLIMETRE, lens, depth_lens, unknown=_UNKNOWN)
-        listed.append(ListedImage(
+        listed.append(PosedImage(
             colors[number].name, colors[number], lens, viewmat,
             depth=depth if path.is_file() else None))
     return tracked_sequence("7scenes", listed, folder, len(colors) - len(listed), notices)
@@ -129,11 +125,8 @@ def _kinect(folder: Path, size: tuple[int, int]) -> tuple[Lens, Lens | None, tup
 def read_tum(folder: Path) -> PosedSet:
     """Returns a TUM RGB-D sequence without the frames that motion capture lost.
 
-    Poses are interpolated at the times of the frames.
-
-    Raises:
-        InputError: no frame has an image and a pose.
-        FormatError: a list is damaged or names files outside the folder.
+    Poses are interpolated at the times of the frames. InputError if no frame has an image and a
+    pose; FormatError if a list is damaged or names files outside the folder.
     """
     names, times = _read_list(folder, "rgb.txt")
     camera = _TUM_NAME.search(folder.absolute().name)
@@ -145,7 +138,7 @@ def read_tum(folder: Path) -> PosedSet:
     viewmats = _interpolate_poses(folder / "groundtruth.txt", times)
     depths = _pair_depth(folder, times)
     listed = [
-        ListedImage(
+        PosedImage(
             PurePosixPath(name).name, resolve_inside(folder, name, f"{folder / 'rgb.txt'}"),
             lens, viewmat,
             depth=None if depth is None else DepthFile(depth, _TUM_DEPTH, lens))
@@ -192,9 +185,7 @@ def _read_list(folder: Path, name: str) -> tuple[list[str], NDArray[np.float64]]
     return [rows[at][1] for at in order], times[order]
 
 
-def _interpolate_poses(
-    path: Path, times: NDArray[np.float64]
-) -> list[NDArray[np.float64] | None]:
+def _interpolate_poses(path: Path, times: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
     """Returns [4, 4] world to camera at each time, None where the path has a gap or ends."""
     values = _numbers([row[:8] for row in _read_rows(path, 8)], path)
     values = values[np.argsort(values[:, 0], kind="stable")] if len(values) else values

@@ -1,7 +1,7 @@
 """Data sets with known cameras: what their readers return, and the files that they list.
 
-A reader lists images with lenses and poses (`ListedImage`); `find_images` keeps those whose file
-exists, each with a lens of its size, as a `PosedSet`.
+A reader lists images with lenses and poses; `find_images` keeps those whose file exists, each with
+a lens of its size, as a `PosedSet`.
 """
 
 from __future__ import annotations
@@ -101,12 +101,12 @@ def _axis(lens: Lens, axis: int) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class ListedImage:
-    """An image as a data set lists it, whether or not its file exists."""
+class PosedImage:
+    """An image whose camera is known; its file need not exist before `find_images`."""
 
     name: str  # unique within the set
-    path: Path  # where its file should be
-    lens: Lens  # intrinsics as the data set gives them, whatever the size of the file
+    path: Path
+    lens: Lens  # intrinsics, at any size before `find_images` and at that of the file after it
     viewmat: NDArray[np.float64]  # [4, 4] float64 world to camera, OpenCV axes
     held_out: bool = False  # the data set itself holds it out for the score
     depth: DepthFile | None = None  # reads its depth, None without depth
@@ -114,24 +114,10 @@ class ListedImage:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedImage:
-    """An image whose file exists; the other fields are those of `ListedImage`."""
-
-    name: str
-    path: Path
-    lens: int  # index into the lenses of the set, which are of the size of the files
-    viewmat: NDArray[np.float64]
-    held_out: bool = False
-    depth: DepthFile | None = None
-    mask: Path | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class PosedSet:
     """A data set with poses."""
 
     layout: str  # the name of one of `layouts.LAYOUTS`
-    lenses: tuple[Lens, ...]  # intrinsics at the full size of the images
     images: tuple[PosedImage, ...]  # in the order of the data set
     missing: tuple[str, ...] = ()  # names of images that it lists, but whose files do not exist
     metric: bool = False  # its unit is the metre
@@ -141,9 +127,14 @@ class PosedSet:
     colors: NDArray[np.uint8] | None = None  # [P, 3] RGB of the points
     notices: tuple[str, ...] = ()  # what the user should know about how it was read
 
+    @property
+    def lenses(self) -> tuple[Lens, ...]:
+        """The different intrinsics of the images."""
+        return tuple(dict.fromkeys(image.lens for image in self.images))
+
 
 def find_images(
-    layout: str, listed: Sequence[ListedImage], where: Path, *, missing: Sequence[str] = ()
+    layout: str, listed: Sequence[PosedImage], where: Path, *, missing: Sequence[str] = ()
 ) -> PosedSet:
     """Returns the images whose files exist, with lenses scaled to the size of the files.
 
@@ -174,15 +165,12 @@ def find_images(
     missing = (*(item.name for item in listed if not is_file(item.path)), *missing)
     sizes = [image_size(item.path) for item in existing]
     factor = _check_sizes(existing, sizes)
-    lenses: dict[Lens, int] = {}
     images = []
     for item, size in zip(existing, sizes, strict=True):
         lens = item.lens
         if size != (lens.width, lens.height):
             lens = lens.resized(*size)
-        images.append(PosedImage(
-            item.name, item.path, lenses.setdefault(lens, len(lenses)), item.viewmat,
-            item.held_out, item.depth and replace(item.depth, lens=lens), item.mask))
+        images.append(replace(item, lens=lens, depth=item.depth and replace(item.depth, lens=lens)))
     notices = []
     if missing:
         notices.append(f"{len(missing)} of the {len(names)} images that it lists are missing, "
@@ -190,10 +178,10 @@ def find_images(
     if factor != 1:
         notices.append(f"its images are {factor:.4g} times as large as its cameras say, so the "
                        "intrinsics were scaled")
-    return PosedSet(layout, tuple(lenses), tuple(images), missing, notices=tuple(notices))
+    return PosedSet(layout, tuple(images), missing, notices=tuple(notices))
 
 
-def _check_sizes(items: Sequence[ListedImage], sizes: Sequence[tuple[int, int]]) -> float:
+def _check_sizes(items: Sequence[PosedImage], sizes: Sequence[tuple[int, int]]) -> float:
     """Returns by which factor the files are larger than their lenses."""
     factor = float(np.median([
         width / item.lens.width for item, (width, _) in zip(items, sizes, strict=True)]))

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import lens_from_matrix, make_lens, viewmat_from_pose
-from recon_cli.io.posed import DepthFile, ListedImage, PosedSet, find_images, image_size
+from recon_cli.io.posed import DepthFile, PosedImage, PosedSet, find_images, image_size
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace.atomic import read_json
 
@@ -87,7 +87,7 @@ def _read_params(folder: Path) -> tuple[Lens, float]:
 
 def _list_sequence(
     folder: Path, lens: Lens, scale: float, *, held_out: bool = False
-) -> list[ListedImage]:
+) -> list[PosedImage]:
     """Returns the frames of one results/ folder by number."""
     files = {}
     for path in (folder / "results").iterdir():
@@ -103,7 +103,7 @@ def _list_sequence(
         path = files.get(number, folder / "results" / f"frame{number:0{digits}d}{suffix}")
         viewmat = viewmat_from_pose(rows[number], f"{folder / _TRAJ}, line {number + 1},")
         depth = path.with_name(path.stem.replace("frame", "depth") + ".png")
-        listed.append(ListedImage(
+        listed.append(PosedImage(
             prefix + path.name, path, lens, viewmat, held_out,
             DepthFile(depth, 1 / scale, lens) if depth.is_file() else None))
     return listed
@@ -170,12 +170,12 @@ def read_scannet(folder: Path) -> PosedSet:
             lost += 1
             continue
         depth = DepthFile(depths[number], _MILLIMETRE, lens, own) if number in depths else None
-        listed.append(ListedImage(path.name, path, lens, viewmat, depth=depth))
+        listed.append(PosedImage(path.name, path, lens, viewmat, depth=depth))
     return tracked_sequence("scannet", listed, folder, lost)
 
 
 def tracked_sequence(
-    layout: str, listed: Sequence[ListedImage], folder: Path, lost: int,
+    layout: str, listed: Sequence[PosedImage], folder: Path, lost: int,
     notices: tuple[str, ...] = (),
 ) -> PosedSet:
     """Returns the frames of a metric sequence that have a pose; `lost` others have none.

@@ -27,7 +27,7 @@ from recon_cli.io.ply import read_ply_points
 from recon_cli.io.posed import (
     SUFFIXES,
     DepthFile,
-    ListedImage,
+    PosedImage,
     PosedSet,
     find_images,
     image_size,
@@ -359,14 +359,12 @@ def _short_names(frames: Sequence[_Frame]) -> list[str]:
     return ["/".join(path[shared:]) for path in parts]
 
 
-def _list_frame(
-    frame: _Frame, name: str, held_out: str, finder: _FileFinder
-) -> ListedImage:
+def _list_frame(frame: _Frame, name: str, held_out: str, finder: _FileFinder) -> PosedImage:
     viewmat = viewmat_from_pose(
         frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
     depth, unit = _beside(frame, "depth_file_path", finder), _unit(frame)
-    return ListedImage(
+    return PosedImage(
         name, frame.path, lens, viewmat, frame.part == held_out,
         None if depth is None else DepthFile(depth, unit, lens),
         _beside(frame, "mask_path", finder))

@@ -48,7 +48,7 @@ def test_a_distorted_lens_is_undone(posed):
     lens = Lens("OPENCV", posed_sets.WIDTH, posed_sets.HEIGHT, (
         *posed.lenses[0].params, 0.1, 0.0, 0.0, 0.0))
     straight, _ = points_from_depth(replace(posed, images=posed.images[:1]))
-    bent, _ = points_from_depth(replace(posed, images=posed.images[:1], lenses=(lens,)))
+    bent, _ = points_from_depth(replace(posed, images=(replace(posed.images[0], lens=lens),)))
     ray = bent[0] - posed_sets.pose(0)[:3, 3]
     x, y = ray[:2] / ray[2]
     stretched = np.array([x, y]) * (1 + 0.1 * (x * x + y * y))

@@ -34,7 +34,7 @@ def assert_same(posed, views, folder=""):
     for image, (name, camera) in zip(posed.images, views, strict=True):
         assert folder + image.name == name
         np.testing.assert_allclose(image.viewmat, camera.viewmat, atol=1e-14)
-        lens = posed.lenses[image.lens]
+        lens = image.lens
         assert (lens.model, lens.width, lens.height) == ("PINHOLE", camera.width, camera.height)
         assert lens.params == (camera.fx, camera.fy, camera.cx, camera.cy)
 

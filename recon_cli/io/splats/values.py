@@ -163,9 +163,7 @@ def encode_smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     return largest, signed[_others(largest)].reshape(-1, 3)
 
 
-def decode_smallest_three(
-    largest: NDArray[np.int64], others: NDArray[np.floating[Any]]
-) -> Floats:
+def decode_smallest_three(largest: NDArray[np.int64], others: NDArray[np.floating[Any]]) -> Floats:
     """Returns quaternions [N, 4]: the inverse of `encode_smallest_three`."""
     quats = np.empty((len(others), 4), np.float32)
     quats[_others(largest)] = others.ravel()
