@@ -23,7 +23,6 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import ColorRange, Colorspace
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon_cli.errors import ConfigError
 from recon_cli.flythrough.paths import visible_depths
@@ -100,27 +99,22 @@ def write_frame(
     file = f"{name}.png"
     for kind in kinds:
         if kind == RGB:
-            write_png(folder / RGB / file, to_uint8(_array(output.rgb)))
+            write_png(folder / RGB / file, to_uint8(output.rgb.cpu().numpy()))
         elif kind == ALPHA:
-            write_png(folder / ALPHA / file, to_uint8(_array(output.alpha)))
+            write_png(folder / ALPHA / file, to_uint8(output.alpha.cpu().numpy()))
         else:
-            steps = depth_steps(_array(surfaces.depth), _array(surfaces.alpha), scale.step)
+            depth, alpha = surfaces.depth.cpu().numpy(), surfaces.alpha.cpu().numpy()
+            steps = depth_steps(depth, alpha, scale.step)
             write_png(folder / DEPTH / file, steps)
             write_png(folder / DEPTH_COLOR / file, depth_colors(steps, scale))
-
-
-def _array(tensor: Tensor) -> NDArray[np.float32]:
-    array: NDArray[np.float32] = tensor.cpu().numpy()
-    return array
 
 
 def depth_steps(
     depth: NDArray[np.float32], alpha: NDArray[np.float32], step: float
 ) -> NDArray[np.uint16]:
-    """Returns z-depth [H, W] in whole steps of world units, the mean weighted by alpha T.
+    """Returns z-depth [H, W] in whole steps of world units from the sums of alpha T z and alpha T.
 
-    0 where alpha is below one half; otherwise clipped to 1 to 65535. `depth` is the sum of alpha T
-    z.
+    0 where alpha is below one half; otherwise clipped to 1 to 65535.
     """
     covered = alpha >= _MIN_ALPHA
     mean = depth.astype(np.float64) / np.where(covered, alpha, 1) / step

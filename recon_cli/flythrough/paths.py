@@ -39,7 +39,11 @@ def smooth_path(viewmats: NDArray[np.float64], count: int) -> NDArray[np.float64
     fine = np.linspace(0, last, int(_FINE * last) + 1)
     length = _path_length(*_split(curve(fine)))
     at = np.interp(np.linspace(0, length[-1], count), length, fine)
-    return _to_viewmats(*_split(curve(at)))
+    centers, turns = _split(curve(at))
+    smooth = np.tile(np.eye(4), (count, 1, 1))
+    smooth[:, :3, :3] = turns.as_matrix().transpose(0, 2, 1)
+    smooth[:, :3, 3] = -np.einsum("cij,cj->ci", smooth[:, :3, :3], centers)
+    return smooth
 
 
 def _fit_spline(
@@ -84,13 +88,6 @@ def _path_length(centers: NDArray[np.float64], rotations: Rotation) -> NDArray[n
 def _shares(parts: NDArray[np.float64]) -> NDArray[np.float64]:
     total = parts.sum()
     return np.asarray(parts / total if total > 1e-12 else np.zeros_like(parts))
-
-
-def _to_viewmats(centers: NDArray[np.float64], rotations: Rotation) -> NDArray[np.float64]:
-    viewmats = np.tile(np.eye(4), (len(centers), 1, 1))
-    viewmats[:, :3, :3] = rotations.as_matrix().transpose(0, 2, 1)
-    viewmats[:, :3, 3] = -np.einsum("cij,cj->ci", viewmats[:, :3, :3], centers)
-    return viewmats
 
 
 def orbit_path(

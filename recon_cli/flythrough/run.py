@@ -69,7 +69,7 @@ class FrameFolder:
         them for readers of the record. FormatError if the record of an earlier run is damaged.
         """
         settings = {"schema": _SCHEMA, **settings}
-        before = self._read_record()
+        before = self.read_record()
         if before is not None and before["digest"] != sha256_json(settings):
             changed = sorted(key for key in {*settings, *before["settings"]}
                              if settings.get(key) != before["settings"].get(key))
@@ -92,17 +92,11 @@ class FrameFolder:
         """Returns the path of a frame's picture in one of the folders."""
         return self.root / folder / f"{name}.png"
 
-    @property
-    def video(self) -> Any:
-        """The encoding of the finished video; None if there is none of these frames."""
-        record = self._read_record()
-        return record["video"] if record else None
+    def record_video(self, encoding: dict[str, Any]) -> None:
+        """Adds the encoding of the finished video of these frames to the record."""
+        write_json(self.root / RECORD, {**(self.read_record() or {}), "video": encoding})
 
-    @video.setter
-    def video(self, encoding: Any) -> None:
-        write_json(self.root / RECORD, {**(self._read_record() or {}), "video": encoding})
-
-    def _read_record(self) -> dict[str, Any] | None:
+    def read_record(self) -> dict[str, Any] | None:
         """Returns the record of an earlier run; None in a new folder."""
         path = self.root / RECORD
         if not path.exists():
@@ -121,15 +115,6 @@ class FrameFolder:
                 picture.unlink()
         for path in (*(self.root / f"{output}.mp4" for output in FOLDERS), self.root / PATH):
             path.unlink(missing_ok=True)
-
-
-def check_folder(root: Path) -> None:
-    """Raises WorkspaceError if a folder holds files that no earlier run wrote."""
-    others = {path.name for path in root.iterdir() if not path.match(LEFTOVERS)} - {LOCK, HOLDER}
-    if others and RECORD not in others:
-        raise WorkspaceError(
-            f"{root} is not empty: it holds {min(others)}, but no {RECORD}, so recon did not "
-            "create it.", hint="Give a new or an empty folder with --out.")
 
 
 def render_frames(request: RenderRequest, job: Job) -> str:
@@ -188,7 +173,11 @@ def _make_folders(request: RenderRequest, plan: CameraPlan, workspace: Path) -> 
     if request.out is not None and request.out_file is None:
         folder = request.out.absolute()
     _make_folder(folder)
-    check_folder(folder)
+    others = {path.name for path in folder.iterdir() if not path.match(LEFTOVERS)} - {LOCK, HOLDER}
+    if others and RECORD not in others:
+        raise WorkspaceError(
+            f"{folder} is not empty: it holds {min(others)}, but no {RECORD}, so recon did not "
+            "create it.", hint="Give a new or an empty folder with --out.")
     if request.out_file is not None:
         _make_folder(request.out_file.absolute().parent)
         if request.out_file.is_dir():
@@ -246,11 +235,13 @@ def _render_missing(
 def _encode_videos(frames: FrameFolder, encoding: VideoEncoding, ctx: StageContext) -> list[Path]:
     """Returns one video an output, encoded again unless frames and settings are the same."""
     videos = {output: frames.root / f"{output}.mp4" for output in frames.outputs}
-    if frames.video == asdict(encoding) and all(path.is_file() for path in videos.values()):
+    record = frames.read_record()
+    if record and record["video"] == asdict(encoding) and all(
+            path.is_file() for path in videos.values()):
         return list(videos.values())
     with ctx.progress.bar("encode", len(videos) * len(frames.names), unit="frame") as bar:
         for output, path in videos.items():
             pictures = [frames.frame_path(VIDEO_FRAMES[output], name) for name in frames.names]
             encode_video(pictures, path, encoding, threads=ctx.threads, on_frame=bar.advance)
-    frames.video = asdict(encoding)
+    frames.record_video(asdict(encoding))
     return list(videos.values())

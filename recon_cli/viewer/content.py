@@ -207,11 +207,9 @@ def _format(value: float) -> str:
 
 
 class PhotoPairs:
-    """Photos of views next to recon's own renders of them, made on request, by one thread at a
-    time.
+    """Photos of views next to recon's own renders of them, made on request.
 
-    `job` has the device, backend and threads to render with; `max_size` is the longest side in
-    pixels.
+    One thread at a time may use it. `max_size` is the longest side in pixels.
     """
 
     def __init__(self, job: Job, max_size: int) -> None:

@@ -39,9 +39,7 @@ logger = logging.getLogger("recon")
 
 
 class LiveView(TrainCallback):
-    """Sends the Gaussians in training to all browsers of a server; the workspace's sfm knows the
-    up.
-    """
+    """Sends the Gaussians in training to all browsers of a server."""
 
     def __init__(self, server: Server, workspace: Workspace) -> None:
         self._server, self._workspace = server, workspace
@@ -60,19 +58,16 @@ class LiveView(TrainCallback):
         """Moves all browsers to the first training camera."""
         self._label, self._until, self._psnr_db = label, until, None
         try:
-            self._place_browsers(cameras, splats)
+            up = self._up(cameras)
+            depths = visible_depths(cameras[0], splats.means.detach().cpu().double().numpy())
+            distance = float(np.median(depths)) if len(depths) else 1.0
+            start = browser_camera(cameras[0], distance, FAR)
+            self._server.scene.set_up_direction(up)
+            set_initial_camera(self._server, start)
+            for client in self._server.get_clients().values() if self._node is None else ():
+                move_browser(client, start, up, cameras[0])
         except Exception:  # the viewer must never end a training
             logger.debug("the browsers could not be placed", exc_info=True)
-
-    def _place_browsers(self, cameras: Sequence[Camera], splats: Splats) -> None:
-        up = self._up(cameras)
-        depths = visible_depths(cameras[0], splats.means.detach().cpu().double().numpy())
-        start = browser_camera(cameras[0], float(np.median(depths)) if len(depths) else 1.0, FAR)
-        self._server.scene.set_up_direction(up)
-        set_initial_camera(self._server, start)
-        if self._node is None:
-            for client in self._server.get_clients().values():
-                move_browser(client, start, up, cameras[0])
 
     def on_step(self, iteration: int, splats: Splats) -> None:
         """Sends the Gaussians if an update is due and a browser is connected."""

@@ -58,13 +58,11 @@ def start_server(host: str, port: int | None, *, label: str) -> Iterator[tuple[S
 
 
 def _free_port(host: str, port: int | None) -> int:
-    if port is not None:
-        if not _is_free(host, port):
-            raise _port_error(port)
-        return port
-    for candidate in range(PORT, PORT + _TRIED):
+    for candidate in range(PORT, PORT + _TRIED) if port is None else (port,):
         if _is_free(host, candidate):
             return candidate
+    if port is not None:
+        raise _port_error(port)
     raise ConfigError(
         f"The ports {PORT} to {PORT + _TRIED - 1} are all in use.",
         hint="Give another with --port.")

@@ -7,25 +7,33 @@ are rows of a palette of at most 65,536. A quaternion is its three smaller compo
 in alpha, 252 plus the index of the greatest in wxyz. Opacity is a byte after the sigmoid. Axes are
 those of the .ply that the scene would be written to.
 
+Nothing is unpacked to the disk. Sizes in a zip's directory are only claims, so every entry is read
+up to a bound that follows from the number of Gaussians, which the size of the file bounds in turn.
 Source: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog, read
 together with files that splat-transform writes: scales are logarithms there, quaternions wxyz.
 """
 
 from __future__ import annotations
 
+import io
+import json
 import math
+import sys
+import zipfile
+import zlib
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
 
-from recon_cli.io.splats.codebooks import fit_codebook, fit_palette, nearest_entries
-from recon_cli.io.splats.sog_archive import Archive, Meta, pack_archive, read_meta
+from recon_cli.io.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
+    UntrustedFile,
     decode_smallest_three,
     encode_smallest_three,
     logit,
@@ -42,10 +50,19 @@ ROW = 64  # palette entries in a row of their image
 _STEPS = 65535  # of a position along an axis
 _TAG = 252  # of a quaternion whose greatest component is w
 _ROOT2 = math.sqrt(2)  # only the greatest component of a unit quaternion exceeds 1 / sqrt(2)
-_MAX_ENTRIES = 65535  # of a palette, besides one of zeros
+_MAX_ENTRIES = 65535  # of a palette, besides one of zeros: labels are 16 bits
+_MAX_COUNT = 16383 * 16383  # pixels of the largest WebP
 # Gaussians per entry. A scene of photos with 60,000 (fox, degree 3) loses .15, .19, .25 and .33 dB
 # with 4, 8, 16 and 32, and takes 23.7, 18.7, 16.1 and 14.7 bytes each.
 _SHARE = 16
+META = "meta.json"
+_META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
+_SMALL = 1 << 20  # Gaussians or pixels that are always accepted: a few hundred MB
+_START, _ENTRY = b"PK\x03\x04", b"PK\x01\x02"  # of the file, and of each entry of its directory
+_ENTRIES = 64  # a .sog has eight
+_HEADER = 1 << 16  # bytes of an image beside its pixels
+_DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip can hold: the same scene, the same bytes
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others cannot be stopped at a bound
 Doubles = NDArray[np.float64]
 
 
@@ -106,50 +123,49 @@ def read_sog(path: Path) -> Splats:
     the file is missing, damaged, of version 1, or does not hold what it promises.
     """
     archive = Archive(path)
-    meta = read_meta(archive)
-    archive.check_count(meta.count)
-    first = archive.pixels(meta.means[0], meta.count)
+    meta = archive.meta()
+    means, scales, quats, sh0 = (
+        archive.part(meta, name) for name in ("means", "scales", "quats", "sh0"))
+    count = archive.whole(meta, "count", 1, _MAX_COUNT)
+    archive.check_count(count)
+    low, high = archive.numbers(means, "mins", 3, 3), archive.numbers(means, "maxs", 3, 3)
+    low_name, high_name = archive.files(means, 2)
+    first = archive.pixels(low_name, count)
     size = (first.shape[1], first.shape[0])
 
     def rows(name: str) -> Bytes:
-        return archive.pixels(name, meta.count, size=size).reshape(-1, 4)[: meta.count]
+        return archive.pixels(name, count, size=size).reshape(-1, 4)[:count]
 
-    low_bytes, high_bytes = first.reshape(-1, 4)[: meta.count, :3], rows(meta.means[1])[:, :3]
-    quats = rows(meta.quats_file)
-    if (quats[:, 3] < _TAG).any():
+    low_bytes, high_bytes = first.reshape(-1, 4)[:count, :3], rows(high_name)[:, :3]
+    turns, colors = rows(*archive.files(quats, 1)), rows(*archive.files(sh0, 1))
+    if (turns[:, 3] < _TAG).any():
         raise archive.error("quaternions without their greatest component")
-    sh0 = rows(meta.sh0_file)
     return splats_from_arrays(path, {
-        "means": unpack_means(low_bytes, high_bytes, meta.low, meta.high),
+        "means": unpack_means(low_bytes, high_bytes, low, high),
         "quats": decode_smallest_three(
-            quats[:, 3].astype(np.int64) - _TAG, (quats[:, :3] / 255 * 2 - 1) / _ROOT2),
-        "log_scales": _look_up(rows(meta.scales_file)[:, :3], meta.scales, archive),
-        "logit_opacities": logit(sh0[:, 3] / 255, _LEAST_OPACITY),
-        "sh_dc": _look_up(sh0[:, :3], meta.sh0, archive),
+            turns[:, 3].astype(np.int64) - _TAG, (turns[:, :3] / 255 * 2 - 1) / _ROOT2),
+        "log_scales": archive.look_up(rows(*archive.files(scales, 1))[:, :3], scales),
+        "logit_opacities": logit(colors[:, 3] / 255, _LEAST_OPACITY),
+        "sh_dc": archive.look_up(colors[:, :3], sh0),
         "sh_rest": _read_harmonics(archive, meta, rows),
     })
 
 
-def _look_up(indices: Bytes, book: Floats, archive: Archive) -> Floats:
-    if indices.max() >= len(book):
-        raise archive.error(f"the number {indices.max()} of a codebook of {len(book)}")
-    return np.asarray(book[indices])
-
-
-def _read_harmonics(archive: Archive, meta: Meta, rows: Callable[[str], Bytes]) -> Floats:
+def _read_harmonics(archive: Archive, meta: dict[str, Any], rows: Callable[[str], Bytes]) -> Floats:
     """Returns coefficients [M, T, 3]."""
-    harmonics = meta.harmonics
-    if harmonics is None:
+    if meta.get("shN") is None:
         return np.zeros((0, 0, 3), np.float32)
-    lines = -(-harmonics.count // ROW)
-    width = ROW * TERMS[harmonics.degree]
-    entries = archive.pixels(harmonics.files[0], width * lines, size=(width, lines))[:, :, :3]
-    parts = rows(harmonics.files[1])
+    part = archive.part(meta, "shN")
+    count = archive.whole(part, "count", 1, _MAX_ENTRIES + 1)
+    terms = TERMS[archive.whole(part, "bands", 1, 3)]
+    entries_name, labels_name = archive.files(part, 2)
+    width, lines = ROW * terms, -(-count // ROW)
+    entries = archive.pixels(entries_name, width * lines, size=(width, lines))[:, :, :3]
+    parts = rows(labels_name)
     labels = parts[:, 0] + 256 * parts[:, 1].astype(np.int64)
-    if labels.max() >= harmonics.count:
-        raise archive.error(f"the label {labels.max()} of a palette of {harmonics.count}")
-    coefficients = _look_up(entries, harmonics.codebook, archive)
-    return np.asarray(coefficients.reshape(-1, TERMS[harmonics.degree], 3)[labels])
+    if labels.max() >= count:
+        raise archive.error(f"the label {labels.max()} of a palette of {count}")
+    return np.asarray(archive.look_up(entries, part).reshape(-1, terms, 3)[labels])
 
 
 def pack_means(means: Floats) -> tuple[Doubles, Doubles, NDArray[np.int64]]:
@@ -202,3 +218,153 @@ def pack_harmonics(
     names = ["shN_centroids.webp", "shN_labels.webp"]
     return {"count": len(entries), "bands": TERMS.index(terms), "codebook": _json(book),
             "files": names}, dict(zip(names, (pixels, _image(rows)), strict=True))
+
+
+class Archive(UntrustedFile):
+    """An open .sog; every method raises FormatError if the file does not hold what it promises."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _START, ".sog")
+        if self.data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
+            raise self.error(f"more than {_ENTRIES} entries: no .sog")
+        try:
+            self._zip = zipfile.ZipFile(io.BytesIO(self.data))
+        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+            raise self.error(f"a zip that is no .sog: {error}") from error
+        self._entries = {entry.filename: entry for entry in self._zip.infolist()}
+        if len(self._entries) < len(self._zip.infolist()):
+            raise self.error("two entries of one name")
+        for name in self._entries:
+            if _escapes(name):
+                raise self.error(f"the entry {name!r:.80}, which leaves the archive")
+
+    def meta(self) -> dict[str, Any]:
+        """Returns the object in meta.json of version 2."""
+        meta = self.json_object(self._read(META, _META_LIMIT))
+        if "version" not in meta and isinstance(meta.get("means"), dict):
+            raise self.error("version 1 of the format, which is not supported")
+        if self.whole(meta, "version", 0, sys.maxsize) != 2:
+            raise self.error(f"version {meta['version']} of the format; version 2 can be read")
+        return meta
+
+    def part(self, meta: dict[str, Any], name: str) -> dict[str, Any]:
+        """Returns an object of meta.json."""
+        part = meta.get(name)
+        if not isinstance(part, dict):
+            raise self.error(f"a meta.json without {name}")
+        return part
+
+    def files(self, part: dict[str, Any], count: int) -> list[str]:
+        """Returns the names of the images of a part."""
+        names = part.get("files")
+        if not isinstance(names, list) or len(names) != count or not all(
+                isinstance(name, str) for name in names):
+            raise self.error(f"files = {names!r:.40}; needed are {count} names")
+        return names
+
+    def look_up(self, indices: NDArray[np.uint8], part: dict[str, Any]) -> Floats:
+        """Returns the numbers of a part's codebook, which has at most 256."""
+        book = self.numbers(part, "codebook", 1, BOOK).astype(np.float32)
+        if indices.max() >= len(book):
+            raise self.error(f"the number {indices.max()} of a codebook of {len(book)}")
+        return np.asarray(book[indices])
+
+    def check_count(self, count: int) -> None:
+        """Raises FormatError for more Gaussians than a file of this size is likely to hold.
+
+        They take about 16 bytes each; images of one colour take none, however large they are.
+        """
+        if count > _SMALL + len(self.data):
+            raise self.error(f"{count} Gaussians in {len(self.data)} bytes, as it claims")
+
+    def pixels(
+        self, name: str, count: int, *, size: tuple[int, int] | None = None
+    ) -> NDArray[np.uint8]:
+        """Returns the pixels [H, W, 4] of an image of at least `count` pixels, and not many more.
+
+        `size` is the (width, height) that it must have; None for any.
+        """
+        most = max(4 * count, _SMALL)
+        data = self._read(name, 4 * most + _HEADER)
+        if data[8:16] == b"WEBPVP8 ":
+            raise self.error(f"{name}, which has lossy compression that destroys its values")
+        if (claimed := _webp_size(data)) is not None:
+            self._check_size(claimed, name, count, most, size)
+        try:
+            with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
+                if image.mode not in ("RGB", "RGBA") or getattr(image, "n_frames", 1) != 1:
+                    raise self.error(f"{name}, which is no single image of 8 bits a channel")
+                self._check_size(image.size, name, count, most, size)
+                return np.asarray(image.convert("RGBA"))
+        except (OSError, UnidentifiedImageError, ValueError, SyntaxError, zlib.error,
+                Image.DecompressionBombError) as error:
+            raise self.error(f"{name}, which is no image: {error}") from error
+
+    def _check_size(
+        self, actual: tuple[int, int], name: str, count: int, most: int,
+        needed: tuple[int, int] | None,
+    ) -> None:
+        width, height = actual
+        if not count <= width * height <= most:
+            raise self.error(f"{name} of {width}x{height} pixels for {count} values")
+        if needed is not None and actual != needed:
+            raise self.error(
+                f"{name} of {width}x{height} pixels, needed are {needed[0]}x{needed[1]}")
+
+    def _read(self, name: str, most: int) -> bytes:
+        entry = self._entries.get(name)
+        if entry is None:
+            raise self.error(f"no entry {name!r:.80}")
+        if entry.flag_bits & 1 or entry.compress_type not in _METHODS:
+            raise self.error(f"the entry {name}, which is encrypted or compressed unusually")
+        try:
+            with self._zip.open(entry) as file:
+                data = file.read(most + 1)
+                whole = len(data) <= most and not file.read(1)
+        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError,
+                NotImplementedError) as error:
+            raise self.error(f"the entry {name}, which cannot be unpacked: {error}") from error
+        if not whole:
+            raise self.error(f"the entry {name}, which unpacks to more than {most} bytes")
+        return data
+
+
+def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
+    """Returns the bytes of a .sog with images [H, W, 3] or [H, W, 4] by name.
+
+    The same arguments give the same bytes.
+    """
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
+        text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
+        archive.writestr(zipfile.ZipInfo(META, _DATE), text)
+        for name, pixels in images.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), encode_webp(pixels))
+    return data.getvalue()
+
+
+def encode_webp(pixels: NDArray[np.uint8]) -> bytes:
+    """Returns a lossless WebP of [H, W, 3] or [H, W, 4], exact under an alpha of 0 too."""
+    data = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(
+        data, "WEBP", lossless=True, exact=True, quality=75, method=4)
+    return data.getvalue()
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    """Returns (width, height) from the header of a WebP (RFC 9649); None for other images.
+
+    Pillow's decoder allocates memory when it opens a file, before it reports the size.
+    """
+    if data[8:12] != b"WEBP" or len(data) < 30:
+        return None
+    if data[12:16] == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+
+
+def _escapes(name: str) -> bool:
+    """Returns whether a path would lead out of the folder that it is unpacked to."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name

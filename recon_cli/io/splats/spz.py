@@ -129,15 +129,11 @@ def spz_splats(path: Path, data: bytes) -> Splats:
     return flip_yz(splats_from_arrays(path, {
         "means": _positions(places, header.fractional_bits),
         "quats": _rotations(rotations.reshape(n, -1)),
-        "log_scales": _floats(scales).reshape(n, 3) / _SCALE_STEPS - _SCALE_OFFSET,
+        "log_scales": scales.astype(np.float32).reshape(n, 3) / _SCALE_STEPS - _SCALE_OFFSET,
         "logit_opacities": decode_opacities(opacities),
-        "sh_dc": (_floats(colors).reshape(n, 3) / 255 - 0.5) / _COLOR,
-        "sh_rest": (_floats(harmonics).reshape(shape) - _HARMONIC) / _HARMONIC,
+        "sh_dc": (colors.astype(np.float32).reshape(n, 3) / 255 - 0.5) / _COLOR,
+        "sh_rest": (harmonics.astype(np.float32).reshape(shape) - _HARMONIC) / _HARMONIC,
     }))
-
-
-def _floats(data: Bytes) -> Floats:
-    return data.astype(np.float32)
 
 
 def _fractional_bits(path: Path, means: Floats) -> int:
@@ -181,7 +177,7 @@ def _vector_bytes(quats: Floats) -> Bytes:
 def _rotations(data: Bytes) -> Floats:
     """Returns quaternions wxyz from [N, 4] bytes, or from the [N, 3] of version 2."""
     if data.shape[1] == 3:
-        vector = _floats(data) / 127.5 - 1
+        vector = data.astype(np.float32) / 127.5 - 1
         real = np.sqrt(np.maximum(0, 1 - (vector * vector).sum(axis=1, keepdims=True)))
         return np.concatenate([real, vector], axis=1)
     word = np.ascontiguousarray(data).view("<u4")

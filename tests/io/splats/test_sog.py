@@ -13,8 +13,7 @@ from scenes import camera_at, with_harmonics
 
 from recon_cli.errors import InputError
 from recon_cli.io.ply import write_ply
-from recon_cli.io.splats.sog import read_sog, write_sog
-from recon_cli.io.splats.sog_archive import encode_webp
+from recon_cli.io.splats.sog import encode_webp, read_sog, write_sog
 from recon_cli.render.registry import render
 
 ROUNDING = 1e-6  # of float32, of values about 1

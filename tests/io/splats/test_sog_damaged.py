@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.sog import read_sog, write_sog
-from recon_cli.io.splats.sog_archive import encode_webp
+from recon_cli.io.splats.sog import encode_webp, read_sog, write_sog
 
 COUNT = 70  # a palette of 5, images of 9 x 8
 
