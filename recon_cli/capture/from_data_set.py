@@ -78,7 +78,8 @@ def _choose_images(config: IngestConfig, posed: PosedSet, ctx: IngestContext) ->
 
 
 def _write_images(
-    images: Sequence[PosedImage], names: Sequence[str], max_size: int, out: Path, ctx: IngestContext,
+    images: Sequence[PosedImage], names: Sequence[str], max_size: int, out: Path,
+    ctx: IngestContext,
 ) -> dict[str, str]:
     """Writes frames and masks; returns why some images could not be read, by frame name."""
     broken: dict[str, str] = {}

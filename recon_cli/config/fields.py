@@ -18,35 +18,21 @@ from recon_cli.errors import ConfigError
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """What is declared about a field besides its type and default.
+    """What is declared about a field besides its type and default."""
 
-    Attributes:
-        help: one sentence.
-        unit: of a number.
-        choices: the values that are allowed; empty for any.
-        minimum: smallest value.
-        maximum: largest value.
-        hashed: whether the field affects the result, and so the fingerprint of its stage.
-        expert: whether --help leaves it to --help-all.
-        flags: help of each choice that gets a flag of its own in place of one option: --force.
-        automatic: what None means.
-        metavar: how --help names the value.
-        read: makes the value of the one word that is typed.
-        repeatable: whether the option may be given several times; the texts are joined by commas.
-    """
-
-    help: str
+    help: str  # one sentence
     unit: str = ""
-    choices: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()  # the values that are allowed; empty for any
     minimum: float | None = None
     maximum: float | None = None
-    hashed: bool = True
-    expert: bool = False
+    hashed: bool = True  # the field affects the result, and so the fingerprint of its stage
+    expert: bool = False  # --help leaves it to --help-all
+    # help of each choice that gets a flag of its own in place of one option: --force
     flags: Mapping[str, str] = field(default_factory=dict)
-    automatic: str = ""
+    automatic: str = ""  # what None means
     metavar: str = ""
-    read: Callable[[str], Any] | None = None
-    repeatable: bool = False
+    read: Callable[[str], Any] | None = None  # makes the value of the one word that is typed
+    repeatable: bool = False  # may be given several times; the texts are joined by commas
 
 
 def option(default: Any, help: str, **info: Any) -> Any:
@@ -75,11 +61,7 @@ def member_types(kind: Any) -> tuple[type, ...]:
 
 @dataclass(frozen=True)
 class StageConfig:
-    """Base of every config: checks type, choices and range of each field.
-
-    Raises:
-        ConfigError: a value has the wrong type or lies outside its range.
-    """
+    """Base of every config: checks type, choices and range of each field, or raises ConfigError."""
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):

@@ -47,9 +47,7 @@ _TRUTH = {"true": True, "false": False}
 def read_settings(path: Path) -> Settings:
     """Returns what a recon.toml sets, with every section, field and value checked.
 
-    Raises:
-        ConfigError: the file is missing or no TOML, or sets what does not exist or a value that
-            cannot be used.
+    ConfigError if the file is missing or no TOML, or sets what does not exist or cannot be used.
     """
     try:
         with path.open("rb") as file:
@@ -74,8 +72,7 @@ def read_settings(path: Path) -> Settings:
 def parse_assignment(text: str) -> Settings:
     """Returns what `section.field=value` sets, the value typed as the field is.
 
-    Raises:
-        ConfigError: the text has another form, names no field, or the value cannot be used.
+    ConfigError if the text has another form, names no field, or the value cannot be used.
     """
     path, equals, value = text.partition("=")
     section, dot, name = path.strip().partition(".")

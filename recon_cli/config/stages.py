@@ -36,11 +36,7 @@ class IngestConfig(StageConfig):
 
 
 def parse_holdout(text: str) -> tuple[str, float, float]:
-    """Returns (kind, a, b) of --holdout: ("every", N, 0), ("segment", A, B) or ("none", 0, 0).
-
-    Raises:
-        ConfigError: the text has another form.
-    """
+    """Returns (kind, a, b) of --holdout: ("every", N, 0), ("segment", A, B) or ("none", 0, 0)."""
     kind, *numbers = text.split(":")
     try:
         values = [float(number) for number in numbers]

@@ -154,9 +154,9 @@ def measure_harm(
     loo = torch.zeros(len(splats), dtype=torch.float64, device=device)
     total = 0.0
     for view in views:
-        output = _render_scores(leaves, view.camera, backend, view.counting(device))
-        difference = output.rgb - view.pixels(device)
         mask = view.counting(device)
+        output = _render_scores(leaves, view.camera, backend, mask)
+        difference = output.rgb - view.pixels(device)
         if mask is not None:
             difference = difference * mask[..., None]
         error = 0.5 * difference.square().sum()

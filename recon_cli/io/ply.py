@@ -47,6 +47,17 @@ _MAX_LOGIT = math.log(254.75 / 0.25)
 # which lack scale_2: a thousandth of a millimetre in metres.
 _FLAT = math.log(1e-6)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
+_HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
+_END = re.compile(rb"\nend_header[ \t]*\r?\n")
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_DIGITS = 15  # of a count; larger ones fit on no disk
+_OF_MESHES = ("face", "tristrips", "edge")
+_POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 logger = logging.getLogger("recon")
 
@@ -181,31 +192,6 @@ def write_points(path: Path, splats: Splats) -> None:
         rows[name] = column
     properties = [f"{kind} {name}" for name, (kind, _) in kinds.items()]
     write_bytes(path, format_header({"vertex": (len(rows), properties)}) + rows.tobytes())
-
-
-_HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
-
-
-_END = re.compile(rb"\nend_header[ \t]*\r?\n")
-
-
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
-}
-
-
-_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-
-_DIGITS = 15  # of a count; larger ones fit on no disk
-
-
-_OF_MESHES = ("face", "tristrips", "edge")
-
-
-_POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 
 @dataclass(frozen=True)

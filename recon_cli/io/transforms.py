@@ -101,13 +101,11 @@ def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float,
             hint="Undistort the images first, for example with COLMAP's image_undistorter.")
     if not any(values.values()):
         return "PINHOLE", ()
-    if named == "FULL_OPENCV" or values["k3"]:
-        # nerfstudio's k4 is a fourth power of r^2, COLMAP's a divisor.
-        if values["k4"] and named != "FULL_OPENCV":
-            raise FormatError(f"{where} has k4 = {values['k4']:g}, which {named} does not have.")
-        return "FULL_OPENCV", tuple(values[key] for key in _COEFFICIENTS)
-    if values["k4"]:
+    # nerfstudio's k4 is a fourth power of r^2, COLMAP's a divisor.
+    if values["k4"] and named != "FULL_OPENCV":
         raise FormatError(f"{where} has k4 = {values['k4']:g}, which {named} does not have.")
+    if named == "FULL_OPENCV" or values["k3"]:
+        return "FULL_OPENCV", tuple(values[key] for key in _COEFFICIENTS)
     return "OPENCV", tuple(values[key] for key in ("k1", "k2", "p1", "p2"))
 
 
