@@ -137,18 +137,20 @@ def follow(ranks: ProcessGroup) -> None:
         LostError: the leader is gone.
     """
     ready: set[str] = set()
-    while (word := ranks.broadcast_int(_DONE)) != _DONE:
-        if word == EXCHANGE:
-            join_exchange(ranks)
-            continue
-        given = unpack_fit(receive_arrays(ranks), ranks)
-        if given.task.backend not in ready:
-            registry.use_threads(given.task.backend, given.threads)
-            registry.prepare(given.task.backend, lambda: None)
-            ready.add(given.task.backend)
-        _take_part(given)
-        del given  # the next one needs the room
-    ranks.leave()
+    try:
+        while (word := ranks.broadcast_int(_DONE)) != _DONE:
+            if word == EXCHANGE:
+                join_exchange(ranks)
+                continue
+            given = unpack_fit(receive_arrays(ranks), ranks)
+            if given.task.backend not in ready:
+                registry.use_threads(given.task.backend, given.threads)
+                registry.prepare(given.task.backend, lambda: None)
+                ready.add(given.task.backend)
+            _take_part(given)
+            del given  # the next one needs the room
+    finally:  # gloo's threads let go of tensors, which they must not while Python ends
+        ranks.leave()
 
 
 def _take_part(given: Fit) -> None:
