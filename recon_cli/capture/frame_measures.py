@@ -100,32 +100,24 @@ def measure_exposure(gray: NDArray[np.uint8]) -> tuple[float, float, float]:
     return float(np.mean(few <= BLACK)), float(np.mean(few >= BLOWN_OUT)), float(areas.std())
 
 
-def well_exposed(
-    exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
-) -> NDArray[np.bool_]:  # [F]
-    """Returns which frames are neither black nor blown out for the most part."""
+def well_exposed(exposures: NDArray[np.float64]) -> NDArray[np.bool_]:  # [F]
+    """Returns which frames are not black or blown out for the most part, by `measure_exposure`."""
     return np.asarray(exposures[:, :2].sum(axis=1) <= MOST_CLIPPED)
 
 
-def has_content(
-    exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
-) -> NDArray[np.bool_]:  # [F]
-    """Returns which frames show anything at all: neither all clipped nor flat."""
+def has_content(exposures: NDArray[np.float64]) -> NDArray[np.bool_]:  # [F]
+    """Returns which frames are neither all clipped nor flat, by rows of `measure_exposure`."""
     visible = exposures[:, :2].sum(axis=1) <= ALL_CLIPPED
     return np.asarray(visible & (exposures[:, 2] >= FLAT))
 
 
 def check_exposure(
-    name: str,
-    exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
-    *,
-    least: int,
-    unit: str = "frames",
+    name: str, exposures: NDArray[np.float64], *, least: int, unit: str = "frames"
 ) -> None:
     """Raises InputError when fewer than `least` frames show anything, and says what is wrong.
 
-    `name` is that of the capture, which consists of `unit`; `exposures` are those of all frames
-    that could be read.
+    `name` is that of the capture, which consists of `unit`; `exposures` [F, 3] are rows of
+    `measure_exposure` for all frames that could be read.
     """
     usable = int(has_content(exposures).sum())
     if usable >= least:
@@ -137,8 +129,7 @@ def check_exposure(
         ("over-exposed", blown > MOST_CLIPPED, "Record again with less exposure: tap on a bright "
          "part of the room before you start."),
         ("flat", ~has_content(exposures), "Record again with furniture, edges and texture in view; "
-         "bare walls cannot be reconstructed."),
-    )
+         "bare walls cannot be reconstructed."))
     kind, hit, hint = next((row for row in kinds if row[1].sum() * 2 > len(black)), kinds[-1])
     raise InputError(
         f"{name} is {kind}: {int(hit.sum())} of its {len(black)} {unit} are. Only {usable} show "

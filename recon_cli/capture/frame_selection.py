@@ -139,13 +139,10 @@ def judge_frames(
     return Judgement(usable, usable & ~good, refused)
 
 
-def check_motion(
-    name: str,
-    motion: NDArray[np.float64],  # [F], NaN where unknown
-) -> str:
-    """Returns a warning where the camera hardly moves, else nothing.
+def check_motion(name: str, motion: NDArray[np.float64]) -> str:
+    """Returns a warning where the camera of the video `name` hardly moves, else nothing.
 
-    `motion` is the displacement gained with each frame, in widths; `name` is that of the video.
+    `motion` [F] is the displacement gained with each frame, in widths, NaN where unknown.
 
     Raises:
         InputError: the camera does not move at all, as far as its motion is known.
@@ -167,11 +164,8 @@ def check_motion(
     return ""
 
 
-def sharp_frames(
-    sharpness: NDArray[np.float64],  # [F]
-    share: float,
-) -> NDArray[np.bool_]:  # [F]
-    """Returns which frames reach `share` of the usual sharpness around them."""
+def sharp_frames(sharpness: NDArray[np.float64], share: float) -> NDArray[np.bool_]:  # [F]
+    """Returns which frames reach `share` of the usual sharpness [F] around them."""
     usual = percentile_filter(
         sharpness, GATE_PERCENTILE, size=min(GATE_WINDOW, len(sharpness)), mode="nearest")
     return np.asarray(sharpness >= share * usual)
@@ -204,13 +198,11 @@ def bridge_gaps(
     return usable
 
 
-def path_length(
-    motion: NDArray[np.float64],  # [F], NaN where unknown
-) -> NDArray[np.float64]:  # [F]
+def path_length(motion: NDArray[np.float64]) -> NDArray[np.float64]:  # [F]
     """Returns the path length up to each frame in widths; unknown steps count as the median one.
 
-    Where no step is known (a blank wall throughout) or nothing moves, all steps are equal and tiny,
-    so that a choice over the path becomes a choice over time.
+    `motion` [F] is NaN where unknown. Where no step is known (a blank wall throughout) or nothing
+    moves, all steps are equal and tiny, so that a choice over the path becomes one over time.
     """
     known = motion[~np.isnan(motion)]
     typical = float(np.median(known[1:])) if len(known) > 1 else 0.0
@@ -307,18 +299,14 @@ class PhotoMeasures:
     sharpness: float
 
 
-def measure_photo(
-    rgb: NDArray[np.uint8],  # [H, W, 3]
-) -> PhotoMeasures:
-    """Returns the measures that the selection among photos needs."""
+def measure_photo(rgb: NDArray[np.uint8]) -> PhotoMeasures:
+    """Returns the measures of a photo, [H, W, 3], that the selection needs."""
     gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     return PhotoMeasures(signature(gray), measure_exposure(gray), measure_sharpness(gray))
 
 
-def signature(
-    gray: NDArray[np.uint8],  # [H, W]
-) -> NDArray[np.float32]:  # [SIDE * SIDE]
-    """Returns a picture reduced by area, without its mean and of length 1; zero where it is flat.
+def signature(gray: NDArray[np.uint8]) -> NDArray[np.float32]:  # [SIDE * SIDE]
+    """Returns a picture [H, W] reduced by area, without its mean and of length 1; zero if flat.
 
     The same picture at another brightness or size has nearly the same signature.
     """
@@ -393,15 +381,11 @@ def find_duplicates(
 
 def describe_dropped(candidates: Sequence[FrameCandidate]) -> list[str]:
     """Returns notices about photos that could be read but are left out."""
-    notices = []
     alike = [
         f"{photo.source} (like {candidates[photo.like].source})" for photo in candidates
         if photo.reason is Reason.DUPLICATE and photo.like is not None]
-    if alike:
-        notices.append(f"{len(alike)} photos are left out because others show the same: "
-                       f"{list_names(alike, NAMED)}.")
     empty = [photo.source for photo in candidates if photo.reason is Reason.CLIPPED]
-    if empty:
-        notices.append(f"{len(empty)} photos are left out because they are black, blown out or "
-                       f"flat: {list_names(empty, NAMED)}.")
-    return notices
+    return [
+        f"{len(names)} photos are left out because {reason}: {list_names(names, NAMED)}."
+        for names, reason in ((alike, "others show the same"),
+                              (empty, "they are black, blown out or flat")) if names]

@@ -9,16 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
-from recon_cli.capture.frame_selection import (
-    NAMED,
-    FrameCandidate,
-    PhotoMeasures,
-    Reason,
-    choose_photos,
-    describe_dropped,
-    measure_photo,
-)
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.images import Photo, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
@@ -66,9 +58,13 @@ def ingest(
     broken = folder.broken | unreadable
     readable = sum(photo is not None for photo in measures)
     check_count(path, readable, broken)
-    _report_broken(tuple(broken.values()), ctx)
-    record = choose_photos(path.name, [photo.path.name for photo in photos], names, measures)
-    for text in describe_dropped(record):
+    for reason in list(broken.values())[:frame_selection.NAMED]:
+        ctx.notice(f"A photo is left out: {reason}")
+    if (more := len(broken) - frame_selection.NAMED) > 0:
+        ctx.notice(f"{more} more photos are left out for similar reasons.")
+    record = frame_selection.choose_photos(
+        path.name, [photo.path.name for photo in photos], names, measures)
+    for text in frame_selection.describe_dropped(record):
         ctx.notice(text)
     sheet = _make_sheet(path.name, record, names, out)
     frame_of = {photos[candidate.index]: candidate.name for candidate in record
@@ -82,7 +78,11 @@ def ingest(
     return IngestedSource(
         "photos",
         _frame_groups(groups, path, config.max_size),
-        _frames(groups, frame_of, out),
+        tuple(sorted((
+            Frame(frame_of[photo], None, photo.path.name, None, held_out=False, group=index,
+                  masked=(out / store.MASKS / frame_of[photo]).exists())
+            for index, group in enumerate(groups) for photo in group.photos),
+            key=lambda frame: frame.name)),
         declared=readable + len(broken), decoded=readable, lost=len(broken),
         skipped=tuple(sorted(dropped | broken.keys())), selection=Selection(record, sheet, prefix))
 
@@ -103,14 +103,6 @@ def _list_photos(paths: Sequence[Path], ctx: IngestContext) -> tuple[Path, Photo
     return path, list_photos(home.iterdir())
 
 
-def _report_broken(reasons: Sequence[str], ctx: IngestContext) -> None:
-    """Says why photos are left out; the record of the selection names all of them."""
-    for reason in reasons[:NAMED]:
-        ctx.notice(f"A photo is left out: {reason}")
-    if len(reasons) > NAMED:
-        ctx.notice(f"{len(reasons) - NAMED} more photos are left out for similar reasons.")
-
-
 def _find_masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestContext) -> FolderMasks:
     """Returns the masks in a given folder; given files have none."""
     if not paths[0].is_dir():
@@ -119,7 +111,8 @@ def _find_masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestConte
     if masks.outside:
         ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
     if masks.unused:
-        ctx.notice(f"Masks without a photo are left out: {list_names(masks.unused, NAMED)}.")
+        names = list_names(masks.unused, frame_selection.NAMED)
+        ctx.notice(f"Masks without a photo are left out: {names}.")
     if masks.unused and not masks.by_photo:
         ctx.notice(
             f"No mask is used: that of {photos[0].path.name} must be called "
@@ -128,11 +121,11 @@ def _find_masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestConte
 
 
 def _make_sheet(
-    title: str, record: Sequence[FrameCandidate], names: Sequence[str], out: Path
+    title: str, record: Sequence[frame_selection.FrameCandidate], names: Sequence[str], out: Path
 ) -> ContactSheet:
     """Returns the contact sheet, and removes the files of photos that are not selected."""
     files = {candidate.index: out / store.FOLDER / names[candidate.index]
-             for candidate in record if candidate.reason is not Reason.DAMAGED}
+             for candidate in record if candidate.reason is not frame_selection.Reason.DAMAGED}
     height, width = read_png(next(iter(files.values()))).shape[:2]
     sheet = ContactSheet(title, record, width, height)
     for index in sorted(sheet.wanted & files.keys()):
@@ -176,15 +169,16 @@ def _drop_raw_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) 
 def _write_photos(
     photos: Mapping[str, Photo], masks: Mapping[str, Path], plan: RawPlan, out: Path, max_size: int,
     ctx: IngestContext,
-) -> tuple[list[PhotoMeasures | None], dict[str, str]]:
+) -> tuple[list[frame_selection.PhotoMeasures | None], dict[str, str]]:
     """Writes photos by frame name; returns their measures, and why some cannot be read."""
-    measures: list[PhotoMeasures | None] = []
+    measures: list[frame_selection.PhotoMeasures | None] = []
     unreadable: dict[str, str] = {}
     with ctx.progress.bar("photos", len(photos), unit="photo") as bar:
         for name, photo in photos.items():
             mask = masks.get(photo.path.name)
             try:
-                measures.append(measure_photo(_write_photo(photo, mask, plan, out, name, max_size)))
+                rgb = _write_photo(photo, mask, plan, out, name, max_size)
+                measures.append(frame_selection.measure_photo(rgb))
             except InputError as error:
                 unreadable[photo.path.name] = f"{error.message} {error.hint}".rstrip()
                 measures.append(None)
@@ -220,12 +214,3 @@ def _frame_groups(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> 
         focal = None if photo.focal_px is None else photo.focal_px * scale
         frame_groups.append(Group(name, width, height, focal_px=focal))
     return tuple(frame_groups)
-
-
-def _frames(groups: Sequence[PhotoGroup], names: dict[Photo, str], out: Path) -> tuple[Frame, ...]:
-    """Returns the frames sorted by name, each with its group and whether it has a mask."""
-    frames = [
-        Frame(names[photo], None, photo.path.name, None, held_out=False, group=index,
-              masked=(out / store.MASKS / names[photo]).exists())
-        for index, group in enumerate(groups) for photo in group.photos]
-    return tuple(sorted(frames, key=lambda frame: frame.name))

@@ -12,15 +12,6 @@ from numpy.typing import NDArray
 from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_measures import check_exposure, well_exposed
-from recon_cli.capture.frame_selection import (
-    MIN_FRAMES,
-    Judgement,
-    automatic_count,
-    check_motion,
-    choose_frames,
-    judge_frames,
-    path_length,
-)
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.scan import Scan, decode_threads, scan_video
 from recon_cli.capture.video import frames_at, read_declared_length
@@ -43,7 +34,7 @@ class ScannedVideo:
     path: Path
     scan: Scan
     lengths: NDArray[np.float64]  # [F], `path_length` up to each frame
-    judgement: Judgement
+    judgement: frame_selection.Judgement
 
 
 def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
@@ -63,18 +54,18 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     for notice in scan.notices:
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
-    check_exposure(path.name, scan.exposure[scan.whole], least=MIN_FRAMES)
+    check_exposure(path.name, scan.exposure[scan.whole], least=frame_selection.MIN_FRAMES)
     whole = int(scan.whole.sum())
     clipped = whole - int(well_exposed(scan.exposure[scan.whole]).sum())
     if 2 * clipped > whole:  # the rest cannot replace what they showed
         ctx.notice(
             f"{clipped} of {whole} frames of {path.name} are left out: they are mostly black or "
             "blown out.")
-    warning = check_motion(path.name, scan.motion)
+    warning = frame_selection.check_motion(path.name, scan.motion)
     if warning:
         ctx.notice(warning)
-    lengths = path_length(scan.motion)
-    return ScannedVideo(path, scan, lengths, judge_frames(
+    lengths = frame_selection.path_length(scan.motion)
+    return ScannedVideo(path, scan, lengths, frame_selection.judge_frames(
         lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness))
 
 
@@ -84,13 +75,14 @@ def frame_counts(config: IngestConfig, sources: Sequence[ScannedVideo]) -> list[
     --frames, or what the motion needs up to --max-frames, is divided by the lengths of the paths; a
     video gets at least `MIN_FRAMES`.
     """
-    wanted = [automatic_count(source.lengths, most=config.max_frames) for source in sources]
+    wanted = [frame_selection.automatic_count(source.lengths, most=config.max_frames)
+              for source in sources]
     total = config.frames or min(config.max_frames, sum(wanted))
     if len(sources) <= 1:
         return [total] * len(sources)
     sums = np.cumsum([source.lengths[-1] for source in sources])
     cuts = np.round(sums / sums[-1] * total).astype(int)
-    return [max(MIN_FRAMES, int(count)) for count in np.diff(cuts, prepend=0)]
+    return [max(frame_selection.MIN_FRAMES, int(count)) for count in np.diff(cuts, prepend=0)]
 
 
 def ingest(
@@ -105,7 +97,7 @@ def ingest(
         InputError: too few frames are sharp, or the file has changed.
     """
     path, scan, judgement = source.path, source.scan, source.judgement
-    chosen = choose_frames(
+    chosen = frame_selection.choose_frames(
         source.lengths, scan.sharpness, judgement.usable, count, bridges=judgement.bridges)
     _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
@@ -128,10 +120,10 @@ def ingest(
 def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
     """Says how many frames are missing or damaged; refuses a video that has too few left."""
     decoded, whole = len(scan.whole), int(scan.whole.sum())
-    if whole < MIN_FRAMES:
+    if whole < frame_selection.MIN_FRAMES:
         raise InputError(
-            f"{path} has {whole} whole frames of {scan.expected}, but at least {MIN_FRAMES} are "
-            "needed.",
+            f"{path} has {whole} whole frames of {scan.expected}, but at least "
+            f"{frame_selection.MIN_FRAMES} are needed.",
             hint="Give a longer video, or copy it from the camera again if it should be longer.")
     inexact = max(COUNT_SHARE * scan.declared, COUNT_FRAMES)
     if whole < decoded or scan.gaps or scan.lost > inexact:
@@ -145,9 +137,10 @@ def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
 def _report_short(scan: Scan, chosen: int, requested: int | None, ctx: IngestContext) -> None:
     """Says why fewer frames were chosen than requested; refuses too few."""
     whole = int(scan.whole.sum())
-    if chosen < MIN_FRAMES:
+    if chosen < frame_selection.MIN_FRAMES:
         raise InputError(
-            f"Only {chosen} of {whole} frames are sharp, but at least {MIN_FRAMES} are needed.",
+            f"Only {chosen} of {whole} frames are sharp, but at least "
+            f"{frame_selection.MIN_FRAMES} are needed.",
             hint="Lower --sharpness, or record again with slower movements.")
     if requested is None or chosen == requested:
         return

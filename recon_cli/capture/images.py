@@ -1,8 +1,8 @@
 """One photo: its upright size, its lens by EXIF, and its pixels as 8-bit RGB.
 
-Pillow reads photos, and LibRaw the headers of camera RAW. A photo is read whole or refused: a
-truncated JPEG never passes. Colour profiles are not applied, so that the photos of one camera stay
-comparable, and no metadata is carried over.
+Pillow reads photos, and LibRaw the headers of camera RAW. A photo is read whole or refused with an
+InputError: a truncated JPEG never passes. Colour profiles are not applied, so that the photos of
+one camera stay comparable, and no metadata is carried over.
 """
 
 from __future__ import annotations
@@ -103,11 +103,7 @@ def inspect_photo(path: Path) -> Photo:
 
 
 def read_photo(photo: Photo) -> NDArray[np.uint8]:
-    """Returns a photo's pixels, upright RGB, [H, W, 3]; `raw.develop` reads RAW instead.
-
-    Raises:
-        InputError: the file is truncated, damaged, or of an unsupported pixel format.
-    """
+    """Returns a photo's pixels, upright RGB, [H, W, 3]; `raw.develop` reads RAW instead."""
     if photo.is_raw:
         raise ValueError(f"{photo.path.name} is camera RAW")
     rgb = read_rgb(photo.path)
@@ -116,11 +112,7 @@ def read_photo(photo: Photo) -> NDArray[np.uint8]:
 
 
 def read_alpha(photo: Photo) -> NDArray[np.uint8] | None:
-    """Returns a photo's opacity, upright, [H, W], 255 for opaque; None where it holds none.
-
-    Raises:
-        InputError: see `read_photo`.
-    """
+    """Returns a photo's opacity, upright, [H, W], 255 for opaque; None where it holds none."""
     if photo.is_raw:
         return None
     try:
@@ -135,11 +127,7 @@ def read_alpha(photo: Photo) -> NDArray[np.uint8] | None:
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
-    """Returns any picture's pixels, upright, as RGB, [H, W, 3], on black where transparent.
-
-    Raises:
-        InputError: the file is truncated, damaged, or of an unsupported pixel format.
-    """
+    """Returns any picture's pixels, upright, as RGB, [H, W, 3], on black where transparent."""
     return _on_black(_decode(path, upright=True))
 
 
@@ -147,9 +135,6 @@ def read_as_stored(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | N
     """Returns a picture's RGB, [H, W, 3], and opacity, [H, W] or None, ignoring EXIF orientation.
 
     The poses of a data set belong to the pixels as they are in the file.
-
-    Raises:
-        InputError: see `read_rgb`.
     """
     image = _decode(path, upright=False)
     return _on_black(image), _alpha(image) if image.has_transparency_data else None
@@ -321,14 +306,12 @@ def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
 def _sensor_mm(detail: dict[int, Any]) -> float | None:
     """Returns the length of the sensor's longer side."""
     density = _positive(detail.get(ExifTags.Base.FocalPlaneXResolution))
-    across = [
-        _positive(detail.get(tag))
-        for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    sides = (_positive(detail.get(tag)) or 0.0
+             for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
     unit = UNIT_MM.get(detail.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
-    longer = max((side for side in across if side is not None), default=None)
-    if density is None or longer is None or unit is None:
+    if density is None or unit is None:
         return None
-    size = longer / density * unit
+    size = max(sides) / density * unit
     return size if SENSOR_MM[0] <= size <= SENSOR_MM[1] else None
 
 

@@ -1,8 +1,8 @@
 """The noise of a frame: its estimate, and the filters that remove it.
 
-The estimate uses only the flat parts of a frame. Over whole frames, the same estimator reads up to
-4/255 off clean frames of a richly textured room, as much as off truly noisy ones; over the flat
-parts it reads at most 2.5/255 there, and 4.6 to 5.5 where noise of 5 was added.
+The estimate uses only the flat parts of a frame. Over whole frames it reads up to 4/255 off clean
+frames of a richly textured room; over the flat parts at most 2.5/255, and 4.6 to 5.5 where noise of
+5 was added.
 
 A threshold of 3 ignores noise that a video codec has already smoothed: decoded frames of two noisy
 room videos read .8 to 2.4, and no filter at any strength brings them more than .2 dB closer to
@@ -52,10 +52,8 @@ GUIDE_DIAMETER, GUIDE_SIGMA_SPACE = 5, 1.0
 JOINT_DIAMETER, JOINT_SIGMA_SPACE = 9, 2.5
 
 
-def estimate_noise(
-    rgb: NDArray[np.uint8],  # [H, W, 3]
-) -> float:
-    """Returns the standard deviation of the noise in 1/255, 0 where a frame is plainly flat.
+def estimate_noise(rgb: NDArray[np.uint8]) -> float:
+    """Returns the noise of a frame [H, W, 3] as standard deviation in 1/255, 0 where it is flat.
 
     It is a low percentile over tiles of Donoho's median of the finest diagonal wavelet coefficients
     (scikit-image).

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,15 +67,11 @@ def _holds_photos(folder: Path) -> bool:
     files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
     if any(path.suffix.lower() in PHOTO_SUFFIXES for path in files):
         return True
-    return any(_is_photo(path) for path in files)
-
-
-def _is_photo(path: Path) -> bool:
-    try:
-        inspect_photo(path)
-    except InputError:
-        return False
-    return True
+    for path in files:
+        with suppress(InputError):
+            inspect_photo(path)
+            return True
+    return False
 
 
 def _natural_key(stem: str) -> list[tuple[int, str]]:
@@ -136,7 +133,7 @@ def group_photos(photos: Sequence[Photo]) -> list[PhotoGroup]:
             groups.append([photo])
         else:
             home.append(photo)
-    names = _names([group[0] for group in groups])
+    names = _name_groups([group[0] for group in groups])
     return [PhotoGroup(name, tuple(group)) for name, group in zip(names, groups, strict=True)]
 
 
@@ -173,21 +170,17 @@ def _same_focal(first: float | None, other: float | None) -> bool:
     return max(first, other) <= min(first, other) * (1 + SAME_FOCAL)
 
 
-def _names(firsts: Sequence[Photo]) -> list[str]:
+def _name_groups(firsts: Sequence[Photo]) -> list[str]:
     """Returns a name for each group, with its focal length where that is needed."""
     plain = [f"{photo.camera} {photo.width}x{photo.height}".strip() for photo in firsts]
     twice = {name for name, count in Counter(plain).items() if count > 1}
-    names = [
-        f"{name} {_focal(photo)}".strip() if name in twice else name
-        for name, photo in zip(plain, firsts, strict=True)]
     counts: Counter[str] = Counter()
-    for place, name in enumerate(names):
+    names = []
+    for name, photo in zip(plain, firsts, strict=True):
+        if name in twice and photo.focal_mm is not None:
+            name = f"{name} {photo.focal_mm:g} mm".strip()
+        elif name in twice and photo.focal_px is not None:
+            name = f"{name} f = {photo.focal_px:.0f} px".strip()
         counts[name] += 1
-        names[place] = name if counts[name] == 1 else f"{name} ({counts[name]})"
+        names.append(name if counts[name] == 1 else f"{name} ({counts[name]})")
     return names
-
-
-def _focal(photo: Photo) -> str:
-    if photo.focal_mm is not None:
-        return f"{photo.focal_mm:g} mm"
-    return "" if photo.focal_px is None else f"f = {photo.focal_px:.0f} px"

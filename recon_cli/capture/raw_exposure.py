@@ -91,24 +91,19 @@ def drop_contradicted(nominal: Sequence[float | None], pairs: Pairs) -> list[flo
     """Returns the exposures by EXIF without those that the pixels contradict, the worst first."""
     known = list(nominal)
     while True:
+        errors: dict[int, list[float]] = {}  # EXIF of a photo minus that by each of its pairs
+        for (a, b), apart in pairs.items():
+            dark, bright = known[a], known[b]
+            if dark is not None and bright is not None:
+                errors.setdefault(b, []).append(bright - dark - apart)
+                errors.setdefault(a, []).append(apart - bright + dark)
         doubts = {
             photo: abs(float(np.median(off)))
-            for photo, off in _contradictions(known, pairs).items() if len(off) >= MIN_WITNESSES}
+            for photo, off in errors.items() if len(off) >= MIN_WITNESSES}
         worst = max(doubts, key=doubts.__getitem__, default=None)
         if worst is None or doubts[worst] < DOUBT_EV:
             return known
         known[worst] = None
-
-
-def _contradictions(known: Sequence[float | None], pairs: Pairs) -> dict[int, list[float]]:
-    """Returns by how much EXIF makes each photo too bright, according to each of its pairs."""
-    errors: dict[int, list[float]] = {}
-    for (a, b), apart in pairs.items():
-        dark, bright = known[a], known[b]
-        if dark is not None and bright is not None:
-            errors.setdefault(b, []).append(bright - dark - apart)
-            errors.setdefault(a, []).append(apart - bright + dark)
-    return errors
 
 
 def complete_exposures(known: Sequence[float | None], pairs: Pairs) -> NDArray[np.float64]:

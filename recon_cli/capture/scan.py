@@ -11,15 +11,9 @@ import numpy as np
 from av.video.frame import PictureType
 from numpy.typing import NDArray
 
+from recon_cli.capture import video
 from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
-from recon_cli.capture.video import (
-    convert_hint,
-    decode,
-    moving_pictures,
-    open_video,
-    read_declared_length,
-)
 from recon_cli.errors import InputError
 
 # B-frames in a row: x264 writes 3 by default and 8 at its slowest. HEVC encoders mark whole groups
@@ -114,7 +108,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     gaps: list[tuple[int, int | None]] = []  # (frames before it, pts)
     first: DecodedPicture | None = None
     meter = MotionMeter()
-    for item in decode(path, threads=threads):
+    for item in video.decode(path, threads=threads):
         if isinstance(item, Gap):
             gaps.append((len(measures), item.pts))
             continue
@@ -122,13 +116,13 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         measures.append(_measure(item, meter))
         step()
     if first is None:
-        with open_video(path) as (_, stream):
+        with video.open_video(path) as (_, stream):
             codec = stream.codec_context.name
         raise InputError(
             f"No frame of {path} can be decoded; its codec is {codec}.",
-            hint=f"Copy it from the camera again. {convert_hint(path)}")
+            hint=f"Copy it from the camera again. {video.convert_hint(path)}")
     width, height = first.size
-    claim = read_declared_length(path)
+    claim = video.read_declared_length(path)
     return Scan(
         width=width, height=height, gaps=len(gaps),
         declared=claim.count(_frame_rate(measures) or claim.rate),
@@ -197,8 +191,8 @@ def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> 
     A varying frame rate needs no notice: frames are chosen by their times and the camera's path.
     """
     notices = []
-    with open_video(path) as (container, _):
-        videos = len(moving_pictures(container))
+    with video.open_video(path) as (container, _):
+        videos = len(video.moving_pictures(container))
     if videos > 1:
         notices.append(f"{path.name} holds {videos} videos: the first that can be decoded is used.")
     if first.tags.transfer is not None:

@@ -1,8 +1,9 @@
 """Video files through PyAV: whether a file is a video, its declared length, its frames in order.
 
 A packet that cannot be decoded is skipped and reported as a `Gap`. Of several videos in one file
-the first is used; sound and covers are ignored. `codec_name` and `lacks_index` read the container
-themselves, for the messages about files that FFmpeg cannot open.
+the first is used; sound and covers are ignored. Whatever opens a video raises what `open_video`
+does. `codec_name` and `lacks_index` read the container themselves, for the messages about files
+that FFmpeg cannot open.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import mmap
 import re
 import struct
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,8 +99,8 @@ def _video_stream(path: Path, container: InputContainer) -> VideoStream:
             hint=convert_hint(path))
     if lacks_index(path):
         raise _truncated(path)
-    kinds = {"video": "a still picture or text"}
-    types = sorted({kinds.get(stream.type, stream.type) for stream in container.streams})
+    types = sorted({"a still picture or text" if stream.type == "video" else stream.type
+                    for stream in container.streams})
     only = f", only {', '.join(types)}" if types else ": it is empty"
     raise InputError(
         f"{path} holds no video that can be decoded{only}.",
@@ -135,11 +136,7 @@ class DeclaredLength:
 
 
 def read_declared_length(path: Path) -> DeclaredLength:
-    """Returns what a video's container says about its length.
-
-    Raises:
-        InputError: as `open_video`.
-    """
+    """Returns the length of a video by its container."""
     with open_video(path) as (container, stream):
         if stream.duration is not None and stream.time_base is not None:
             seconds = float(stream.duration * stream.time_base)
@@ -153,15 +150,12 @@ def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
 
     The frames of an undamaged video do not depend on `threads`; around damage they do. A frame of
     another size than the first counts as lost. Interlaced frames are deinterlaced.
-
-    Raises:
-        InputError: as `open_video`.
     """
     with open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         tags: Tags | None = None
-        for item in deinterlace(_of_one_size(_frames(container, stream))):
+        for item in deinterlace(_decode_frames(container, stream)):
             if isinstance(item, Gap):
                 yield item
                 continue
@@ -176,7 +170,7 @@ def frames_at(
     """Yields (index, RGB [H, W, 3]) of the frames at these indices, in ascending order.
 
     Raises:
-        InputError: as `open_video`, or the file does not hold the frames that it held before.
+        InputError: the file does not hold the frames that it held before.
     """
     missing = set(indices)
     if not missing:
@@ -193,35 +187,18 @@ def frames_at(
         hint="Do not change the file while it is read, then run the same command again.")
 
 
-def _of_one_size(items: Iterable[av.VideoFrame | Gap]) -> Iterator[av.VideoFrame | Gap]:
+def _decode_frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame | Gap]:
+    """Yields the frames of one size, and gaps; continues after errors of demuxer and decoder."""
     size: tuple[int, int] | None = None
-    for item in items:
-        if isinstance(item, av.VideoFrame):
-            size = size or (item.width, item.height)
-            if (item.width, item.height) != size:
-                yield Gap(item.pts)
-                continue
-        yield item
-
-
-def _frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame | Gap]:
-    for packet in _packets(container, stream):
-        if isinstance(packet, Gap):
-            yield packet
-            continue
-        try:
-            yield from packet.decode()
-        except av.error.FFmpegError:
-            yield Gap(packet.pts)
-
-
-def _packets(
-    container: InputContainer, stream: VideoStream
-) -> Iterator[av.Packet[VideoStream] | Gap]:
-    """Yields the packets of a stream; continues after errors of the demuxer."""
     for _ in range(MAX_DEMUX_ERRORS):
         try:
-            yield from container.demux(stream)
+            for packet in container.demux(stream):
+                try:
+                    for frame in packet.decode():
+                        size = size or (frame.width, frame.height)
+                        yield frame if (frame.width, frame.height) == size else Gap(frame.pts)
+                except av.error.FFmpegError:
+                    yield Gap(packet.pts)
             return
         except av.error.FFmpegError:
             yield Gap(None)

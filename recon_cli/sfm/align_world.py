@@ -88,13 +88,13 @@ class WorldFrame:
 
 
 def world_transform(
-    points: NDArray[np.float64],
-    viewmats: Mapping[str, NDArray[np.float64]],
+    points: NDArray[np.float64],  # [P, 3] sparse points in the mapper's frame
+    viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera of each frame
     *,
-    gravity: bool,
+    gravity: bool,  # find up; False leaves the axes and the origin
     scale_between: ScaleBetween | None,
-    metric: bool,
-    pinholes: Mapping[str, Pinhole] | None = None,
+    metric: bool,  # the mapper's units are metres, as in a data set with measured poses
+    pinholes: Mapping[str, Pinhole] | None = None,  # of undistorted frames, for FRAME:u,v
 ) -> WorldFrame:
     """Returns the world frame of a model.
 
@@ -102,20 +102,18 @@ def world_transform(
     the evidence says why. The scale is that of `scale_between`, whose points x,y,z are in the
     turned frame, as a viewer shows it. The origin stays where it is when the scale changes.
 
-    Args:
-        points: [P, 3] sparse points in the mapper's frame.
-        viewmats: [4, 4] world to camera of each frame, by name.
-        gravity: find up; False leaves the axes and the origin.
-        scale_between: gives the scale.
-        metric: the mapper's units are metres, as in a data set with measured poses.
-        pinholes: undistorted camera of each frame, by name; needed for FRAME:u,v.
-
     Raises:
         ConfigError: a place of `scale_between` is unknown.
     """
     names = sorted(viewmats)
-    up, turn, axis, strength = _upright_frame(
-        points, np.array([viewmats[name] for name in names]).reshape(-1, 4, 4), gravity)
+    matrices = np.array([viewmats[name] for name in names]).reshape(-1, 4, 4)
+    up = (find_gravity(points, matrices) if gravity
+          else Gravity(None, None, None, "it was not looked for"))
+    turn, axis, strength = Similarity(), "mapper", None
+    if up.up is not None:
+        axes = upright_axes(up, points, matrices)
+        turn, strength = axes.similarity, axes.walls.strength
+        axis = "walls" if axes.walls.found else "cameras"
     measured = None
     if scale_between:
         moved = {name: turn.viewmat(viewmats[name]) for name in names}
@@ -126,20 +124,6 @@ def world_transform(
     return WorldFrame(
         scale.after(turn), evidence, measured,
         (*_describe_up(evidence, gravity), _describe_scale(source, measured, metric)))
-
-
-def _upright_frame(
-    points: NDArray[np.float64], viewmats: NDArray[np.float64], gravity: bool
-) -> tuple[Gravity, Similarity, str, float | None]:
-    """Returns what is known of up, the frame that follows, and the source of its x axis."""
-    if not gravity:
-        return Gravity(None, None, None, "it was not looked for"), Similarity(), "mapper", None
-    gravity_found = find_gravity(points, viewmats)
-    if gravity_found.up is None:
-        return gravity_found, Similarity(), "mapper", None
-    axes = upright_axes(gravity_found, points, viewmats)
-    axis = "walls" if axes.walls.found else "cameras"
-    return gravity_found, axes.similarity, axis, axes.walls.strength
 
 
 def _evidence(gravity: Gravity, axis: str, strength: float | None, source: str) -> WorldEvidence:

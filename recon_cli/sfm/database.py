@@ -81,16 +81,11 @@ def scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
     return size
 
 
-def inlier_counts(path: Path) -> tuple[int, int, int]:
-    """Returns (verified pairs, verified matches, those of pairs that a homography explains)."""
-    pairs, matches, flat = np.array(inlier_counts_by_distance(path)).reshape(-1, 3).sum(axis=0)
-    return int(pairs), int(matches), int(flat)
+def count_inliers(path: Path) -> list[tuple[int, int, int]]:
+    """Returns (verified pairs, verified matches, those of pairs that a homography explains).
 
-
-def inlier_counts_by_distance(path: Path) -> list[tuple[int, int, int]]:
-    """Returns what `inlier_counts` does for pairs 1, 2 to 3, 4 to 7, ... apart in order of names.
-
-    Distances without a verified pair are left out.
+    Pairs are counted by their distance in order of names: 1, 2 to 3, 4 to 7, ... Distances without
+    a verified pair are left out.
     """
     with closing(_connect(path)) as connection:
         images = [image for image, in connection.execute(
@@ -103,8 +98,8 @@ def inlier_counts_by_distance(path: Path) -> list[tuple[int, int, int]]:
         first, second = (place[image] for image in divmod(pair, _PAIR_BASE))
         apart = abs(first - second).bit_length()
         pairs, total, flat = counts.get(apart, (0, 0, 0))
-        counts[apart] = (
-            pairs + 1, total + matches, flat + (matches if config in _HOMOGRAPHIES else 0))
+        flat += matches if config in _HOMOGRAPHIES else 0
+        counts[apart] = (pairs + 1, total + matches, flat)
     return [counts[apart] for apart in sorted(counts)]
 
 

@@ -184,7 +184,10 @@ def _try_fallback(
     folder = fresh_folder(job.attempts / fallback.name)
     start = time.monotonic()
     wanted = fallback.choose_pairs(job) if before else set()  # those of the first are matched
-    expected = _estimate_seconds(job, len(wanted - database.pair_names(job.database)), before)
+    matched = StepLog(job.out).result("matches") or {"seconds": 0.0, "rows": 0}
+    per_pair = float(matched["seconds"]) / max(1, int(matched["rows"]))
+    expected = (len(wanted - database.pair_names(job.database)) * per_pair
+                + SLOWER * max((attempt.seconds for attempt in before), default=0.0))
     if before and start + expected > deadline:
         return MapperAttempt(
             fallback.name, reason, skipped=f"it would take about {expected / 60:.0f} minutes")
@@ -203,13 +206,6 @@ def _try_fallback(
         candidate.model.compute_mean_reprojection_error())
 
 
-def _estimate_seconds(job: MappingJob, count: int, before: Sequence[MapperAttempt]) -> float:
-    """Returns about how many seconds matching `count` pairs and mapping will take."""
-    matched = StepLog(job.out).result("matches") or {"seconds": 0.0, "rows": 0}
-    per_pair = float(matched["seconds"]) / max(1, int(matched["rows"]))
-    return count * per_pair + SLOWER * max((attempt.seconds for attempt in before), default=0.0)
-
-
 def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
     """Publishes the best model, if it passes the checks, and returns the result of the step."""
     chosen = best_attempt(attempts)
@@ -217,7 +213,11 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
     try:
         checks.check_registered(job.names, registered, job.min_registered)
     except SfmError as error:
-        raise SfmError(f"{error.message} {_describe(attempts)}", hint=error.hint) from error
+        counts = ", ".join(
+            f"{attempt.name} was skipped for lack of time" if attempt.skipped else
+            f"{attempt.name} found {len(attempt.registered)}" for attempt in attempts)
+        raise SfmError(
+            f"{error.message} Cameras by mapper: {counts}.", hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
     folder = job.attempts / chosen.name / "model"
     model = pycolmap.Reconstruction(folder)
@@ -233,13 +233,6 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
         "models": chosen.models, "apart": [list(part) for part in chosen.apart],
         "rejected": chosen.rejected, "verdict": verdict.to_json(), "lines": verdict.lines(),
         "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}
-
-
-def _describe(attempts: Sequence[MapperAttempt]) -> str:
-    counts = (
-        f"{attempt.name} was skipped for lack of time" if attempt.skipped else
-        f"{attempt.name} found {len(attempt.registered)}" for attempt in attempts)
-    return f"Cameras by mapper: {', '.join(counts)}."
 
 
 def _incremental(pairs: str, reason: str) -> Fallback:

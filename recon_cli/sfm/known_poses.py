@@ -94,13 +94,18 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         check = spot_check(job, known.viewmats)
         if not check.fits:
             raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
-        lines = check.lines()
+        lines = [check.describe()]
     else:
         posed = build_posed_model(job.database, None, _rigid(known.viewmats, known.viewmats))
         model = mapper.triangulate(job, posed, refine_intrinsics=bool(_uncalibrated_cameras(job)))
         if job.pose_use == "refine":
             movement = _refine(job, model, known)
-        _check_fit(job, model)
+        # The share of the verified matches that the points confirm.
+        matches = sum(count for _, count, _ in database.count_inliers(job.database))
+        lengths = np.array([point.track.length() for point in model.points3D.values()])
+        share = float((lengths * (lengths - 1) / 2).sum()) / max(1, matches)
+        if share < MIN_AGREEING:
+            raise _misfit(share, MIN_AGREEING)
         verdict = examine(
             model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times)
         check_weak_link(verdict, job.accept_weak)
@@ -153,15 +158,6 @@ def _rigid(
     return {name: pycolmap.Rigid3d(viewmats[name][:3]) for name in names}
 
 
-def _check_fit(job: MappingJob, model: pycolmap.Reconstruction) -> None:
-    """Raises SfmError when the points of the model confirm hardly any verified match."""
-    _, matches, _ = database.inlier_counts(job.database)
-    lengths = np.array([point.track.length() for point in model.points3D.values()])
-    share = float((lengths * (lengths - 1) / 2).sum()) / max(1, matches)
-    if share < MIN_AGREEING:
-        raise _misfit(share, MIN_AGREEING)
-
-
 def _misfit(share: float, least: float) -> SfmError:
     return SfmError(
         f"The given poses do not fit the images: {share:.0%} of the matches agree with them, but "
@@ -172,7 +168,7 @@ def _misfit(share: float, least: float) -> SfmError:
 
 def _refine(job: MappingJob, model: pycolmap.Reconstruction, known: KnownPoses) -> dict[str, float]:
     """Adjusts poses and points in place, aligns them with the given poses, returns the movement."""
-    before = model.compute_mean_reprojection_error()
+    error_before = model.compute_mean_reprojection_error()
     fixed = set(model.cameras) - _uncalibrated_cameras(job)
     for _ in range(2):  # the first one drops points that the given poses had spoilt
         mapper.adjust(model, constant=fixed)
@@ -180,12 +176,12 @@ def _refine(job: MappingJob, model: pycolmap.Reconstruction, known: KnownPoses) 
     original = np.stack([known.viewmats[name] for name in names])
     model.transform(align_to_given(_viewmats(model, names), original))
     model.update_point_3d_errors()
-    movement = measure_movement(_viewmats(model, names), original)
-    return {**movement, "reprojection_error_px_before": before}
+    return {**measure_movement(_viewmats(model, names), original),
+            "reprojection_error_px_before": error_before}
 
 
 def align_to_given(refined: Poses, given: Poses) -> pycolmap.Sim3d:
-    """Returns the similarity that brings cameras closest to where they were given.
+    """Returns the similarity that brings cameras closest to the given ones.
 
     The rotation is the mean over the cameras, so that it is determined even if the centres lie on
     one line; scale and translation are least squares over the centres.
@@ -227,8 +223,7 @@ def _viewmats(model: pycolmap.Reconstruction, names: Collection[str]) -> Poses:
 
 
 def _centers(viewmats: Poses) -> NDArray[np.float64]:
-    centers: NDArray[np.float64] = -np.einsum("fji,fj->fi", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    return centers
+    return np.asarray(-np.einsum("fji,fj->fi", viewmats[:, :3, :3], viewmats[:, :3, 3]))
 
 
 @dataclass(frozen=True)
@@ -243,12 +238,12 @@ class SpotCheck:
         """Whether the poses can be used."""
         return self.share is None or self.share >= MIN_SPOT_AGREEING
 
-    def lines(self) -> list[str]:
+    def describe(self) -> str:
         """Returns a sentence for the terminal."""
         if self.share is None:
-            return [f"The given poses could not be checked: {self.matches} matches are too few."]
-        return [f"{self.share:.0%} of {self.matches} matches between sampled images agree with "
-                "the given poses."]
+            return f"The given poses could not be checked: {self.matches} matches are too few."
+        return (f"{self.share:.0%} of {self.matches} matches between sampled images agree with the "
+                "given poses.")
 
 
 def spot_check(

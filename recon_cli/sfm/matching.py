@@ -262,9 +262,11 @@ def match_pairs(job: MappingJob, pairs: Iterable[Pair], report: Reporter) -> Non
 
 def count_matches(job: MappingJob) -> Result:
     """Returns the numbers of matched pairs, verified pairs and verified matches."""
-    pairs, matches, _ = database.inlier_counts(job.database)
-    rows = database.progress(job.database, "matches")
-    return {"rows": rows, "verified_pairs": pairs, "matches": matches}
+    groups = database.count_inliers(job.database)
+    return {
+        "rows": database.progress(job.database, "matches"),
+        "verified_pairs": sum(pairs for pairs, _, _ in groups),
+        "matches": sum(matches for _, matches, _ in groups)}
 
 
 def check_motion(job: MappingJob) -> None:
@@ -275,7 +277,7 @@ def check_motion(job: MappingJob) -> None:
     walk with small steps 0.91 of all matches were flat, 0.22 of those 64 frames apart; in a turn on
     the spot all are.
     """
-    groups = database.inlier_counts_by_distance(job.database)
+    groups = database.count_inliers(job.database)
     total = sum(matches for _, matches, _ in groups)
     large = [counts for counts in groups if counts[1] >= MIN_SHARE * total]
     deepest = min(large, key=lambda counts: counts[2] / counts[1], default=(0, 0, 0))

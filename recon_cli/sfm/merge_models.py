@@ -62,7 +62,7 @@ def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> Mo
         larger = merged.model.num_reg_images() > best.model.num_reg_images()
         if larger and (merged.verdict.trusted or not best.verdict.trusted):
             best = merged
-    return ModelCandidate(best.model, best.verdict, _apart(best, others), best.rejected)
+    return ModelCandidate(best.model, best.verdict, _list_apart(best, others), best.rejected)
 
 
 def _drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandidate:
@@ -83,11 +83,11 @@ def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> ModelVerdict:
     return verdict.examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
 
 
-def _apart(
-    chosen: ModelCandidate, others: Sequence[pycolmap.Reconstruction]
+def _list_apart(
+    best: ModelCandidate, others: Sequence[pycolmap.Reconstruction]
 ) -> tuple[tuple[str, ...], ...]:
     """Returns the frames of other models that no model before them holds, three or more."""
-    held, parts = {*mapper.list_registered(chosen.model), *chosen.rejected}, []
+    held, parts = {*mapper.list_registered(best.model), *best.rejected}, []
     for other in others:
         new = sorted(set(mapper.list_registered(other)) - held)
         held.update(new)
@@ -129,8 +129,11 @@ def similarity(
     """Returns the similarity from points to those of `base`, None where too few agree."""
     if len(source) < MIN_INLIERS:
         return None
+    points = np.array([point.xyz for point in base.points3D.values()])
+    centers = np.array([image.projection_center() for image in _images(base)])
+    depths = np.linalg.norm(points - np.median(centers, axis=0), axis=1)
     options = pycolmap.RANSACOptions()
-    options.max_error = MAX_ERROR * _depth(base)
+    options.max_error = MAX_ERROR * float(np.median(depths))
     options.max_num_trials = MAX_TRIALS
     options.random_seed = seed
     estimate = pycolmap.estimate_sim3d_robust(source, target, options)
@@ -208,10 +211,3 @@ def _pair_points(
     return {
         (ours[row], theirs[other]) for row, other in rows.tolist()
         if row in ours and other in theirs}
-
-
-def _depth(model: pycolmap.Reconstruction) -> float:
-    """Returns the median distance of a point from the cameras that see it."""
-    points = np.array([point.xyz for point in model.points3D.values()])
-    centers = np.array([image.projection_center() for image in _images(model)])
-    return float(np.median(np.linalg.norm(points - np.median(centers, axis=0), axis=1)))

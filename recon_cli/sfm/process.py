@@ -178,7 +178,9 @@ def _timeout_error(max_minutes: float, monitor: Monitor) -> SfmError:
 
 
 def _crash_error(log: Path, code: int, monitor: Monitor) -> SfmError:
-    how = f"was ended by {_signal_name(-code)}" if code < 0 else f"stopped with exit code {code}"
+    names = {number.value: number.name for number in signal.Signals}
+    how = f"stopped with exit code {code}" if code >= 0 else (
+        f"was ended by {names.get(-code, f'signal {-code}')}")
     hint = "Run it again: features and matches found so far are kept."
     if code == -signal.SIGKILL:
         hint = (
@@ -187,13 +189,6 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> SfmError:
     return SfmError(
         f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
         f"{last_error(log)}", hint=hint)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def last_error(log: Path) -> str:

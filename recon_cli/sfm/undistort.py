@@ -16,7 +16,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from recon_cli.io.colmap import Pinhole
 from recon_cli.io.records import read_poses
@@ -42,7 +41,8 @@ def place_model(job: MappingJob) -> Result:
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
-        {name: _viewmat(image) for name, image in images.items()},
+        {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+         for name, image in images.items()},
         gravity=job.gravity and not job.known_poses,
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
         metric=job.known_poses and job.poses is not None and read_poses(job.poses).metric,
@@ -62,12 +62,6 @@ def move_model(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
         similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 
-def _viewmat(image: pycolmap.Image) -> NDArray[np.float64]:
-    viewmat = np.eye(4)
-    viewmat[:3] = image.cam_from_world().matrix()
-    return viewmat
-
-
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:
     """Returns the camera of the undistorted image, to whose pixels --scale-between may point."""
     flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
@@ -84,18 +78,14 @@ def undistort(job: MappingJob, report: Reporter) -> Result:
     _undistort(job, job.frames, names, work)
     _write_twins(job, names, work)
     _write_masks(job, masked, work)
-    cameras = _cameras(pycolmap.Reconstruction(work / SPARSE))
+    flat = pycolmap.Reconstruction(work / SPARSE)
+    counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
+    cameras = [
+        {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
+         "frames": counts[index]}
+        for index, camera in sorted(flat.cameras.items())]
     publish(work, job.out / "undistorted")
     return {"cameras": cameras}
-
-
-def _cameras(model: pycolmap.Reconstruction) -> list[dict[str, float]]:
-    """Returns width, height, focal length in pixels and frames of each camera, in its order."""
-    used = Counter(model.image(i).camera_id for i in model.reg_image_ids())
-    return [
-        {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
-         "frames": used[index]}
-        for index, camera in sorted(model.cameras.items())]
 
 
 def _write_twins(job: MappingJob, names: Sequence[str], work: Path) -> None:

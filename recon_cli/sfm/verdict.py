@@ -23,14 +23,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.errors import SfmError, list_names
-from recon_cli.sfm import view_graph
+from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
-from recon_cli.sfm.visual_aliasing import (
-    MIN_OVERLAP,
-    VisualAliasing,
-    find_aliasing,
-    measure_overlap,
-)
+from recon_cli.sfm.visual_aliasing import VisualAliasing
 from recon_cli.sfm.weakest_cut import (
     MIN_AGREEING,
     MIN_MATCHES,
@@ -151,28 +146,21 @@ class ModelVerdict:
 
 def examine(
     model: pycolmap.Reconstruction,
-    database: Path,
-    names: Sequence[str],
+    database: Path,  # of COLMAP; Python's SQLite must not have it open
+    names: Sequence[str],  # of all images given to the mapper; the database may hold more
     *,
-    sharpness: Mapping[str, float | None] | None = None,
-    times: Mapping[str, float | None] | None = None,
+    sharpness: Mapping[str, float | None] | None = None,  # variance of the Laplacian, where known
+    times: Mapping[str, float | None] | None = None,  # seconds in the video, where known
 ) -> ModelVerdict:
     """Returns the verdict on a finished model, which is not changed.
-
-    Args:
-        model: the reconstruction.
-        database: COLMAP's database of the images; Python's SQLite must not have it open.
-        names: of all images that were given to the mapper; the database may hold more.
-        sharpness: variance of the Laplacian of each image, where known.
-        times: seconds of each image in the video, where known.
 
     Raises:
         ValueError: the database lacks an image, or the model holds one that is not in `names`.
     """
     evidence = gather_evidence(model, database, names)
-    overlap = measure_overlap(model, evidence)
+    overlap = visual_aliasing.measure_overlap(model, evidence)
     weakest_cut, outliers = find_weakest_cut(evidence, overlap)
-    aliasing = find_aliasing(evidence, overlap)
+    aliasing = visual_aliasing.find_aliasing(evidence, overlap)
     rows = evidence.registered
     placed = [name for name, has_camera in zip(names, rows, strict=True) if has_camera]
     model_parts = _parts(placed, evidence.shared[np.ix_(rows, rows)].astype(np.float64))
@@ -232,12 +220,12 @@ def _describe_break(cut: WeakestCut) -> list[str]:
 
 
 def _describe_aliasing(aliasing: VisualAliasing) -> list[str]:
-    if aliasing.share is None or aliasing.share >= MIN_OVERLAP:
+    if aliasing.share is None or aliasing.share >= visual_aliasing.MIN_OVERLAP:
         return []
     return [
         f"{_sides(aliasing.sides)} should see the same surfaces, but only {aliasing.share:.0%} of "
-        f"them are found in both and {MIN_OVERLAP:.0%} are needed: the model is broken between "
-        "them, or two places that look alike lie over each other."]
+        f"them are found in both and {visual_aliasing.MIN_OVERLAP:.0%} are needed: the model is "
+        "broken between them, or two places that look alike lie over each other."]
 
 
 def _sides(sides: tuple[Names, Names]) -> str:

@@ -3,9 +3,8 @@
 Two equal doors, seen by images that nothing else connects, can be merged without a single match
 that disagrees. What gives such a model away is what was *not* matched: the two groups of cameras
 now seem to stand in one place and look the same way, but all they have in common is the door.
-(Zach, Irschara and Bischof 2008 call these missing correspondences.) Halves that are off by a
-degree or by a fiftieth of the extent show as well: COLMAP has dropped the points that fit one of
-them only.
+(Zach, Irschara and Bischof 2008: missing correspondences.) Halves that are off by a degree or by a
+fiftieth of the extent show as well: COLMAP has dropped the points that fit one of them only.
 
 The images are compared by the cells of a grid, not by points, because most points lie on whatever
 is rich in texture, which may be the very thing that looks alike.
@@ -13,7 +12,6 @@ is rich in texture, which may be the very thing that looks alike.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,7 +80,7 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
     row = {name: index for index, name in enumerate(evidence.names)}
     images = {row[model.image(i).name]: model.image(i) for i in model.reg_image_ids()}
     positions = np.array([point.xyz for _, point in sorted(model.points3D.items())]).reshape(-1, 3)
-    frames = {index: _in_frame(image, positions) for index, image in sorted(images.items())}
+    frames = {index: _project(image, positions) for index, image in sorted(images.items())}
     samples = _sample(evidence, positions, frames)
     cells = _cells(samples, np.ones_like(samples.image, np.bool_), count)
     expected, confirmed = np.zeros((count, count)), np.zeros((count, count))
@@ -99,8 +97,7 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
 
 
 def is_confirmed(
-    expected: NDArray[np.float64],  # [C]
-    confirmed: NDArray[np.float64],  # [C]
+    expected: NDArray[np.float64], confirmed: NDArray[np.float64]  # [C] each
 ) -> NDArray[np.bool_]:  # [C]
     """Returns across which of C cuts enough cells should look the same, and do."""
     return np.asarray((expected >= MIN_CELLS) & (confirmed >= MIN_OVERLAP * expected))
@@ -134,11 +131,8 @@ def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
     return VisualAliasing(share, "", (first, second), int(view_graph.across(expected, side)))
 
 
-def _in_frame(
-    image: pycolmap.Image,
-    positions: NDArray[np.float64],  # [M, 3]
-) -> NDArray[np.float64]:  # [M, 2]
-    """Returns where points lie in an image, 0 to 1 across it and down it; NaN outside.
+def _project(image: pycolmap.Image, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns where points [M, 3] lie in an image, [M, 2], 0 to 1 across and down; NaN outside.
 
     Distortion is ignored, because its polynomial brings far points back into the image: its frame
     is the rectangle that the undistorted middles of its edges span.
@@ -160,17 +154,15 @@ def _sample(
     positions: NDArray[np.float64],  # [M, 3]
     frames: dict[int, NDArray[np.float64]],
 ) -> _Samples:
-    image, point, cell = [], [], []
+    parts = [np.zeros((3, 0), np.int64)]
     for index, frame in frames.items():
         inside = np.flatnonzero(evidence.visible[index] & ~np.isnan(frame[:, 0]))
         some = inside[np.linspace(0, len(inside) - 1, min(MAX_POINTS, len(inside))).astype(int)]
         column, line = (frame[some] * GRID).astype(np.int64).T
-        image.append(np.full(len(some), index))
-        point.append(some)
-        cell.append((index * GRID + line) * GRID + column)
-    images, points = _concatenate(image), _concatenate(point)
-    rays = positions[points] - evidence.centers[images]
-    return _Samples(images, points, _concatenate(cell), rays)
+        cells = (index * GRID + line) * GRID + column
+        parts.append(np.stack([np.full(len(some), index), some, cells]))
+    images, points, cells = np.concatenate(parts, axis=1)
+    return _Samples(images, points, cells, positions[points] - evidence.centers[images])
 
 
 def _likely(
@@ -202,7 +194,3 @@ def _cells(
     """Returns the cells of each image that hold at least so many of the chosen samples."""
     held = np.bincount(samples.cell[chosen], minlength=count * GRID * GRID)
     return np.asarray(held.reshape(count, -1) >= least)
-
-
-def _concatenate(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    return np.concatenate([np.zeros(0, np.int64), *parts])
