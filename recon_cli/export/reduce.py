@@ -38,8 +38,7 @@ def measure_change(
 
 
 def crop(splats: Splats, box: Box) -> Splats:
-    """Returns the Gaussians whose centres are in a box, its sides included; ConfigError if none is.
-    """
+    """Returns the Gaussians with their centres in a box or on it; ConfigError if none is."""
     low, high = splats.means.new_tensor(box[:3]), splats.means.new_tensor(box[3:])
     inside = ((splats.means >= low) & (splats.means <= high)).all(dim=1)
     if not inside.any():

@@ -103,8 +103,7 @@ def _numbers(values: NDArray[np.float64]) -> str:
 
 
 def make_lens(model: str, width: float, height: float, params: Sequence[float], where: str) -> Lens:
-    """Returns the intrinsics of a file; FormatError if they are unknown, incomplete or implausible.
-    """
+    """Returns the intrinsics of a file; FormatError if they are unknown or implausible."""
     if model not in MODELS:
         raise FormatError(
             f"{where} has the camera model {model}, known are {', '.join(MODELS)}.",

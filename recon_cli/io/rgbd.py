@@ -196,9 +196,8 @@ def _list_numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Returns the files that are named by a number, in its order."""
     if not folder.is_dir():
         return {}
-    files = [path for path in folder.iterdir()
-             if path.suffix.lower() in suffixes and path.stem.isdecimal()]
-    return {int(path.stem): path for path in sorted(files, key=lambda path: int(path.stem))}
+    return dict(sorted((int(path.stem), path) for path in folder.iterdir()
+                       if path.suffix.lower() in suffixes and path.stem.isdecimal()))
 
 
 def _read_lens(folder: Path, kind: str, size: tuple[int, int]) -> Lens:

@@ -100,8 +100,7 @@ def load_workspace(job: Job, model: str) -> ViewerContent:
 
 
 def load_file(path: Path) -> ViewerContent:
-    """Returns a splat file, seen from a corner of its room; FormatError if it is damaged or empty.
-    """
+    """Returns a splat file, seen from a corner of its room; FormatError if it is empty."""
     splats = read_splats(path)
     models = {path.name: pack_splats(splats)}
     if not len(models[path.name].splats):

@@ -49,8 +49,7 @@ def format_of(path: Path) -> SplatFormat:
 
 
 def read_splats(path: Path) -> Splats:
-    """Returns the Gaussians of a file in any of FORMATS, on the CPU; FormatError if it is damaged.
-    """
+    """Returns the Gaussians of a file in any of FORMATS; FormatError if it is damaged."""
     row = format_of(path)
     try:
         return row.read(path)
