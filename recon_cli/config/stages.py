@@ -287,12 +287,7 @@ EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html",
 
 
 def read_matrix(path: str) -> list[float]:
-    """Returns the 16 numbers of a JSON file with 4 rows of 4 numbers, row by row.
-
-    Raises:
-        FormatError: the file is missing or no JSON.
-        ConfigError: it holds something else.
-    """
+    """Returns the 16 numbers of a JSON file with 4 rows of 4 numbers, row by row."""
     rows = read_json(Path(path))
     if not (isinstance(rows, list) and len(rows) == 4 and all(
             isinstance(row, list) and len(row) == 4

@@ -82,16 +82,9 @@ def align_to_views(
 ) -> Alignment:
     """Returns the frame in which a scene fits the training views best, and how well.
 
-    Args:
-        splats: as they are in the file.
-        scene: the views of the workspace.
-        world: from the frame of the source to that of the workspace.
-        frame: source, workspace, or auto for the better one.
-        max_size: longest side of the images in pixels.
-        ctx: backend and device.
-
-    Raises:
-        ReconstructionError: no training view can be compared.
+    `world` leads from the frame of the source to that of the workspace; `frame` is one of these, or
+    auto for the better one. `max_size` is the longest side of the images in pixels.
+    ReconstructionError if no training view can be compared.
     """
     frames = {WORKSPACE: Similarity(), SOURCE: world}
     if frame != "auto":

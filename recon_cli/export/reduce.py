@@ -58,7 +58,7 @@ def fit_to_size(
     """Returns the scene reduced to a file size, by the degree and count that look best together.
 
     For each degree as many Gaussians of the highest scores as fit; of these scenes the one with the
-    highest PSNR.
+    highest PSNR. ConfigError if not even one Gaussian fits.
 
     Args:
         splats: the scene.
@@ -66,9 +66,6 @@ def fit_to_size(
         size_of: returns the size of the file of a scene.
         score_of: returns how much each Gaussian matters, [N]; called at most once.
         psnr_db: returns the PSNR of a scene on views that the scores do not use.
-
-    Raises:
-        ConfigError: not even one Gaussian fits.
     """
     if size_of(splats) <= max_bytes:
         return splats

@@ -41,11 +41,7 @@ class Pinhole:
 
 
 def read_scene(
-    undistorted: Path,
-    *,
-    held_out: frozenset[str],
-    validation: float,
-    denoised: Path | None = None,
+    undistorted: Path, *, held_out: frozenset[str], validation: float, denoised: Path | None = None
 ) -> Scene:
     """Returns the registered views and the points of an undistorted model.
 

@@ -413,20 +413,12 @@ def write_transforms(
     *,
     held_out: Collection[str] = (),
 ) -> None:
-    """Writes the cameras of images, whole or not at all.
+    """Writes the cameras of images, by paths below the folder of the file, whole or not at all.
 
-    Intrinsics that all cameras share are written once. With held-out images the lists
+    Intrinsics that all cameras share are written once. With held-out paths the lists
     train_filenames, val_filenames and test_filenames are written; the last two are those images,
-    because nerfstudio requires both.
-
-    Args:
-        path: of the transforms.json.
-        views: path of each image below the folder of `path`, with slashes, and its camera.
-        held_out: those of the image paths that are not to be trained on.
-
-    Raises:
-        InputError: there are no views.
-        ValueError: a path leaves the folder, appears twice, or is held out but no view.
+    because nerfstudio requires both. InputError if there are no views; ValueError if a path leaves
+    the folder, appears twice, or is held out but no view.
     """
     if not views:
         raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")

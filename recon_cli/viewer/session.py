@@ -208,7 +208,7 @@ class Session:
                 self._submit(lambda: frustums.add_photos(photos, lambda: self._gone))
                 self._frustums = frustums
             if self._frustums is not None:
-                self._frustums.show(self._cameras.value)
+                self._frustums.parent.visible = self._cameras.value
 
     def _jump_to(self, label: str) -> None:
         """Moves the camera to a view, hides the frustums and shows the view's photo."""
@@ -281,7 +281,7 @@ class Frustums:
         self, client: viser.ClientHandle, content: ViewerContent, jump: Callable[[str], None]
     ) -> None:
         self._client, self._content, self._jump = client, content, jump
-        self._parent = client.scene.add_frame("/cameras", show_axes=False)
+        self.parent = client.scene.add_frame("/cameras", show_axes=False)  # shows or hides all
         with client.atomic():
             self._handles = {
                 view.label: self._add(number, view) for number, view in enumerate(content.views)}
@@ -296,10 +296,6 @@ class Frustums:
             cast_shadow=False, receive_shadow=False)
         handle.on_click(lambda _: self._jump(view.label))
         return handle
-
-    def show(self, visible: bool) -> None:
-        """Shows or hides all of them."""
-        self._parent.visible = visible
 
     def add_photos(self, photos: PhotoPairs, stopped: Callable[[], bool]) -> None:
         """Shows the photos in the frustums, until `stopped` returns True."""

@@ -152,12 +152,8 @@ def read_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> Splats:
     """Returns the Gaussians of a .glb as float32 tensors; other points and meshes are skipped.
 
     The order is the file's; where several primitives hold Gaussians, those with coefficients come
-    first. Behind the last one of a primitive that has any, Gaussians are of degree 0.
-
-    Args:
-        path: of the .glb.
-        axes: [3, 3] rotation from the wanted axes to those of glTF, as in `write_glb`; None for
-            those that the file records, or else `Z_UP`.
+    first. Behind the last one of a primitive that has any, Gaussians are of degree 0. `axes` are as
+    in `write_glb`; None for those that the file records, or else `Z_UP`.
 
     Raises:
         FormatError: the file is missing or damaged, holds no Gaussians, or needs what is not

@@ -136,16 +136,9 @@ def write_html(
 ) -> None:
     """Writes a page that shows `splats`, whole or not at all.
 
-    Values are quantized as by `write_spz`, but coefficients to 1/128; the errors are those of
-    `spz_bytes`.
-
-    Args:
-        path: of the .html.
-        splats: of any degree.
-        title: of the page; any text.
-        up: [3] unit vector.
-        views: names and cameras that a visitor can step through, first the one that the page
-            opens at; without any it opens in front of the scene.
+    Values are quantized as by `write_spz`, but coefficients to 1/128. `up` is a unit vector [3]. A
+    visitor can step through the cameras of `views`; the page opens at the first of them, or in
+    front of the scene. The errors are those of `spz_bytes`.
     """
     packed = spz_bytes(path, splats, harmonic_step=1)  # beside the scripts size hardly counts
     scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '

@@ -200,8 +200,7 @@ class SpzHeader:
     @property
     def sizes(self) -> tuple[int, ...]:
         """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
-        rotation = 3 if self.version < 3 else 4
-        each = (9, 1, 3, 3, rotation, 3 * TERMS[self.sh_degree])
+        each = (9, 1, 3, 3, 3 if self.version < 3 else 4, 3 * TERMS[self.sh_degree])
         return tuple(self.count * size for size in each)
 
 
@@ -222,13 +221,8 @@ def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
 def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
     """Returns the header and the six arrays of a file.
 
-    Args:
-        path: for messages.
-        data: its content.
-
-    Raises:
-        FormatError: the data is damaged, of another format or version, promises more than a file
-            of its size can hold, or holds less or more than it promises.
+    FormatError if the data is damaged, of another format or version, promises more than a file of
+    its size can hold, or holds less or more than it promises.
     """
     try:
         if data.startswith(b"\x1f\x8b"):
