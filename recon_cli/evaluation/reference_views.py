@@ -164,8 +164,7 @@ def score_views(
             None if mask is None else float(mask.mean())))
         corrected.append(corrected_psnr(image, photo, mask))
         on_view(view, image)
-    return RenderScores(
-        tuple(scores), statistics.fmean(corrected), statistics.median(milliseconds))
+    return RenderScores(tuple(scores), statistics.fmean(corrected), statistics.median(milliseconds))
 
 
 def mean_psnr(

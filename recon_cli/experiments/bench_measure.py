@@ -107,8 +107,7 @@ class BackendResult:
 
 def _finite(accuracy: Accuracy) -> dict[str, Any]:
     """Returns an accuracy as JSON, with null for infinity."""
-    return {name: None if value == math.inf else value
-            for name, value in asdict(accuracy).items()}
+    return {name: None if value == math.inf else value for name, value in asdict(accuracy).items()}
 
 
 @dataclass(frozen=True)
@@ -337,8 +336,7 @@ class _Measurement:
         """Returns the memory of a first pass, after one on a tiny scene that compiles kernels."""
         renderer, device = registry.renderer(backend), self._plan.device
         _render_and_back(build_scene(QUICK, self._scene.sh_degree, device), renderer)
-        return instruments.measure_memory(
-            partial(_render_and_back, self._scene, renderer), device)
+        return instruments.measure_memory(partial(_render_and_back, self._scene, renderer), device)
 
     def _time(self, work: Callable[[], object]) -> Mapping[str, float]:
         watch = Stopwatch(self._plan.device)

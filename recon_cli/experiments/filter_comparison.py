@@ -221,8 +221,7 @@ def gain_db(scores: Sequence[FilterScore], score: FilterScore) -> float:
 
 
 def _score_of_none(scores: Sequence[FilterScore], level: float) -> FilterScore:
-    return next(
-        score for score in scores if score.filter == "none" and score.noise_255 == level)
+    return next(score for score in scores if score.filter == "none" and score.noise_255 == level)
 
 
 def _table(scores: Sequence[FilterScore]) -> str:

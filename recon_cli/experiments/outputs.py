@@ -43,8 +43,7 @@ class OutputFiles:
                 f"--plot is {self.plot}, but it must end in .png or .svg.",
                 hint=f"Try --plot {self.plot.with_suffix('.svg').name}.")
         if self.plot is not None and not _can_draw():
-            raise ConfigError(
-                "--plot needs matplotlib, which is not installed.", hint=_INSTALL)
+            raise ConfigError("--plot needs matplotlib, which is not installed.", hint=_INSTALL)
         if self.markdown is not None:
             _with_text(self.markdown, "")
 

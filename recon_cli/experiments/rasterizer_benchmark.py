@@ -225,8 +225,7 @@ def _stages(where: str, scene: BenchedScene) -> Table:
                 *((number(gpairs_per_s), percent(fraction)) if part in rates else ("", ""))))
     threads = next(iter(scene.backends.values())).speed.threads
     columns = ("ms, 1 thread", f"ms, {threads} threads") if several else ("ms",)
-    return Table(
-        ("stage", *columns, "Gpairs/s a core", "of peak"), rows, f"Stages ({where})")
+    return Table(("stage", *columns, "Gpairs/s a core", "of peak"), rows, f"Stages ({where})")
 
 
 _ERRORS = ("image max", "image RMS", "pixels > 1e-5", "gradient rel.", "worst", "gradient 1 - cos")

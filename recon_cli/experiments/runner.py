@@ -234,9 +234,7 @@ class Runner:
         self._base, self._progress = base, progress
         self._machine, self._records = machine, records
 
-    def pilot_seconds(
-        self, loaded: LoadedScene, variants: Sequence[Variant]
-    ) -> dict[str, float]:
+    def pilot_seconds(self, loaded: LoadedScene, variants: Sequence[Variant]) -> dict[str, float]:
         """Returns the approximate seconds of a step by variant; the pilots also warm caches."""
         seconds = {}
         label = f"{loaded.folders.name}: pilots"

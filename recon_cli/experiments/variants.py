@@ -37,8 +37,7 @@ class Variant:
 
     def config(self, base: RunConfig, *, iterations: int, seed: int) -> RunConfig:
         """Returns the options of one run; ConfigError for a value out of range."""
-        return dataclasses.replace(
-            base, **{**self.options, "iterations": iterations, "seed": seed})
+        return dataclasses.replace(base, **{**self.options, "iterations": iterations, "seed": seed})
 
     def record(self) -> dict[str, Any]:
         """Returns everything that affects the result, as JSON."""
