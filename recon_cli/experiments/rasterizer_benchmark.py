@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -82,9 +82,8 @@ class BenchRequest:
         """Returns the record to compare with, if any; ReconError if it does not compare."""
         if self.compare is None:
             return None
-        old, size = read_record(self.compare), plan.size
-        settings = {"gaussians": size.gaussians, "width": size.width, "height": size.height,
-                    "sh_degree": plan.sh_degree}
+        old = read_record(self.compare)
+        settings = {**asdict(plan.size), "sh_degree": plan.sh_degree}
         check_comparable(old, self.scene, settings, plan.threads)
         return old
 

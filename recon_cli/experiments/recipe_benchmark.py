@@ -14,21 +14,21 @@ import numpy as np
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.evaluation.scores import Table, number
-from recon_cli.experiments.instruments import Host, examine, timing_of
+from recon_cli.experiments.instruments import Host, timing_of
 from recon_cli.experiments.outputs import OutputFiles, add_legend, drawing
 from recon_cli.experiments.runner import (
     STEPS,
     CurvePoint,
     ExperimentRequest,
     Runner,
-    Runs,
+    SceneRuns,
     shared_options,
 )
 from recon_cli.experiments.scenes import LoadedScene, check_scenes
 from recon_cli.experiments.variants import Variant
-from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
 
+ALL = "all"  # the only comparison
 _SCORES = 20  # along a run: each is of all validation views
 _INCH = 3.2  # of a panel
 
@@ -67,17 +67,6 @@ class RecipeRequest(ExperimentRequest):
 
 
 @dataclass(frozen=True)
-class SceneCurves:
-    """All recipes on one scene."""
-
-    views: int  # that were scored
-    width: int  # of the first of them in pixels
-    height: int
-    recipes: Mapping[str, Variant]
-    runs: Runs
-
-
-@dataclass(frozen=True)
 class CurvesResult:
     """A run of the benchmark."""
 
@@ -85,12 +74,13 @@ class CurvesResult:
     seeds: int
     base: RunConfig
     targets_db: tuple[float, ...]  # of the command line
-    scenes: Mapping[str, SceneCurves]
+    recipes: tuple[Variant, ...]
+    scenes: Mapping[str, SceneRuns]
 
-    def targets_of(self, scene: SceneCurves) -> tuple[float, ...]:
+    def targets_of(self, scene: SceneRuns) -> tuple[float, ...]:
         """Returns the targets of the command line, or the PSNR that all runs of a scene reach."""
         return self.targets_db or (common_target(
-            [record.points for records in scene.runs.values() for record in records]),)
+            [record.points for records in scene.runs[ALL].values() for record in records]),)
 
     def record(self) -> dict[str, Any]:
         """Returns the content of the JSON file."""
@@ -98,15 +88,15 @@ class CurvesResult:
             "schema": "recon-bench-train", "version": 1, "machine": asdict(self.host),
             "seeds": self.seeds, "base": shared_options(self.base),
             "scenes": {name: {
-                "views": scene.views, "width": scene.width, "height": scene.height,
-                "recipes": {recipe: self._recipe(scene, recipe) for recipe in scene.recipes},
+                **scene.size_record(),
+                "recipes": {recipe.name: self._recipe(scene, recipe) for recipe in self.recipes},
             } for name, scene in self.scenes.items()},
         }
 
-    def _recipe(self, scene: SceneCurves, recipe: str) -> dict[str, Any]:
-        records, targets = scene.runs[recipe], self.targets_of(scene)
+    def _recipe(self, scene: SceneRuns, recipe: Variant) -> dict[str, Any]:
+        records, targets = scene.runs[ALL][recipe.name], self.targets_of(scene)
         return {
-            **scene.recipes[recipe].record(), "iterations": records[0].last.iteration,
+            **recipe.record(), "iterations": records[0].last.iteration,
             **{key: {f"{db:g}": [seconds_to(record.points, db, clock) for record in records]
                      for db in targets}
                for key, (_, clock) in (("seconds_to", _WALL), ("cpu_seconds_to", _CPU))},
@@ -118,28 +108,24 @@ class CurvesResult:
 def run(request: RecipeRequest, progress: Progress) -> str:
     """Trains every recipe, writes the files, and returns the text for the terminal."""
     paths = check_scenes(request.scenes)
-    ctx = render_context(request.compute, progress)
-    host = examine(ctx.threads, ctx.device)
     runner = Runner(request.base, progress)
     with tempfile.TemporaryDirectory(prefix="recon-bench-") as scratch:
-        scenes = request.load(paths, Path(scratch), "validation", ctx)
-        result = CurvesResult(host, request.seeds, request.base, request.targets_db, {
-            loaded.folders.name: measure(loaded, request, runner) for loaded in scenes})
+        host, scenes = request.load(paths, Path(scratch), "validation", progress)
+        result = CurvesResult(
+            host, request.seeds, request.base, request.targets_db, request.recipes,
+            {loaded.folders.name: measure(loaded, request, runner) for loaded in scenes})
     return request.outputs.write(
         result.record(), head(result), tables(result), lambda path: draw(result, path))
 
 
-def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> SceneCurves:
+def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> SceneRuns:
     """Returns the curves of every recipe; pilots warm caches, and turn seconds into steps."""
     seconds = runner.pilot_seconds(loaded, request.recipes)
     steps = {name: request.steps(seconds_per_step) for name, seconds_per_step in seconds.items()}
     runs = runner.run_all(
         loaded, request.recipes, request.seeds, steps, label=loaded.folders.name,
         score_at=score_steps)
-    camera = loaded.scored[0].camera
-    return SceneCurves(
-        len(loaded.scored), camera.width, camera.height,
-        {recipe.name: recipe for recipe in request.recipes}, runs)
+    return SceneRuns.of(loaded, {ALL: runs})
 
 
 def score_steps(iterations: int, count: int = _SCORES) -> tuple[int, ...]:
@@ -187,13 +173,13 @@ def median_cell(values: Sequence[float | None], digits: int = 3) -> str:
     return cell if len(known) == len(values) else f"{cell}, {len(known)} of {len(values)}"
 
 
-def _table(name: str, scene: SceneCurves, result: CurvesResult) -> Table:
+def _table(name: str, scene: SceneRuns, result: CurvesResult) -> Table:
     targets = result.targets_of(scene)
     header = ("recipe", *(f"{kind} to {db:g} dB" for db in targets for kind in ("s", "CPU s")),
               "PSNR dB", "SSIM", "Gaussians", "MB", "steps", "s", "CPU s")
 
     def row(recipe: str) -> tuple[str, ...]:
-        records = scene.runs[recipe]
+        records = scene.runs[ALL][recipe]
 
         def last(figure: Figure, digits: int = 3) -> str:
             return median_cell([figure(record.last) for record in records], digits)
@@ -207,7 +193,7 @@ def _table(name: str, scene: SceneCurves, result: CurvesResult) -> Table:
 
     title = (f"{name}: {scene.views} validation views at {scene.width}x{scene.height}, "
              f"at most {result.base.max_gaussians:,} Gaussians")
-    return Table(header, [row(recipe) for recipe in scene.recipes], title)
+    return Table(header, [row(recipe) for recipe in scene.runs[ALL]], title)
 
 
 def draw(result: CurvesResult, path: Path) -> None:
@@ -220,7 +206,7 @@ def draw(result: CurvesResult, path: Path) -> None:
         panels = figure.subplots(rows, len(_PANELS), squeeze=False)
         for line, (name, scene) in zip(panels, result.scenes.items(), strict=True):
             for axes, (across, up) in zip(line, _PANELS, strict=True):
-                for recipe, records in scene.runs.items():
+                for recipe, records in scene.runs[ALL].items():
                     x, y = (np.array([[value(point) for point in record.points]
                                       for record in records]) for _, value in (across, up))
                     curve, = axes.plot(

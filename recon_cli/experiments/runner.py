@@ -28,9 +28,11 @@ from recon_cli.context import StageContext, TrainCallback
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.evaluation.reference_views import mean_score
 from recon_cli.evaluation.scores import MeanScore
+from recon_cli.experiments.instruments import Host, examine
 from recon_cli.experiments.scenes import LoadedScene, load_for_training, open_scene
 from recon_cli.experiments.variants import MidPrune, TrainingRun, Variant
 from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -86,14 +88,17 @@ class ExperimentRequest:
     compute: ComputeConfig = field(default_factory=ComputeConfig)
 
     def load(
-        self, paths: Mapping[str, Path], scratch: Path, split: str, ctx: StageContext
-    ) -> list[LoadedScene]:
-        """Returns the scenes of `scenes.check_scenes`; data sets become workspaces in `scratch`."""
-        return [
-            load_for_training(open_scene(
-                name, path, scratch, self.settings, self.compute, ctx.progress), split, self.base,
-                ctx)
-            for name, path in paths.items()]
+        self, paths: Mapping[str, Path], scratch: Path, split: str, progress: Progress
+    ) -> tuple[Host, list[LoadedScene]]:
+        """Returns this machine, and the scenes of `scenes.check_scenes`, ready for training.
+
+        Data sets become workspaces in `scratch`; the views of `split` are scored.
+        """
+        ctx = render_context(self.compute, progress)
+        host = examine(ctx.threads, ctx.device)
+        return host, [load_for_training(
+            open_scene(name, path, scratch, self.settings, self.compute, progress), split,
+            self.base, ctx) for name, path in paths.items()]
 
 
 def base_config(
@@ -156,6 +161,26 @@ class Record:
 
 
 Runs = Mapping[str, tuple[Record, ...]]  # by variant, then by seed
+
+
+@dataclass(frozen=True)
+class SceneRuns:
+    """All runs on one scene."""
+
+    views: int  # that were scored
+    width: int  # of the first of them in pixels
+    height: int
+    runs: Mapping[str, Runs]  # by comparison
+
+    @staticmethod
+    def of(loaded: LoadedScene, runs: Mapping[str, Runs]) -> SceneRuns:
+        """Returns the runs on a scene."""
+        camera = loaded.scored[0].camera
+        return SceneRuns(len(loaded.scored), camera.width, camera.height, runs)
+
+    def size_record(self) -> dict[str, int]:
+        """Returns number and size of the views as JSON."""
+        return {"views": self.views, "width": self.width, "height": self.height}
 
 
 def key_of(loaded: LoadedScene, run: TrainingRun) -> str:

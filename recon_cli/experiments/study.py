@@ -18,7 +18,7 @@ from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread, paired_t
 from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.evaluation.scores import Table
-from recon_cli.experiments.instruments import Host, examine
+from recon_cli.experiments.instruments import Host
 from recon_cli.experiments.outputs import add_legend, draw_if_possible, drawing
 from recon_cli.experiments.runner import (
     ExperimentRequest,
@@ -26,6 +26,7 @@ from recon_cli.experiments.runner import (
     Records,
     Runner,
     Runs,
+    SceneRuns,
     key_of,
     shared_options,
 )
@@ -38,7 +39,6 @@ from recon_cli.experiments.variants import (
     TrainingRun,
     Variant,
 )
-from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import sha256_json
@@ -90,17 +90,6 @@ class StudyRequest(ExperimentRequest):
 
 
 @dataclass(frozen=True)
-class StudiedScene:
-    """All runs on one scene."""
-
-    views: int  # test views that were scored
-    width: int  # of the first of them in pixels
-    height: int
-    digest: str  # of the scene's files
-    runs: Mapping[str, Runs]  # by comparison
-
-
-@dataclass(frozen=True)
 class StudyResult:
     """The runs of a study, and the figures made of them."""
 
@@ -108,7 +97,8 @@ class StudyResult:
     seeds: int
     base: RunConfig
     clock: str
-    scenes: Mapping[str, StudiedScene]
+    scenes: Mapping[str, SceneRuns]
+    digests: Mapping[str, str]  # of the scenes' files
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -153,8 +143,7 @@ class StudyResult:
             "base": shared_options(self.base), "clock": self.clock,
             "arms": [variant.record() | {"label": variant.label} for variant in VARIANTS],
             "scenes": {name: {
-                "views": scene.views, "width": scene.width, "height": scene.height,
-                "digest": scene.digest, "parts": self.parts(name),
+                **scene.size_record(), "digest": self.digests[name], "parts": self.parts(name),
             } for name, scene in self.scenes.items()},
             "comparisons": {
                 name: {row: self._comparison_record(row, name) for row in self.rows}
@@ -187,15 +176,15 @@ def run(request: StudyRequest, progress: Progress) -> str:
             hint="Give another folder with --out.") from error
     with (disk_errors(out, "running study"),
           hold_lock(out, "study", other="another folder with --out")):
-        ctx = render_context(request.compute, progress)
-        host = examine(ctx.threads, ctx.device)
         records = Records(out)
-        scenes = request.load(paths, out / "scenes", "test", ctx)
+        host, scenes = request.load(paths, out / "scenes", "test", progress)
         machine = f"{host.cpu}, {host.device}, {host.threads} threads"
         study = Study(request, records, progress, machine)
         logger.warning("%s", study.announcement(scenes))
-        result = StudyResult(host, request.seeds, request.base, request.clock, {
-            loaded.folders.name: study.run_scene(loaded) for loaded in scenes})
+        result = StudyResult(
+            host, request.seeds, request.base, request.clock,
+            {loaded.folders.name: study.run_scene(loaded) for loaded in scenes},
+            {loaded.folders.name: loaded.folders.digest for loaded in scenes})
         atomic.write_json(out / "study.json", result.record())
         atomic.write_bytes(out / "study.md", markdown(result).encode())
         draw_if_possible(lambda path: draw(result, path), out / "study.svg")
@@ -260,15 +249,13 @@ class Study:
                 variant, self._request.base, by_variant[variant.name], seed)) is None
             for by_variant in steps for seed in range(self._request.seeds))
 
-    def run_scene(self, loaded: LoadedScene) -> StudiedScene:
+    def run_scene(self, loaded: LoadedScene) -> SceneRuns:
         """Returns all runs on a scene; the missing ones are made now."""
         steps = dict.fromkeys((variant.name for variant in VARIANTS), self._request.iterations)
         equal = self._run_all(loaded, EQUAL_STEPS, steps)
         runs = {EQUAL_STEPS: equal,
                 EQUAL_SECONDS: self._run_all(loaded, EQUAL_SECONDS, self._steps(loaded, equal))}
-        camera = loaded.scored[0].camera
-        return StudiedScene(
-            len(loaded.scored), camera.width, camera.height, loaded.folders.digest, runs)
+        return SceneRuns.of(loaded, runs)
 
     def _run_all(self, loaded: LoadedScene, comparison: str, steps: Mapping[str, int]) -> Runs:
         return self._runner.run_all(

@@ -19,13 +19,12 @@ from recon_cli.experiments.instruments import Host
 from recon_cli.experiments.recipe_benchmark import (
     CurvesResult,
     RecipeRequest,
-    SceneCurves,
     common_target,
     median_cell,
     score_steps,
     seconds_to,
 )
-from recon_cli.experiments.runner import CurvePoint, Record, Runner
+from recon_cli.experiments.runner import CurvePoint, Record, Runner, SceneRuns
 from recon_cli.experiments.scenes import SceneFolders, load_for_training
 from recon_cli.experiments.variants import (
     REFERENCE,
@@ -165,11 +164,11 @@ def test_seconds_become_steps_by_a_pilot(
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     records = tuple(Record((point(0, 10), point(1, 20 + seed)), "") for seed in range(2))
-    recipes = {name: Variant(name, name) for name in ("one", "two")}
-    scene = SceneCurves(3, 64, 48, recipes, dict.fromkeys(recipes, records))
+    recipes = tuple(Variant(name, name) for name in ("one", "two"))
+    scene = SceneRuns(3, 64, 48, {module.ALL: dict.fromkeys(("one", "two"), records)})
     host = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
-    found = CurvesResult(host, 2, BASE, (), {"a": scene, "b": scene})
-    module.draw(found, tmp_path / "a.png")
+    result = CurvesResult(host, 2, BASE, (), recipes, {"a": scene, "b": scene})
+    module.draw(result, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 5000
-    assert module.tables(found)[0].rows[0][0] == "one"
-    assert "s to 20 dB" in module.tables(found)[0].headings
+    assert module.tables(result)[0].rows[0][0] == "one"
+    assert "s to 20 dB" in module.tables(result)[0].headings

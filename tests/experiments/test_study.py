@@ -70,7 +70,7 @@ def made(monkeypatch):
 
 def values(scene, comparison, variant, figure):
     """Returns a figure by seed."""
-    return StudyResult(None, 1, BASE, "wall", {"tiny": scene}).values(
+    return StudyResult(None, 1, BASE, "wall", {"tiny": scene}, {}).values(
         "tiny", comparison, variant, figure)
 
 

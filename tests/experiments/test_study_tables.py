@@ -7,7 +7,7 @@ import pytest
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments import study
 from recon_cli.experiments.instruments import Host
-from recon_cli.experiments.runner import CurvePoint, Record
+from recon_cli.experiments.runner import CurvePoint, Record, SceneRuns
 from recon_cli.experiments.study import (
     COMPARISONS,
     EQUAL_SECONDS,
@@ -16,7 +16,6 @@ from recon_cli.experiments.study import (
     PAIRS,
     TABLE_I,
     VARIANTS,
-    StudiedScene,
     StudyResult,
     published_scores,
 )
@@ -40,12 +39,13 @@ def scene(base_db, gains, machine="A CPU"):
                              (base_db + gain + noise + extra) / 50),), machine,
                        "original images" + (", far" if variant in VARIANTS[2:] else ""))
                 for noise, extra in zip(NOISE, own, strict=True))
-    return StudiedScene(4, 600, 340, "digest", runs)
+    return SceneRuns(4, 600, 340, runs)
 
 
 def result(**scenes):
-    return StudyResult(HOST, 3, RunConfig(), "wall", scenes or {
-        "office0": scene(30.0, (0.0, 0.5, 1.0, 0.1)), "home": scene(20.0, (0.0, -0.1, 1.0, 0.1))})
+    scenes = scenes or {
+        "office0": scene(30.0, (0.0, 0.5, 1.0, 0.1)), "home": scene(20.0, (0.0, -0.1, 1.0, 0.1))}
+    return StudyResult(HOST, 3, RunConfig(), "wall", scenes, dict.fromkeys(scenes, "digest"))
 
 
 def rows(table):
@@ -53,12 +53,12 @@ def rows(table):
 
 
 def test_every_scene_and_the_mean_has_a_row_for_each_arm():
-    found = rows(study.scores(result(), EQUAL_STEPS))
-    assert list(found) == [f"{row}, {variant.label}"
+    table = rows(study.scores(result(), EQUAL_STEPS))
+    assert list(table) == [f"{row}, {variant.label}"
                            for row in ("office0", "home", MEAN) for variant in VARIANTS]
-    assert found["office0, 3DGS"] == (
+    assert table["office0, 3DGS"] == (
         "30.00", "0.30", "0.6000", "0.0060", "100", "5,000", "1.2", "10.0", "20.0")
-    assert found[f"{MEAN}, paper"][0] == "25.20"
+    assert table[f"{MEAN}, paper"][0] == "25.20"
 
 
 def test_a_single_scene_has_no_mean_of_scenes():
@@ -67,14 +67,14 @@ def test_a_single_scene_has_no_mean_of_scenes():
 
 
 def test_every_pair_has_its_interval():
-    found = rows(study.differences(result(), EQUAL_SECONDS))
-    assert len(found) == 3 * len(PAIRS) == 15
-    assert found["office0, paper - 3DGS"][:3] == ("+0.50", "+0.50", "+0.50")
-    assert found["home, paper - 3DGS"][:3] == ("-0.10", "-0.10", "-0.10")
+    table = rows(study.differences(result(), EQUAL_SECONDS))
+    assert len(table) == 3 * len(PAIRS) == 15
+    assert table["office0, paper - 3DGS"][:3] == ("+0.50", "+0.50", "+0.50")
+    assert table["home, paper - 3DGS"][:3] == ("-0.10", "-0.10", "-0.10")
     # noise 0.5, -0.5, 0 around 0.1: half width 4.3027 x 0.5 / sqrt 3
-    assert found["home, ours pruned - 3DGS"][:3] == ("+0.10", "-1.14", "+1.34")
-    assert found[f"{MEAN}, paper - 3DGS"][:3] == ("+0.20", "+0.20", "+0.20")
-    assert found["home, paper - ours"][0] == "-1.10"
+    assert table["home, ours pruned - 3DGS"][:3] == ("+0.10", "-1.14", "+1.34")
+    assert table[f"{MEAN}, paper - 3DGS"][:3] == ("+0.20", "+0.20", "+0.20")
+    assert table["home, paper - ours"][0] == "-1.10"
 
 
 def test_the_words_say_whether_an_interval_contains_zero():
@@ -87,16 +87,16 @@ def test_the_words_say_whether_an_interval_contains_zero():
     assert "several machines" not in text
     assert ("home: original images (3DGS and paper), original images, far (ours and ours pruned)."
             in text)
-    one = StudyResult(HOST, 1, RunConfig(), "wall", {"home": StudiedScene(1, 9, 9, "", {
+    one = StudyResult(HOST, 1, RunConfig(), "wall", {"home": SceneRuns(1, 9, 9, {
         name: {variant: records[:1] for variant, records in arms.items()}
-        for name, arms in scene(20.0, (0.0, 1.0, 1.0, 1.0)).runs.items()})})
+        for name, arms in scene(20.0, (0.0, 1.0, 1.0, 1.0)).runs.items()})}, {})
     assert "one seed shows no interval" in study.text(one)
 
 
 def test_runs_of_two_machines_are_told():
-    found = result(home=scene(20.0, (0, 0, 0, 0)), office=scene(20.0, (0, 0, 0, 0), "Another"))
-    assert found.machines == ("A CPU", "Another")
-    assert "several machines" in study.text(found)
+    mixed = result(home=scene(20.0, (0, 0, 0, 0)), office=scene(20.0, (0, 0, 0, 0), "Another"))
+    assert mixed.machines == ("A CPU", "Another")
+    assert "several machines" in study.text(mixed)
 
 
 def test_the_figures_of_the_paper_stand_beside_scenes_of_their_names():
