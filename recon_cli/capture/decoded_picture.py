@@ -3,12 +3,10 @@
 Pixels that are not square are stretched along the width, as players do, so that rows are never
 mixed. A mirrored display matrix is read as its rotation.
 
-HDR (HLG or PQ) becomes sRGB bytes with BT.709 primaries. Display light comes from ITU-R BT.2100:
-the EOTF of PQ, or of HLG with its OOTF for a display of 1000 cd/m2. The curve that fits it below
-the white of SDR is the EETF of Report BT.2408, Annex 5 (in BT.2390 up to revision 7). It is applied
-to the largest of R, G and B, which keeps the hue and avoids clipping. One curve is used for every
-frame of every video: a curve that adapts to the scene would give one wall another colour in each
-frame. The peak in a file's metadata is ignored.
+HDR (HLG or PQ) becomes sRGB with BT.709 primaries. Display light comes from ITU-R BT.2100: the EOTF
+of PQ, or of HLG with its OOTF for a display of 1000 cd/m2. The EETF of Report BT.2408, Annex 5,
+fits it below the white of SDR. It is applied to the largest of R, G and B, which keeps the hue, and
+is the same for all frames, so that a wall keeps its colour; the peak in the metadata is ignored.
 """
 
 from __future__ import annotations
@@ -53,8 +51,7 @@ BT709, BT2020, P3 = 1, 9, 12
 PRIMARIES = {
     BT709: ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06)),
     BT2020: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
-    P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
-}
+    P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))}
 D65 = (0.3127, 0.3290)
 # Steps of the gain over the root of the light: neighbours differ by less than 0.2 %.
 GAIN_STEPS = 4096
@@ -100,8 +97,7 @@ def read_tags(stream: VideoStream) -> Tags:
     return Tags(
         # The container's value, else the codec's; 0 where neither has one.
         stream.sample_aspect_ratio or Fraction(1),
-        TRANSFERS.get(int(context.color_trc)),
-        int(context.color_primaries))
+        TRANSFERS.get(int(context.color_trc)), int(context.color_primaries))
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,27 +265,20 @@ def to_sdr(
     """
     pixels = rgb.reshape(-1, 1, 3)
     sdr = np.empty(pixels.shape, np.uint8)
-    for start in range(0, len(pixels), STRIP):
-        strip = slice(start, start + STRIP)
-        sdr[strip] = _strip_to_sdr(pixels[strip], transfer, primaries)
-    return sdr.reshape(rgb.shape)
-
-
-def _strip_to_sdr(
-    pixels: NDArray[np.uint16], transfer: Transfer, primaries: int  # [N, 1, 3]
-) -> NDArray[np.uint8]:
-    light = _light_table(transfer).take(pixels)
     to_bt709, luminance = _matrices(primaries)
-    linear = cv2.transform(light, to_bt709)
-    if transfer is Transfer.HLG:
-        # The OOTF scales all three by a power of the luminance, so it may come after the matrix.
-        linear = _scale(linear, cv2.pow(cv2.transform(light, luminance), HLG_GAMMA - 1))
-    # Below 0 are colours that BT.709 cannot show. Not linear.max(axis=2): 28 ms a megapixel.
-    largest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
-    root = cv2.sqrt(np.maximum(largest, 0) / GAIN_REACH)
-    gain = _gain_table().take((root * (GAIN_STEPS - 1) + 0.5).astype(np.uint16))
-    linear = np.clip(_scale(linear, gain), 0, 1)
-    return _code_table().take((linear * 65535 + 0.5).astype(np.uint16))
+    for start in range(0, len(pixels), STRIP):
+        light = _light_table(transfer).take(pixels[start:start + STRIP])
+        linear = cv2.transform(light, to_bt709)
+        if transfer is Transfer.HLG:
+            # The OOTF scales all three by a power of the luminance, so the matrix may come first.
+            linear = _scale(linear, cv2.pow(cv2.transform(light, luminance), HLG_GAMMA - 1))
+        # Below 0 are colours that BT.709 cannot show. Not linear.max(axis=2): 28 ms a megapixel.
+        largest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
+        root = cv2.sqrt(np.maximum(largest, 0) / GAIN_REACH)
+        gain = _gain_table().take((root * (GAIN_STEPS - 1) + 0.5).astype(np.uint16))
+        linear = np.clip(_scale(linear, gain), 0, 1)
+        sdr[start:start + STRIP] = _code_table().take((linear * 65535 + 0.5).astype(np.uint16))
+    return sdr.reshape(rgb.shape)
 
 
 def _scale(rgb: NDArray[np.float32], factor: NDArray[np.float32]) -> NDArray[np.float32]:

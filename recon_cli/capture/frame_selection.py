@@ -80,8 +80,7 @@ MEANINGS = {
     Reason.CLIPPED: "mostly black, blown out or flat",
     Reason.BLURRED: "less sharp than those around it",
     Reason.DUPLICATE: "same view as a kept one",
-    Reason.CLOSE: "too close to a kept one",
-}
+    Reason.CLOSE: "too close to a kept one"}
 
 
 @dataclass(frozen=True)
@@ -107,8 +106,7 @@ def write_choice(path: Path, candidates: Sequence[FrameCandidate]) -> None:
     atomic.write_json(path, {
         "counts": count_reasons(candidates),
         "meanings": {reason.value: text for reason, text in MEANINGS.items()},
-        "candidates": [dataclasses.asdict(candidate) for candidate in candidates],
-    })
+        "candidates": [dataclasses.asdict(candidate) for candidate in candidates]})
 
 
 @dataclass(frozen=True, eq=False)

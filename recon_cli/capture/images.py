@@ -28,27 +28,23 @@ from recon_cli.errors import InputError
 RAW_SUFFIXES = frozenset({
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".iiq", ".kdc", ".mef",
     ".mos", ".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2",
-    ".srf", ".srw", ".x3f",
-})
+    ".srf", ".srw", ".x3f"})
 # What cameras and converters write. Pillow also opens documents (EPS by way of Ghostscript).
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM")
 # A file with one of these endings that cannot be read is a broken photo; any other is no photo.
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
-    ".ppm", ".tif", ".tiff", ".webp",
-}
+    ".ppm", ".tif", ".tiff", ".webp"}
 # What Pillow raises on damaged files, by format; OSError includes what it cannot identify, and
 # pillow_heif raises RuntimeError for what libheif refuses.
 BROKEN = (
     OSError, SyntaxError, ValueError, EOFError, IndexError, OverflowError, struct.error,
-    RuntimeError, Image.DecompressionBombError,
-)
+    RuntimeError, Image.DecompressionBombError)
 # What undoes each orientation of EXIF 2.32, section 4.6.4; 1 is upright.
 TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_90,
-}
+    6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_90}
 QUARTER_TURNS = frozenset({5, 6, 7, 8})  # those of them that swap width and height
 RAW_QUARTER_TURNS = frozenset({5, 6})  # LibRaw: flip
 # TIFF 6.0: ImageWidth, ImageLength, BitsPerSample, and PlanarConfiguration with its value for

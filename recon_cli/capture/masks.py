@@ -56,8 +56,7 @@ def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FolderMasks:
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     """Returns a mask for width x height pixels, [H, W], 255 where they count, else 0.
 
-    Its own EXIF orientation is applied; a mask of the same shape but another size is resampled to
-    the nearest pixel.
+    Its EXIF orientation is applied; a mask of the same shape but another size is resampled.
 
     Raises:
         InputError: it cannot be read, has another shape, or ignores every pixel.

@@ -4,9 +4,8 @@ The estimate uses only the flat parts of a frame. Over whole frames it reads up 
 frames of a richly textured room; over the flat parts at most 2.5/255, and 4.6 to 5.5 where noise of
 5 was added.
 
-A threshold of 3 ignores noise that a video codec has already smoothed: decoded frames of two noisy
-room videos read .8 to 2.4, and no filter at any strength brings them more than .2 dB closer to
-their clean originals (tests/bench/bench_denoise.py --decoded).
+A threshold of 3 ignores noise that a video codec has already smoothed: frames of two noisy videos
+read .8 to 2.4, and no filter gains more than .2 dB there (tests/bench/bench_denoise.py --decoded).
 
 PSNR in dB and share of the edges kept at noise of 5, 10, 15 and 20 of 255: means over ten frames of
 five captures (fox, two rendered rooms, desk_monitors, snowmiku; photos halved first), each filter
@@ -18,8 +17,7 @@ at its best strength; time relative to bilateral (tests/bench/bench_denoise.py):
     guided, 1.5       39.3  .99   34.5  .96   31.5  .93   29.5  .90   2.6
     non-local means   37.6 1.00   33.7  .98   31.7  .94   30.4  .89   35
 
-joint is closest to the truth and keeps most edges at every level: it is the default. The guided
-filter (He et al. 2010) and non-local means lose to both others and are not offered.
+joint is the default. The guided filter (He et al. 2010) and non-local means are not offered.
 """
 
 from __future__ import annotations

@@ -77,21 +77,20 @@ def plan_raw(paths: Sequence[Path], *, step: Callable[[], None] = lambda: None) 
     broken: dict[str, str] = {}
     headers = [header for path in paths if (header := _try_read(_read_header, path, broken))]
     common = _by_camera(headers)
-    measures: list[RawMeasures] = []
-    readable: list[_Header] = []
+    readable: list[tuple[_Header, RawMeasures]] = []
     for header in headers:
         view = _try_read(partial(_measure, shared=common[header.camera]), header.path, broken)
         if view is not None:
-            measures.append(view)
-            readable.append(header)
+            readable.append((header, view))
         step()
     if not readable:
         return RawPlan({}, broken)
-    ev = exposures(measures, _nominal(readable))
+    measures = [view for _, view in readable]
+    ev = exposures(measures, _nominal([header for header, _ in readable]))
     gains = -ev - math.log2(_white(measures, ev))
     return RawPlan({
         header.path.name: RawShot(*common[header.camera], float(gain))
-        for header, gain in zip(readable, gains, strict=True)}, broken)
+        for (header, _), gain in zip(readable, gains, strict=True)}, broken)
 
 
 def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:

@@ -35,15 +35,13 @@ MAX_DEMUX_ERRORS = 100
 MARKS = (
     re.compile(rb"hdlr.{8}vide.*?stsd.{12}([\x20-\x7e]{4})", re.DOTALL),
     re.compile(rb"(V_[A-Z0-9_/]{3,30})"),
-    re.compile(rb"strh.{4}vids([\x20-\x7e]{4})", re.DOTALL),
-)
+    re.compile(rb"strh.{4}vids([\x20-\x7e]{4})", re.DOTALL))
 SIGNATURES = (rb"....ftyp|....moov|....mdat|....wide", rb"\x1aE\xdf\xa3", rb"RIFF....AVI ")
 # Codecs that a build may lack: HEVC for patents, AV1 and VVC for age.
 NAMES = {
     "av01": "AV1", "V_AV1": "AV1", "AV01": "AV1",
     "hvc1": "HEVC", "hev1": "HEVC", "dvh1": "HEVC", "dvhe": "HEVC", "V_MPEGH/ISO/HEVC": "HEVC",
-    "vvc1": "VVC", "vvi1": "VVC", "evc1": "EVC",
-}
+    "vvc1": "VVC", "vvi1": "VVC", "evc1": "EVC"}
 
 
 @contextmanager

@@ -42,10 +42,7 @@ def check_texture(keypoints: Mapping[str, int]) -> None:
 def check_motion(pairs: int, matches: int, flat: int) -> None:
     """Raises SfmError when no pair of frames matches, or none shows depth.
 
-    Args:
-        pairs: verified pairs of frames.
-        matches: verified matches in all of them.
-        flat: those of pairs that a homography explains.
+    Of the verified matches, `flat` belong to pairs that a homography explains.
     """
     if pairs == 0:
         raise SfmError(

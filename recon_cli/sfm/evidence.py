@@ -88,16 +88,12 @@ def gather_evidence(
     for column, (_, point) in enumerate(sorted(model.points3D.items())):
         visible[[rows[element.image_id] for element in point.track.elements], column] = True
     return MatchEvidence(
-        names=tuple(names),
+        names=tuple(names), centers=centers, visible=visible, tried=tried,
         registered=np.isin(np.arange(len(names)), list(placed)),
-        centers=centers,
         keypoints=np.array([len(keypoints[index]) for index in range(len(names))], np.int64),
-        visible=visible,
-        tried=tried,
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
-        agreeing=_count_agreeing(placed, keypoints, pairs, matches),
-    )
+        agreeing=_count_agreeing(placed, keypoints, pairs, matches))
 
 
 def _read_matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:

@@ -5,8 +5,7 @@ enough, and where it is expected to end in time. Matches stay in the database, a
 adds pairs to them. The best of all models is the result.
 
 Each finished attempt is recorded, so that an interrupted run continues after it. An interrupted
-mapping starts again: continued from COLMAP's snapshot of 40 of 75 frames, the sample got other
-points, and cameras up to 0.1% of the path elsewhere. That saved 8 s.
+mapping starts again: continued from a snapshot of COLMAP, the sample got other cameras and points.
 """
 
 from __future__ import annotations
@@ -216,8 +215,7 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
         counts = ", ".join(
             f"{attempt.name} was skipped for lack of time" if attempt.skipped else
             f"{attempt.name} found {len(attempt.registered)}" for attempt in attempts)
-        raise SfmError(
-            f"{error.message} Cameras by mapper: {counts}.", hint=error.hint) from error
+        raise SfmError(f"{error.message} Cameras by mapper: {counts}.", hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
     folder = job.attempts / chosen.name / "model"
     model = pycolmap.Reconstruction(folder)
@@ -248,5 +246,4 @@ def _near_or_similar(job: MappingJob) -> set[matching.Pair]:
 _PAIRS: dict[str, Callable[[MappingJob], set[matching.Pair]]] = {
     "exhaustive": lambda job: matching.exhaustive_pairs(job.names),
     "sequential": lambda job: matching.sequential_pairs(job.names),
-    "retrieval": _near_or_similar,
-}
+    "retrieval": _near_or_similar}

@@ -83,22 +83,21 @@ def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruct
 
 
 def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) -> None:
-    """Runs bundle adjustment with the principal point free; drops points that got lost.
+    """Adjusts a model in place with the principal point free; drops points that got lost.
 
     The mapper keeps it in the middle, because a few images cannot tell it from a shift. All of them
-    can: on the fox photos it comes out 2 px from the published value, 16 px off the middle.
-
-    The model is changed in place; the intrinsics of the cameras `constant` stay as they are.
+    can: on the fox photos it comes out 2 px from the published value, 16 px off the middle. The
+    intrinsics of the cameras `constant` stay as they are.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
     options.ceres.solver_options.num_threads = THREADS
     fixed = {*constant, *_rare_cameras(model)}
-    if not fixed:
-        pycolmap.bundle_adjustment(model, options)
-    else:
+    if fixed:
         _adjust_some(model, options, fixed)
+    else:
+        pycolmap.bundle_adjustment(model, options)
     # Nothing holds a point whose rays went parallel: one of 2,084 ended 1e153 away.
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
     model.update_point_3d_errors()
@@ -124,8 +123,7 @@ def describe_model(model: pycolmap.Reconstruction) -> Result:
         "mean_track_length": model.compute_mean_track_length() if tracks else None,
         "reprojection_error_px": model.compute_mean_reprojection_error() if tracks else None,
         "median_triangulation_angle_deg":
-            float(np.median(triangulation_angles(model))) if tracks else None,
-    }
+            float(np.median(triangulation_angles(model))) if tracks else None}
 
 
 def list_registered(model: pycolmap.Reconstruction) -> list[str]:

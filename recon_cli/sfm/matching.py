@@ -146,8 +146,7 @@ def exhaustive_pairs(names: Sequence[str]) -> set[Pair]:
 def sequential_pairs(names: Sequence[str]) -> set[Pair]:
     """Returns the pairs of near images in the order of their names, and of those 2, 4, ... apart.
 
-    The powers of two reach from one round through a room to the next without growing with the
-    square of the number of images.
+    The powers of two reach from one round through a room to the next.
     """
     ordered = sorted(names)
     near = range(1, SEQUENTIAL_OVERLAP + 1)
@@ -223,8 +222,7 @@ def _describe(
     """Returns one unit vector an image, [N, W * 128]; zero where it has no features.
 
     The residuals of each word are scaled to one length, so that a repeated texture does not
-    outweigh the rest ("intra-normalisation", Arandjelovic and Zisserman, CVPR 2013). The mean of
-    all images is subtracted.
+    outweigh the rest (Arandjelovic and Zisserman, CVPR 2013). The mean of all is subtracted.
     """
     vectors = np.zeros((len(features), *words.shape), np.float32)
     for row, descriptors in zip(vectors, features, strict=True):

@@ -158,8 +158,8 @@ def find_shared_points(
         for pair, geometry in geometries:
             first, second = (names[image] for image in pycolmap.pair_id_to_image_pair(pair))
             rows = geometry.inlier_matches
-            same |= _pair_points(ours.get(first), theirs.get(second), rows)
-            same |= _pair_points(ours.get(second), theirs.get(first), rows[:, ::-1])
+            same |= _pair_points(ours.get(first, {}), theirs.get(second, {}), rows)
+            same |= _pair_points(ours.get(second, {}), theirs.get(first, {}), rows[:, ::-1])
     ordered = sorted(same)
     return (np.array([source.point3D(point).xyz for point, _ in ordered]).reshape(-1, 3),
             np.array([target.point3D(point).xyz for _, point in ordered]).reshape(-1, 3))
@@ -196,18 +196,15 @@ def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 def _points_of_keypoints(model: pycolmap.Reconstruction) -> dict[str, dict[int, int]]:
     """Returns the point that each keypoint shows, by name of image and index of the keypoint."""
     return {
-        image.name: {
-            row: point.point3D_id for row, point in enumerate(image.points2D)
-            if point.has_point3D()}
+        image.name: {row: point.point3D_id for row, point in enumerate(image.points2D)
+                     if point.has_point3D()}
         for image in _images(model)}
 
 
 def _pair_points(
-    ours: Mapping[int, int] | None, theirs: Mapping[int, int] | None, rows: NDArray[np.uint32]
+    ours: Mapping[int, int], theirs: Mapping[int, int], rows: NDArray[np.uint32]
 ) -> set[tuple[int, int]]:
     """Returns the points that matches [M, 2] between two images make one."""
-    if ours is None or theirs is None:
-        return set()
     return {
         (ours[row], theirs[other]) for row, other in rows.tolist()
         if row in ours and other in theirs}

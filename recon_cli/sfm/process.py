@@ -25,8 +25,7 @@ _DOING = {
     "features": ("finding features", "frame"),
     "matches": ("matching frames", "pair"),
     "mapping": ("placing cameras", "frame"),
-    "undistorted": ("undistorting frames", "frame"),
-}
+    "undistorted": ("undistorting frames", "frame")}
 _STEP = {"mapping": "model"}  # the step that a phase belongs to, where the names differ
 LOG = "log.txt"
 _LOG_TAIL = 64 * 1024  # bytes

@@ -2,10 +2,7 @@
 
 The share of registered images and the reprojection error do not see the worst failures: two good
 halves placed wrongly to each other (`weakest_cut`), and two places laid over each other
-(`visual_aliasing`). Where only neighbours were matched, neither sees a half whose only fault is its
-scale.
-
-Nothing is changed here; the mapper and the stage decide what follows.
+(`visual_aliasing`). Where only neighbours were matched, neither sees a half of wrong scale.
 """
 
 from __future__ import annotations

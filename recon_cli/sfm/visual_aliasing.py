@@ -1,8 +1,8 @@
 """Visual aliasing: two places that look alike and were laid over each other (doppelgangers).
 
 Two equal doors, seen by images that nothing else connects, can be merged without a single match
-that disagrees. What gives such a model away is what was *not* matched: the two groups of cameras
-now seem to stand in one place and look the same way, but all they have in common is the door.
+that disagrees. The missing matches reveal such a model: the two groups of cameras now seem to stand
+in one place and look the same way, but all they have in common is the door.
 (Zach, Irschara and Bischof 2008: missing correspondences.) Halves that are off by a degree or by a
 fiftieth of the extent show as well: COLMAP has dropped the points that fit one of them only.
 
@@ -150,9 +150,7 @@ def _project(image: pycolmap.Image, positions: NDArray[np.float64]) -> NDArray[n
 
 
 def _sample(
-    evidence: MatchEvidence,
-    positions: NDArray[np.float64],  # [M, 3]
-    frames: dict[int, NDArray[np.float64]],
+    evidence: MatchEvidence, positions: NDArray[np.float64], frames: dict[int, NDArray[np.float64]]
 ) -> _Samples:
     parts = [np.zeros((3, 0), np.int64)]
     for index, frame in frames.items():
@@ -186,11 +184,8 @@ def _likely(
 
 
 def _cells(
-    samples: _Samples,
-    chosen: NDArray[np.bool_],  # [S]
-    count: int,
-    least: int = MIN_POINTS,
+    samples: _Samples, chosen: NDArray[np.bool_], count: int, least: int = MIN_POINTS
 ) -> NDArray[np.bool_]:  # [N, GRID * GRID]
-    """Returns the cells of each image that hold at least so many of the chosen samples."""
+    """Returns the cells of `count` images that hold at least so many of the chosen samples [S]."""
     held = np.bincount(samples.cell[chosen], minlength=count * GRID * GRID)
     return np.asarray(held.reshape(count, -1) >= least)

@@ -3,11 +3,10 @@
 A mapper that goes wrong at one frame builds two good halves and places them wrongly to each other.
 Every image has a camera then, and the reprojection error, taken over the matches that the mapper
 kept, is small. The matches that it rejected show the break: those across it disagree with the
-poses. All matches together hardly show it, since few lie across.
+poses.
 
 Matches can also be rejected rightly, because two places that look alike match each other. So a cut
-is ignored when its two sides show what they should (`visual_aliasing`), which those of a broken
-model do not.
+is ignored when its two sides show the same surfaces (`visual_aliasing`).
 """
 
 from __future__ import annotations

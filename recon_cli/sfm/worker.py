@@ -44,8 +44,7 @@ def work(job: MappingJob, report: Reporter) -> None:
             known_poses.build_known_model(job, report) if job.known_poses
             else fallbacks.build_model(job, report, deadline=deadline)),
         "sparse": lambda: undistort.place_model(job),
-        "undistorted": lambda: undistort.undistort(job, report),
-    }
+        "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)
     if "features" in job.steps:
         _prepare_database(job, log)
