@@ -91,20 +91,31 @@ def load_reference_views(
         ConfigError: they are smaller than the window of SSIM.
         FormatError: an image cannot be read.
     """
-    loaded, hidden = [], []
-    for view in views:
-        camera = fit_camera(view.camera, max_size)
+    for camera in (fit_camera(view.camera, max_size) for view in views):
         if min(camera.width, camera.height) < MIN_SIDE:
             raise ConfigError(
                 f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
                 f"needs {MIN_SIDE} pixels a side.", hint="Use a larger --max-size.")
-        image, mask = read_masked_image(view.original, view.mask, camera.width, camera.height)
+    return load_views(views, max_size, "not scored", ctx)
+
+
+def load_views(
+    views: Sequence[View], max_size: int, consequence: str, ctx: StageContext | None = None, *,
+    denoised: bool = False,
+) -> list[ReferenceView]:
+    """Returns views without those whose mask leaves too little; a notice gives the consequence."""
+    loaded, hidden = [], []
+    for view in views:
+        camera = fit_camera(view.camera, max_size)
+        path = view.denoised if denoised else view.original
+        image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
         if leaves_enough(mask):
             loaded.append(ReferenceView(camera, image, mask, name=view.name))
         else:
             hidden.append(view.name)
-    if ctx is not None:
-        notice_hidden(hidden, "not scored", ctx)
+    if hidden and ctx is not None:
+        ctx.notice(f"{len(hidden)} views are {consequence}: their masks leave fewer than "
+                   f"{MIN_PIXELS} pixels: {', '.join(hidden)}")
     return loaded
 
 
@@ -125,13 +136,6 @@ def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[
             f"The masks leave nothing to score of {len(scene.test)} held-out views.",
             hint=MASK_HINT)
     return views
-
-
-def notice_hidden(names: Sequence[str], consequence: str, ctx: StageContext) -> None:
-    """Gives notice of the views that are left out because of their masks."""
-    if names:
-        ctx.notice(f"{len(names)} views are {consequence}: their masks leave fewer than "
-                   f"{MIN_PIXELS} pixels: {', '.join(names)}")
 
 
 def render_on_black(splats: Splats, camera: Camera, sh_degree: int, backend: str) -> RenderOutput:

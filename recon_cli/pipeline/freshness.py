@@ -156,14 +156,16 @@ class WorkspaceCheck:
         needs = [self.check(need) for need in row.needs]
         reasons = [
             f"{check.row.name} is stale" for check in needs if check.manifest and not check.fresh]
-        expected = self._expected_key(row, config, manifest.key, sources)
+        expected = self._current_key(row, config, manifest.key, sources)
         reasons += differences(manifest.key, expected, section=layers.section_of(row.config))
-        reasons += find_changed_outputs(
-            self._workspace.folder(row.name), manifest, row.volatile)
-        reasons += _unreadable_summary(row, manifest)
+        reasons += find_changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)
+        try:  # another version may have written another record
+            row.summary.from_json(manifest.run.summary)
+        except ManifestError as error:
+            reasons.append(error.message)
         return StageCheck(row, manifest, tuple(reasons), gone, self._resumable(row))
 
-    def _expected_key(
+    def _current_key(
         self, row: Stage, config: StageConfig, stored: ResultKey, sources: tuple[Source, ...]
     ) -> ResultKey:
         """Returns the key that the result of a run would have now."""
@@ -172,9 +174,7 @@ class WorkspaceCheck:
             upstream[need] = upstream[need] or stored.upstream.get(need)
         return ResultKey(row.name, row.version, config.hashed_fields(), sources, upstream)
 
-    def _read_again(
-        self, stored: tuple[Source, ...]
-    ) -> tuple[tuple[str, ...], tuple[Source, ...]]:
+    def _read_again(self, stored: tuple[Source, ...]) -> tuple[tuple[str, ...], tuple[Source, ...]]:
         """Returns the paths of sources that cannot be read any more, and all as they are now."""
         gone = tuple(source.path for source in stored if not os.access(source.path, os.R_OK))
         return gone, tuple(
@@ -188,7 +188,7 @@ class WorkspaceCheck:
         if partial is None:
             return None
         _, sources = self._read_again(partial.key.sources)
-        expected = self._expected_key(row, self.config(row, partial.key), partial.key, sources)
+        expected = self._current_key(row, self.config(row, partial.key), partial.key, sources)
         return partial if expected.fingerprint == partial.key.fingerprint else None
 
 
@@ -199,12 +199,3 @@ def _accepts(config: type[StageConfig], name: str, value: object) -> bool:
     except ConfigError:
         return False
     return True
-
-
-def _unreadable_summary(row: Stage, manifest: Manifest) -> list[str]:
-    """Returns why the summary of a result cannot be read, as that of another version may not be."""
-    try:
-        row.summary.from_json(manifest.run.summary)
-    except ManifestError as error:
-        return [error.message]
-    return []

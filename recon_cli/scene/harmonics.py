@@ -90,7 +90,7 @@ def generators() -> Tensor:
     return torch.stack(matrices)
 
 
-def rotated(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
+def rotate_sh(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
     """Returns the coefficients of the same colours in turned axes.
 
     Args:

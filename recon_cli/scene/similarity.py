@@ -70,8 +70,7 @@ class Similarity:
     def inverse(self) -> Similarity:
         """Returns the similarity that leads back."""
         rotation = self.rotation.T
-        return Similarity(
-            1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
     def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns points [..., 3] in new coordinates."""

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.scene.harmonics import rotated
+from recon_cli.scene.harmonics import rotate_sh
 from recon_cli.scene.similarity import Similarity
 
 SH_C0 = 0.28209479177387814  # the constant basis function, 1 / (2 sqrt(pi))
@@ -163,22 +163,22 @@ def transformed(splats: Splats, similarity: Similarity) -> Splats:
     log_scales = splats.log_scales.double() + math.log(similarity.scale)
     quats, sh_rest = splats.quats, splats.sh_rest
     if not np.array_equal(similarity.rotation, np.eye(3)):
-        quats = _turned(quats, similarity.rotation)
-        sh_rest = rotated(sh_rest, similarity.rotation)
+        quats = _rotate_quats(quats, similarity.rotation)
+        sh_rest = rotate_sh(sh_rest, similarity.rotation)
     return Splats(
         means.to(splats.means.dtype), quats, log_scales.to(splats.log_scales.dtype),
         splats.logit_opacities, splats.sh_dc, sh_rest)
 
 
-def _turned(quats: Tensor, rotation: NDArray[np.float64]) -> Tensor:
+def _rotate_quats(quats: Tensor, rotation: NDArray[np.float64]) -> Tensor:
     """Returns quaternions [N, 4] wxyz after a rotation: the product q(rotation) * quats."""
     w, *vector = quaternion(rotation)
     turn = torch.tensor([w, *vector], dtype=torch.float64, device=quats.device)
     none = quats.new_tensor([1.0, 0, 0, 0])
-    given = torch.where((quats == 0).all(-1, keepdim=True), none, quats).double()
-    axis, own = turn[1:].expand(len(quats), 3), given[:, 1:]
-    real = turn[0] * given[:, :1] - (axis * own).sum(-1, keepdim=True)
-    imaginary = turn[0] * own + given[:, :1] * axis + torch.linalg.cross(axis, own)
+    valid = torch.where((quats == 0).all(-1, keepdim=True), none, quats).double()
+    axis, own = turn[1:].expand(len(quats), 3), valid[:, 1:]
+    real = turn[0] * valid[:, :1] - (axis * own).sum(-1, keepdim=True)
+    imaginary = turn[0] * own + valid[:, :1] * axis + torch.linalg.cross(axis, own)
     return torch.cat([real, imaginary], dim=-1).to(quats.dtype)
 
 

@@ -66,17 +66,17 @@ def find_floor(
     sample = near[:: max(1, len(near) // _FLOOR_SAMPLE)]
     normal, height = up, 0.0
     for reach, step in ((cone_deg, 1.0), (1.0, 0.25)):  # a degree moves the rim by two thicknesses
-        tilts = _tilted(normal, reach, step)
+        tilts = _tilt_directions(normal, reach, step)
         peaks = [_lowest_peak(sample @ tilt, centers @ tilt, thick) for tilt in tilts]
         best = max(range(len(tilts)), key=lambda row: peaks[row][0])
         count, height = peaks[best]
         if count < 0:
             return None
         normal = tilts[best]
-    normal, height = _fitted(near, normal, height, thick)
+    normal, height = _fit_plane(near, normal, height, thick)
     if normal @ up < np.cos(np.radians(cone_deg)):
         return None
-    floor = _measured(near, normal, height, thick)
+    floor = _measure_floor(near, normal, height, thick)
     wide = _width(near, floor, thick) >= _MIN_WIDTH * size
     good = bool(
         floor.share >= _MIN_SHARE and floor.below <= _MAX_BELOW
@@ -94,10 +94,10 @@ def find_walls(points: NDArray[np.float64], up: NDArray[np.float64]) -> Walls:
     flat = np.stack([near @ first, near @ np.cross(up, first)], axis=1)
     bins = _THICKNESS * size
     degrees = np.arange(0.0, 90.0)
-    scores = np.array([_peakiness(flat, one, bins) for one in degrees])
+    scores = np.array([_peakiness(flat, angle, bins) for angle in degrees])
     best = degrees[scores.argmax()]
     fine = best + np.linspace(-1, 1, 21)
-    heading = np.radians(fine[np.argmax([_peakiness(flat, one, bins) for one in fine])])
+    heading = np.radians(fine[np.argmax([_peakiness(flat, angle, bins) for angle in fine])])
     along = np.cos(heading) * first + np.sin(heading) * np.cross(up, first)
     strength = float(scores.max() / np.median(scores))
     return Walls(along, strength, strength >= _MIN_WALLS)
@@ -112,7 +112,7 @@ def _near(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     return points[distances <= _REACH * size], size
 
 
-def _tilted(up: NDArray[np.float64], reach: float, step: float) -> NDArray[np.float64]:
+def _tilt_directions(up: NDArray[np.float64], reach: float, step: float) -> NDArray[np.float64]:
     """Returns unit vectors [K, 3] on a grid of `step` degrees, up to `reach` degrees from `up`."""
     first = np.linalg.svd(up[None])[2][1]
     line = np.radians(np.arange(-np.floor(reach / step), np.floor(reach / step) + 1) * step)
@@ -141,7 +141,7 @@ def _lowest_peak(
     return int(layers[best]), float(tops[best] - thick)
 
 
-def _fitted(
+def _fit_plane(
     points: NDArray[np.float64], normal: NDArray[np.float64], height: float, thick: float
 ) -> tuple[NDArray[np.float64], float]:
     """Returns the plane through the points within two, then one thickness (Tukey's weights)."""
@@ -159,7 +159,7 @@ def _fitted(
     return normal, height
 
 
-def _measured(
+def _measure_floor(
     points: NDArray[np.float64], normal: NDArray[np.float64], height: float, thick: float
 ) -> Floor:
     layers = (points @ normal - height) / thick

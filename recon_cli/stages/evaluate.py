@@ -73,7 +73,7 @@ class _Evaluation:
     import_record: ImportRecord | None
     scene: Scene
     held_out: Sequence[ReferenceView]
-    seen: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
+    training_views: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
     ctx: StageContext
 
     @property
@@ -97,7 +97,7 @@ class _Evaluation:
             splats, self.held_out, degree, backend, perceptual=perceptual, on_view=save)
         seen_db = {
             name: mean_psnr(splats, views, degree, backend, corrected=self.gains, on_view=on_view)
-            for name, views in self.seen.items()}
+            for name, views in self.training_views.items()}
         log = self.folders[model] / LOG
         seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
         return ModelMetrics.of(
@@ -136,7 +136,7 @@ def run(
     for view in evaluation.held_out:
         _save(out / "truth" / f"{Path(view.name).stem}.png", view.image)
     perceptual, lacking = load_lpips()
-    views = len(evaluation.held_out) + sum(map(len, evaluation.seen.values()))
+    views = len(evaluation.held_out) + sum(map(len, evaluation.training_views.values()))
     with ctx.progress.bar("evaluate", len(evaluation.folders) * views, unit="view") as bar:
         models = {model: evaluation.score(model, perceptual, bar.advance)
                   for model in evaluation.folders}
@@ -156,9 +156,7 @@ def run(
     return EvaluateSummary(**means)
 
 
-def _load(
-    config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext
-) -> _Evaluation:
+def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> _Evaluation:
     train_config = read_config(inputs.folders["train"])
     scene = load_scene(inputs, validation=train_config.validation)
     size = config.max_size or train_config.max_size
@@ -166,18 +164,16 @@ def _load(
     # where training refined its cameras, their images are no longer what these cameras show
     splits = {"training": scene.train if train_config.poses != "on" else (),
               "validation": scene.validation}
-    seen = {name: views for name, split in splits.items() if (
+    training_views = {name: views for name, split in splits.items() if (
         views := load_reference_views(evenly_spread(split, _SEEN_VIEWS), size))}
     folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
     return _Evaluation(
         out, folders, train_config, ImportRecord.read(inputs.folders["train"]), scene, held_out,
-        seen, ctx)
+        training_views, ctx)
 
 
-def _save_pictures(
-    out: Path, model: str, view: ReferenceView, image: NDArray[np.float32]
-) -> None:
+def _save_pictures(out: Path, model: str, view: ReferenceView, image: NDArray[np.float32]) -> None:
     """Saves the render of a held-out view, and its difference from the photo."""
     name, rendered = f"{Path(view.name).stem}.png", to_uint8(image)
     _save(out / "renders" / model / name, rendered)

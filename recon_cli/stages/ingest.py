@@ -40,7 +40,7 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     store.prepare_frames_folder(out)
     parts = _ingest(config, inputs.sources, out, ctx)
     source = merge_sources(parts)
-    held = _held_out(source, config, ctx)
+    held = _choose_held_out(source, config, ctx)
     _check_split(source, held, config, ctx)
     frames = tuple(replace(frame, held_out=frame.name in held) for frame in source.frames)
     for part in parts:
@@ -66,7 +66,9 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     )
 
 
-def _held_out(source: IngestedSource, config: IngestConfig, ctx: StageContext) -> frozenset[str]:
+def _choose_held_out(
+    source: IngestedSource, config: IngestConfig, ctx: StageContext
+) -> frozenset[str]:
     """Returns the names of the held-out frames: the data set's choice, else ours."""
     if not source.splits:
         return store.choose_held_out(

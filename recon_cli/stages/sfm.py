@@ -114,7 +114,7 @@ def _summary(frames: FrameList, job: MappingJob) -> SfmSummary:
 def _report(summary: SfmSummary, ctx: StageContext) -> None:
     """Says what was tried, which frames have no camera and which models were left aside."""
     for sentence in (*_attempts(summary.rungs), *summary.lines, *_movement(summary.poses),
-                     *_left_out(summary), *summary.world.sentences):
+                     *_describe_left_out(summary), *summary.world.sentences):
         ctx.notice(sentence)
 
 
@@ -138,7 +138,7 @@ def _movement(poses: PosesSummary | None) -> Iterator[str]:
                f"{poses.turned_median_deg:.2f} degrees (at most {poses.turned_max_deg:.2f}).")
 
 
-def _left_out(summary: SfmSummary) -> Iterator[str]:
+def _describe_left_out(summary: SfmSummary) -> Iterator[str]:
     """Yields sentences on frames without a camera and on models that were left aside."""
     missing, held_out = summary.unregistered, summary.unregistered_held_out
     for name, reason in summary.rejected.items():

@@ -85,19 +85,16 @@ class AsyncTrainer:
     def _start(self) -> None:
         """Starts one step."""
         state, schedule = self._state, self._task.schedule
-        self._trail.append(_Before(
-            state.iteration, list(state.queue), state.generator.get_state()))
+        self._trail.append(_Before(state.iteration, list(state.queue), state.generator.get_state()))
         iteration = state.iteration + 1
         gathers, moves_sh = schedule.gathers(iteration), schedule.moves_sh(iteration)
         self._batch.begin(state)
         for _ in range(schedule.config.batch_views):
-            view = self._task.pyramid.view(
-                next_view(state, self._task), schedule.level(iteration))
+            view = self._task.pyramid.view(next_view(state, self._task), schedule.level(iteration))
             statistics = self._compute.start(
                 state.optimizer, view, schedule.sh_degree(iteration),
                 schedule.config.ssim_weight, variance=gathers and self._strategy.variance)
-            self._batch.add(
-                state, statistics if gathers else None, view.camera, moves_sh=moves_sh)
+            self._batch.add(state, statistics if gathers else None, view.camera, moves_sh=moves_sh)
         counted = self._batch.end(state, gathers=gathers, moves_sh=moves_sh)
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=moves_sh,
@@ -143,7 +140,7 @@ class _Batch:
             gathered = self._gathered if several else state.gathered
             gathered.add(statistics, camera.width, camera.height)
         if several:
-            state.optimizer.keep(1 / self._views, sh_rest=moves_sh)
+            state.optimizer.accumulate(1 / self._views, sh_rest=moves_sh)
             self._seen |= self._compute.counted
             self._loss += self._compute.status.loss
 
@@ -153,7 +150,7 @@ class _Batch:
             return self._compute.counted
         status = self._compute.status
         going, sound = status.going, status.skipped == self._before
-        state.optimizer.kept(sh_rest=moves_sh)
+        state.optimizer.take_accumulated(sh_rest=moves_sh)
         if gathers:  # of a step that is taken again nothing may stay
             state.gathered.join(self._gathered.times(going))
         self._skipped += going & ~sound

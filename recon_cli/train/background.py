@@ -17,9 +17,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.task import reduced
+from recon_cli.train.task import reduce_view
 
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart
@@ -58,30 +59,31 @@ def far_content(
     centers = np.stack([view.camera.center for view in views])
     directions = fibonacci_sphere(_DIRECTIONS)
     sphere = centers.mean(axis=0) + _RADIUS * extent * directions
-    seen, empty, total = np.zeros(len(sphere)), np.zeros(len(sphere)), np.zeros((len(sphere), 3))
+    looked_at, empty = np.zeros(len(sphere)), np.zeros(len(sphere))
+    total = np.zeros((len(sphere), 3))
     for view in views[::max(1, -(-len(views) // _VIEWS))]:
-        small = reduced(view, _LEVEL)
-        covered = _covered(small, points)
-        rows, column, line = _projected(small, sphere)
-        seen[rows] += 1
+        small = reduce_view(view, _LEVEL)
+        covered = _cover_mask(small, points)
+        rows, column, line = project_points(small.camera, sphere)
+        looked_at[rows] += 1
         free = ~covered[line, column]
         if small.mask is not None:
             free &= small.mask[line, column]
         empty[rows[free]] += 1
         total[rows[free]] += small.image[line[free], column[free]] / 255
-    far = (empty >= _AGREE) & (empty >= _SHARE * seen)
-    share = float(far.sum() / max(1, (seen > 0).sum()))
+    far = (empty >= _AGREE) & (empty >= _SHARE * looked_at)
+    share = float(far.sum() / max(1, (looked_at > 0).sum()))
     colors = total / np.maximum(empty, 1)[:, None]
-    far, colors = _filled(directions, far, colors)
+    far, colors = _fill_gaps(directions, far, colors)
     spacing = _RADIUS * extent * np.sqrt(4 * np.pi / _DIRECTIONS)
     return FarContent(sphere[far], colors[far], float(_SPACING * spacing), share)
 
 
 def faces(view: TrainView, content: FarContent, points: NDArray[np.float64]) -> bool:
     """Tells whether a view sees some of what lies far outside, past the points [P, 3]."""
-    small = reduced(view, _LEVEL)
-    _, column, line = _projected(small, content.positions)
-    return int((~_covered(small, points)[line, column]).sum()) >= _FACING
+    small = reduce_view(view, _LEVEL)
+    _, column, line = project_points(small.camera, content.positions)
+    return int((~_cover_mask(small, points)[line, column]).sum()) >= _FACING
 
 
 def fibonacci_sphere(n: int) -> NDArray[np.float64]:
@@ -93,11 +95,10 @@ def fibonacci_sphere(n: int) -> NDArray[np.float64]:
     return np.stack([flat * np.cos(around), flat * np.sin(around), z], axis=1)
 
 
-def _projected(
-    view: TrainView, points: NDArray[np.float64]
+def project_points(
+    camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Returns the rows of the points inside the image, and the columns and lines they fall on."""
-    camera = view.camera
     x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
     ahead = np.maximum(z, 1e-9)
     u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
@@ -106,9 +107,9 @@ def _projected(
     return rows, u[rows].astype(np.int64), v[rows].astype(np.int64)
 
 
-def _covered(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _cover_mask(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Returns where a point lies near, [H, W]."""
-    _, column, line = _projected(view, points)
+    _, column, line = project_points(view.camera, points)
     hit = np.zeros((view.camera.height, view.camera.width), np.uint8)
     hit[line, column] = 1
     pixels = np.argwhere(hit)
@@ -121,7 +122,7 @@ def _covered(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(hit, disc) > 0)
 
 
-def _filled(
+def _fill_gaps(
     directions: NDArray[np.float64], far: NDArray[np.bool_], colors: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Returns the far directions with their surroundings, coloured by their neighbours."""

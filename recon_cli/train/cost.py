@@ -1,4 +1,4 @@
-"""What processes send each other in a step, timed before a run: no view is looked at for that."""
+"""What a run will take, from a few timed steps, reports, checkpoints and exchanges before it."""
 
 from __future__ import annotations
 
@@ -122,10 +122,10 @@ def calibrate(
     levels: list[LevelCost] = []
     for level in wanted:
         if levels and clock() >= late:
-            levels.append(_scaled(levels[-1], level))
+            levels.append(_scale_cost(levels[-1], level))
         else:
             levels.append(probe.level(level))
-    report = probe.report() if clock() < late else _guessed_report(levels[-1], task)
+    report = probe.report() if clock() < late else _guess_report(levels[-1], task)
     save_ms = probe.save_ms(scratch)
     return CostModel(tuple(reversed(levels)), report, save_ms, clock() - start)
 
@@ -134,7 +134,7 @@ def _levels(schedule: Schedule) -> set[int]:
     return {factor for _, factor in schedule.recipe.levels}
 
 
-def _scaled(cost: LevelCost, level: int) -> LevelCost:
+def _scale_cost(cost: LevelCost, level: int) -> LevelCost:
     """Returns what a finer level takes: the fixed part grows with the pixels, the other less.
 
     On `living` a thousand Gaussians take .14 ms at a quarter of the size and .32 at the half.
@@ -143,7 +143,7 @@ def _scaled(cost: LevelCost, level: int) -> LevelCost:
     return LevelCost(level, cost.fixed_ms * side**2, cost.each_ms * side)
 
 
-def _guessed_report(finest: LevelCost, task: Task) -> LevelCost:
+def _guess_report(finest: LevelCost, task: Task) -> LevelCost:
     """Returns a third of a step for each validation view: the forward pass."""
     share = len(task.validation) / 3
     return LevelCost(1, finest.fixed_ms * share, finest.each_ms * share)
@@ -187,7 +187,7 @@ class _Probe:
         self._clock, self._each = clock, each
         most = min(config.max_gaussians, _MOST)
         self.small, self.large = (
-            _grown(points, colors, count, config.sh_degree).map(
+            _grow_splats(points, colors, count, config.sh_degree).map(
                 lambda tensor: tensor.to(task.device))
             for count in (max(1, most // _FEW), most))
         views = np.linspace(0, len(task.train) - 1, _STEPS + _WARM).round().astype(int)
@@ -197,8 +197,7 @@ class _Probe:
         """Returns the cost of a step at a level, from those at two counts."""
         for view in set(self._views):
             self._task.pyramid.view(view, level)
-        return self._line(
-            level, self._step_ms(self.small, level), self._step_ms(self.large, level))
+        return self._line(level, self._step_ms(self.small, level), self._step_ms(self.large, level))
 
     def _line(self, level: int, few: float, many: float) -> LevelCost:
         small, large = len(self.small) / 1000, len(self.large) / 1000
@@ -251,7 +250,7 @@ def _middle(schedule: Schedule, level: int) -> int:
     return steps[len(steps) // 2] - 1
 
 
-def _grown(
+def _grow_splats(
     points: NDArray[np.float64], colors: NDArray[np.uint8], count: int, sh_degree: int
 ) -> Splats:
     """Returns `count` Gaussians that cost what trained ones do: the points', split at random."""
@@ -277,16 +276,16 @@ def with_exchange(
         return cost
     begin = time.perf_counter()
     many = min(_MANY, max(2 * _FEWEST, most))
-    low, high = (_led(ranks, n, TERMS[sh_degree], device) for n in (_FEWEST, many))
+    low, high = (_lead_exchange(ranks, n, TERMS[sh_degree], device) for n in (_FEWEST, many))
     each = max(0.0, (high - low) / ((many - _FEWEST) / 1000))
     fixed = max(0.0, low - each * _FEWEST / 1000)
     levels = tuple(
-        replace(one, fixed_ms=one.fixed_ms + fixed, each_ms=one.each_ms + each)
-        for one in cost.levels)
+        replace(level, fixed_ms=level.fixed_ms + fixed, each_ms=level.each_ms + each)
+        for level in cost.levels)
     return replace(cost, levels=levels, seconds=cost.seconds + time.perf_counter() - begin)
 
 
-def _led(ranks: ProcessGroup, count: int, terms: int, device: torch.device) -> float:
+def _lead_exchange(ranks: ProcessGroup, count: int, terms: int, device: torch.device) -> float:
     try:
         ranks.broadcast_int(EXCHANGE)
         for number in (count, terms, int(device.type == "cuda")):
@@ -306,13 +305,14 @@ def join_exchange(ranks: ProcessGroup) -> None:
 def _exchange_ms(ranks: ProcessGroup, count: int, terms: int, device: torch.device) -> float:
     """Returns the median of what a step with so many Gaussians exchanges."""
     gradients = [torch.zeros(count, width, device=device) for width in (*_WIDTHS, 3 * terms)]
-    found, gathered = torch.zeros(11, dtype=torch.float64), DensificationStats.zeros(count, device)
+    results = torch.zeros(11, dtype=torch.float64)
+    gathered = DensificationStats.zeros(count, device)
     marks = []
     for _ in range(_ROUNDS + _WARM_UP + 1):
         marks.append(time.perf_counter())
         ranks.broadcast_int(0)
         ranks.add(gradients)
-        ranks.add([found])
+        ranks.add([results])
         gathered.over(ranks)
         float(gathered.radius[0])  # waits for a GPU
     return 1e3 * statistics.median(

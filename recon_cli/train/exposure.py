@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.background import project_points
 from recon_cli.train.optimizer import SparseAdam
 
 # Falling to a tenth as in INRIA 3DGS (exposure_lr_init .01, exposure_lr_final .001), but lower: in
@@ -95,7 +95,7 @@ class Estimate:
         return self.spread > _DRIFTS
 
 
-def estimated(
+def estimate_gains(
     views: Sequence[TrainView],
     points: NDArray[np.float64],  # [P, 3]
     *,
@@ -112,24 +112,24 @@ def estimated(
         chosen = np.random.default_rng(seed).permutation(len(points))[:_POINTS]
         points = points[np.sort(chosen)]
     logs = np.stack([_log_colors(view, points) for view in views])
-    return _solved(*_pairs(logs), len(views))
+    return _solve(*_pairs(logs), len(views))
 
 
 def _log_colors(
     view: TrainView, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:  # [P, 3]
     """Returns the logarithm of each point's colour; NaN where it is not seen or may be clipped."""
-    image, block = _reduced(view)
-    columns, rows, shown = _pixels(view.camera, points)
-    rows, columns = rows[shown] // block, columns[shown] // block
-    inside = (rows < image.shape[0]) & (columns < image.shape[1])
+    image, block = _reduce(view)
+    rows, column, line = project_points(view.camera, points)
+    column, line = column // block, line // block
+    inside = (line < image.shape[0]) & (column < image.shape[1])
     colors = np.full((len(points), 3), np.nan)
-    colors[np.flatnonzero(shown)[inside]] = image[rows[inside], columns[inside]]
+    colors[rows[inside]] = image[line[inside], column[inside]]
     fair = ((colors > _DARK) & (colors < _BRIGHT)).all(axis=1, keepdims=True)
     return np.log(np.where(fair, colors, np.nan))
 
 
-def _reduced(view: TrainView) -> tuple[NDArray[np.float64], int]:
+def _reduce(view: TrainView) -> tuple[NDArray[np.float64], int]:
     """Returns the means of square blocks of a view, NaN where the mask ignores a pixel."""
     block = max(1, round(max(view.image.shape) / _SIDE))
     height, width = (side // block * block for side in view.image.shape[:2])
@@ -140,29 +140,16 @@ def _reduced(view: TrainView) -> tuple[NDArray[np.float64], int]:
     return np.asarray(blocks.mean(axis=(1, 3))), block
 
 
-def _pixels(
-    camera: Camera, points: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Returns column and row [P] of each point, and whether it lies in the picture."""
-    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
-    ahead = z > 0
-    z = np.where(ahead, z, 1.0)
-    at_x, at_y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    shown = ahead & (at_x >= 0) & (at_x < camera.width) & (at_y >= 0) & (at_y < camera.height)
-    return (np.where(shown, at_x, 0).astype(np.int64),
-            np.where(shown, at_y, 0).astype(np.int64), shown)
-
-
 _Pairs = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]
 
 
 def _pairs(logs: NDArray[np.float64]) -> _Pairs:
     """Returns pairs [E, 2], their median log-ratios [E, 3] and weights [E, 3] from [F, P, 3]."""
-    seen = np.isfinite(logs[..., 0])
+    visible = np.isfinite(logs[..., 0])
     pairs, medians, weights = [], [], []
     for first in range(len(logs)):
         for second in range(first + 1, len(logs)):
-            both = seen[first] & seen[second]
+            both = visible[first] & visible[second]
             if (count := int(both.sum())) < _LEAST:
                 continue
             ratios = logs[second, both] - logs[first, both]
@@ -175,7 +162,7 @@ def _pairs(logs: NDArray[np.float64]) -> _Pairs:
             np.array(weights).reshape(-1, 3))
 
 
-def _solved(
+def _solve(
     pairs: NDArray[np.intp], medians: NDArray[np.float64], weights: NDArray[np.float64], views: int
 ) -> Estimate:
     """Returns the log-gains g that minimise sum w (g_second - g_first - median)^2."""

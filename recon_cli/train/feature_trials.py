@@ -21,12 +21,12 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.background import FarContent, faces, far_content
-from recon_cli.train.exposure import Estimate, estimated
+from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.poses import worth_a_trial
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.task import Task, reduced
+from recon_cli.train.task import Task, reduce_view
 from recon_cli.workspace.summaries import TrialDecision
 
 # A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
@@ -40,7 +40,7 @@ _DENSEST = 3  # of few views; what is left must still hang together
 Arm = Callable[[], Sequence[float]]
 
 
-def skipped(name: str, reason: str) -> TrialDecision:
+def skip_trial(name: str, reason: str) -> TrialDecision:
     """Returns the decision against a part that nothing speaks for, untried."""
     return TrialDecision(
         name=name, on=False, mean_db=None, standard_error_db=None, reason=reason, seconds=0.0)
@@ -149,27 +149,27 @@ def examine(scene: Candidate) -> Needs:
     bench = _Bench(scene)
     decisions: list[TrialDecision] = []
 
-    def settled(part: str, sign: str | None, against: str) -> None:
+    def settle(part: str, sign: str | None, against: str) -> None:
         """Puts a part into `config`, by the options, a missing sign, or a trial."""
         nonlocal config
         if getattr(config, part) != "auto":
             return
-        decision = (skipped(part, against) if sign is None
-                    else bench.tried(part, config, sign))
+        decision = (
+            skip_trial(part, against) if sign is None else bench.try_part(part, config, sign))
         decisions.append(decision)
         config = _with(config, part, _word(part, on=decision.on))
 
     if config.images == "auto" and scene.twins is None:
         config = replace(config, images="original")
     elif config.images == "auto":
-        settled("images", "denoised", "")
-    settled("far", "on" if bench.far.share >= _FAR_SHARE else None,
+        settle("images", "denoised", "")
+    settle("far", "on" if bench.far.share >= _FAR_SHARE else None,
             f"points cover {100 * (1 - bench.far.share):.1f}% of what the views see")
-    settled("exposure", "on" if bench.drift.drifts else None,
+    settle("exposure", "on" if bench.drift.drifts else None,
             f"brightness of the same points differs by {100 * bench.drift.spread:.1f}% only")
     task = scene.task
     error = None if task.camera_error is None else task.camera_error * task.train[0].camera.fx
-    settled("poses", "on" if worth_a_trial(error) else None,
+    settle("poses", "on" if worth_a_trial(error) else None,
             "the reprojection error is not known" if error is None
             else f"the reprojection error is {error:.2f} px of a training image")
     if scene.harmonics:
@@ -197,25 +197,24 @@ class _Bench:
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
                     else FarContent(np.zeros((0, 3)), np.zeros((0, 3)), 1.0, 0.0))
         drifting = task.schedule.config.exposure != "off"
-        self.drift = (estimated(task.train, scene.points) if drifting
+        self.drift = (estimate_gains(task.train, scene.points) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0))
         self._scores: dict[tuple[object, ...], list[float]] = {}
 
-    def tried(self, part: str, config: RunConfig, value: str) -> TrialDecision:
+    def try_part(self, part: str, config: RunConfig, value: str) -> TrialDecision:
         """Returns whether a part pays on top of what is on already."""
         if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
-            return skipped(part, "there are too few views to try it on")
-        arms = (_with(config, part, one) for one in (_word(part, on=False), value))
-        without, with_it = arms
+            return skip_trial(part, "there are too few views to try it on")
+        without, with_it = _with(config, part, _word(part, on=False)), _with(config, part, value)
         telling = self._telling(part)
         if len(telling) < 2:
-            return skipped(part, "too few of the views to score see any of it")
+            return skip_trial(part, "too few of the views to score see any of it")
 
-        def told(config: RunConfig) -> list[float]:
-            scores = self._run(config)
-            return [scores[i] for i in telling]
+        def scores(config: RunConfig) -> list[float]:
+            values = self._run(config)
+            return [values[i] for i in telling]
 
-        return decide(part, (lambda: told(without), lambda: told(with_it)))
+        return decide(part, (lambda: scores(without), lambda: scores(with_it)))
 
     def degree(self, config: RunConfig, decisions: list[TrialDecision]) -> int:
         """Returns the lowest degree of the colours that the highest does not beat by enough."""
@@ -256,22 +255,22 @@ class _Bench:
                 config = _with(config, part, _word(part, on=False))
         key = (config.sh_degree, *(getattr(config, part) for part in PARTS))
         if key not in self._scores:
-            self._scores[key] = self._trained(replace(
+            self._scores[key] = self._train(replace(
                 config, iterations=_STEPS, max_gaussians=min(config.max_gaussians, _CAP),
                 early_stop=False, batch_views=1))
         return self._scores[key]
 
-    def _trained(self, config: RunConfig) -> list[float]:
+    def _train(self, config: RunConfig) -> list[float]:
         scene, task = self._scene, self._scene.task
         train = task.train
         if scene.twins is not None and config.images == "denoised":
             train, _ = scene.twins()
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         schedule = Schedule(config, dataclasses.replace(Schedule(config).recipe, levels=()))
-        small = Task([reduced(train[i], LEVEL) for i in rows], [], schedule, task.extent,
+        small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
                      task.backend, task.device, camera_error=task.camera_error)
         # reduced views would be reduced once more in the search for what lies far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)
-        return [mean_psnr(state.splats, [reduced(view, LEVEL)], config.sh_degree, task.backend,
+        return [mean_psnr(state.splats, [reduce_view(view, LEVEL)], config.sh_degree, task.backend,
                           corrected=True) for view in held_out]

@@ -47,10 +47,10 @@ class Importance:
     @staticmethod
     def of_score(name: str, n: int, device: torch.device) -> Importance:
         """Returns the record of no view that gathers no more than one score needs."""
-        found = Importance.zeros(n, device)
-        found.leaves_out = name == "loo"
-        found.weighs = name in ("paper", "lightgaussian", "blend_sum", "blend_max")
-        return found
+        importance = Importance.zeros(n, device)
+        importance.leaves_out = name == "loo"
+        importance.weighs = name in ("paper", "lightgaussian", "blend_sum", "blend_max")
+        return importance
 
     @property
     def needs_views(self) -> bool:

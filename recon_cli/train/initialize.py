@@ -13,7 +13,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.errors import TrainingError
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
-from recon_cli.train.exposure import Exposure, estimated
+from recon_cli.train.exposure import Exposure, estimate_gains
 from recon_cli.train.poses import WORTH_PX, Poses
 from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.task import Task
@@ -78,7 +78,7 @@ def first_state(
         far = None
     elif far is None:
         far = far_content(task.train, points, task.extent)
-    gains = estimated(task.train, points).log_gains if config.exposure == "on" else None
+    gains = estimate_gains(task.train, points).log_gains if config.exposure == "on" else None
     splats = first_splats(config, points, colors, far, most=most)
     exposure, poses = _parts(task, gains)
     return new_state(
@@ -86,7 +86,7 @@ def first_state(
         backend=task.backend, exposure=exposure, poses=poses)
 
 
-def saved_state(path: Path, task: Task) -> TrainState:
+def restore_state(path: Path, task: Task) -> TrainState:
     """Returns the state of a run from its checkpoint.
 
     Raises:
@@ -99,7 +99,7 @@ def saved_state(path: Path, task: Task) -> TrainState:
         exposure=exposure, poses=poses)
 
 
-def finished_state(splats: Splats, task: Task) -> TrainState:
+def make_finished_state(splats: Splats, task: Task) -> TrainState:
     """Returns the state of a run that ended with these Gaussians, none of whose steps were taken.
 
     For scenes that were trained elsewhere: all that a run does early on lies behind it.

@@ -49,7 +49,7 @@ class MemoryEstimate:
         return (self.images + self.pixel_buffers + self.gaussians + self.gaussian_buffers
                 + self.program)
 
-    def described(self) -> str:
+    def describe(self) -> str:
         """Returns the estimate in words."""
         buffers = self.pixel_buffers + self.gaussian_buffers
         return (f"about {_megabytes(self.total)} (images {_megabytes(self.images)}, Gaussians "
@@ -93,7 +93,7 @@ def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
     by_count = needed.gaussians + needed.gaussian_buffers
     lower = "--max-size" if by_size > by_count else "--max-gaussians"
     raise TrainingError(
-        f"Training needs {needed.described()}, but {_megabytes(free)} are free.",
+        f"Training needs {needed.describe()}, but {_megabytes(free)} are free.",
         hint=f"Lower {lower}, or close other programs.")
 
 
@@ -143,5 +143,5 @@ def check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
     """
     needed = _memory(scene, config, ctx, gaussians=config.max_gaussians)
     free = _free_bytes(ctx)
-    logger.info("training takes %s at most; %.0f MB are free", needed.described(), free / 1e6)
+    logger.info("training takes %s at most; %.0f MB are free", needed.describe(), free / 1e6)
     refuse_what_does_not_fit(needed, free)

@@ -57,7 +57,7 @@ class SplatOptimizer:
             self._taken = self._taken.to(splats.means.device)
         self._factor = 1.0
         self._buffers: dict[str, dict[str, Tensor]] = {}
-        self._kept: dict[str, Tensor] = {}
+        self._accumulated: dict[str, Tensor] = {}
         self._capacity = max(len(splats), config.max_gaussians)
         self._show(splats)
         with torch.no_grad():
@@ -112,20 +112,15 @@ class SplatOptimizer:
         return gradient
 
     @torch.no_grad()
-    def keep(self, share: float, *, sh_rest: bool) -> None:
-        """Adds a share of the gradients to those that are kept for `kept`, and uses them up.
-
-        Args:
-            share: of one view in a step of several.
-            sh_rest: those of the higher SH degrees, too.
-        """
-        for name in self._moved(sh_rest=sh_rest):
+    def accumulate(self, share: float, *, sh_rest: bool) -> None:
+        """Adds a share of the gradients, those of one view of several, and uses them up."""
+        for name in self._names(sh_rest=sh_rest):
             value = getattr(self.splats, name)
             if not self.fused and value.grad is None:
                 continue
-            if name not in self._kept:
-                self._kept[name] = torch.zeros_like(value)
-            self._kept[name].add_(self.gradient(name), alpha=share)
+            if name not in self._accumulated:
+                self._accumulated[name] = torch.zeros_like(value)
+            self._accumulated[name].add_(self.gradient(name), alpha=share)
         self.discard()
 
     def discard(self) -> None:
@@ -134,13 +129,13 @@ class SplatOptimizer:
             value.grad = None  # autograd would add the next one to it
 
     @torch.no_grad()
-    def kept(self, *, sh_rest: bool) -> list[Tensor]:
-        """Makes what was kept the gradients of the next step, and returns them to be changed."""
+    def take_accumulated(self, *, sh_rest: bool) -> list[Tensor]:
+        """Makes the accumulated gradients those of the next step; returns them to be changed."""
         gradients = []
-        for name in self._moved(sh_rest=sh_rest):
+        for name in self._names(sh_rest=sh_rest):
             value = getattr(self.splats, name)
-            kept = self._kept.pop(name, None)
-            total = torch.zeros_like(value) if kept is None else kept
+            total = self._accumulated.pop(name, None)
+            total = torch.zeros_like(value) if total is None else total
             if self.fused:
                 total = self._view(name, "gradient").copy_(total)
             else:
@@ -148,7 +143,7 @@ class SplatOptimizer:
             gradients.append(total)
         return gradients
 
-    def _moved(self, *, sh_rest: bool) -> list[str]:
+    def _names(self, *, sh_rest: bool) -> list[str]:
         return [name for name in self._buffers if sh_rest or name != "sh_rest"]
 
     def step(
@@ -163,7 +158,7 @@ class SplatOptimizer:
         """
         self._factor = factor
         self._rates["means"] = means_rate * self._extent / factor
-        names = self._moved(sh_rest=sh_rest)
+        names = self._names(sh_rest=sh_rest)
         if self._backend == "triton":
             load("recon_cli.render.triton.optimizer.step")(
                 *self._groups(names), taken=self._taken, counted=counted, betas=_BETAS,
@@ -213,8 +208,8 @@ class SplatOptimizer:
         self._show(splats)
         for name, value in splats.parameters().items():
             for role in _MOMENTS:  # one parameter at a time: the copies stay small
-                kept = _followed(moments.pop((name, role)), source[: len(value)], value)
-                self._view(name, role).copy_(kept)
+                self._view(name, role).copy_(
+                    _follow_rows(moments.pop((name, role)), source[: len(value)], value))
             self._view(name, "value").copy_(value)
 
     def forget(self, name: str) -> None:
@@ -239,7 +234,7 @@ class SplatOptimizer:
                 self._view(name, role).copy_(tensors[f"adam.{name}.{role}"])
 
 
-def _followed(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
+def _follow_rows(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
     """Returns the old rows of a moment in their new places, zeros where there was none.
 
     `moment` is [rows before, ...], `like` [K, ...] the parameter now, with more or fewer
@@ -287,13 +282,13 @@ class SparseAdam:
 
     def center(self) -> None:
         """Takes the mean of all rows back to 0 by moving those that were ever stepped alike."""
-        seen = self._count > 0
-        if seen.any():
-            self.value[seen] -= self.value.sum(dim=0) / seen.sum()
+        stepped = self._count > 0
+        if stepped.any():
+            self.value[stepped] -= self.value.sum(dim=0) / stepped.sum()
 
     def tensors(self, prefix: str) -> dict[str, Tensor]:
         """Returns values, moments and counts by name, for a checkpoint."""
-        return {f"{prefix}.{role}": self._held(role) for role in _ROW_ROLES}
+        return {f"{prefix}.{role}": self._tensor(role) for role in _ROW_ROLES}
 
     def restore(self, prefix: str, tensors: dict[str, Tensor]) -> None:
         """Takes back what `tensors` returned.
@@ -303,8 +298,8 @@ class SparseAdam:
             RuntimeError: they are of another number of images.
         """
         for role in _ROW_ROLES:
-            self._held(role).copy_(tensors[f"{prefix}.{role}"])
+            self._tensor(role).copy_(tensors[f"{prefix}.{role}"])
 
-    def _held(self, role: str) -> Tensor:
-        held: Tensor = getattr(self, role if role == "value" else f"_{role}")
-        return held
+    def _tensor(self, role: str) -> Tensor:
+        tensor: Tensor = getattr(self, role if role == "value" else f"_{role}")
+        return tensor

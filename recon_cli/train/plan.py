@@ -24,7 +24,7 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate, with_exchange
 from recon_cli.train.feature_trials import PARTS, Candidate, Needs, examine
-from recon_cli.train.initialize import first_state, saved_state
+from recon_cli.train.initialize import first_state, restore_state
 from recon_cli.train.memory import gaussians_that_fit
 from recon_cli.train.schedule import RECIPES, Schedule
 from recon_cli.train.state import TrainState
@@ -62,8 +62,7 @@ class Quality:
 
 # A draft takes 11 to 15 CPU seconds of one thread on living, office and fox (docs/benchmarks.md,
 # "Budgets of a training"); the others follow from what steps of their size and count take.
-QUALITIES = {
-    "draft": Quality(1500, 400), "normal": Quality(3000, 600), "high": Quality(8000, 800)}
+QUALITIES = {"draft": Quality(1500, 400), "normal": Quality(3000, 600), "high": Quality(8000, 800)}
 
 
 @dataclass(frozen=True)
@@ -170,9 +169,7 @@ def _count_detailed_pixels(view: TrainView) -> int:
     return int((detailed if view.mask is None else detailed & view.mask).sum())
 
 
-def _fill_in(
-    asked: TrainConfig, iterations: int, max_gaussians: int, max_size: int
-) -> RunConfig:
+def _fill_in(asked: TrainConfig, iterations: int, max_gaussians: int, max_size: int) -> RunConfig:
     values = {item.name: getattr(asked, item.name) for item in dataclasses.fields(asked)}
     degree = 3 if asked.sh_degree is None else asked.sh_degree
     return RunConfig(**{
@@ -191,8 +188,7 @@ def _largest(fits: Callable[[int], bool], low: int, high: int) -> int:
 def plan_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext) -> Task:
     """Returns the task of a run by its plan: a recorded one, or one that is made and recorded."""
     if (out / TrainPlan.FILE).exists():
-        recorded = dataclasses.replace(
-            read_config(out), checkpoint_every=config.checkpoint_every)
+        recorded = dataclasses.replace(read_config(out), checkpoint_every=config.checkpoint_every)
         return load_task(scene, recorded, ctx)
     first = first_config(config)
     fit_memory = gaussians_that_fit(scene, first, ctx)
@@ -207,8 +203,7 @@ def plan_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext) -
     _report_plan(plan, asked, facts, ctx)
     config = run_config(asked, plan)
     write_config(out, config)
-    write_json(
-        out / TrainPlan.FILE, dataclasses.replace(plan, needs=needs.decisions).to_json())
+    write_json(out / TrainPlan.FILE, dataclasses.replace(plan, needs=needs.decisions).to_json())
     return dataclasses.replace(task, schedule=Schedule(config))
 
 
@@ -217,9 +212,7 @@ def model_parts(config: RunConfig) -> dict[str, Any]:
     return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
 
 
-def choose_parts(
-    task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False
-) -> Needs:
+def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False) -> Needs:
     """Returns which parts of the model the scene needs, and logs the reasons."""
     config = task.schedule.config
 
@@ -270,6 +263,6 @@ def _report_plan(plan: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageC
 def first_or_saved(task: Task, scene: Scene, checkpoint: Path) -> TrainState:
     """Returns the state that a checkpoint holds, or the first one."""
     if checkpoint.exists():
-        return saved_state(checkpoint, task)
+        return restore_state(checkpoint, task)
     most = first_count(task.schedule.config, len(scene.points))
     return first_state(task, scene.points, scene.colors, most=most)

@@ -70,7 +70,7 @@ class Poses:
     def camera(self, image: int, camera: Camera) -> Camera:
         """Returns an image's camera as it is refined so far."""
         twist = self.twists[image]
-        return moved(camera, twist[:3], twist[3:]) if twist.any() else camera
+        return move_camera(camera, twist[:3], twist[3:]) if twist.any() else camera
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
         """Moves one camera, and all that were ever moved back to a mean of 0.
@@ -101,7 +101,7 @@ def worth_a_trial(error_px: float | None) -> bool:
     return error_px is not None and error_px > WORTH_PX
 
 
-def moved(
+def move_camera(
     camera: Camera,
     turn: NDArray[np.float64],  # [3] rotation vector in world axes, rad
     move: NDArray[np.float64],  # [3] world units
@@ -135,18 +135,18 @@ def camera_gradient(
 
     `gradients` are those of `splats` as rendered with `camera`; sh_rest is not read.
     """
-    seen = torch.nonzero(gradients.sh_dc.any(dim=1) | gradients.means.any(dim=1))[:, 0]
-    offsets = splats.means.detach()[seen].double() - torch.from_numpy(camera.center).to(
+    rows = torch.nonzero(gradients.sh_dc.any(dim=1) | gradients.means.any(dim=1))[:, 0]
+    offsets = splats.means.detach()[rows].double() - torch.from_numpy(camera.center).to(
         splats.means.device)
-    pull = gradients.means[seen].double()
+    pull = gradients.means[rows].double()
     torque = torch.linalg.cross(offsets, pull) + _quat_torque(
-        splats.quats.detach()[seen].double(), gradients.quats[seen].double())
+        splats.quats.detach()[rows].double(), gradients.quats[rows].double())
     degree = min(sh_degree, splats.sh_degree)
-    colored = seen < len(splats.sh_rest)  # the first ones; the others have no harmonics
+    colored = rows < len(splats.sh_rest)  # the first ones; the others have no harmonics
     if degree > 0 and bool(colored.any()):
-        rows = seen[colored]
         torque[colored] -= _color_torque(
-            offsets[colored], splats.sh_rest.detach()[rows], gradients.sh_dc[rows] / SH_C0, degree)
+            offsets[colored], splats.sh_rest.detach()[rows[colored]],
+            gradients.sh_dc[rows[colored]] / SH_C0, degree)
     sums = torch.cat([torque, pull], dim=1).cpu().numpy().sum(axis=0)
     return np.asarray(-sums)
 

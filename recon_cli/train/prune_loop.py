@@ -16,9 +16,10 @@ from torch import Tensor
 
 from recon_cli.context import TrainCallback
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.densification import replace_splats
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance, add_views
-from recon_cli.train.state import DensificationStats, TrainState
+from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 
 RATIO = 0.5  # that is removed where no limit is given
@@ -75,9 +76,7 @@ def survivors(score: Tensor, count: int) -> Tensor:
 
 def remove(state: TrainState, rows: Tensor) -> None:
     """Goes on with the Gaussians at `rows` alone; they keep their moments."""
-    splats = state.splats.select(rows)
-    state.optimizer.replace(splats, rows)
-    state.gathered = DensificationStats.zeros(len(splats), splats.means.device)
+    replace_splats(state, state.splats.select(rows), rows)
 
 
 class PruneRun:

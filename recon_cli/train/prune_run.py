@@ -25,7 +25,7 @@ from recon_cli.io.ply import read_ply
 from recon_cli.io.records import ImportRecord
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.importance import Importance
-from recon_cli.train.initialize import finished_state, saved_state
+from recon_cli.train.initialize import make_finished_state, restore_state
 from recon_cli.train.prune_loop import PruneRun, remaining, rounds_within
 from recon_cli.train.runner import LOG, Segment, TrainLog, run_fit, seconds_at
 from recon_cli.train.schedule import RecoverySchedule
@@ -87,13 +87,13 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
         ConfigError: the middle of a run is asked for that took place elsewhere.
     """
     train = inputs.folders["train"]
-    origin = ImportRecord.read(train)
-    if origin and config.at == "mid":
+    import_record = ImportRecord.read(train)
+    if import_record and config.at == "mid":
         raise ConfigError(
-            f"at is mid, but the scene was imported from {origin.file}: the middle of its training "
-            "is not known.", hint="Prune it with --at end.")
-    if origin and origin.doubt:
-        ctx.notice(origin.doubt)
+            f"at is mid, but the scene was imported from {import_record.file}: the middle of its "
+            "training is not known.", hint="Prune it with --at end.")
+    if import_record and import_record.doubt:
+        ctx.notice(import_record.doubt)
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
@@ -102,14 +102,14 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     path = train / "mid.safetensors" if config.at == "mid" else final
 
     def begin() -> TrainState:
-        if origin:
-            return finished_state(read_ply(train / "splats.ply"), task)
-        return saved_state(path, task)
+        if import_record:
+            return make_finished_state(read_ply(train / "splats.ply"), task)
+        return restore_state(path, task)
 
     start, epoch = begin(), task.schedule.epoch(len(task.train))
     steps = config.recovery
     if steps is None:
-        rest = saved_state(final, task).steps - start.steps if config.at == "mid" else 0
+        rest = restore_state(final, task).steps - start.steps if config.at == "mid" else 0
         steps = _recovery_steps(config, train_config, epoch, rest)
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
@@ -131,7 +131,7 @@ class StoredPruneRun(PruneRun):
         self.done = self._read_rounds()
         path = out / _name(len(self.done))
         super().__init__(
-            saved_state(path, source.task) if path.exists() else source.begin(),
+            restore_state(path, source.task) if path.exists() else source.begin(),
             source.recovery(source.first, source.until), source.first, source.until,
             rounds=source.rounds, score=source.config.score, beta=source.config.beta)
         self.removals_done = len(self.done)
@@ -149,8 +149,7 @@ class StoredPruneRun(PruneRun):
                 earlier_seconds=self.source.earlier_seconds, checkpoint=_name(number)),
                 self._ctx, importance)
         wall, cpu = self._trained
-        self._trained = (
-            wall + time.perf_counter() - begin, cpu + time.process_time() - cpu_begin)
+        self._trained = (wall + time.perf_counter() - begin, cpu + time.process_time() - cpu_begin)
 
     def score(self, until: int) -> Tensor:
         """Trains up to a step and returns the score [N].
@@ -193,7 +192,7 @@ class StoredPruneRun(PruneRun):
         self.done[-1] = dataclasses.replace(self.done[-1], kept=False)
         good = self._out / GOOD
         self.state = (
-            saved_state(good, self.source.task) if good.exists() else self.source.begin())
+            restore_state(good, self.source.task) if good.exists() else self.source.begin())
 
     def write_rounds(self) -> None:
         """Writes the list of rounds, whole or not at all."""

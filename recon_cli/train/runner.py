@@ -41,7 +41,7 @@ class Segment:
 
 
 @contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+def _defer_interrupt() -> Iterator[Callable[[], bool]]:
     """Yields whether Ctrl-C was pressed, so that a step is never cut in half.
 
     A second Ctrl-C interrupts at once. Outside the main thread signals are left alone.
@@ -77,7 +77,7 @@ def run_fit(
         KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
     """
     out, total = segment.out, segment.until - segment.first
-    with _deferred_interrupt() as interrupted, ctx.progress.bar(
+    with _defer_interrupt() as interrupted, ctx.progress.bar(
         segment.label, total, unit="step", done=state.iteration - segment.first
     ) as bar:
         callbacks = (
@@ -171,8 +171,7 @@ class CheckpointThrottle:
 
     def allows(self) -> bool:
         """Tells whether another checkpoint keeps to its share of the time."""
-        return self._took <= LONG_SAVE or (
-            SAVE_SHARE * (self._clock() - self._last) >= self._took)
+        return self._took <= LONG_SAVE or (SAVE_SHARE * (self._clock() - self._last) >= self._took)
 
     @contextmanager
     def saving(self) -> Iterator[None]:

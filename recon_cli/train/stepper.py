@@ -22,18 +22,19 @@ _SKIPPED_FLOOR = 5
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """What the B views of a step say beside their gradients."""
+class _BatchResult:
+    """Of the B views of a step, all but the gradients of the Gaussians."""
 
     loss: NDArray[np.float64]  # [B]
-    seen: NDArray[np.float64]  # [B] 1 where the view saw a Gaussian
+    visible: NDArray[np.float64]  # [B] 1 where the view saw a Gaussian
     turn: NDArray[np.float64]  # [B, 6] gradients of the cameras
     gain: NDArray[np.float64]  # [B, 3] gradients of the log-gains
 
     @staticmethod
-    def nothing(views: int) -> _Found:
-        """Returns what no view said."""
-        return _Found(np.zeros(views), np.zeros(views), np.zeros((views, 6)), np.zeros((views, 3)))
+    def zeros(views: int) -> _BatchResult:
+        """Returns the result of no view."""
+        return _BatchResult(
+            np.zeros(views), np.zeros(views), np.zeros((views, 6)), np.zeros((views, 3)))
 
 
 class Stepper:
@@ -56,45 +57,45 @@ class Stepper:
         state, task = self._state, self._task
         iteration = state.iteration + 1
         batch = [next_view(state, task) for _ in range(task.schedule.config.batch_views)]
-        found = self._gather(batch, iteration)
+        result = self._gather(batch, iteration)
         state.iteration = iteration
-        loss = float(found.loss.mean())
+        loss = float(result.loss.mean())
         if not np.isfinite(loss):
             state.optimizer.discard()
             skip(state, task)
             return loss
-        if found.seen.any():
-            self._move(batch, found, iteration)
+        if result.visible.any():
+            self._move(batch, result, iteration)
         self._strategy.control(state, task)
         return loss
 
-    def _gather(self, batch: list[int], iteration: int) -> _Found:
+    def _gather(self, batch: list[int], iteration: int) -> _BatchResult:
         """Looks at this process's share of the views and leaves their mean gradient."""
         state, ranks = self._state, self._task.ranks
         moves_sh = self._task.schedule.moves_sh(iteration)
-        found, gathers = _Found.nothing(len(batch)), self._task.schedule.gathers(iteration)
+        result, gathers = _BatchResult.zeros(len(batch)), self._task.schedule.gathers(iteration)
         several = len(batch) > 1 or not ranks.alone
         # in a sum of its own, so that who looked at which view changes no bit
         gathered = state.gathered if not several else DensificationStats.zeros(
             len(state.splats), self._task.device)
         for place in range(ranks.rank, len(batch), ranks.count):
             view = self._view(batch[place], iteration)
-            statistics = self._look(view, batch[place], place, found, iteration)
+            statistics = self._look(view, batch[place], place, result, iteration)
             if statistics is None:
                 continue
             if gathers:
                 gathered.add(statistics, view.camera.width, view.camera.height)
             if several:
-                state.optimizer.keep(1 / len(batch), sh_rest=moves_sh)
+                state.optimizer.accumulate(1 / len(batch), sh_rest=moves_sh)
         if several:
-            ranks.add(state.optimizer.kept(sh_rest=moves_sh))
+            ranks.add(state.optimizer.take_accumulated(sh_rest=moves_sh))
         if not ranks.alone:
-            ranks.add([torch.from_numpy(values) for values in vars(found).values()])
+            ranks.add([torch.from_numpy(values) for values in vars(result).values()])
             if gathers:
                 gathered.over(ranks)
         if several and gathers:
             state.gathered.join(gathered)
-        return found
+        return result
 
     def _view(self, index: int, iteration: int) -> TrainView:
         view = self._task.pyramid.view(index, self._task.schedule.level(iteration))
@@ -103,40 +104,39 @@ class Stepper:
         return replace(view, camera=self._state.poses.camera(index, view.camera))
 
     def _look(
-        self, view: TrainView, index: int, place: int, found: _Found, iteration: int
+        self, view: TrainView, index: int, place: int, result: _BatchResult, iteration: int
     ) -> Statistics | None:
         """Leaves the gradients of one view; None where they are no part of the step."""
         state, importance = self._state, self._importance
         schedule = self._task.schedule
         degree = schedule.sh_degree(iteration)
-        found.loss[place], statistics = self._compute(
+        result.loss[place], statistics = self._compute(
             state.optimizer, view, degree, schedule.config.ssim_weight,
             variance=schedule.gathers(iteration) and self._strategy.variance,
             gain=None if state.exposure is None else state.exposure.gain(index),
             scores=importance is not None and importance.weighs,
             loo=importance is not None and importance.leaves_out)
-        if statistics is None or not np.isfinite(found.loss[place]):
+        if statistics is None or not np.isfinite(result.loss[place]):
             return None
-        found.seen[place] = 1
+        result.visible[place] = 1
         if importance is not None:
             importance.add(statistics)
         if state.poses is not None:
-            found.turn[place] = self._compute.camera_gradient(
-                state.optimizer, view.camera, degree)
+            result.turn[place] = self._compute.camera_gradient(state.optimizer, view.camera, degree)
         if state.exposure is not None:
-            found.gain[place] = self._compute.log_gain_gradient
+            result.gain[place] = self._compute.log_gain_gradient
         return statistics
 
-    def _move(self, batch: list[int], found: _Found, iteration: int) -> None:
+    def _move(self, batch: list[int], result: _BatchResult, iteration: int) -> None:
         """Moves all parameters against their gradients."""
         state, schedule = self._state, self._task.schedule
         for place, index in enumerate(batch):
-            if not found.seen[place]:
+            if not result.visible[place]:
                 continue
             if state.poses is not None:
-                state.poses.step(index, found.turn[place], schedule.share(iteration))
+                state.poses.step(index, result.turn[place], schedule.share(iteration))
             if state.exposure is not None:
-                state.exposure.step(index, found.gain[place], schedule.share(iteration))
+                state.exposure.step(index, result.gain[place], schedule.share(iteration))
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
             factor=schedule.rate_factor(iteration))

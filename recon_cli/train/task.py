@@ -40,7 +40,7 @@ class Task:
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 
 
-def reduced(view: TrainView, factor: int) -> TrainView:
+def reduce_view(view: TrainView, factor: int) -> TrainView:
     """Returns a view reduced by area, its camera with it; the same where it would be too small.
 
     A reduced pixel counts only where all that it covers counts.
@@ -53,8 +53,7 @@ def reduced(view: TrainView, factor: int) -> TrainView:
     mask = None
     if view.mask is not None:
         hidden = (~view.mask).astype(np.float32)
-        mask = np.asarray(cv2.resize(
-            hidden, (width, height), interpolation=cv2.INTER_AREA) == 0)
+        mask = np.asarray(cv2.resize(hidden, (width, height), interpolation=cv2.INTER_AREA) == 0)
     return TrainView(camera.resized(width, height), np.ascontiguousarray(image), mask)
 
 
@@ -66,7 +65,7 @@ class Pyramid:
         self._at = cache(self._reduced)
 
     def _reduced(self, index: int, factor: int) -> TrainView:
-        view = reduced(self._views[index], factor)
+        view = reduce_view(self._views[index], factor)
         return view.page_locked() if self._page_locked else view
 
     def view(self, index: int, factor: int) -> TrainView:

@@ -12,9 +12,7 @@ import torch
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, TrainingError
-from recon_cli.evaluation.metrics import leaves_enough
-from recon_cli.evaluation.reference_views import MASK_HINT, notice_hidden
-from recon_cli.io.images import fit_camera, read_masked_image
+from recon_cli.evaluation import reference_views
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import TrainView
@@ -37,7 +35,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     if len(train) < 2:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
-            hint=MASK_HINT)
+            hint=reference_views.MASK_HINT)
     if ctx.device == "cuda":
         train = [view.page_locked() for view in train]
     error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
@@ -56,21 +54,10 @@ def _refuse_tiny_units(scene: Scene) -> None:
             "of the data set.")
 
 
-def load_views(
-    views: Sequence[View], config: RunConfig, ctx: StageContext
-) -> list[TrainView]:
+def load_views(views: Sequence[View], config: RunConfig, ctx: StageContext) -> list[TrainView]:
     """Returns the views at the training size, without those whose mask leaves next to nothing."""
-    loaded, hidden = [], []
-    for view in views:
-        camera = fit_camera(view.camera, config.max_size)
-        path = view.denoised if config.images == "denoised" else view.original
-        image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
-        if leaves_enough(mask):
-            loaded.append(TrainView(camera, image, mask))
-        else:
-            hidden.append(view.name)
-    notice_hidden(hidden, "not trained on", ctx)
-    return loaded
+    return [*reference_views.load_views(
+        views, config.max_size, "not trained on", ctx, denoised=config.images == "denoised")]
 
 
 def write_config(folder: Path, config: RunConfig) -> None:

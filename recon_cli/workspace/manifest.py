@@ -56,10 +56,8 @@ class ResultKey:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ResultKey:
         """Returns the key that `to_json` described."""
-        sources = tuple(
-            Source(item["path"], _digests(item["files"])) for item in value["inputs"])
-        return cls(
-            value["stage"], value["version"], value["config"], sources, value["upstream"])
+        sources = tuple(Source(item["path"], _digests(item["files"])) for item in value["inputs"])
+        return cls(value["stage"], value["version"], value["config"], sources, value["upstream"])
 
 
 @dataclass(frozen=True)
@@ -150,8 +148,7 @@ class PartialRun:
         """Returns the record, or None where there is none that can be read."""
         try:
             value = read_json(path)
-            return cls(
-                ResultKey.from_json(value), value["done"], value["total"], value["seconds"])
+            return cls(ResultKey.from_json(value), value["done"], value["total"], value["seconds"])
         except (FormatError, KeyError, TypeError, AttributeError):
             return None
 

@@ -84,8 +84,7 @@ def _decode(name: str, kind: Any, item: Any) -> Any:
         return kind.from_json(item)
     if kind is Any or isinstance(item, _SCALARS.get(kind, ())):
         return item
-    raise ManifestError(
-        f"the record holds {item!r} as {name}: another version of recon wrote it")
+    raise ManifestError(f"the record holds {item!r} as {name}: another version of recon wrote it")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from test_similarity import random_rotation
 
-from recon_cli.scene.harmonics import basis_rest, generators, rotated, rotation_blocks
+from recon_cli.scene.harmonics import basis_rest, generators, rotate_sh, rotation_blocks
 
 EXACT = 1e-12
 DEGREES = {1: slice(0, 3), 2: slice(3, 8), 3: slice(8, 15)}
@@ -32,7 +32,7 @@ def test_a_turned_function_has_the_old_value_in_the_turned_direction(degree, rot
     alone = torch.zeros_like(sh)
     alone[:, DEGREES[degree]] = sh[:, DEGREES[degree]]
     before = torch.einsum("dj,njc->ndc", basis_rest(seen, 3), alone)
-    after = torch.einsum("dj,njc->ndc", basis_rest(turned, 3), rotated(alone, rotation))
+    after = torch.einsum("dj,njc->ndc", basis_rest(turned, 3), rotate_sh(alone, rotation))
     assert torch.allclose(before, after, rtol=0, atol=EXACT)
 
 
@@ -92,15 +92,15 @@ def test_a_quarter_turn_about_z_swaps_and_signs_the_terms_of_every_degree():
 def test_the_dtype_is_kept_and_float32_is_rounded_once():
     rotation, = rotations(1)
     sh = torch.randn(3, 15, 3, generator=torch.Generator().manual_seed(0))
-    turned = rotated(sh, rotation)
+    turned = rotate_sh(sh, rotation)
     assert turned.dtype == torch.float32
-    assert torch.equal(turned, rotated(sh.double(), rotation).float())
+    assert torch.equal(turned, rotate_sh(sh.double(), rotation).float())
 
 
 def test_a_generator_is_the_start_of_a_turn():
     reach, about = 1e-5, np.array([0.6, -0.3, 0.8])
     sh = torch.randn(4, 15, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    ahead, behind = (rotated(sh, Rotation.from_rotvec(sign * reach * about).as_matrix())
+    ahead, behind = (rotate_sh(sh, Rotation.from_rotvec(sign * reach * about).as_matrix())
                      for sign in (1, -1))
     change = torch.einsum("i,ikm,nmc->nkc", torch.from_numpy(about), generators(), sh)
     # central differences: the third order leaves reach^2 times a number of the order of 10

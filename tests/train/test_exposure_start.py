@@ -11,7 +11,7 @@ from recon_cli.io.depth_points import points_from_depth
 from recon_cli.io.layouts import read_posed
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.exposure import estimated
+from recon_cli.train.exposure import estimate_gains
 
 WIDTH, HEIGHT = 120, 90
 CAMERA = Camera(WIDTH, HEIGHT, 100.0, 100.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
@@ -41,14 +41,14 @@ def centered(gains):
 
 
 def test_gains_of_one_wall_are_found_up_to_their_mean():
-    found = estimated(views(), points())
+    found = estimate_gains(views(), points())
     assert found.log_gains == pytest.approx(centered(GAINS), abs=ROUNDING)
     assert found.spread == pytest.approx(centered(GAINS).std(axis=0).max(), abs=ROUNDING)
     assert found.drifts
 
 
 def test_views_of_one_exposure_do_not_drift():
-    found = estimated([TrainView(CAMERA, wall())] * 4, points())
+    found = estimate_gains([TrainView(CAMERA, wall())] * 4, points())
     assert (found.spread, found.drifts, found.compared) == (0.0, False, 6)
 
 
@@ -57,7 +57,7 @@ def test_what_hides_a_third_of_the_points_in_one_view_does_not_mislead():
     image = images[1].image.copy()
     image[:, : WIDTH // 3] = (30, 160, 90)
     images[1] = TrainView(CAMERA, image)
-    assert estimated(images, points()).log_gains == pytest.approx(centered(GAINS), abs=0.05)
+    assert estimate_gains(images, points()).log_gains == pytest.approx(centered(GAINS), abs=0.05)
 
 
 def test_pixels_under_a_mask_and_blown_out_ones_say_nothing():
@@ -66,20 +66,20 @@ def test_pixels_under_a_mask_and_blown_out_ones_say_nothing():
     image[: HEIGHT // 2], mask[: HEIGHT // 2] = 128, False
     image[HEIGHT // 2:, : 2 * WIDTH // 3] = 255
     images[2] = TrainView(CAMERA, image, mask)
-    assert estimated(images, points(2000)).log_gains == pytest.approx(
+    assert estimate_gains(images, points(2000)).log_gains == pytest.approx(
         centered(GAINS), abs=3 * ROUNDING)
 
 
 def test_a_view_that_shares_no_point_has_no_gain_and_no_say():
     turned = np.diag([-1.0, 1.0, -1.0, 1.0])
     images = [*views(), TrainView(replace(CAMERA, viewmat=turned), wall((0.5, 0.5, 0.5)))]
-    found = estimated(images, points())
+    found = estimate_gains(images, points())
     assert not found.log_gains[-1].any()
     assert found.log_gains[:-1] == pytest.approx(centered(GAINS), abs=ROUNDING)
 
 
 def test_without_points_nothing_is_known():
-    found = estimated(views(), np.zeros((0, 3)))
+    found = estimate_gains(views(), np.zeros((0, 3)))
     assert (found.spread, found.compared) == (0.0, 0)
     assert not found.log_gains.any()
 
@@ -97,7 +97,7 @@ def filmed(room, name, every=4):
 
 def test_the_gains_of_a_room_whose_exposure_drifts_are_found(shared_data):
     room = shared_data / "rooms" / "office"
-    found = estimated(filmed(room, "video_noisy.mp4"), points_from_depth(read_posed(room))[0])
+    found = estimate_gains(filmed(room, "video_noisy.mp4"), points_from_depth(read_posed(room))[0])
     frames = json.loads((room / "noisy.json").read_text())["per_frame"][::4]
     truth = np.log([frame["gain"] * np.array(frame["wb_bgr"][::-1]) for frame in frames])
     # the gains act on linear light and the pixels are gamma-coded: log-gains shrink by about 2.2
@@ -111,5 +111,5 @@ def test_the_gains_of_a_room_whose_exposure_drifts_are_found(shared_data):
 @pytest.mark.parametrize("room", ["office", "living"])
 def test_a_room_of_one_exposure_does_not_drift(shared_data, room):
     folder = shared_data / "rooms" / room
-    assert not estimated(
+    assert not estimate_gains(
         filmed(folder, "video.mp4"), points_from_depth(read_posed(folder))[0]).drifts

@@ -12,7 +12,7 @@ from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
-from recon_cli.train.poses import Poses, moved
+from recon_cli.train.poses import Poses, move_camera
 from recon_cli.train.state import new_state
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 8, 80, 60, 70.0
@@ -64,7 +64,7 @@ def disturbed(views):
     moves -= (moves * arms).sum() / (arms * arms).sum() * arms
     turns *= TURN / np.linalg.norm(turns, axis=1).mean()
     moves *= MOVE / np.linalg.norm(moves, axis=1).mean()
-    return [replace(view, camera=moved(view.camera, turn, move))
+    return [replace(view, camera=move_camera(view.camera, turn, move))
             for view, turn, move in zip(views, turns, moves, strict=True)]
 
 

@@ -11,7 +11,7 @@ from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step, photometric_loss
-from recon_cli.train.poses import Poses, camera_gradient, moved, worth_a_trial
+from recon_cli.train.poses import Poses, camera_gradient, move_camera, worth_a_trial
 from recon_cli.train.state import new_state
 
 BLACK = torch.zeros(3, dtype=torch.float64)
@@ -61,7 +61,7 @@ def slopes(splats, camera, degree, reach=REACH):
         step = np.zeros(6)
         step[k] = reach
         with torch.no_grad():
-            ahead, behind = (loss_of(splats, moved(camera, s[:3], s[3:]), degree).item()
+            ahead, behind = (loss_of(splats, move_camera(camera, s[:3], s[3:]), degree).item()
                              for s in (step, -step))
         result[k] = (ahead - behind) / (2 * reach)
     return result
@@ -137,9 +137,9 @@ def test_any_number_of_threads_gives_the_same_gradient(backend, monkeypatch):
 
 def test_a_camera_turns_about_its_own_centre():
     camera = camera_at()
-    turned = moved(camera, np.array([0.1, -0.2, 0.3]), np.zeros(3))
+    turned = move_camera(camera, np.array([0.1, -0.2, 0.3]), np.zeros(3))
     assert turned.center == pytest.approx(camera.center, abs=1e-12)
-    shifted = moved(camera, np.zeros(3), np.array([1.0, 2.0, 3.0]))
+    shifted = move_camera(camera, np.zeros(3), np.array([1.0, 2.0, 3.0]))
     assert shifted.center == pytest.approx(camera.center + np.arange(1, 4), abs=1e-12)
     assert shifted.viewmat[:3, :3] == pytest.approx(camera.viewmat[:3, :3], abs=1e-12)
 

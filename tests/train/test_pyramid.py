@@ -7,7 +7,7 @@ from scenes import camera_at, random_splats
 
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.task import Pyramid, reduced
+from recon_cli.train.task import Pyramid, reduce_view
 
 # A picture that is rendered small and one that is rendered large and averaged differ by what a
 # pixel's blur adds. Measured .03 on soft Gaussians; a camera off by half a pixel gives .09.
@@ -20,7 +20,7 @@ def view(width=64, height=48, mask=None):
 
 
 def test_a_pixel_is_the_mean_of_those_that_it_covers():
-    small = reduced(view(), 2)
+    small = reduce_view(view(), 2)
     blocks = view().image.reshape(24, 2, 32, 2, 3).mean((1, 3))
     assert np.abs(small.image - blocks).max() <= 0.5
     assert (small.camera.width, small.camera.height) == (32, 24)
@@ -33,13 +33,13 @@ def test_the_camera_of_a_reduced_view_shows_the_same_picture():
     with torch.no_grad():
         large = render(splats, camera, torch.zeros(3), 0).rgb
         truth = TrainView(camera, (large.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
-        small = reduced(truth, 2)
+        small = reduce_view(truth, 2)
         rgb = render(splats, small.camera, torch.zeros(3), 0).rgb.clamp(0, 1).numpy()
     assert np.abs(rgb - small.image / 255).mean() < PICTURE
 
 
 def test_sizes_that_do_not_divide_keep_the_field_of_view():
-    odd = reduced(view(101, 75), 4)
+    odd = reduce_view(view(101, 75), 4)
     assert (odd.camera.width, odd.camera.height) == (25, 19)
     full = view(101, 75).camera
     assert odd.camera.fx / 25 == pytest.approx(full.fx / 101)
@@ -49,7 +49,7 @@ def test_sizes_that_do_not_divide_keep_the_field_of_view():
 def test_a_reduced_pixel_counts_only_where_all_that_it_covers_counts():
     mask = np.ones((96, 128), bool)
     mask[10, 10] = False
-    small = reduced(view(128, 96, mask), 4)
+    small = reduce_view(view(128, 96, mask), 4)
     assert small.mask is not None
     assert not small.mask[2, 2]
     assert small.mask.sum() == small.mask.size - 1
@@ -57,7 +57,7 @@ def test_a_reduced_pixel_counts_only_where_all_that_it_covers_counts():
 
 def test_an_image_that_would_be_too_small_stays_as_it_is():
     tiny = view(40, 30)
-    assert reduced(tiny, 4) is tiny
+    assert reduce_view(tiny, 4) is tiny
 
 
 def test_a_pyramid_makes_each_size_once():

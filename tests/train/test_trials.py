@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon_cli.evaluation.metrics import corrected_psnr
-from recon_cli.train.feature_trials import LEAST_VIEWS, decide, skipped, split
+from recon_cli.train.feature_trials import LEAST_VIEWS, decide, skip_trial, split
 
 BASE = [20.0, 31.0, 25.0, 28.0, 22.0, 33.0, 27.0, 24.0]
 
@@ -63,7 +63,7 @@ def test_the_seconds_of_both_arms_are_counted():
 
 
 def test_what_is_skipped_costs_nothing_and_says_why():
-    decision = skipped("exposure", "the gains of the views differ by 0.01")
+    decision = skip_trial("exposure", "the gains of the views differ by 0.01")
     assert (decision.on, decision.mean_db, decision.seconds) == (False, None, 0.0)
     assert "0.01" in decision.reason
 

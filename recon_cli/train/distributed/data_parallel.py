@@ -33,7 +33,7 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import EXCHANGE, join_exchange
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
-from recon_cli.train.initialize import saved_state
+from recon_cli.train.initialize import restore_state
 from recon_cli.train.schedule import RecoverySchedule, Schedule
 from recon_cli.train.state import TrainState, save_state, tensors_of
 from recon_cli.train.stepper import Stepper
@@ -142,21 +142,21 @@ def follow(ranks: ProcessGroup) -> None:
             if word == EXCHANGE:
                 join_exchange(ranks)
                 continue
-            given = unpack_fit(receive_arrays(ranks), ranks)
-            if given.task.backend not in ready:
-                registry.use_threads(given.task.backend, given.threads)
-                registry.prepare(given.task.backend, lambda: None)
-                ready.add(given.task.backend)
-            _take_part(given)
-            del given  # the next one needs the room
+            shared = unpack_fit(receive_arrays(ranks), ranks)
+            if shared.task.backend not in ready:
+                registry.use_threads(shared.task.backend, shared.threads)
+                registry.prepare(shared.task.backend, lambda: None)
+                ready.add(shared.task.backend)
+            _take_part(shared)
+            del shared  # the next one needs the room
     finally:  # gloo's threads let go of tensors, which they must not while Python ends
         ranks.leave()
 
 
-def _take_part(given: Fit) -> None:
+def _take_part(shared: Fit) -> None:
     """Takes the steps that the leader takes."""
-    state, ranks = given.state, given.task.ranks
-    stepper = Stepper(state, given.task, given.importance)
+    state, ranks = shared.state, shared.task.ranks
+    stepper = Stepper(state, shared.task, shared.importance)
     while (word := ranks.broadcast_int(_STOP)) not in (_STOP, _END):
         try:
             if word == _COMPARE:
@@ -170,8 +170,8 @@ def _take_part(given: Fit) -> None:
             if ranks.broadcast_int(_STOP) != _STOP:  # the leader met nothing of the kind
                 raise
             return
-    if word == _END and given.importance is not None:
-        given.importance.over(ranks)
+    if word == _END and shared.importance is not None:
+        shared.importance.over(ranks)
 
 
 def _say_and_compare(state: TrainState, ranks: ProcessGroup) -> None:
@@ -258,7 +258,7 @@ def unpack_fit(arrays: dict[str, NDArray[Any]], ranks: ProcessGroup) -> Fit:
         torch.device(said["device"]), camera_error=said["camera_error"], ranks=ranks)
     with tempfile.TemporaryDirectory() as folder:
         arrays["state"].tofile(Path(folder) / _STATE)
-        state = saved_state(Path(folder) / _STATE, task)
+        state = restore_state(Path(folder) / _STATE, task)
     importance = None
     if said["scores"]:
         importance = Importance.zeros(len(state.splats), task.device)
@@ -279,8 +279,7 @@ def receive_arrays(ranks: ProcessGroup) -> dict[str, NDArray[Any]]:
     """Returns the arrays that the leader sends."""
     names = np.zeros(ranks.broadcast_int(0), np.uint8)
     ranks.broadcast(torch.from_numpy(names))
-    arrays = {
-        name: np.zeros(shape, dtype) for name, dtype, shape in json.loads(names.tobytes())}
+    arrays = {name: np.zeros(shape, dtype) for name, dtype, shape in json.loads(names.tobytes())}
     for array in arrays.values():
         ranks.broadcast(torch.from_numpy(array))
     return arrays

@@ -44,32 +44,31 @@ class TorchProcessGroup(ProcessGroup):
             torch.cuda.set_device(own)
         by_nccl = gpus > 0 and dist.is_nccl_available()
         try:
-            dist.init_process_group(
-                "cpu:gloo,cuda:nccl" if by_nccl else "gloo", timeout=_PATIENCE)
+            dist.init_process_group("cpu:gloo,cuda:nccl" if by_nccl else "gloo", timeout=_PATIENCE)
         except (RuntimeError, ValueError) as error:
             raise BackendError(
                 f"The processes cannot be connected: {error}.",
                 hint="Start them with torchrun, and name the network with GLOO_SOCKET_IFNAME where "
                 "there are several.") from error
-        found = TorchProcessGroup(
+        group = TorchProcessGroup(
             dist.get_rank(), dist.get_world_size(), int(os.environ["LOCAL_WORLD_SIZE"]))
-        seen = torch.tensor([own < gpus, own >= gpus], dtype=torch.int64)
-        found.all_reduce_max(seen)
-        found.lacks_gpu = bool(seen.all())
-        return found
+        has_and_lacks = torch.tensor([own < gpus, own >= gpus], dtype=torch.int64)
+        group.all_reduce_max(has_and_lacks)
+        group.lacks_gpu = bool(has_and_lacks.all())
+        return group
 
     def add(self, tensors: Sequence[Tensor]) -> None:
         """Replaces tensors by their sums over all processes, the same bits in each."""
         small: dict[tuple[torch.dtype, torch.device], list[Tensor]] = {}
         for tensor in tensors:
             if tensor.numel() > _SMALL:
-                with _connected():
+                with _catch_lost():
                     dist.all_reduce(tensor)
             else:
                 small.setdefault((tensor.dtype, tensor.device), []).append(tensor)
         for several in small.values():
             flat = torch.cat([tensor.reshape(-1) for tensor in several])
-            with _connected():
+            with _catch_lost():
                 dist.all_reduce(flat)
             for tensor in several:
                 tensor.copy_(flat[: tensor.numel()].view_as(tensor))
@@ -77,7 +76,7 @@ class TorchProcessGroup(ProcessGroup):
 
     def all_reduce_max(self, tensor: Tensor) -> None:
         """Replaces the values of a tensor by the greatest of all processes."""
-        with _connected():
+        with _catch_lost():
             dist.all_reduce(tensor, dist.ReduceOp.MAX)
 
     def broadcast_int(self, number: int) -> int:
@@ -88,7 +87,7 @@ class TorchProcessGroup(ProcessGroup):
 
     def broadcast(self, tensor: Tensor) -> None:
         """Replaces the values of a tensor by those of the leader's."""
-        with _connected():
+        with _catch_lost():
             dist.broadcast(tensor, 0)
 
     def leave(self) -> None:
@@ -98,7 +97,7 @@ class TorchProcessGroup(ProcessGroup):
 
 
 @contextmanager
-def _connected() -> Iterator[None]:
+def _catch_lost() -> Iterator[None]:
     """Raises LostError where a process is gone."""
     if not dist.is_initialized():
         raise _lost()
