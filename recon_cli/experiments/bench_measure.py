@@ -32,7 +32,7 @@ from recon_cli.experiments.bench_scene import (
 from recon_cli.experiments.instruments import Host, Samples, Stopwatch, Timing, timing_of
 from recon_cli.progress import Bar, Progress
 from recon_cli.render import registry
-from recon_cli.render.contract import Renderer, RenderOutput
+from recon_cli.render.contract import Renderer, RenderOutput, StepOptions
 from recon_cli.render.numba.loss import C1, C2, MAPS, RADIUS, photometric, taps
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
@@ -172,7 +172,7 @@ def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
     view = TrainView(scene.camera, noise(scene))
 
     def step(mark: Mark) -> None:
-        compute(optimizer, view, scene.sh_degree, still.ssim_weight)
+        compute(optimizer, view, StepOptions(scene.sh_degree, still.ssim_weight))
         mark("gradients")
         optimizer.step(still.means_rate, sh_rest=scene.sh_degree > 0)
         mark(_ADAM)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from recon_cli.render import Statistics
+from recon_cli.render.contract import StepOptions
 from recon_cli.scene.camera import Camera
 from recon_cli.train.densification import STRATEGIES
 from recon_cli.train.gradient import DeferredStep, gradient_step
@@ -88,12 +89,13 @@ class AsyncTrainer:
         self._trail.append(_Before(state.iteration, list(state.queue), state.generator.get_state()))
         iteration = state.iteration + 1
         gathers, moves_sh = schedule.gathers(iteration), schedule.moves_sh(iteration)
+        options = StepOptions(
+            schedule.sh_degree(iteration), schedule.config.ssim_weight,
+            details=gathers and self._strategy.variance)
         self._batch.begin(state)
         for _ in range(schedule.config.batch_views):
             view = self._task.pyramid.view(next_view(state, self._task), schedule.level(iteration))
-            statistics = self._compute.start(
-                state.optimizer, view, schedule.sh_degree(iteration),
-                schedule.config.ssim_weight, variance=gathers and self._strategy.variance)
+            statistics = self._compute.start(state.optimizer, view, options)
             self._batch.add(state, statistics if gathers else None, view.camera, moves_sh=moves_sh)
         counted = self._batch.end(state, gathers=gathers, moves_sh=moves_sh)
         state.optimizer.step(

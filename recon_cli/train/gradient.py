@@ -53,16 +53,13 @@ class GradientStep(Protocol):
         """
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
-        loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
+        gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view; None where it sees no Gaussian.
 
-        The statistics are valid until the next call. Their `variance` is computed where it is
-        asked for. The rendered channels are multiplied by `gain` [3] before they are compared;
-        None stands for ones. With `scores` there are hits and blend weights too, and with `loo`
-        loo, over the pixels that the view's mask counts.
+        The statistics are valid until the next call. The rendered channels are multiplied by
+        `gain` [3] before they are compared; None stands for ones.
         """
 
 
@@ -78,8 +75,7 @@ class DeferredStep(GradientStep, Protocol):
         """What the device records of each view."""
 
     def start(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions
     ) -> Statistics:
         """Starts the work on one view and returns its statistics, zeros where it counts nothing."""
 
@@ -116,15 +112,13 @@ class _FusedStep:
         return gradient
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
-        loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
+        gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera,
-            TargetImage(view.image, view.mask, gain),
-            StepOptions(sh_degree, ssim_weight, details=variance, scores=scores, loo=loo))
+            TargetImage(view.image, view.mask, gain), options)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -152,15 +146,13 @@ class _DeviceStep:
         return camera_gradient(optimizer.splats, optimizer.gradients, camera, sh_degree)
 
     def start(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
-        loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
+        gain: NDArray[np.float32] | None = None,
     ) -> Statistics:
         """Starts the work on one view and returns its statistics."""
         self._compute(
             optimizer.splats.map(lambda tensor: tensor.detach()), optimizer.gradients, view.camera,
-            TargetImage(view.image, view.mask, gain),
-            StepOptions(sh_degree, ssim_weight, details=variance, scores=scores, loo=loo))
+            TargetImage(view.image, view.mask, gain), options)
         return self._compute.statistics
 
     def close(self) -> StepReport:
@@ -168,15 +160,12 @@ class _DeviceStep:
         return self._compute.close()
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
-        loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
+        gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         while True:
-            statistics = self.start(
-                optimizer, view, sh_degree, ssim_weight, variance=variance, gain=gain,
-                scores=scores, loo=loo)
+            statistics = self.start(optimizer, view, options, gain)
             report = self.close()
             if report.stopped is None:  # else there is room for it now
                 break
@@ -201,22 +190,22 @@ class _AutogradStep:
         return camera_gradient(optimizer.splats, gradients, camera, sh_degree)
 
     def __call__(
-        self, optimizer: SplatOptimizer, view: TrainView, sh_degree: int, ssim_weight: float, *,
-        variance: bool = False, gain: NDArray[np.float32] | None = None, scores: bool = False,
-        loo: bool = False,
+        self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
+        gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
         """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
         device, counting = splats.means.device, view.counting(splats.means.device)
         output = render(
-            splats, view.camera, splats.means.new_zeros(3), sh_degree, backend=self._backend,
-            scores=variance or scores or loo, mask=counting)
+            splats, view.camera, splats.means.new_zeros(3), options.sh_degree,
+            backend=self._backend, scores=options.details or options.scores or options.loo,
+            mask=counting)
         rgb = output.rgb
         log_gain = None
         if gain is not None:
             log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
             rgb = rgb * log_gain.exp()
-        loss = photometric_loss(rgb, view.pixels(device), ssim_weight, mask=counting)
+        loss = photometric_loss(rgb, view.pixels(device), options.ssim_weight, mask=counting)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import TrainingError
 from recon_cli.render import Statistics
+from recon_cli.render.contract import StepOptions
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.densification import STRATEGIES
 from recon_cli.train.gradient import gradient_step
@@ -110,12 +111,14 @@ class Stepper:
         state, importance = self._state, self._importance
         schedule = self._task.schedule
         degree = schedule.sh_degree(iteration)
-        result.loss[place], statistics = self._compute(
-            state.optimizer, view, degree, schedule.config.ssim_weight,
-            variance=schedule.gathers(iteration) and self._strategy.variance,
-            gain=None if state.exposure is None else state.exposure.gain(index),
+        options = StepOptions(
+            degree, schedule.config.ssim_weight,
+            details=schedule.gathers(iteration) and self._strategy.variance,
             scores=importance is not None and importance.weighs,
             loo=importance is not None and importance.leaves_out)
+        result.loss[place], statistics = self._compute(
+            state.optimizer, view, options,
+            None if state.exposure is None else state.exposure.gain(index))
         if statistics is None or not np.isfinite(result.loss[place]):
             return None
         result.visible[place] = 1

@@ -42,7 +42,7 @@ from gpu_scene import AFTER, photometric, training, without_graphs
 
 from recon_cli.experiments.bench_scene import SceneSize
 from recon_cli.render import render
-from recon_cli.render.contract import TILE
+from recon_cli.render.contract import TILE, StepOptions
 from recon_cli.render.triton import passes
 from recon_cli.render.triton import step as triton_step
 from recon_cli.train.gradient import gradient_step
@@ -182,7 +182,7 @@ def staged(
         for number in range(rounds + 2):
             hold(device)
             first = moment(device)
-            compute.start(optimizer, view, 3, schedule.config.ssim_weight)
+            compute.start(optimizer, view, StepOptions(3, schedule.config.ssim_weight))
             move(schedule.means_rate(AFTER), sh_rest=True, counted=compute.counted)
             last = moment(device)
             whole, now = between(first, last), clock.collect()

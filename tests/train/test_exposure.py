@@ -8,6 +8,7 @@ from scenes import camera_at, random_splats
 from recon_cli.config.stages import TrainConfig
 from recon_cli.io.images import fill_masked
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import Exposure
@@ -36,7 +37,7 @@ def step_of(splats, view, backend, gain):
     """Loss, gradients of the splats and of the log-gain that a step leaves."""
     state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
-    loss, _ = compute(state.optimizer, view, 3, 0.2, gain=gain)
+    loss, _ = compute(state.optimizer, view, StepOptions(3, 0.2), gain)
     held = state.optimizer.gradients.parameters().items()
     if not state.optimizer.fused:
         held = ((name, leaf.grad) for name, leaf in state.splats.parameters().items())
@@ -94,7 +95,7 @@ def test_a_white_picture_of_a_gray_room_has_the_slope_of_its_brightness(backend)
     gain = np.array([0.1, 0.2, 0.05], np.float32)
     state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
-    compute(state.optimizer, view, 3, 0.0, gain=gain)
+    compute(state.optimizer, view, StepOptions(3, 0.0), gain)
     with torch.no_grad():
         rgb = render(splats, CAMERA, torch.zeros(3), 3, backend=backend).rgb.numpy()
     assert rgb.max() * gain.max() < 1

@@ -8,6 +8,7 @@ from tiny_task import importance_of
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.importance import (
@@ -135,7 +136,8 @@ def test_a_training_step_leaves_the_scores_of_its_view(backend):
     mask = np.random.default_rng(0).random((20, 30)) < 0.5
     view = blank(camera_at(30, 20), mask)
     optimizer = SplatOptimizer(splats, RunConfig(), 1.0, backend=backend)
-    _, statistics = gradient_step(backend)(optimizer, view, 0, 0.2, scores=True, loo=True)
+    _, statistics = gradient_step(backend)(
+        optimizer, view, StepOptions(0, 0.2, scores=True, loo=True))
     trained = Importance.zeros(60, CPU)
     trained.add(statistics)
     expected = importance_of(splats, [view], sh_degree=0, backend=backend)

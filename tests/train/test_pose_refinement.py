@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
@@ -84,7 +85,7 @@ def train(splats, views, epochs, *, poses, scene_moves):
         view = views[image]
         if poses is not None:
             view = replace(view, camera=poses.camera(image, view.camera))
-        compute(state.optimizer, view, 3, 0.2)
+        compute(state.optimizer, view, StepOptions(3, 0.2))
         if poses is not None:
             poses.step(image, compute.camera_gradient(state.optimizer, view.camera, 3),
                        step / (epochs * VIEWS))

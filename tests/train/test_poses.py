@@ -7,6 +7,7 @@ from scenes import camera_at, leaves, one_splat, random_splats
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
@@ -50,7 +51,7 @@ def collected(held):
 def after_a_step(splats, camera, degree, backend):
     state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
-    compute(state.optimizer, TrainView(camera, photograph()), degree, 0.2)
+    compute(state.optimizer, TrainView(camera, photograph()), StepOptions(degree, 0.2))
     return state, compute
 
 

@@ -8,6 +8,7 @@ from scenes import camera_at, joined, one_splat, random_splats
 from recon_cli.config.stages import RunConfig
 from recon_cli.io.images import fill_masked
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.state import new_state
@@ -35,7 +36,8 @@ def photograph(seed=0):
 def gradients_of(splats, view, backend, degree=3):
     """The loss and the gradients that a step leaves in the optimizer."""
     state = new_state(splats, CONFIG, 1.0, backend=backend)
-    loss, statistics = gradient_step(backend)(state.optimizer, view, degree, 0.2)
+    loss, statistics = gradient_step(backend)(
+        state.optimizer, view, StepOptions(degree, 0.2))
     held = state.optimizer.gradients.parameters().items()
     if not state.optimizer.fused:
         held = ((name, leaf.grad) for name, leaf in state.splats.parameters().items())

@@ -8,6 +8,7 @@ from interpreter import DEVICE
 from scenes import camera_at, random_splats
 
 from recon_cli.render import render
+from recon_cli.render.contract import StepOptions
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
@@ -29,12 +30,12 @@ def half():
     return np.random.default_rng(1).random((18, 24)) < 0.5
 
 
-def step(splats, view, **wanted):
+def step(splats, view, gain=None, **wanted):
     """The optimizer that a step leaves its gradients in, the step, loss and statistics."""
     optimizer = SplatOptimizer(
         splats.map(lambda tensor: tensor.clone().to(DEVICE)), CONFIG, 1.0, backend="triton")
     compute = gradient_step("triton", DEVICE)
-    loss, statistics = compute(optimizer, view, DEGREE, WEIGHT, **wanted)
+    loss, statistics = compute(optimizer, view, StepOptions(DEGREE, WEIGHT, **wanted), gain)
     return optimizer, compute, loss, statistics
 
 
@@ -62,7 +63,7 @@ def near(ours, theirs, tolerance=GRADIENT_TOLERANCE):
 def test_a_step_leaves_loss_gradients_and_statistics(mask, gain):
     view = TrainView(CAMERA, photograph(), mask)
     optimizer, compute, loss, statistics = step(
-        SEEN, view, gain=gain, variance=True, scores=True, loo=True)
+        SEEN, view, gain=gain, details=True, scores=True, loo=True)
     true_loss, leaves, true_gain, truth = exact(SEEN, view, gain)
     assert loss == pytest.approx(true_loss, abs=LOSS_TOLERANCE)
     for name, leaf in leaves.parameters().items():
