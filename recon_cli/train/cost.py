@@ -161,11 +161,9 @@ class _StepTimer(TrainCallback):
         self.marks = [clock()]
 
     def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
-        """Returns True: the device must be waited for."""
         return True
 
     def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
-        """Marks the time."""
         self.marks.append(self._clock())
         if self.marks[-1] >= self.marks[0] + self._seconds and len(self.marks) > 1 + _WARM:
             raise _Enough

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -164,14 +165,14 @@ def examine(scene: Candidate) -> Needs:
     elif config.images == "auto":
         settle("images", "denoised", "")
     settle("far", "on" if bench.far.share >= _FAR_SHARE else None,
-            f"points cover {100 * (1 - bench.far.share):.1f}% of what the views see")
+           f"points cover {100 * (1 - bench.far.share):.1f}% of what the views see")
     settle("exposure", "on" if bench.drift.drifts else None,
-            f"brightness of the same points differs by {100 * bench.drift.spread:.1f}% only")
+           f"brightness of the same points differs by {100 * bench.drift.spread:.1f}% only")
     task = scene.task
     error = None if task.camera_error is None else task.camera_error * task.train[0].camera.fx
     settle("poses", "on" if worth_a_trial(error) else None,
-            "the reprojection error is not known" if error is None
-            else f"the reprojection error is {error:.2f} px of a training image")
+           "the reprojection error is not known" if error is None
+           else f"the reprojection error is {error:.2f} px of a training image")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
     return Needs(config, tuple(decisions))
@@ -221,17 +222,14 @@ class _Bench:
         if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
             return config.sh_degree
         for low in (0, 1):
-            if not self._gains(config, low, decisions):
+            few = replace(config, sh_degree=low)
+            decisions.append(decide(
+                f"harmonics above degree {low}",
+                (partial(self._run, few), partial(self._run, config)),
+                threshold_db=_HARMONICS_DB))
+            if not decisions[-1].on:
                 return low
         return config.sh_degree
-
-    def _gains(self, config: RunConfig, low: int, decisions: list[TrialDecision]) -> bool:
-        """Tells whether all degrees are better than some, and adds the decision."""
-        few = replace(config, sh_degree=low)
-        decisions.append(decide(
-            f"harmonics above degree {low}", (lambda: self._run(few), lambda: self._run(config)),
-            threshold_db=_HARMONICS_DB))
-        return decisions[-1].on
 
     def _telling(self, part: str) -> list[int]:
         """Returns which held-out views can tell whether a part pays; the others only add noise."""

@@ -100,13 +100,11 @@ class _FusedStep:
 
     @property
     def log_gain_gradient(self) -> NDArray[np.float64]:
-        """Gradient [3] of the logarithm of the gain."""
         return self._compute.log_gain_gradient
 
     def camera_gradient(
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
     ) -> NDArray[np.float64]:
-        """Returns the gradient [6] of a turn and a move of the camera."""
         gradient: NDArray[np.float64] = load("recon_cli.render.numba.step.camera_gradient")(
             optimizer.splats, optimizer.gradients, camera, sh_degree)
         return gradient
@@ -115,7 +113,6 @@ class _FusedStep:
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
         gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
-        """Returns the loss and the statistics of the view."""
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera,
             TargetImage(view.image, view.mask, gain), options)
@@ -131,39 +128,33 @@ class _DeviceStep:
 
     @property
     def counted(self) -> Tensor:
-        """[1] int32, zero where the last view came to nothing."""
         return self._compute.counted
 
     @property
     def status(self) -> StepStatus:
-        """What the device records of each view."""
         return self._compute.status
 
     def camera_gradient(
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
     ) -> NDArray[np.float64]:
-        """Returns the gradient [6] of a turn and a move of the camera."""
         return camera_gradient(optimizer.splats, optimizer.gradients, camera, sh_degree)
 
     def start(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
         gain: NDArray[np.float32] | None = None,
     ) -> Statistics:
-        """Starts the work on one view and returns its statistics."""
         self._compute(
             optimizer.splats.map(lambda tensor: tensor.detach()), optimizer.gradients, view.camera,
             TargetImage(view.image, view.mask, gain), options)
         return self._compute.statistics
 
     def close(self) -> StepReport:
-        """Waits for the work, and tells what became of it."""
         return self._compute.close()
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
         gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
-        """Returns the loss and the statistics of the view."""
         while True:
             statistics = self.start(optimizer, view, options, gain)
             report = self.close()
@@ -184,7 +175,6 @@ class _AutogradStep:
     def camera_gradient(
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
     ) -> NDArray[np.float64]:
-        """Returns the gradient [6] of a turn and a move of the camera."""
         gradients = optimizer.splats.map(
             lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
         return camera_gradient(optimizer.splats, gradients, camera, sh_degree)
@@ -193,7 +183,6 @@ class _AutogradStep:
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
         gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
-        """Returns the loss and the statistics of the view."""
         splats = optimizer.splats
         device, counting = splats.means.device, view.counting(splats.means.device)
         output = render(

@@ -25,11 +25,16 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate, with_exchange
 from recon_cli.train.feature_trials import PARTS, Candidate, Needs, examine
 from recon_cli.train.initialize import first_state, restore_state
-from recon_cli.train.memory import gaussians_that_fit
 from recon_cli.train.schedule import RECIPES, Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
-from recon_cli.train.train_data import load_task, load_views, read_config, write_config
+from recon_cli.train.train_data import (
+    gaussians_that_fit,
+    load_task,
+    load_views,
+    read_config,
+    write_config,
+)
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import TrainPlan
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from recon_cli.config.stages import PruneConfig, RunConfig
+from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.evaluation.reference_views import load_scene
@@ -109,18 +109,12 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     start, epoch = begin(), task.schedule.epoch(len(task.train))
     steps = config.recovery
     if steps is None:
-        rest = restore_state(final, task).steps - start.steps if config.at == "mid" else 0
-        steps = _recovery_steps(config, train_config, epoch, rest)
+        # from the middle as many as the unpruned run took, which may have stopped early
+        steps = (restore_state(final, task).steps - start.steps if config.at == "mid"
+                 else max(train_config.iterations // _END_RECOVERY, _END_EPOCHS * epoch))
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
         config.rounds or rounds_within(steps, epoch), seconds_at(train / LOG, start.iteration))
-
-
-def _recovery_steps(config: PruneConfig, train: RunConfig, epoch: int, rest: int) -> int:
-    """Returns how many steps the recovery takes; `rest` are those of training from its middle."""
-    if config.at == "mid":  # as many as the unpruned run took, which may have stopped early
-        return rest
-    return max(train.iterations // _END_RECOVERY, _END_EPOCHS * epoch)
 
 
 class StoredPruneRun(PruneRun):

@@ -1,10 +1,12 @@
-"""The views that a run trains on, from disk, and the options that it was started with."""
+"""The views that a run trains on, the memory that it takes, and the options it was started with."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,13 +15,28 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, TrainingError
 from recon_cli.evaluation import reference_views
+from recon_cli.io.images import fit_camera
+from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.memory import check_memory, refuse_few_views
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import read_json, write_bytes
+
+logger = logging.getLogger("recon")
+
+# Memory is counted from what the code allocates and rounded up; `recon bench` measures a step.
+_FLOATS = 14  # of a Gaussian, its higher SH coefficients apart
+_LARGEST = 4  # numbers of the largest parameter, these apart: a quaternion
+# values, gradients and two moments, and a copy of the values while densification rebuilds them
+_COPIES = 4 + 1
+# a record, indices and the gradient sums of about six tiles
+_BUFFERS_PER_GAUSSIAN = 128 + 6 * 72
+_BUFFERS_PER_PIXEL = 96  # image, its gradient, three maps of the loss, transmittance
+_PROGRAM = 350 << 20  # Python, torch and the kernels
+_TORCH_FACTOR = 4  # autograd keeps what the fused kernels compute again
 
 
 def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
@@ -76,7 +93,122 @@ def read_config(folder: Path) -> RunConfig:
     names = {item.name for item in dataclasses.fields(RunConfig)}
     try:
         return RunConfig(**{name: value for name, value in values.items() if name in names})
-    except ConfigError as error:
+    except (ConfigError, AttributeError) as error:
         raise FormatError(
             f"{path} is of another version of recon: {error}",
             hint="Run `recon train --again`.") from error
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """The bytes that a run needs at its peak."""
+
+    images: int  # all views as uint8, and their masks
+    pixel_buffers: int  # of one step, for each pixel of a view
+    gaussians: int  # parameters, gradients, moments at the largest count
+    gaussian_buffers: int  # of one step, for each Gaussian
+    program: int  # everything else
+
+    @property
+    def total(self) -> int:
+        """Sum of all parts."""
+        return (self.images + self.pixel_buffers + self.gaussians + self.gaussian_buffers
+                + self.program)
+
+    def describe(self) -> str:
+        """Returns the estimate in words."""
+        buffers = self.pixel_buffers + self.gaussian_buffers
+        return (f"about {_megabytes(self.total)} (images {_megabytes(self.images)}, Gaussians "
+                f"{_megabytes(self.gaussians)}, buffers {_megabytes(buffers)})")
+
+
+def estimate_memory(
+    *, views: int, width: int, height: int, gaussians: int, fused: bool, sh_degree: int = 3,
+    masks: int = 0,
+) -> MemoryEstimate:
+    """Returns the memory that training takes.
+
+    Of views and masks held in memory, the size in pixels of the largest. `fused`: the backend
+    computes gradients without autograd.
+    """
+    pixels = width * height
+    rest = 3 * TERMS[sh_degree]
+    # and of one moment of one parameter at a time
+    per_gaussian = 4 * (_COPIES * (_FLOATS + rest) + max(_LARGEST, rest))
+    factor = 1 if fused else _TORCH_FACTOR
+    return MemoryEstimate(
+        images=pixels * (3 * views + masks), pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
+        gaussians=gaussians * per_gaussian,
+        gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM)
+
+
+def gaussians_within(one: MemoryEstimate, free: int) -> int:
+    """Returns the most Gaussians that fit into `free` bytes; 0 where not even the rest does.
+
+    `one` is an estimate with a single Gaussian.
+    """
+    each = one.gaussians + one.gaussian_buffers
+    return max(0, (free - one.total + each) // each)
+
+
+def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
+    """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes."""
+    if needed.total <= free:
+        return
+    by_size = needed.images + needed.pixel_buffers
+    by_count = needed.gaussians + needed.gaussian_buffers
+    lower = "--max-size" if by_size > by_count else "--max-gaussians"
+    raise TrainingError(
+        f"Training needs {needed.describe()}, but {_megabytes(free)} are free.",
+        hint=f"Lower {lower}, or close other programs.")
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 1e6:,.0f} MB"
+
+
+def gaussians_that_fit(scene: Scene, config: RunConfig, ctx: StageContext) -> int:
+    """Returns how many Gaussians memory has room for, before the images are loaded.
+
+    Raises:
+        TrainingError: fewer than two views are left to train on.
+    """
+    refuse_few_views(scene)
+    return gaussians_within(_memory(scene, config, ctx, gaussians=1), _free_bytes(ctx))
+
+
+def refuse_few_views(scene: Scene) -> None:
+    """Raises TrainingError unless there are two views to train on."""
+    if len(scene.train) < 2:
+        raise TrainingError(
+            f"{len(scene.train)} views are left to train on; at least 2 are needed.",
+            hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
+
+
+def _memory(
+    scene: Scene, config: RunConfig, ctx: StageContext, *, gaussians: int
+) -> MemoryEstimate:
+    views = (*scene.train, *scene.validation)
+    width, height = reference_views.sizes_of(
+        [fit_camera(view.camera, config.max_size) for view in views])[0]
+    return estimate_memory(
+        views=len(views), width=width, height=height, gaussians=gaussians,
+        fused=ctx.backend == "numba", sh_degree=config.sh_degree,
+        masks=sum(view.mask is not None for view in views))
+
+
+def _free_bytes(ctx: StageContext) -> int:
+    return (torch.cuda.mem_get_info()[0] if ctx.device == "cuda"
+            else free_memory_bytes() // ctx.ranks.local)
+
+
+def check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
+    """Says what the run will take, and refuses what does not fit.
+
+    Raises:
+        TrainingError: there is not enough memory.
+    """
+    needed = _memory(scene, config, ctx, gaussians=config.max_gaussians)
+    free = _free_bytes(ctx)
+    logger.info("training takes %s at most; %.0f MB are free", needed.describe(), free / 1e6)
+    refuse_what_does_not_fit(needed, free)

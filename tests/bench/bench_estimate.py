@@ -23,9 +23,8 @@ from recon_cli.render import registry
 from recon_cli.stages import train
 from recon_cli.train import plan
 from recon_cli.train.cost import calibrate
-from recon_cli.train.memory import gaussians_that_fit
 from recon_cli.train.runner import Segment, run_fit
-from recon_cli.train.train_data import load_task
+from recon_cli.train.train_data import gaussians_that_fit, load_task
 
 CLOCKS = {"cpu": time.process_time, "wall": time.perf_counter}
 

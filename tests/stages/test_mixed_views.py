@@ -15,7 +15,7 @@ from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image
 from recon_cli.stages import evaluate, prune, train
 from recon_cli.train import memory, train_data
-from recon_cli.train.memory import estimate
+from recon_cli.train.train_data import estimate_memory
 
 CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05)
@@ -90,7 +90,7 @@ def test_the_largest_view_decides_the_memory_and_masks_are_counted(tmp_path, mon
 
     def recorded(**values):
         asked.append(values)
-        return estimate(**values)
+        return estimate_memory(**values)
 
     monkeypatch.setattr(memory, "estimate", recorded)
     inputs = make_inputs(tmp_path, TWO[::-1])  # the smaller one comes first

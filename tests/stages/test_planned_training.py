@@ -14,10 +14,10 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.stages import prune, train
-from recon_cli.train import fit, memory, runner
+from recon_cli.train import fit, runner, train_data
 from recon_cli.train import plan as planning
-from recon_cli.train.memory import estimate
 from recon_cli.train.state import save_state
+from recon_cli.train.train_data import estimate_memory
 
 CONTEXT = StageContext(backend="numba")
 OPEN = TrainConfig(minutes=0.02, densify_every=10, checkpoint_every=30)
@@ -101,8 +101,8 @@ def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monke
 
 
 def test_memory_that_is_short_lowers_the_cap_and_says_so(inputs, tmp_path, monkeypatch, caplog):
-    needed = estimate(views=9, width=48, height=36, gaussians=5500, fused=True)
-    monkeypatch.setattr(memory, "free_memory_bytes", lambda: needed.total)
+    needed = estimate_memory(views=9, width=48, height=36, gaussians=5500, fused=True)
+    monkeypatch.setattr(train_data, "free_memory_bytes", lambda: needed.total)
     monkeypatch.setattr(planning, "useful_cap", lambda *_: 9000)
     summary = run(TrainConfig(iterations=2), inputs, tmp_path / "out")
     assert summary.max_gaussians == pytest.approx(5500, abs=10)

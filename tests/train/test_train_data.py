@@ -1,12 +1,18 @@
-"""The options that a run was started with, as a later version reads them."""
+"""The options of a run as a later version reads them, and the memory that it will take."""
 
 import json
 
 import pytest
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.errors import FormatError
-from recon_cli.train.train_data import read_config, write_config
+from recon_cli.errors import FormatError, TrainingError
+from recon_cli.train.train_data import (
+    estimate_memory,
+    gaussians_within,
+    read_config,
+    refuse_what_does_not_fit,
+    write_config,
+)
 
 
 def rewrite(folder, **values):
@@ -25,3 +31,51 @@ def test_a_value_that_is_no_longer_known_is_refused_with_the_way_out(tmp_path):
     with pytest.raises(FormatError, match="densify is 'mcmc'") as caught:
         read_config(tmp_path)
     assert "recon train --again" in caught.value.hint
+
+
+def needed(**changes):
+    values = {"views": 100, "width": 640, "height": 360, "gaussians": 100_000, "fused": True}
+    return estimate_memory(**(values | changes))
+
+
+def test_images_are_counted_as_bytes():
+    assert needed(gaussians=0).images == 100 * 640 * 360 * 3
+
+
+def test_a_mask_is_a_byte_a_pixel():
+    assert needed(masks=7).images - needed().images == 7 * 640 * 360
+
+
+def test_a_gaussian_takes_at_most_one_and_a_half_kilobytes():
+    assert needed().gaussians <= 1500 * 100_000
+
+
+def test_a_gaussian_without_higher_harmonics_takes_a_quarter():
+    # 14 of 59 numbers and the copy of a quaternion instead of 45 coefficients
+    assert needed(sh_degree=0).gaussians == 100_000 * 4 * (5 * 14 + 4)
+    assert needed(sh_degree=3).gaussians == 100_000 * 4 * (5 * 59 + 45)
+
+
+def test_what_fits_is_not_refused():
+    refuse_what_does_not_fit(needed(), needed().total)
+
+
+@pytest.mark.parametrize(("changes", "option"), [
+    ({"gaussians": 50_000_000}, "--max-gaussians"),
+    ({"views": 3000, "width": 4000, "height": 3000}, "--max-size"),
+    ({"views": 2, "width": 16_000, "height": 12_000}, "--max-size"),
+])
+def test_the_error_says_what_to_lower(changes, option):
+    with pytest.raises(TrainingError, match="MB are free") as caught:
+        refuse_what_does_not_fit(needed(**changes), 8_000_000_000)
+    assert option in caught.value.hint
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_as_many_gaussians_fit_as_there_is_room_for_and_no_more(fused):
+    one, free = needed(gaussians=1, fused=fused), 1_500_000_000
+    most = gaussians_within(one, free)
+    refuse_what_does_not_fit(needed(gaussians=most, fused=fused), free)
+    with pytest.raises(TrainingError):
+        refuse_what_does_not_fit(needed(gaussians=most + 1, fused=fused), free)
+    assert gaussians_within(one, 1000) == 0

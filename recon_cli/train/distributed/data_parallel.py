@@ -97,12 +97,10 @@ class _Leader(TrainCallback):
         self.between_steps = False  # the others wait for a word
 
     def start_step(self) -> None:
-        """Has all processes take the next step."""
         self._task.ranks.broadcast_int(self._state.iteration)
         self.between_steps = False
 
     def on_step(self, iteration: int, splats: Splats) -> None:
-        """Calls the callbacks and starts the next step."""
         self.between_steps = True
         if self._task.schedule.densifies(iteration):
             _say_and_compare(self._state, self._task.ranks)
@@ -112,14 +110,12 @@ class _Leader(TrainCallback):
             self.start_step()
 
     def on_report(self, report: TrainReport) -> None:
-        """Compares the processes and calls the callbacks."""
         self.between_steps = True
         _say_and_compare(self._state, self._task.ranks)
         for callback in self._callbacks:
             callback.on_report(report)
 
     def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
-        """Returns True: the others wait after every step."""
         return True
 
 
