@@ -40,22 +40,18 @@ class Outcome:
     ran: bool
 
 
-def _ignore(_outcome: Outcome) -> None:
-    """Reports to nobody."""
-
-
 @dataclass(frozen=True)
 class Job:
-    """Where to work and on what terms."""
+    """A workspace, and the settings and devices to work with."""
 
-    workspace: Workspace  # holds the results
+    workspace: Workspace
     settings: Settings = field(default_factory=dict)  # what recon.toml, --config and --set set
     # device, backend and threads as typed
     compute: ComputeConfig = field(default_factory=ComputeConfig)
     progress: Progress = field(default_factory=NullProgress)  # opens progress bars
     # called with every stage that was run or is up to date
-    report: Callable[[Outcome], None] = _ignore
-    table: Sequence[Stage] = STAGES  # the stages
+    report: Callable[[Outcome], None] = lambda _outcome: None
+    table: Sequence[Stage] = STAGES
     # called while Gaussians are trained; they do not affect the result
     callbacks: tuple[TrainCallback, ...] = ()
     ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads

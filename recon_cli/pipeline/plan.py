@@ -213,7 +213,7 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
 
 
 def _run_if_needed(job: Job, row: Stage) -> Iterator[Outcome]:
-    """Runs a stage that nobody asked for, with the options it had, unless it is fresh by now."""
+    """Runs a stage that a target needs, with the options it had, unless it is fresh by now."""
     checks = job.inspect()
     check = checks.check(row.name)
     if not check.fresh:

@@ -28,8 +28,8 @@ class Lens:
     """Known intrinsics of an image that may be distorted."""
 
     model: str  # one of `MODELS`
-    width: int  # image width in pixels
-    height: int  # image height in pixels
+    width: int  # pixels
+    height: int
     # in COLMAP's order: focal lengths and principal point in pixels (the centre of the first pixel
     # lies at 0.5), then distortion coefficients without a unit
     params: tuple[float, ...]
@@ -58,12 +58,12 @@ class Lens:
 class Camera:
     """A pinhole camera at a place."""
 
-    width: int  # image width in pixels
-    height: int  # image height in pixels
-    fx: float  # focal length in pixels along x
-    fy: float  # focal length in pixels along y
+    width: int  # pixels
+    height: int
+    fx: float  # focal lengths in pixels
+    fy: float
     cx: float  # principal point in pixels; the centre of the first pixel lies at 0.5
-    cy: float  # principal point in pixels
+    cy: float
     viewmat: NDArray[np.float64]  # [4, 4] float64, world to camera; x right, y down, z forward
 
     def __post_init__(self) -> None:
@@ -80,10 +80,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Returns the camera of the same view resampled to width x height pixels."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height,
-            fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy,
-        )
+        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
+                       cx=self.cx * sx, cy=self.cy * sy)
 
 
 def looking_at(

@@ -15,23 +15,15 @@ _ROUNDING = 1e-4  # of a matrix in float32 or in decimals that somebody wrote
 _ORTHOGONAL = 1e-6  # what is off by more is no rotation; a product of ten rotations is off by 1e-15
 
 
-def _no_rotation() -> NDArray[np.float64]:
-    return np.eye(3)
-
-
-def _no_translation() -> NDArray[np.float64]:
-    return np.zeros(3)
-
-
 @dataclass(frozen=True, eq=False)
 class Similarity:
     """Takes old world coordinates to new ones: x' = scale * rotation @ x + translation."""
 
     scale: float = 1.0  # new units in one old unit, above 0
     # [3, 3] float64, from old to new axes
-    rotation: NDArray[np.float64] = field(default_factory=_no_rotation)
+    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     # [3] float64, the old origin in new coordinates
-    translation: NDArray[np.float64] = field(default_factory=_no_translation)
+    translation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.scale) and self.scale > 0):

@@ -83,11 +83,6 @@ def _frame(config: DenoiseConfig, source: Path, target: Path) -> _Outcome:
             noise = max(sigma, config.threshold)
             write_png(target, FILTERS[config.filter](rgb, noise, config.strength))
         else:
-            _copy(source, target)
+            with atomic.replacing(target) as temporary:  # with a link, editing one changes both
+                shutil.copyfile(source, temporary)
     return _Outcome(source.name, sigma, filtered)
-
-
-def _copy(source: Path, target: Path) -> None:
-    """Copies a file byte by byte; with a hard link, editing one would change the other."""
-    with atomic.replacing(target) as temporary:
-        shutil.copyfile(source, temporary)

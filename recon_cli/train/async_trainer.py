@@ -1,9 +1,8 @@
 """Steps that the host starts on a device without waiting for the one before to end.
 
-Host and device meet where something must be decided: at each densification, each report, and
-whenever somebody wants to see the state. What went wrong in between the device has written down:
-a loss that was not finite moved nothing, and a step that its buffers had no room for stopped it and
-all that follow. Those are taken back here and taken again.
+They synchronize at each densification, each report, and whenever a callback reads the state. The
+device records failures in between: a loss that was not finite moved nothing, and a step without
+room in the buffers stopped itself and all that follow. Those are rolled back and taken again.
 """
 
 from __future__ import annotations
@@ -136,7 +135,7 @@ class _Batch:
     def add(
         self, state: TrainState, statistics: Statistics | None, camera: Camera, *, moves_sh: bool
     ) -> None:
-        """Takes what one view left; `statistics` are None where nobody gathers them."""
+        """Adds one view; `statistics` are None where densification needs none."""
         several = self._views > 1
         if statistics is not None:
             gathered = self._gathered if several else state.gathered

@@ -183,7 +183,7 @@ class Strategy:
 
 
 def replace_splats(state: TrainState, splats: Splats, source: Tensor) -> None:
-    """Goes on with other Gaussians; `source` as in `SplatOptimizer.replace`.
+    """Replaces the Gaussians of a run; `source` as in `SplatOptimizer.replace`.
 
     Raises:
         TrainingError: none is left.

@@ -63,7 +63,7 @@ class Exposure:
         return self._rows.tensors(_PREFIX)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Takes back what `tensors` returned."""
+        """Restores what `tensors` returned."""
         self._rows.restore(_PREFIX, tensors)
 
 

@@ -58,7 +58,7 @@ class Importance:
         return self.weighs or self.leaves_out
 
     def add(self, statistics: Statistics) -> None:
-        """Adds what one view's passes found, as far as it is gathered."""
+        """Adds the statistics of one view, as far as they are gathered."""
         self.views += 1
         if self.weighs:
             self.hits += statistics.hits
@@ -68,7 +68,7 @@ class Importance:
             self.loo += statistics.loo
 
     def over(self, ranks: ProcessGroup) -> None:
-        """Takes together what the processes found that train together."""
+        """Reduces the sums over the processes that train together."""
         views = torch.tensor([self.views])
         ranks.add([views, self.hits, self.blend_sum, self.loo])
         ranks.all_reduce_max(self.blend_max)

@@ -195,7 +195,7 @@ class SplatOptimizer:
 
     @torch.no_grad()
     def replace(self, splats: Splats, source: Tensor) -> None:
-        """Goes on with other Gaussians.
+        """Replaces the Gaussians.
 
         Args:
             splats: the new Gaussians, N of them, of any degree; views of this optimizer's own only
@@ -291,7 +291,7 @@ class SparseAdam:
         return {f"{prefix}.{role}": self._tensor(role) for role in _ROW_ROLES}
 
     def restore(self, prefix: str, tensors: dict[str, Tensor]) -> None:
-        """Takes back what `tensors` returned.
+        """Restores what `tensors` returned.
 
         Raises:
             KeyError: one is missing.

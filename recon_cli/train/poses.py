@@ -89,7 +89,7 @@ class Poses:
         return self._rows.tensors(_PREFIX)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Takes back what `tensors` returned."""
+        """Restores what `tensors` returned."""
         self._rows.restore(_PREFIX, tensors)
 
 

@@ -75,7 +75,7 @@ def survivors(score: Tensor, count: int) -> Tensor:
 
 
 def remove(state: TrainState, rows: Tensor) -> None:
-    """Goes on with the Gaussians at `rows` alone; they keep their moments."""
+    """Keeps only the Gaussians at `rows`, with their moments."""
     replace_splats(state, state.splats.select(rows), rows)
 
 

@@ -32,7 +32,7 @@ _VERSION = 5
 
 @dataclass(eq=False)
 class DensificationStats:
-    """How the loss pulled at each Gaussian since the last densification."""
+    """Gradient statistics of each Gaussian since the last densification."""
 
     # [N] sum over steps of the length of the projected mean's gradient, in normalised device
     # coordinates
@@ -45,11 +45,11 @@ class DensificationStats:
 
     @staticmethod
     def zeros(n: int, device: torch.device) -> DensificationStats:
-        """Returns a record of nothing for n Gaussians."""
+        """Returns the statistics of n Gaussians before any step."""
         return DensificationStats(*(torch.zeros(n, device=device) for _ in range(4)))
 
     def add(self, statistics: Statistics, width: int, height: int) -> None:
-        """Adds what one backward pass over an image of width x height found."""
+        """Adds the statistics of a backward pass over an image of width x height."""
         # numbers and not a tensor of them: a copy to a GPU would wait for it
         across, down = statistics.means2d_grad.unbind(-1)
         self.pull += torch.stack((across * (width / 2), down * (height / 2)), -1).norm(dim=-1)
@@ -58,7 +58,7 @@ class DensificationStats:
         self.variance += statistics.variance
 
     def over(self, ranks: ProcessGroup) -> None:
-        """Takes together what the processes found that train together."""
+        """Reduces the statistics over the processes that train together."""
         ranks.add([self.pull, self.count, self.variance])
         ranks.all_reduce_max(self.radius)
 
@@ -67,7 +67,7 @@ class DensificationStats:
         return DensificationStats(*(value * factor for value in vars(self).values()))
 
     def join(self, other: DensificationStats) -> None:
-        """Adds what was found elsewhere."""
+        """Adds the statistics of other views."""
         self.pull += other.pull
         self.count += other.count
         self.radius = torch.maximum(self.radius, other.radius)

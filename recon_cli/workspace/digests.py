@@ -24,7 +24,7 @@ class FileDigest:
 
 @dataclass(frozen=True)
 class Source:
-    """One file or folder that the user handed in."""
+    """One file or folder of the user's."""
 
     path: str  # absolute
     # digests by path relative to the folder; a single file goes by its name

@@ -1,7 +1,7 @@
 """Typed records between stages: what a stage returns, and the JSON files that others read.
 
-A stage builds its record, the pipeline stores `to_json()` as `summary` in its manifest, and whoever
-reads the result of another stage reads the same type by `from_json`. Fields are the JSON keys, in
+A stage builds its record, the pipeline stores `to_json()` as `summary` in its manifest, and a stage
+that reads the result of another reads the same type by `from_json`. Fields are the JSON keys, in
 their order. A field whose default is None is left out of the JSON while it is None; every other
 field is always written.
 """
