@@ -46,11 +46,9 @@ class Job:
 
     workspace: Workspace
     settings: Settings = field(default_factory=dict)  # what recon.toml, --config and --set set
-    # device, backend and threads as typed
-    compute: ComputeConfig = field(default_factory=ComputeConfig)
+    compute: ComputeConfig = field(default_factory=ComputeConfig)  # as typed
     progress: Progress = field(default_factory=NullProgress)  # opens progress bars
-    # called with every stage that was run or is up to date
-    report: Callable[[Outcome], None] = lambda _outcome: None
+    report: Callable[[Outcome], None] = lambda _outcome: None  # gets each stage
     table: Sequence[Stage] = STAGES
     # called while Gaussians are trained; they do not affect the result
     callbacks: tuple[TrainCallback, ...] = ()

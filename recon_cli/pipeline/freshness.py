@@ -37,8 +37,7 @@ class StageCheck:
 
     row: Stage  # the stage
     manifest: Manifest | None  # of the finished result; None where there is none
-    # why the result is stale, in words; empty where it is fresh or missing
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()  # why the result is stale; empty where it is fresh or missing
     gone: tuple[str, ...] = ()  # inputs that no longer exist; that alone makes nothing stale
     partial_run: PartialRun | None = None  # an interrupted run that the next one would resume
 

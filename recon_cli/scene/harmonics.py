@@ -50,12 +50,7 @@ def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
     With M of degree l and Y its row of basis functions, Y(R d) (M c) = Y(d) c for every direction
     d and every c: what was seen along d is seen along R d. M solves that in the least squares over
     fixed directions, and because Y(R d) spans the same functions as Y(d), without a residual.
-
-    Args:
-        rotation: [3, 3] R, from old to new axes.
-
-    Returns:
-        [3, 3], [5, 5] and [7, 7], float64; orthogonal.
+    `rotation` is R [3, 3], from old to new axes. The results are orthogonal, float64.
     """
     directions = _lattice(_DIRECTIONS)
     turned = directions @ torch.from_numpy(np.asarray(rotation, np.float64)).T
@@ -86,19 +81,16 @@ def generators() -> Tensor:
     for axis in torch.eye(3, dtype=torch.float64):
         turn = torch.linalg.cross(axis.expand_as(directions), directions.detach())
         solved = torch.linalg.lstsq(basis.detach(), -(slopes * turn).sum(dim=2).T).solution
-        matrices.append(solved.sign() * (4 * solved.square()).round().sqrt() / 2)
+        # + 0.0 takes the sign of zeros away, which is that of the rounding errors
+        matrices.append(solved.sign() * (4 * solved.square()).round().sqrt() / 2 + 0.0)
     return torch.stack(matrices)
 
 
 def rotate_sh(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
     """Returns the coefficients of the same colours in turned axes.
 
-    Args:
-        sh_rest: [M, T, 3] coefficients of degrees 1 and up, T one of 0, 3, 8, 15.
-        rotation: [3, 3] from old to new axes.
-
-    Returns:
-        [M, T, 3] of the same dtype and device; computed in float64.
+    `sh_rest` [M, T, 3] are those of degrees 1 and up, T one of 0, 3, 8, 15; `rotation` [3, 3] leads
+    from old to new axes. Computed in float64, returned in the dtype of `sh_rest`.
     """
     turned, start = torch.empty_like(sh_rest), 0
     for block in rotation_blocks(rotation):

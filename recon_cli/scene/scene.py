@@ -24,8 +24,7 @@ class View:
     camera: Camera  # pinhole camera at the size of the undistorted image
     original: Path  # the undistorted image; scores are against these pixels
     denoised: Path  # the undistorted denoised twin; equal to `original` where nothing was denoised
-    # the undistorted mask, 255 where a pixel counts; None where all of them do
-    mask: Path | None = None
+    mask: Path | None = None  # undistorted, 255 where a pixel counts; None where all do
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,8 @@ class Similarity:
     """Takes old world coordinates to new ones: x' = scale * rotation @ x + translation."""
 
     scale: float = 1.0  # new units in one old unit, above 0
-    # [3, 3] float64, from old to new axes
-    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
-    # [3] float64, the old origin in new coordinates
-    translation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))  # [3, 3]
+    translation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))  # [3]
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.scale) and self.scale > 0):

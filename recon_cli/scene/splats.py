@@ -1,4 +1,4 @@
-"""Gaussians in another world frame."""
+"""Gaussians as raw parameters: selected, joined, and moved to another world frame."""
 
 from __future__ import annotations
 
@@ -128,9 +128,7 @@ def with_rows(sh_rest: Tensor, rows: int) -> Tensor:
 def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
     """Returns the Gaussians of all parts, those with coefficients first, and their order.
 
-    Returns:
-        The Gaussians, and for each its row [N] in the plain concatenation of the parts. Where all
-        Gaussians have coefficients, or none has, that is their order.
+    The order is the row [N] of each in the plain concatenation of the parts.
 
     Raises:
         ValueError: the parts are of different degrees.
@@ -150,11 +148,8 @@ def transformed(splats: Splats, similarity: Similarity) -> Splats:
     """Returns the same Gaussians in the new world: a moved camera sees the same image.
 
     Computed in float64. Parameters that the similarity leaves alone keep their bits: a change of
-    scale touches neither rotations nor colours.
-
-    Returns:
-        Gaussians of the same dtype and device. Quaternions keep their length, except zeros, which
-        stand for no rotation and become unit quaternions.
+    scale touches neither rotations nor colours. Quaternions keep their length, except zeros, which
+    stand for no rotation and become unit quaternions.
     """
     device = splats.means.device
     rotation = torch.from_numpy(np.asarray(similarity.rotation, np.float64)).to(device)

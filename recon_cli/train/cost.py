@@ -116,7 +116,8 @@ def calibrate(
     `scratch` is a file for a checkpoint, which is deleted again.
     """
     start = clock()
-    wanted = sorted({1, *_levels(task.schedule)}, reverse=True)
+    factors = {factor for _, factor in task.schedule.recipe.levels}
+    wanted = sorted({1, *factors}, reverse=True)
     probe = _Probe(task, points, colors, clock, each=seconds / (2 * len(wanted)))
     late = start + 2 * seconds
     levels: list[LevelCost] = []
@@ -128,10 +129,6 @@ def calibrate(
     report = probe.report() if clock() < late else _guess_report(levels[-1], task)
     save_ms = probe.save_ms(scratch)
     return CostModel(tuple(reversed(levels)), report, save_ms, clock() - start)
-
-
-def _levels(schedule: Schedule) -> set[int]:
-    return {factor for _, factor in schedule.recipe.levels}
 
 
 def _scale_cost(cost: LevelCost, level: int) -> LevelCost:

@@ -133,7 +133,7 @@ class Needs:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A scene as gates look at it."""
+    """A scene for which the parts of the model are chosen."""
 
     task: Task  # views at the training size, and the plan
     points: NDArray[np.float64]  # [P, 3] sparse points in world units

@@ -135,10 +135,7 @@ class PruneRun:
 
 
 def prune_loop(run: PruneRun, target: int) -> None:
-    """Removes all but `target` Gaussians round by round and trains to the end of the run.
-
-    A run that did some of the rounds before goes on with the next one.
-    """
+    """Removes all but `target` Gaussians in the rounds that are left, and trains to the end."""
     n = run.count_before
     plan = plan_removals(n, min(n, target), run.rounds, run.until - run.first)
     for removal in plan[run.removals_done:]:
