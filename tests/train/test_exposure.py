@@ -15,7 +15,7 @@ from recon_cli.train.exposure import Exposure
 from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.state import new_state
 
-# Gradients of float32 against float64, relative in the 2-norm, as in test_step.
+# Gradients of float32 against float64, relative in the 2-norm, as in test_gradient.
 TOLERANCE = 1e-5
 CONFIG = TrainConfig(iterations=10, max_gaussians=300)
 CAMERA = camera_at(60, 41)
