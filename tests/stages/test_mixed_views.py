@@ -14,7 +14,7 @@ from recon_cli.evaluation import reference_views
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import memory, train_data
+from recon_cli.train import train_data
 from recon_cli.train.train_data import estimate_memory
 
 CONFIG = RunConfig(
@@ -92,7 +92,7 @@ def test_the_largest_view_decides_the_memory_and_masks_are_counted(tmp_path, mon
         asked.append(values)
         return estimate_memory(**values)
 
-    monkeypatch.setattr(memory, "estimate", recorded)
+    monkeypatch.setattr(train_data, "estimate_memory", recorded)
     inputs = make_inputs(tmp_path, TWO[::-1])  # the smaller one comes first
     write_masks(inputs, {"000001.png": np.ones((44, 30), bool)})
     scene = reference_views.load_scene(inputs, validation=0.1)
