@@ -92,6 +92,9 @@ class SfmConfig(StageConfig):
         minimum=0.0, maximum=1.0)
     accept_weak: bool = option(
         False, "Continue even if parts of the model are weakly connected.", hashed=False)
+    partial: bool = option(
+        True, "Keep the largest part of a broken model that can be trusted on its own, if it has "
+        "--min-registered of the images.", hashed=False)
     seed: int = option(0, "Random seed of the mapper.", minimum=0)
     gravity: str = option(
         "auto", "Turn the world so that z is up and the floor is at 0, if cameras and points show "

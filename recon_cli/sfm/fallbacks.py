@@ -22,6 +22,7 @@ from recon_cli.errors import SfmError
 from recon_cli.sfm import checks, database, mapper, matching, merge_models
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, StepLog, fresh_folder, publish
 from recon_cli.sfm.merge_models import ModelCandidate
+from recon_cli.sfm.trusted_part import keep_trusted_part
 from recon_cli.sfm.verdict import check_weak_link, examine
 from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace import atomic
@@ -219,17 +220,25 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
     assert chosen is not None  # three frames at least are registered
     folder = job.attempts / chosen.name / "model"
     model = pycolmap.Reconstruction(folder)
+    verdict = examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
+    part = keep_trusted_part(job, model, verdict)
+    if part is not None:
+        model, verdict = part.candidate.model, part.candidate.verdict
+        model.write(folder)
     described = mapper.describe_model(model)
     checks.check_parallax(described["median_triangulation_angle_deg"])
-    verdict = examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
     check_weak_link(verdict, job.accept_weak)
     atomic.write_json(job.out / VERDICT, verdict.to_json())
     publish(folder, job.model)
     shutil.rmtree(job.attempts)
     return {
         **described, "poses": None,
-        "models": chosen.models, "apart": [list(part) for part in chosen.apart],
-        "rejected": chosen.rejected, "verdict": verdict.to_json(), "lines": verdict.lines(),
+        "models": [len(described["registered"]), *chosen.models[1:]],
+        "apart": [list(names) for names in chosen.apart],
+        "left_out": [] if part is None else list(part.left_out),
+        "rejected": {**chosen.rejected, **({} if part is None else part.candidate.rejected)},
+        "verdict": verdict.to_json(),
+        "lines": [*([] if part is None else [part.sentence]), *verdict.lines()],
         "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}
 
 

@@ -25,6 +25,7 @@ from recon_cli.workspace import atomic
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 POLL_SECONDS = 0.25  # between looks at what native code has done
+CLIP_SECONDS = 1e6  # from the start of a clip to that of the next, in the times of a job
 LOG_FILE = "steps.json"  # in the stage's folder: the finished steps
 STEPS = ("features", "matches", "model", "sparse", "undistorted")
 
@@ -58,6 +59,7 @@ class MappingJob:
     max_features: int
     min_registered: float
     accept_weak: bool
+    partial: bool
     gravity: bool
     scale_between: tuple[str, str, float] | None
     max_minutes: float

@@ -93,6 +93,9 @@ def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) ->
     options.refine_principal_point = True
     options.print_summary = False
     options.ceres.solver_options.num_threads = THREADS
+    # Taking images out of a model leaves points with a single ray, which COLMAP cannot adjust.
+    for number in [number for number, point in model.points3D.items() if point.track.length() < 2]:
+        model.delete_point3D(number)
     fixed = {*constant, *_rare_cameras(model)}
     if fixed:
         _adjust_some(model, options, fixed)

@@ -53,19 +53,19 @@ def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> Mo
         return None
     largest, *others = sorted(models, key=mapper.model_size, reverse=True)
     mapper.adjust(largest)
-    best = _drop_outliers(job, largest)
+    best = drop_outliers(job, largest)
     for other in others:
         joined = merge(job, best.model, other)
         if joined is None:
             continue
-        merged = _drop_outliers(job, joined)
+        merged = drop_outliers(job, joined)
         larger = merged.model.num_reg_images() > best.model.num_reg_images()
         if larger and (merged.verdict.trusted or not best.verdict.trusted):
             best = merged
     return ModelCandidate(best.model, best.verdict, _list_apart(best, others), best.rejected)
 
 
-def _drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandidate:
+def drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandidate:
     """Takes the images that the verdict suspects out of a model and adjusts the rest."""
     first = _examine(job, model)
     wrong = {

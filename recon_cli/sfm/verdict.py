@@ -175,6 +175,16 @@ def examine(
                   *describe_shifted_centres(model, database)))
 
 
+def is_broken(cut: WeakestCut) -> bool:
+    """Returns whether too few matches across a cut agree with the cameras."""
+    return cut.share is not None and cut.share < MIN_AGREEING
+
+
+def is_aliased(aliasing: VisualAliasing) -> bool:
+    """Returns whether two groups of cameras show too little of what both should show."""
+    return aliasing.share is not None and aliasing.share < visual_aliasing.MIN_OVERLAP
+
+
 def check_weak_link(verdict: ModelVerdict, accept: bool) -> None:
     """Raises SfmError for a model that is put together wrongly, unless `accept` (--accept-weak)."""
     sentences = [*_describe_break(verdict.weakest_cut), *_describe_aliasing(verdict.aliasing)]
@@ -209,7 +219,7 @@ def _describe_problems(
 
 
 def _describe_break(cut: WeakestCut) -> list[str]:
-    if cut.share is None or cut.share >= MIN_AGREEING:
+    if not is_broken(cut):
         return []
     return [
         f"The model is broken: only {cut.share:.0%} of the {cut.matches} matches between "
@@ -217,7 +227,7 @@ def _describe_break(cut: WeakestCut) -> list[str]:
 
 
 def _describe_aliasing(aliasing: VisualAliasing) -> list[str]:
-    if aliasing.share is None or aliasing.share >= visual_aliasing.MIN_OVERLAP:
+    if not is_aliased(aliasing):
         return []
     return [
         f"{_sides(aliasing.sides)} should see the same surfaces, but only {aliasing.share:.0%} of "

@@ -17,10 +17,8 @@ from recon_cli.io import records as store
 from recon_cli.io.records import POSES, FrameList, read_poses
 from recon_cli.sfm import process
 from recon_cli.sfm.align_world import parse_place
-from recon_cli.sfm.job import CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
-
-APART = 1e6  # seconds from clip to clip: the camera may have gone anywhere meanwhile
 
 
 def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> SfmSummary:
@@ -49,6 +47,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         max_features=config.max_features,
         min_registered=config.min_registered,
         accept_weak=config.accept_weak,
+        partial=config.partial,
         gravity=config.gravity == "auto",
         scale_between=config.scale_between,
         max_minutes=config.max_minutes,
@@ -77,7 +76,7 @@ def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:
 
 def _times(frames: FrameList) -> dict[str, float]:
     """Returns the seconds of video frames; one clip follows another after a gap of any length."""
-    return {frame.name: frame.time_seconds + APART * frame.group for frame in frames.frames
+    return {frame.name: frame.time_seconds + CLIP_SECONDS * frame.group for frame in frames.frames
             if frame.time_seconds is not None}
 
 

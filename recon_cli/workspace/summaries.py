@@ -211,6 +211,7 @@ class SfmSummary(JsonRecord):
     unregistered_held_out: tuple[str, ...]  # those of them that are held out
     world: WorldSummary
     cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
+    left_out: tuple[str, ...] = ()  # names of the frames whose part of the model is not trusted
 
     @property
     def trusted(self) -> bool | None:

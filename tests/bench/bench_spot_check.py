@@ -52,7 +52,7 @@ def main(workspace: Path) -> None:
         job = MappingJob(
             frames=ingest / FOLDER, denoised=ingest / FOLDER, out=Path(out), groups=groups,
             masks=None, poses=ingest / POSES, pose_use="keep", given_points=True, pairs="auto",
-            max_features=3000, min_registered=0.5, accept_weak=False, gravity=True,
+            max_features=3000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
             scale_between=None, max_minutes=5.0, seed=0, threads=2, sharpness={}, times={})
         for label, viewmats in spoilt(dict(read_poses(ingest / POSES).viewmats)).items():
             check = known_poses.spot_check(job, viewmats)

@@ -126,3 +126,34 @@ def _camera() -> pycolmap.Camera:
     return pycolmap.Camera(
         camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT,
         params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
+
+
+def walk(**changes) -> MadeModel:
+    """Sixteen cameras half a metre apart along a wall; neighbours see much in common."""
+    return MadeModel(wall(-4, 12, count=2400), along(np.arange(16) * 0.5), **changes)
+
+
+def broken_walk(at: int = 8) -> MadeModel:
+    """The cameras from `at` on are turned and shifted with all that they see but a few points."""
+    motion = moved(1, 2, 0, degrees=20)
+    return walk(
+        motions=dict.fromkeys(range(at, 16), motion),
+        landmark=lambda image, point: point if point < 60 else (image >= at, point))
+
+
+def doubled_place() -> MadeModel:
+    """Two walls 100 m apart that share a poster, laid over each other.
+
+    Nothing else ties the two groups of cameras, so that every match agrees with the model.
+    """
+    poster, first, second = (wall(-1, 0.6, count=400, seed=1), wall(-4, 4, count=1500, seed=2),
+                             wall(-4, 4, count=1500, seed=3))
+    away = np.array([100.0, 0, 0])
+    points = np.concatenate([poster, first, poster + away, second + away])
+    looks = np.arange(len(points))
+    looks[1900:2300] = looks[:400]
+    xs = np.arange(6) * 0.2 - 0.5
+    return MadeModel(
+        points, along([*xs, *(xs + 100)]), looks=looks,
+        motions={index: moved(-100, 0, 0) for index in range(6, 12)},
+        landmark=lambda _, point: int(looks[point]))

@@ -25,7 +25,8 @@ def make_capture(folder, *, frames=20, cameras=1, points=300, seed=0):
     job = MappingJob(
         frames=folder / "frames", denoised=folder / "frames", out=folder,
         groups=(CameraGroup(names, 1024, 768),), masks=None, poses=None, pose_use="keep",
-        given_points=False, pairs="auto", max_features=2000, min_registered=0.5, accept_weak=False,
+        given_points=False, pairs="auto", max_features=2000, min_registered=0.5,
+        accept_weak=False, partial=True,
         gravity=True, scale_between=None,
         max_minutes=5.0, seed=0, threads=1, sharpness={}, times={})
     return job, truth

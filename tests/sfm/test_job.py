@@ -28,7 +28,7 @@ def job(count, pairs="auto"):
         frames=Path("/in/frames"), denoised=Path("/in/denoised"), out=Path("/out"),
         groups=(CameraGroup(tuple(f"{index:06d}.png" for index in range(count)), 600, 340),),
         masks=None, poses=None, pose_use="keep", given_points=False, pairs=pairs,
-        max_features=2048, min_registered=0.5, accept_weak=False,
+        max_features=2048, min_registered=0.5, accept_weak=False, partial=True,
         gravity=True, scale_between=None,
         max_minutes=1.0,
         seed=0, threads=2, sharpness={"000000.png": 12.5}, times={"000000.png": 0.25})

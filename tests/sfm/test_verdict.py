@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from made_model import WIDTH, MadeModel, along, moved, wall
+from made_model import WIDTH, MadeModel, along, broken_walk, doubled_place, moved, walk, wall
 
 from recon_cli.errors import SfmError
 from recon_cli.sfm.evidence import gather_evidence
@@ -23,37 +23,6 @@ from recon_cli.sfm.verdict import (
 
 def verdict_on(made: MadeModel, folder, **known) -> ModelVerdict:
     return examine(made.model(), made.write_database(folder / "database.db"), made.names, **known)
-
-
-def walk(**changes) -> MadeModel:
-    """Sixteen cameras half a metre apart along a wall; neighbours see much in common."""
-    return MadeModel(wall(-4, 12, count=2400), along(np.arange(16) * 0.5), **changes)
-
-
-def broken_walk() -> MadeModel:
-    """The second half is turned and shifted with all that it sees but a handful of points."""
-    motion = moved(1, 2, 0, degrees=20)
-    return walk(
-        motions=dict.fromkeys(range(8, 16), motion),
-        landmark=lambda image, point: point if point < 60 else (image >= 8, point))
-
-
-def doubled_place() -> MadeModel:
-    """Two walls 100 m apart that share a poster, laid over each other.
-
-    Nothing else ties the two groups of cameras, so that every match agrees with the model.
-    """
-    poster, first, second = (wall(-1, 0.6, count=400, seed=1), wall(-4, 4, count=1500, seed=2),
-                             wall(-4, 4, count=1500, seed=3))
-    away = np.array([100.0, 0, 0])
-    points = np.concatenate([poster, first, poster + away, second + away])
-    looks = np.arange(len(points))
-    looks[1900:2300] = looks[:400]
-    xs = np.arange(6) * 0.2 - 0.5
-    return MadeModel(
-        points, along([*xs, *(xs + 100)]), looks=looks,
-        motions={index: moved(-100, 0, 0) for index in range(6, 12)},
-        landmark=lambda _, point: int(looks[point]))
 
 
 def test_a_model_that_all_matches_confirm_is_trusted(tmp_path):
