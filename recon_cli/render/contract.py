@@ -31,17 +31,12 @@ NEAR = 0.05  # world units; COLMAP's scenes measure about ten units across
 
 @dataclass(frozen=True)
 class Approximation:
-    """Where an image may be cheaper than exact. The defaults are the contract.
+    """Where an image may be cheaper than exact. The defaults are the contract."""
 
-    Attributes:
-        alpha_min: fragments below this alpha are dropped.
-        transmittance_min: a pixel stops before it would fall below this; 0 never stops.
-        square: tiles are chosen by the square around three standard deviations of the longer
-            axis, as INRIA's rasterizer does, and not by the ellipse.
-    """
-
-    alpha_min: float = ALPHA_MIN
-    transmittance_min: float = TRANSMITTANCE_MIN
+    alpha_min: float = ALPHA_MIN  # fragments below it are dropped
+    transmittance_min: float = TRANSMITTANCE_MIN  # a pixel stops before it falls below; 0: never
+    # Choose tiles by the square around three standard deviations of the longer axis, as INRIA's
+    # rasterizer does, and not by the ellipse.
     square: bool = False
 
 
@@ -52,37 +47,23 @@ EXACT = Approximation()
 class Statistics:
     """What densification and pruning need, gathered by the same passes that render.
 
-    Pixels that a mask ignores are drawn, but count in none of hits, blend_sum, blend_max and loo.
-
-    Attributes:
-        radii: [N] three standard deviations along the longer axis of the projection in pixels;
-            0 where the Gaussian was culled.
-        hits: [N] int64, pixels that the Gaussian contributes to: alpha >= 1/255 and T (1 - alpha)
-            >= 1e-4 after it (LightGaussian's hit).
-        blend_sum: [N] sum of alpha T over the pixels.
-        blend_max: [N] greatest alpha T over the pixels.
-        means2d_grad: [N, 2] gradient of the loss with respect to the projected mean, per pixel;
-            zeros until backward() has run.
-        absolute_grad: [N, 2] the same with the magnitude of each pixel's part; zeros until
-            backward() has run.
-        variance: [N] sum s^2 - (sum s)^2 / n over the n pixels of the Gaussian, with
-            s = o dL/do = alpha dL/dalpha; zeros until backward() has run.
-        loo: [N] sum over pixels of ||alpha T (c - B)||^2, B the colour composited behind: the
-            squared error that removing this one Gaussian causes; zeros until backward() has run.
-        broken: how many Gaussians were culled because a value in use is not finite, or is projected
-            to one that is not; at degree d the values in use of sh_rest are the first (d+1)^2 - 1
-            coefficients of the Gaussians that have any. Those that lie behind the camera or beside
-            the image anyway need not be counted.
+    Pixels that a mask ignores are drawn, but do not count in hits, blend_sum, blend_max and loo.
+    The gradients, variance and loo are zeros until backward() has run.
     """
 
-    radii: Tensor
-    hits: Tensor
-    blend_sum: Tensor
-    blend_max: Tensor
-    means2d_grad: Tensor
-    absolute_grad: Tensor
-    variance: Tensor
+    radii: Tensor  # [N] 3 standard deviations along the longer axis, in pixels; 0 where culled
+    hits: Tensor  # [N] int64, pixels with alpha >= 1/255 and T (1 - alpha) >= 1e-4 after it
+    blend_sum: Tensor  # [N] sum of alpha T over the pixels
+    blend_max: Tensor  # [N] greatest alpha T
+    means2d_grad: Tensor  # [N, 2] gradient of the loss by the projected mean, per pixel
+    absolute_grad: Tensor  # [N, 2] the same with the magnitude of each pixel's part
+    variance: Tensor  # [N] sum s^2 - (sum s)^2 / n over its n pixels, s = o dL/do = alpha dL/dalpha
+    # [N] sum of ||alpha T (c - B)||^2, B the colour composited behind: the squared error that
+    # removing this one Gaussian causes.
     loo: Tensor
+    # Gaussians culled because a value in use, or what it is projected to, is not finite. At degree
+    # d the first (d+1)^2 - 1 coefficients of sh_rest are in use. Gaussians behind the camera or
+    # beside the image need not be counted.
     broken: int = 0
 
     @staticmethod
@@ -90,69 +71,42 @@ class Statistics:
         """Returns empty statistics for the N Gaussians whose means are `like`, [N, 3]."""
         n = like.shape[0]
         return Statistics(
-            radii=like.new_zeros(n),
-            hits=like.new_zeros(n, dtype=torch.int64),
-            blend_sum=like.new_zeros(n),
-            blend_max=like.new_zeros(n),
-            means2d_grad=like.new_zeros(n, 2),
-            absolute_grad=like.new_zeros(n, 2),
-            variance=like.new_zeros(n),
-            loo=like.new_zeros(n),
-        )
+            radii=like.new_zeros(n), hits=like.new_zeros(n, dtype=torch.int64),
+            blend_sum=like.new_zeros(n), blend_max=like.new_zeros(n),
+            means2d_grad=like.new_zeros(n, 2), absolute_grad=like.new_zeros(n, 2),
+            variance=like.new_zeros(n), loo=like.new_zeros(n))
 
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:
-    """The images of a view and their statistics.
+    """The images of a view and their statistics."""
 
-    Attributes:
-        rgb: [H, W, 3] colour over the background, not clamped.
-        alpha: [H, W] coverage, 1 minus the final transmittance.
-        depth: [H, W] sum of alpha T z, world units; divide by alpha for the expected depth.
-        statistics: see `Statistics`; `hits`, `blend_sum`, `blend_max` and `loo` stay zero unless
-            they were asked for with `scores=True`, with the torch backend `absolute_grad` and
-            `variance` too.
-    """
-
-    rgb: Tensor
-    alpha: Tensor
-    depth: Tensor
+    rgb: Tensor  # [H, W, 3] over the background, not clamped
+    alpha: Tensor  # [H, W] coverage, 1 minus the final transmittance
+    depth: Tensor  # [H, W] sum of alpha T z, world units; over alpha it is the expected depth
+    # hits, blend_sum, blend_max and loo stay zero without `scores=True`; with the torch backend
+    # absolute_grad and variance too.
     statistics: Statistics
 
 
 @dataclass(frozen=True, eq=False)
 class TargetImage:
-    """What a training step compares a rendered view with.
+    """What a training step compares a rendered view with."""
 
-    Attributes:
-        pixels: [H, W, 3].
-        mask: [H, W] True where a pixel counts; None where all do.
-        gain: [3] by which the rendered channels are multiplied first; None for ones.
-    """
-
-    pixels: NDArray[np.uint8]
-    mask: NDArray[np.bool_] | None = None
-    gain: NDArray[np.float32] | None = None
+    pixels: NDArray[np.uint8]  # [H, W, 3]
+    mask: NDArray[np.bool_] | None = None  # [H, W] True where a pixel counts; None: everywhere
+    gain: NDArray[np.float32] | None = None  # [3] factors of the rendered channels; None for ones
 
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What a training step without autograd computes.
+    """What a training step without autograd computes."""
 
-    Attributes:
-        sh_degree: highest in use, as in `recon_cli.render.registry.render`.
-        ssim_weight: w in [0, 1] of the loss (1 - w) L1 + w (1 - SSIM).
-        details: the statistics absolute_grad and variance are wanted too.
-        scores: hits and blend weights too, over the pixels that the mask counts; without it they
-            mean nothing.
-        loo: loo too, likewise.
-    """
-
-    sh_degree: int
-    ssim_weight: float
-    details: bool = False
-    scores: bool = False
-    loo: bool = False
+    sh_degree: int  # highest in use, as in `recon_cli.render.registry.render`
+    ssim_weight: float  # w in [0, 1] of the loss (1 - w) L1 + w (1 - SSIM)
+    details: bool = False  # absolute_grad and variance too
+    scores: bool = False  # hits and blend weights too, over the mask; else they mean nothing
+    loo: bool = False  # likewise
 
 
 class Renderer(Protocol):

@@ -26,17 +26,11 @@ logger = logging.getLogger("recon")
 
 @dataclass(frozen=True)
 class BackendStatus:
-    """Whether a backend can run here.
+    """Whether a backend can run here."""
 
-    Attributes:
-        name: what --backend takes.
-        devices: where it runs.
-        missing: why it cannot run; empty where it can.
-    """
-
-    name: str
-    devices: tuple[str, ...]
-    missing: str = ""
+    name: str  # what --backend takes
+    devices: tuple[str, ...]  # where it runs
+    missing: str = ""  # why it cannot run; empty where it can
 
 
 def available_backends() -> tuple[BackendStatus, ...]:
@@ -143,12 +137,7 @@ def kernels_to_compile(backend: str) -> int:
 
 
 def prepare(backend: str, on_kernel: Callable[[], None]) -> float:
-    """Gets a backend ready and returns the seconds that it took.
-
-    Args:
-        backend: a name from `available_backends`.
-        on_kernel: called after each kernel.
-    """
+    """Gets a backend ready and returns the seconds it took; calls `on_kernel` after each kernel."""
     if backend != "numba":
         return 0.0
     from recon_cli.render.numba.backend import warm_up
@@ -188,16 +177,12 @@ def render(
     Args:
         splats: N Gaussians; gradients flow to every raw parameter that requires them.
         camera: a pinhole camera, OpenCV axes, pixel centres at +0.5.
-        background: [3] colour behind everything.
-        sh_degree: highest spherical-harmonics degree in use, 0 to 3; what the splats have beyond
-            it is left out, and what they do not have counts as zero.
+        background: colour behind everything.
+        sh_degree: highest degree in use, 0 to 3; what the splats do not have counts as zero.
         backend: a name from `available_backends`.
         scores: also gather hits, blend_sum and blend_max, and loo in the backward pass.
-        mask: [H, W] bool, the pixels over which the scores are taken; None takes all. It changes
-            neither the image nor a gradient.
-
-    Returns:
-        The image, alpha, depth and statistics; see `RenderOutput`.
+        mask: bool, the pixels that the scores are taken over, None for all; it changes neither the
+            image nor a gradient.
 
     Raises:
         ValueError: a shape, dtype or device does not fit.

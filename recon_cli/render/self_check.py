@@ -1,10 +1,9 @@
 """Checks the kernels of a backend against the torch backend on this device, and keeps the verdict.
 
-Triton compiles for the GPU at hand, which nobody may have tried these kernels on. So before they
-are used for the first time with a GPU, driver and version, they render small scenes and take
-training steps: images, statistics, gradients, loss and Adam are compared with float64. The verdict
-is kept as JSON in recon's cache folder. The camera's gradient is not compared: with triton it is
-computed by torch from the gradients of the Gaussians.
+Triton compiles for a GPU on which nobody may have tried these kernels. So before their first use
+with a GPU, driver and version, they render small scenes and take training steps: images,
+statistics, gradients, loss and Adam are compared with float64. The verdict is kept as JSON in
+recon's cache folder. The camera's gradient is not compared: with triton, torch computes it.
 """
 
 from __future__ import annotations
@@ -33,9 +32,8 @@ from recon_cli.scene.splats import Splats
 
 logger = logging.getLogger("recon")
 
-# Rounding alone stays under a tenth of these. A fragment within rounding of a threshold may be in
-# or out, which changes a pixel by up to 1/255: images are compared by their rms and loosely by
-# their worst pixel.
+# Rounding alone stays under a tenth of these. A fragment within rounding of a threshold may change
+# a pixel by up to 1/255: images are compared by their rms and loosely by their worst pixel.
 _IMAGE_RMS, _IMAGE_WORST = 1e-4, 2e-2  # in units of max(1, greatest value)
 _RELATIVE = 1e-3  # norm of the error over the norm, of gradients and statistics
 _LOSS = 1e-5
@@ -53,21 +51,13 @@ _DRIVER = Path("/proc/driver/nvidia/version")
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a self-check, as it is kept on disk.
-
-    Attributes:
-        backend: that was checked.
-        device: name of the GPU, or "cpu".
-        failure: what differed and by how much, or what was raised; empty where all is well.
-        errors: every comparison, as a multiple of what is allowed.
-        seconds: that the check took.
-    """
+    """The result of a self-check, as it is kept on disk."""
 
     backend: str
-    device: str
-    failure: str
-    errors: dict[str, float]
-    seconds: float
+    device: str  # name of the GPU, or "cpu"
+    failure: str  # what differed and by how much, or what was raised; empty where all is well
+    errors: dict[str, float]  # every comparison, as a multiple of what is allowed
+    seconds: float  # that the check took
 
     @property
     def passed(self) -> bool:
@@ -86,17 +76,11 @@ class StepResult:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A backend that is to be checked.
-
-    Attributes:
-        name: of the backend.
-        render: the function behind the contract.
-        train_step: takes a training step by its own loss and optimizer, from splats that it leaves
-            alone.
-    """
+    """A backend that is to be checked."""
 
     name: str
     render: Renderer
+    # by its own loss and optimizer; leaves the splats alone
     train_step: Callable[[Splats, Camera, TargetImage, StepOptions], StepResult]
 
 
@@ -156,14 +140,8 @@ def check(
 ) -> Verdict:
     """Compares a backend with the torch backend in float64 and returns the verdict.
 
-    Whatever the backend raises is a verdict too.
-
-    Args:
-        candidate: the backend.
-        device: where it runs.
-        count: Gaussians of a scene.
-        width: of the images in pixels.
-        height: likewise.
+    Whatever the backend raises is a verdict too. `count` is of Gaussians in a scene, `width` and
+    `height` are in pixels.
     """
     start, errors = time.perf_counter(), {}
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
@@ -213,9 +191,7 @@ def _random_splats(count: int, seed: int) -> Splats:
     return Splats(*(torch.from_numpy(value.astype(np.float32)) for value in values))
 
 
-def _compare(
-    candidate: Candidate, splats: Splats, camera: Camera
-) -> Iterator[tuple[str, float]]:
+def _compare(candidate: Candidate, splats: Splats, camera: Camera) -> Iterator[tuple[str, float]]:
     """Yields each comparison with its error as a multiple of what is allowed."""
     ours, again = (_render_backward(candidate.render, splats, camera) for _ in range(2))
     truth = _render_backward(torch_render, splats.map(torch.Tensor.double), camera)
@@ -273,15 +249,12 @@ def _render_backward(render: Renderer, splats: Splats, camera: Camera) -> dict[s
     gradients = torch.autograd.grad(loss, list(parameters.values()))  # type: ignore[arg-type]
     return {
         **{name: image.detach() for name, image in images.items()},
-        **{f"gradient of {name}": value
-           for name, value in zip(parameters, gradients, strict=True)},
+        **{f"gradient of {name}": value for name, value in zip(parameters, gradients, strict=True)},
         **{name: getattr(output.statistics, name) for name in _STATISTICS},
         "broken": output.statistics.radii.new_tensor([float(output.statistics.broken > 0)])}
 
 
-def _reference_step(
-    splats: Splats, camera: Camera, target: TargetImage
-) -> tuple[float, Splats]:
+def _reference_step(splats: Splats, camera: Camera, target: TargetImage) -> tuple[float, Splats]:
     """Returns the loss (1 - w) L1 + w (1 - SSIM) and its gradients in float64, by autograd."""
     leaves = splats.map(lambda tensor: tensor.double().requires_grad_())
     device = splats.means.device

@@ -20,23 +20,14 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.contract import (
-    EXACT,
-    Approximation,
-    RenderOutput,
-    Statistics,
-    StepOptions,
-    TargetImage,
+    EXACT, Approximation, RenderOutput, Statistics, StepOptions, TargetImage
 )
 from recon_cli.render.numba.kernel import cache_folder
 from recon_cli.render.numba.optimizer import step
 from recon_cli.render.numba.step import PhotometricStep, camera_gradient
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.numba.view_pass import (
-    ImageBuffers,
-    Lease,
-    PackedSplats,
-    RenderSettings,
-    flat,
+    ImageBuffers, Lease, PackedSplats, RenderSettings, flat
 )
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -55,8 +46,7 @@ def render(
 ) -> RenderOutput:
     """Renders by the contract, or by a cheaper one; see `recon_cli.render.registry.render`.
 
-    Raises:
-        ValueError: the splats are not float32 on the CPU.
+    Raises ValueError unless the splats are float32 on the CPU.
     """
     if splats.means.dtype != torch.float32 or splats.means.device.type != "cpu":
         raise ValueError(
@@ -120,8 +110,7 @@ def is_warm() -> bool:
 def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
     """Loads or compiles every kernel by running a tiny scene, and returns the seconds it took.
 
-    Args:
-        on_kernel: called after each of the KERNELS kernels is ready.
+    `on_kernel` is called after each of the KERNELS kernels is ready.
     """
     start = time.perf_counter()
     ready: set[str] = set()
@@ -153,9 +142,9 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
 
 @contextmanager
 def _without_scipy() -> Iterator[None]:
-    """Keeps numba from importing scipy.linalg, which takes longer than loading all kernels.
+    """Keeps numba from importing scipy.linalg to look for BLAS, which no kernel needs.
 
-    numba looks for BLAS there when it sets itself up; no kernel multiplies matrices with it.
+    The import takes longer than loading all kernels.
     """
     if _SCIPY in sys.modules:
         yield

@@ -1,9 +1,8 @@
 """Which ellipse meets which tile, and the list of every tile in order of depth.
 
-An instance is one Gaussian in one tile. The test is exact: along a row of tiles the ellipse
-alpha = 1/255 covers one interval of x, found in closed form. Gaussians are sorted once by depth
-(radix sort), then counted into the tiles in that order (stable), so that each tile's list is in
-order of depth, ties in order of index.
+An instance is one Gaussian in one tile. The test is exact: along a row of tiles the ellipse alpha =
+1/255 covers one interval of x, found in closed form. Gaussians are sorted once by depth, then
+counted into the tiles in that order, so that each tile's list is in order of depth, ties by index.
 """
 
 from __future__ import annotations
@@ -44,9 +43,9 @@ def row_starts(rows, starts):
 def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
     """Writes for each row of tiles of each Gaussian the first tile and the end.
 
-    `rows` [M * 2] are first row of tiles and number of rows, `starts` [M + 1] where the spans of
-    each begin. With `square` the whole box counts, not the ellipse in it. Written are `spans`
-    [S * 2] and `tiles` [M], the number of tiles of each Gaussian.
+    `rows` [M * 2] are first row and number of rows, `starts` [M + 1] where the spans of each begin.
+    With `square` the whole box counts, not the ellipse in it. Written are `spans` [S * 2] and
+    `tiles` [M], the number of tiles of each Gaussian.
     """
     n = len(tiles)
     blocks = (n + BLOCK - 1) // BLOCK
@@ -97,9 +96,9 @@ def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
 def order_by_depth(keys, tiles, order, spare):
     """Writes the Gaussians that have tiles in order of depth, ties by index; returns how many.
 
-    Radix sort, four passes of 11 bits. `keys` are the bits of float64 depths, which for positive
-    numbers are ordered as the numbers are. float32 depths would tie, and a tie that the exact
-    depths do not have is a wrong picture where two Gaussians overlap.
+    Radix sort, four passes of 11 bits. `keys` are the bits of positive float64 depths, which are
+    ordered as the numbers are. float32 depths would tie where exact ones do not, and draw
+    overlapping Gaussians in the wrong order.
     """
     n = 0
     for j in range(len(tiles)):

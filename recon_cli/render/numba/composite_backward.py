@@ -6,11 +6,11 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
     R <- g . background at the last fragment,  R <- R + alpha (g . c - R) after each,
     dL/dc = alpha T g,  s = alpha dL/dalpha = alpha T (g . c - R),  T <- T / (1 - alpha).
 
-s is zero where alpha was clamped. Gradients with respect to mean and covariance are moments of s in
-the whitened coordinates (u, v), which are of order one even for needles.
+s is zero where alpha was clamped. Gradients by mean and covariance are moments of s in the whitened
+coordinates (u, v), which are of order one even for needles.
 
 An instance is the outer loop: its sums stay in registers while its rows pass by, and go to a slot
-of its own at the end. No two instances share a slot, so no atomics and the same bits every time.
+of its own at the end: no atomics and the same bits every time.
 """
 
 from __future__ import annotations
@@ -18,19 +18,8 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.numba.compositing import (
-    BATCH_FLOATS,
-    END_ROW,
-    FIRST_ROW,
-    L_BLUE,
-    L_DEPTH,
-    L_GREEN,
-    L_RED,
-    L_U_X,
-    L_U_Y,
-    L_V_Y,
-    LOCAL,
-    load_batch,
-    log2_alpha,
+    BATCH_FLOATS, END_ROW, FIRST_ROW, L_BLUE, L_DEPTH, L_GREEN, L_RED, L_U_X, L_U_Y, L_V_Y, LOCAL,
+    load_batch, log2_alpha
 )
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
@@ -39,12 +28,7 @@ from recon_cli.render.numba.simd_functions import (
     store, totals
 )
 from recon_cli.render.numba.soa import (
-    BATCH,
-    LOG2_ALPHA_MAX,
-    SLOT,
-    TILE_HEIGHT,
-    TILE_PIXELS,
-    TILE_WIDTH,
+    BATCH, LOG2_ALPHA_MAX, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 )
 
 _T, _R, _LAST, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH = (i * TILE_PIXELS for i in range(7))
@@ -60,15 +44,10 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                        scores, counting, sums, evaluated, scratch):
     """Sums the gradients of every instance over the pixels of its tile.
 
-    The arguments are those of `compositing.composite`, and
-
-    Args:
-        counter: [1] shared; tiles already taken.
-        grad_rgb: [H * W * 3] dL/drgb.
-        grad_alpha: [H * W] dL/dalpha, or empty for zeros; so is grad_depth.
-        details: also sum |s u|, |s y|, s^2 and the number of fragments.
-        scores: also sum what leaving one out would change, over the pixels in `counting`.
-        sums: [E * 16] out by slot, see `soa`.
+    The arguments are those of `compositing.composite`, and `grad_*`, dL/d(rgb, alpha, depth), the
+    latter two empty for zeros. Written are `sums` [E * 16] by slot, see `soa`: with `details` also
+    |s u|, |s y|, s^2 and the fragments, with `scores` what leaving one out would change, over
+    `counting`.
     """
     has_alpha, has_depth = len(grad_alpha) > 0, len(grad_depth) > 0
     tiles = len(tile_start) - 1
@@ -188,8 +167,7 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                         g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu, s_uv, s_vv,
                         abs_x, abs_y, squared, hits, loo, zero)))
                 else:
-                    store(sums, to, totals((
-                        g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu)))
+                    store(sums, to, totals((g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu)))
                     store(sums, to + 8, totals((
                         s_uv, s_vv, abs_x, abs_y, squared, hits, loo, zero)))
             end = first

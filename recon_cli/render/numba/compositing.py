@@ -6,8 +6,7 @@ For each pixel, over the Gaussians of its tile in order of depth:
     C += alpha T c,  T <- T (1 - alpha), before the fragment that would leave T < 1e-4.
 
 A row of a tile is one vector. Instances are taken in batches, in the coordinates of their tile.
-Rows are the outer loop of a batch, so that colour and transmittance stay in registers while the
-instances that meet the row are composited.
+Rows are the outer loop of a batch, so that colour and transmittance stay in registers.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ _MARGIN = np.float32(1e-3)  # pixels; more than the rounding of a pixel coordina
 _T, _FINAL, _LAST, _RED, _GREEN, _BLUE, _DEPTH = (i * TILE_PIXELS for i in range(7))
 _COUNTS = 7 * TILE_PIXELS  # 1 where a pixel counts in the scores, 0 elsewhere
 _ALPHA = 8 * TILE_PIXELS  # alpha of a row for each instance of a batch
-# Scores of each instance of a batch, column by column: a sum along the row for each row and each
-# of them would take three times as long.
+# Scores of each instance of a batch, column by column: sums along each row take three times as long
 _HITS, _SUMS, _PEAKS = (_ALPHA + i * BATCH * LANES for i in range(1, 4))
 _BATCH = _ALPHA + 4 * BATCH * LANES
 FORWARD_FLOATS = _BATCH + BATCH_FLOATS
@@ -154,21 +152,17 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
         tile_start: [tiles + 1] where the instances of each tile begin.
         members: [E] Gaussian of each instance, by tile and depth.
         records: [M * 16].
-        width: of the image, pixels; so is height.
-        tiles_x: tiles in a row.
         cutoff: log2 of the least alpha of a fragment.
         t_min: transmittance before which a pixel stops.
-        background: [3].
         rgb: [H * W * 3] out; [H * W] out are alpha, and depth, the sum of alpha T z.
         final: [tiles * TILE_PIXELS] out, T at the end.
         last: [tiles * TILE_PIXELS] out, number of the last instance that contributed, from 1.
         scores: write hits, weights and peaks.
         counting: [H * W] which pixels count in the scores, or empty for all.
         slots: [E] slot of each instance.
-        hits: [E] out by slot, pixels that the instance contributes to; so are weights, the sum of
-            alpha T, and peaks, the greatest alpha T. All zeros before.
+        hits: [E] out by slot, zeros before; so are weights, the sum, and peaks, the maximum of
+            alpha T.
         evaluated: [1] pairs of an instance and a pixel are added.
-        scratch: of the thread.
     """
     tiles = len(tile_start) - 1
     column = lane_numbers()
@@ -242,8 +236,7 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                         store(scratch, _HITS + i, load(scratch, _HITS + i)
                               + select(weight > 0.0, fill(1.0), fill(0.0)))
                         store(scratch, _SUMS + i, load(scratch, _SUMS + i) + weight)
-                        store(scratch, _PEAKS + i,
-                              maximum(load(scratch, _PEAKS + i), weight))
+                        store(scratch, _PEAKS + i, maximum(load(scratch, _PEAKS + i), weight))
                 store(scratch, _T + at, T)
                 store(scratch, _FINAL + at, final_T)
                 store(scratch, _LAST + at, latest)

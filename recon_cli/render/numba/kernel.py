@@ -1,10 +1,9 @@
 """How every kernel is compiled, and where the machine code is kept.
 
-Compiling takes seconds, so the machine code is kept in the user's cache folder and loaded by the
-next process. numba stores it by pickle, which executes what the file says: the folder must belong
-to the user alone, or it is not used. Its name holds a digest of the CPU, the versions and all
-sources here (numba itself checks only the file that a kernel stands in, not what it inlines), so
-that code for another CPU or of another version is never loaded.
+Compiling takes seconds, so the machine code is kept in the user's cache folder. numba stores it by
+pickle, which executes what the file says: the folder must belong to the user alone. Its name holds
+a digest of the CPU, the versions and all sources here (numba checks only the file that a kernel
+stands in, not what it inlines), so that other code is never loaded.
 """
 
 from __future__ import annotations

@@ -5,9 +5,8 @@
                              b1 = mx^2 + my^2 + C1,  b2 = var x + var y + C2   (Wang et al. 2004)
 
 with a Gaussian window of 11 taps, sigma 1.5, and zeros beyond the border. Only var x + var y is
-needed, so four maps are blurred. The window is symmetric, so the gradient blurs three maps of
-derivatives with the same window. The images are rows of interleaved channels: a horizontal tap is
-three numbers away.
+needed, so four maps are blurred; the gradient blurs three maps of derivatives with the same window.
+Channels are interleaved: a horizontal tap is three numbers away.
 """
 
 from __future__ import annotations
@@ -33,8 +32,6 @@ _STEP = np.float32(1 / 255)
 MAPS = 3
 MOMENTS = 4  # planes of a row in scratch
 assert _ROWS * MOMENTS * _WIDTH <= SCRATCH_FLOATS
-
-
 MIN_WIDTH = -(-LANES // CHANNELS)  # pixels; a row must fill one vector
 
 
@@ -148,15 +145,9 @@ def map_down(maps, base, plane, top, height, n, column, window, scratch, to):
 def similarity(counter, image, truth, width, height, window, maps, row_sums, scratch):
     """Writes SSIM's derivatives and the sum of SSIM of each row.
 
-    Args:
-        counter: [1] shared; groups of rows already taken.
-        image: [H * W * 3] float32; truth is uint8.
-        width: of the image in pixels, at least MIN_WIDTH.
-        height: in pixels.
-        window: taps with _PAD zeros at both ends.
-        maps: [3 * H * W * 3] out: by mean, by second moment, by product.
-        row_sums: [H] float64 out, zeros before.
-        scratch: of the thread.
+    `image` [H * W * 3] is float32, `truth` uint8; `window` holds the taps with _PAD zeros at both
+    ends. Written are `maps` [3 * H * W * 3], the derivatives by mean, second moment and product,
+    and `row_sums` [H] float64, zeros before.
     """
     n = CHANNELS * width
     size = n * height
@@ -172,8 +163,7 @@ def similarity(counter, image, truth, width, height, window, maps, row_sums, scr
             low, high = max(origin, 0), min(c1 + _REACH, n)
             for i in range(low, high, LANES):
                 column = min(i, high - LANES)
-                moments_down(image, truth, top, height, n, column, window, scratch,
-                             column - origin)
+                moments_down(image, truth, top, height, n, column, window, scratch, column - origin)
             for r in range(min(_ROWS, height - top)):
                 row_sums[top + r] += compare_row(
                     scratch, MOMENTS * r, c0, c1, n, window, maps, (top + r) * n, size)
@@ -186,8 +176,7 @@ def compare_row(scratch, plane, c0, c1, n, window, maps, base, size):
     for i in range(c0, c1, LANES):
         column = min(i, n - LANES)
         at, to = column - c0, base + column
-        mx, my = blur_row(scratch, plane, at, window), blur_row(
-            scratch, plane + 1, at, window)
+        mx, my = blur_row(scratch, plane, at, window), blur_row(scratch, plane + 1, at, window)
         squares = blur_row(scratch, plane + 2, at, window)
         products = blur_row(scratch, plane + 3, at, window)
         means = fma(mx, mx, my * my)

@@ -1,7 +1,7 @@
 """Adam over all parameters of all Gaussians in one sweep (Kingma and Ba 2015, algorithm 1).
 
-As fast as torch's fused Adam, which is bound by the same memory, but without its OpenMP threads:
-they spin after their work and take the cores from the kernels that follow.
+As fast as torch's fused Adam, which is bound by the same memory, but without its OpenMP threads,
+which spin after their work and take the cores from the kernels that follow.
 """
 
 from __future__ import annotations
@@ -32,17 +32,14 @@ def step(
     Args:
         values: flat contiguous float32 tensors on the CPU, one for each group of parameters.
         gradients: of the same sizes.
-        moments: moving averages of the gradients, and of their squares.
+        moments: moving averages of the gradients, and of their squares, with the decays `betas`.
         rates: learning rate of each group; None leaves the group alone.
         count: steps taken, this one included.
-        betas: decay of the two averages.
-        epsilon: keeps the quotient finite.
     """
     sizes = np.array([0 if rate is None else value.numel()
                       for value, rate in zip(values, rates, strict=True)], np.int64)
     numbers = np.array([rate or 0.0 for rate in rates], np.float32)
-    arrays = (tuple(tensor.numpy() for tensor in group)
-              for group in (values, gradients, *moments))
+    arrays = (tuple(tensor.numpy() for tensor in group) for group in (values, gradients, *moments))
     pool.run(adam, sizes, numbers, *arrays, *betas, 1 - betas[0] ** count, 1 - betas[1] ** count,
              epsilon, scratch=False)
 
@@ -55,8 +52,7 @@ def adam(counter, sizes, rates, values, gradients, first, second, beta1, beta2, 
         m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2,
         p <- p - rate (m / c1) / (sqrt(v / c2) + epsilon),  c1 = 1 - b1^t,  c2 = 1 - b2^t
 
-    `counter` [1] is shared: blocks already taken. `sizes` [G] numbers of each group move, by the
-    learning rates `rates` [G].
+    `sizes` [G] numbers of each group move, by the learning rates `rates` [G].
     """
     keep1, keep2 = np.float32(beta1), np.float32(beta2)
     add1, add2 = np.float32(1 - beta1), np.float32(1 - beta2)

@@ -1,7 +1,7 @@
 """From sums over pixels to gradients of raw parameters: the projection's chain rule, reversed.
 
 With V = J W R S and Sigma' = V V^T + 0.3 I: dL/dV = 2 dL/dSigma' V, and so on down to the raw
-parameters. What the forward pass computed is computed again: that is cheaper than to keep it.
+parameters. The forward pass is computed again: cheaper than to keep it.
 """
 
 from __future__ import annotations
@@ -204,8 +204,7 @@ def shape_gradient(scratch, view):
     store(scratch, (G_SCALE + 2) * LANES, g_2)
     # gradients of the two rows of J W R
     e0, e1, e2 = t0 * u_x * m0, t1 * u_x * m1, t2 * u_x * m2
-    f0, f1, f2 = t0 * (u_y * m0 + v_y * n0), t1 * (u_y * m1 + v_y * n1), t2 * (
-        u_y * m2 + v_y * n2)
+    f0, f1, f2 = t0 * (u_y * m0 + v_y * n0), t1 * (u_y * m1 + v_y * n1), t2 * (u_y * m2 + v_y * n2)
     d00, d01, d02 = ax * e0 + bx * f0, ax * e1 + bx * f1, ax * e2 + bx * f2  # dL/dR
     d10, d11, d12 = ay * e0 + by * f0, ay * e1 + by * f1, ay * e2 + by * f2
     d20, d21, d22 = az * e0 + bz * f0, az * e1 + bz * f1, az * e2 + bz * f2

@@ -2,9 +2,8 @@
 
 EWA splatting (Zwicker et al. 2002, eqs. 24 to 31; Kerbl et al. 2023, eq. 5): the covariance on the
 image is V V^T + 0.3 I with V = J W R S, J the Jacobian of the pinhole projection at the mean.
-
-Basis, signs and order of the spherical harmonics are those of INRIA's 3DGS (after Sloan 2013,
-"Efficient Spherical Harmonic Evaluation"), as in recon_cli.scene.harmonics.
+Spherical harmonics are those of recon_cli.scene.harmonics (INRIA's 3DGS, after Sloan 2013,
+"Efficient Spherical Harmonic Evaluation").
 """
 
 from __future__ import annotations
@@ -47,9 +46,8 @@ _C30, _C31, _C32, _C33, _C34 = (np.float32(c) for c in (
 def cull(counter, means, log_scales, logits, view, alpha_min, candidates, counts, broken, scratch):
     """Writes the ids that may be seen, block by block, and how many each block has.
 
-    The largest axis bounds the ellipse: its half extent is at most
-    sqrt(2 ln(1 / alpha_min) (s_max^2 |J|^2 + 0.3)). What is not finite is not seen and counts as
-    broken.
+    The largest axis bounds the half extent of the ellipse by sqrt(2 ln(1 / alpha_min) (s_max^2
+    |J|^2 + 0.3)). What is not finite is not seen and counts as broken.
     """
     n = len(logits)
     blocks = (n + BLOCK - 1) // BLOCK
@@ -278,9 +276,9 @@ def write_basis(to, at, x, y, z, terms):
 
 @inlined
 def direction_gradient(pull, at, x, y, z, terms):
-    """Returns the gradient with respect to (x, y, z) of sum_k pull_k basis_k(x, y, z).
+    """Returns the gradient of sum_k pull_k basis_k(x, y, z) by x, y, z, taken as independent.
 
-    `pull` holds planes from `at` on; x, y, z are taken as independent.
+    `pull` holds planes from `at` on.
     """
     p0, p1, p2 = load(pull, at), load(pull, at + LANES), load(pull, at + 2 * LANES)
     gx, gy, gz = -_C1 * p2, -_C1 * p0, _C1 * p1

@@ -1,11 +1,9 @@
 """A float32 vector as a numba type, so that kernels are vectorized by construction.
 
-numba leaves vectorization to LLVM's loop vectorizer, which gives up in silence and costs five times
-the speed. Here a kernel says what it wants: `Lanes` is LANES numbers in one register, the
-operators work on all of them at once, and `Mask` is the outcome of a comparison.
-
-LANES is 16 where the CPU has AVX-512 and 8 elsewhere; LLVM splits a vector that is wider than the
-CPU's registers. Loads and stores check no bounds.
+LLVM's loop vectorizer, which numba relies on, gives up in silence and costs five times the speed.
+`Lanes` is LANES numbers in one register, the operators work on all of them at once, and `Mask` is
+the outcome of a comparison. LANES is 16 where the CPU has AVX-512 and 8 elsewhere; LLVM splits a
+vector that is wider than the CPU's registers. Loads and stores check no bounds.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Functions of SIMD lanes: selection, arithmetic, sums across lanes, loads and stores.
-
-Loads and stores address flat arrays and check no bounds.
-"""
+"""Functions of SIMD lanes; loads and stores address flat arrays and check no bounds."""
 
 from __future__ import annotations
 
@@ -200,8 +197,7 @@ def log2(_typing: Any, value: Any) -> Any:
         raw = builder.bitcast(args[0], INTS)
         # the exponent that leaves a mantissa in [sqrt(1/2), sqrt(2))
         exponent = builder.ashr(builder.sub(raw, _integers(_ROOT_HALF_BITS)), _integers(23))
-        mantissa = builder.bitcast(
-            builder.sub(raw, builder.shl(exponent, _integers(23))), VECTOR)
+        mantissa = builder.bitcast(builder.sub(raw, builder.shl(exponent, _integers(23))), VECTOR)
         t = builder.fsub(mantissa, constant(1.0))
         whole = builder.sitofp(exponent, VECTOR)
         return _call(builder, "llvm.fmuladd", t, _polynomial(builder, _LOG2, t), whole)
@@ -246,7 +242,7 @@ def largest(_typing: Any, value: Any) -> Any:
 def totals(_typing: Any, values: Any) -> Any:
     """Returns a vector whose lane i is the sum of the lanes of values[i], a tuple of LANES vectors.
 
-    LANES - 1 additions for all sums together: each level adds neighbours and halves the vectors.
+    LANES - 1 additions in all: each level adds neighbours and halves the number of vectors.
     """
     if list(values) != [lanes_type] * LANES:
         return None
@@ -369,10 +365,8 @@ def transpose(_typing: Any, source: Any, at: Any, target: Any, to: Any) -> Any:
         rows = [builder.load(row(begin, k), align=4, typ=VECTOR) for k in range(LANES)]
         step = 1
         while step < LANES:  # exchanges the off-diagonal squares of every 2 step x 2 step block
-            low = ir.Constant(INTS, [
-                (i - step + LANES if i & step else i) for i in range(LANES)])
-            high = ir.Constant(INTS, [
-                (i + LANES if i & step else i + step) for i in range(LANES)])
+            low = ir.Constant(INTS, [(i - step + LANES if i & step else i) for i in range(LANES)])
+            high = ir.Constant(INTS, [(i + LANES if i & step else i + step) for i in range(LANES)])
             for k in range(LANES):
                 if not k & step:
                     a, b = rows[k], rows[k + step]

@@ -1,9 +1,9 @@
 """The layouts that kernels share: records, slots, and structures of arrays of LANES Gaussians.
 
-In scratch each quantity of a group of LANES Gaussians is a plane, one vector. Raw parameters are
-gathered into planes; rows of higher SH coefficients are transposed both ways. Rows are `stride`
-numbers long, 9, 24 or 45, and only the first Gaussians have one; none of these is a multiple of
-LANES. Nothing is read or written behind the last row.
+In scratch each quantity of a group of LANES Gaussians is a plane, one vector: raw parameters are
+gathered into planes, rows of higher SH coefficients transposed both ways. Rows are `stride` numbers
+long, 9, 24 or 45, no multiple of LANES, and only the first Gaussians have one. Nothing is read or
+written behind the last row.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ U_X, U_Y, V_Y = 2, 3, 4
 LOG2_OPACITY = 5
 RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
 # The ellipse alpha = 1/255 in its bounding box, for culling: at an offset dx the ellipse covers
-# SLOPE_Y dx -+ HALF_Y sqrt(1 - (dx / EXTENT_X)^2), and the same with x and y exchanged.
-# With x and y exchanged the slope is b / c = -U_Y / U_X and the half EXTENT_Y V_Y / U_X.
+# SLOPE_Y dx -+ HALF_Y sqrt(1 - (dx / EXTENT_X)^2). With x and y exchanged the slope is
+# b / c = -U_Y / U_X and the half EXTENT_Y V_Y / U_X.
 EXTENT_X, EXTENT_Y = 10, 11
 SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
 # What float32 drops of the mean: at 640 pixels it is 3e-5, and decides who reaches alpha = 1/255.
@@ -118,10 +118,10 @@ def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, 
 
 @inlined
 def unit_quaternion(scratch):
-    """Returns w, x, y, z of length 1, one over the length, and where there is one.
+    """Returns w, x, y, z of length 1, and what a gradient is multiplied by.
 
-    Divided by the largest entry first: the squares of small entries would vanish. A quaternion
-    of zeros stands for no rotation and has no gradient.
+    Divided by the largest entry first, as squares of small entries vanish. Zeros are no rotation
+    and have no gradient.
     """
     w, x = load(scratch, P_QW * LANES), load(scratch, P_QX * LANES)
     y, z = load(scratch, P_QY * LANES), load(scratch, P_QZ * LANES)
@@ -140,8 +140,8 @@ def unit_quaternion(scratch):
 def image_axes(scratch, view):
     """Returns the rows of J W, [6], and the clamped x/z and y/z.
 
-    The linearisation blows up at grazing angles: x/z and y/z are held within the image widened by
-    15% on each side (INRIA's 3DGS).
+    The linearisation blows up at grazing angles, so x/z and y/z are held near the image (INRIA's
+    3DGS).
     """
     per_z = 1.0 / load(scratch, P_Z * LANES)
     u, v = load(scratch, P_X * LANES) * per_z, load(scratch, P_Y * LANES) * per_z
@@ -156,10 +156,7 @@ def image_axes(scratch, view):
 
 @inlined
 def terms_of_group(ids, first, sh_rest, stride, terms):
-    """Returns how many higher SH terms a group uses: none where no Gaussian of it has any.
-
-    ids ascend, and the Gaussians that have coefficients come first.
-    """
+    """Returns how many higher SH terms a group uses; ids ascend, those without any come last."""
     return terms if stride * np.int64(ids[first]) < len(sh_rest) else 0
 
 

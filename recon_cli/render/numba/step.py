@@ -1,7 +1,6 @@
 """One training view without autograd: its loss, the gradients, and the camera's gradient.
 
-Everything between the parameters and their gradients lies in buffers that are reused, so that a
-step allocates next to nothing.
+All intermediate values lie in buffers that are reused: a step allocates next to nothing.
 """
 
 from __future__ import annotations
@@ -18,11 +17,7 @@ from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.render.numba.simd_functions import fetch_add
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.numba.view_pass import (
-    ImageBuffers,
-    PackedSplats,
-    RenderSettings,
-    ViewPass,
-    flat,
+    ImageBuffers, PackedSplats, RenderSettings, ViewPass, flat
 )
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import generators
@@ -32,18 +27,13 @@ _FROM_BYTE = np.float32(1 / 255)  # the very factor that loss.py takes
 
 
 class PhotometricStep:
-    """Renders a view over black, compares it with its photograph and runs the backward pass.
-
-    Attributes:
-        statistics: of the last view; its tensors are overwritten by each call.
-        log_gain_gradient: [3] float64 of the last view that had a gain.
-    """
+    """Renders a view over black, compares it with its photograph and runs the backward pass."""
 
     def __init__(self) -> None:
         self._pass = ViewPass()
         self._black = np.zeros(CHANNELS, np.float32)
-        self.statistics = Statistics.zeros(torch.zeros(0, 3))
-        self.log_gain_gradient = np.zeros(CHANNELS)
+        self.statistics = Statistics.zeros(torch.zeros(0, 3))  # of the last view; overwritten
+        self.log_gain_gradient = np.zeros(CHANNELS)  # float64, of the last view that had a gain
 
     @property
     def instances(self) -> int:
@@ -61,14 +51,8 @@ class PhotometricStep:
     ) -> float:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
-        A masked pixel counts as one without error, and gets no gradient.
-
-        Args:
-            splats: N Gaussians, float32 on the CPU.
-            gradients: tensors of the same shapes; sh_rest is left alone at degree 0.
-            camera: of the view.
-            target: the photograph; its pixels are contiguous.
-            options: of the step.
+        Splats are float32 on the CPU, the photograph's pixels contiguous; sh_rest of `gradients` is
+        left alone at degree 0. A masked pixel counts as one without error, and gets no gradient.
         """
         height, width, truth = camera.height, camera.width, target.pixels
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
@@ -114,8 +98,8 @@ class PhotometricStep:
     ) -> None:
         """Carries the gradient of y = g x back to x in place, and stores that of log g.
 
-        dL/dlog g = g dL/dg = sum over pixels of y dL/dy. Under a mask y is the truth, but dL/dy 0.
-        `image` and `gradient` are [H, W * 3], `gain` is [W * 3].
+        dL/dlog g = sum over pixels of y dL/dy. Under a mask y is the truth, but dL/dy 0. `image`
+        and `gradient` are [H, W * 3], `gain` is [W * 3].
         """
         columns = np.multiply(image, gradient).sum(axis=0, dtype=np.float64)
         self.log_gain_gradient = columns.reshape(-1, CHANNELS).sum(axis=0)
@@ -130,16 +114,10 @@ def camera_gradient(
 ) -> NDArray[np.float64]:
     """Returns the gradient [6] of a turn and a move of the camera, from those of the Gaussians.
 
-    The derivation stands in recon_cli.train.poses, with a reference in torch. Here the torque of
-    the colours is sum (G_i sh_rest) . dL/dsh_rest with the generators G_i, which needs no direction
-    and no derivative of the basis. Each block of Gaussians has sums of its own: the same bits
-    whatever the number of threads.
-
-    Args:
-        splats: float32 on the CPU.
-        gradients: of the same shapes; sh_rest is not read at degree 0.
-        camera: that they were rendered with.
-        sh_degree: in use.
+    The derivation stands in recon_cli.train.poses. Here the torque of the colours is sum (G_i
+    sh_rest) . dL/dsh_rest with the generators G_i, without direction or derivative of the basis.
+    Each block of Gaussians has sums of its own: the same bits for any number of threads. Splats are
+    float32 on the CPU; sh_rest is not read at degree 0.
     """
     sums = np.zeros((-(-len(splats) // _SUM_BLOCK), 6))
     sh_degree = min(sh_degree, splats.sh_degree)

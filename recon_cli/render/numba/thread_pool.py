@@ -1,9 +1,8 @@
 """Threads that run one kernel together, and the scratch memory that each of them owns.
 
-Kernels release the GIL and take blocks of work from a shared counter, so a Python thread each is
-all it needs: no OpenMP, whose threads spin at every barrier and slow down whatever runs beside
-them. What a block computes does not depend on who takes it: any number of threads gives the same
-bits.
+Kernels release the GIL and take blocks of work from a shared counter. There is no OpenMP, whose
+threads spin at every barrier and slow down whatever runs beside them. What a block computes does
+not depend on who takes it: any number of threads gives the same bits.
 """
 
 from __future__ import annotations
@@ -32,15 +31,11 @@ def empty_aligned(size: int, dtype: Any = np.float32) -> NDArray[Any]:
 
 
 class ThreadPool:
-    """A pool of threads that waits for kernels.
-
-    Attributes:
-        threads: how many run a kernel; torch's number of threads if None.
-        observer: called with the name of each kernel and the seconds that it took.
-    """
+    """A pool of threads that waits for kernels."""
 
     def __init__(self) -> None:
-        self.threads: int | None = None
+        self.threads: int | None = None  # None: torch's number of threads
+        # called with the name of each kernel and the seconds that it took
         self.observer: Callable[[str, float], None] | None = None
         self._lock = threading.Lock()
         self._inboxes: list[SimpleQueue[Callable[[], None]]] = []
@@ -56,17 +51,14 @@ class ThreadPool:
     def run(self, kernel: Kernel, *arguments: Any, scratch: bool = True) -> None:
         """Calls kernel(counter, *arguments, scratch) in every thread and waits for all.
 
-        Args:
-            kernel: takes blocks of work from counter[0] until none is left.
-            *arguments: the same for all threads.
-            scratch: the kernel takes a flat array that no other thread uses as its last argument.
+        The kernel takes blocks of work from counter[0] until none is left. With `scratch` its last
+        argument is a flat array that no other thread uses.
         """
         start = time.perf_counter()
         count = self.size
         counter = np.zeros(1, np.int64)
         with self._lock:
             self._prepare(count)
-
             ended: list[BaseException | None] = []  # the failure of each other thread
 
             def call(number: int) -> None:
@@ -91,8 +83,8 @@ class ThreadPool:
     def _wait(self, ended: list[BaseException | None], count: int) -> BaseException | None:
         """Waits until `count` threads have ended; returns the Ctrl-C that came meanwhile.
 
-        Ctrl-C has to wait as well: no thread may still write when the caller goes on. The list
-        decides; a message on the queue only wakes, because an interrupt may lose one.
+        No thread may still write when the caller goes on. The list decides; a message on the queue
+        only wakes, because an interrupt may lose one.
         """
         interrupt: BaseException | None = None
         while len(ended) < count:

@@ -57,10 +57,7 @@ class PackedSplats:
 
 @dataclass(frozen=True)
 class ImageBuffers:
-    """The images of a view, or the gradients of the loss with respect to them, as flat arrays.
-
-    Gradients of alpha and depth may be empty: zeros.
-    """
+    """The images of a view, or the gradients by them, where alpha and depth may be empty: zeros."""
 
     rgb: NDArray[np.float32]  # [H * W * 3]
     alpha: NDArray[np.float32]  # [H * W]
@@ -69,20 +66,12 @@ class ImageBuffers:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How a view is rendered.
+    """How a view is rendered."""
 
-    Attributes:
-        background: [3].
-        sh_degree: in use; at most what the splats have is used.
-        scores: fill the scores of `Statistics`: hits and blend weights in the forward pass.
-        counting: [H, W] pixels that count in the scores of both passes; None: all of them.
-        approximation: what may be cheaper than exact.
-    """
-
-    background: NDArray[np.float32]
-    sh_degree: int
-    scores: bool = False
-    counting: NDArray[np.bool_] | None = None
+    background: NDArray[np.float32]  # [3]
+    sh_degree: int  # in use; at most what the splats have is used
+    scores: bool = False  # fill hits and blend weights of `Statistics` in the forward pass
+    counting: NDArray[np.bool_] | None = None  # [H, W] pixels in the scores of both passes
     approximation: Approximation = EXACT
 
 
@@ -222,13 +211,9 @@ class ViewPass:
     ) -> None:
         """Writes gradients and statistics of all N Gaussians for the last forward pass.
 
-        Args:
-            splats: as in the forward pass.
-            gradients: out; sh_rest is left alone at degree 0.
-            image: gradients of the loss.
-            statistics: means2d_grad is written, the others as below.
-            details: write absolute_grad and variance.
-            loo: write loo, over the pixels that counted in the forward pass.
+        `image` holds the gradients of the loss; sh_rest of `gradients` is left alone at degree 0.
+        With `details` absolute_grad and variance are written too, with `loo` that, over the pixels
+        that counted in the forward pass.
         """
         sums = self.take("sums", len(self.members) * SLOT)
         evaluated = np.zeros(1, np.int64)

@@ -46,8 +46,7 @@ def bin_to_tiles(projection: Projection, width: int, height: int) -> Instances:
     return Instances(
         tiles_x, tiles_y, gaussians[slots], slots,
         counts=torch.bincount(tiles, minlength=tiles_x * tiles_y),
-        per_gaussian=torch.bincount(gaussians, minlength=len(projection.ids)),
-    )
+        per_gaussian=torch.bincount(gaussians, minlength=len(projection.ids)))
 
 
 def _candidate_chunks(

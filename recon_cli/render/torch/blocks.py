@@ -38,8 +38,7 @@ class Table:
 class Scratch:
     """Named buffers for the intermediate tensors of a block, allocated once.
 
-    A fresh half-megabyte tensor an operation costs its page faults each time, which on a CPU is
-    as much as the arithmetic.
+    On a CPU the page faults of fresh half-megabyte tensors cost as much as the arithmetic.
     """
 
     def __init__(self, like: Tensor) -> None:
@@ -81,8 +80,7 @@ def build_table(
         torch.nn.functional.pad(means2d.double(), (0, 0, 0, 1)),
         torch.nn.functional.pad(whitening, (0, 0, 0, 1)),
         torch.nn.functional.pad(log_o, (0, 1), value=-torch.inf),
-        torch.nn.functional.pad(torch.cat([channels, ones], dim=-1), (0, 0, 0, 1)),
-    )
+        torch.nn.functional.pad(torch.cat([channels, ones], dim=-1), (0, 0, 0, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,13 +107,10 @@ class InstanceLists:
         return list(torch.split(order, size)) if len(order) else []
 
     def walk(self, tiles: Tensor, transmittance: Tensor) -> Iterator[Block]:
-        """Yields the blocks of a group front to back.
+        """Yields the blocks of a group front to back, without tiles that have ended or are opaque.
 
-        A tile drops out when its list ends or no pixel is alive.
-
-        Args:
-            tiles: [n] the group, longest list first.
-            transmittance: [tiles, 256], which the caller updates after each block.
+        `tiles` [n] are the group, longest list first; the caller updates `transmittance` [tiles,
+        256] after each block.
         """
         longest = int(self.counts[tiles[0]])
         steps = torch.arange(DEPTH, device=tiles.device)
@@ -175,9 +170,7 @@ def _below(value: float, dtype: torch.dtype) -> float:
     return float(torch.nextafter(number, number - 1))
 
 
-def composite(
-    alpha: Tensor, before: Tensor, scratch: Scratch
-) -> tuple[Tensor, Tensor, Tensor]:
+def composite(alpha: Tensor, before: Tensor, scratch: Scratch) -> tuple[Tensor, Tensor, Tensor]:
     """Returns odds alpha / (1 - alpha), transmittance after each Gaussian, and the same live.
 
     The live transmittance is 0 from the Gaussian on that would have left less than 1e-4: times
@@ -240,14 +233,9 @@ def sum_magnitudes(
 ) -> Tensor:
     """Returns [n, K, 4]: sum |s y| along x and y, sum s^2, and the number of fragments.
 
-    As in `gradients_of`, s y is a pixel's part of the gradient with respect to the mean.
-
-    Args:
-        slope: [n, K, 256] s = alpha dL/dalpha.
-        weights: [n, K, 256] alpha T, positive where there is a fragment.
-        affine: [n, K, 5] of `whitening_of`.
-        monomials: [3, 256] 1, x, y at the pixels.
-        scratch: its buffer "q" is overwritten.
+    s y is a pixel's part of the gradient by the mean, as in `gradients_of`. `slope` [n, K, 256] is
+    s, `weights` [n, K, 256] alpha T, positive where there is a fragment; `affine` [n, K, 5] is of
+    `whitening_of`, `monomials` [3, 256] are 1, x, y at the pixels. The buffer "q" is overwritten.
     """
     n, k, pixels = slope.shape
     _, l11, l12, v0, l22 = affine.unbind(-1)

@@ -1,8 +1,8 @@
 """From raw parameters to ellipses on the image plane, by plain autograd.
 
-EWA splatting (Zwicker et al. 2002, eqs. 24 to 31) as used by 3D Gaussian Splatting (Kerbl et al.
-2023, eq. 5). Works on the Gaussians that may touch the image only: a first pass without gradients
-decides which, so that memory follows what is seen and not what there is.
+EWA splatting (Zwicker et al. 2002, eqs. 24 to 31) as in 3D Gaussian Splatting (Kerbl et al. 2023,
+eq. 5). A first pass without gradients decides which Gaussians may touch the image, so that memory
+follows what is seen.
 """
 
 from __future__ import annotations
@@ -103,8 +103,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     """Returns the rotation matrices [M, 3, 3] of wxyz quaternions [M, 4] of any length.
 
     A quaternion of zeros stands for no rotation and has no gradient. The largest entry is divided
-    out first, as the squares of small entries vanish; no derivative is lost with it, for the
-    rotation does not depend on the length.
+    out first, as squares of small entries vanish; neither the rotation nor its gradient changes.
     """
     largest = quats.detach().abs().amax(-1, keepdim=True)
     nonzero = largest > _QUATERNION_MIN
@@ -140,9 +139,7 @@ def _in_front(splats: Splats, camera: Camera) -> Tensor:
     return visible
 
 
-def _project_rows(
-    splats: Splats, camera: Camera, ids: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _project_rows(splats: Splats, camera: Camera, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns means2d [M, 2], directions [M, 2, 3] and depths [M] of some rows."""
     R = _rotation(splats, camera)
     t = torch.as_tensor(camera.viewmat[:3, 3], dtype=R.dtype, device=R.device)

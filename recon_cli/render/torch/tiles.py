@@ -1,8 +1,7 @@
 """The torch backend: a vectorized tile rasterizer for any device, in float32 or float64.
 
-Tiles are taken in groups of similar length and composited in blocks; see `blocks`. The
-backward pass walks the blocks back to front and evaluates them again, so that memory does not
-grow with the pairs.
+Tiles are taken in groups of similar length and composited in blocks; see `blocks`. The backward
+pass evaluates the blocks again, back to front, so that memory does not grow with the pairs.
 """
 
 from __future__ import annotations
@@ -215,10 +214,8 @@ def _write_scores(
 class _Tally:
     """Counts hits and blend weights of the instances while they are composited.
 
-    Args:
-        instances: of the view.
-        like: of the dtype and device to count in.
-        counting: [tiles, 256] 1 at the pixels that count and 0 elsewhere; None where all do.
+    `like` has the dtype and device to count in; `counting` [tiles, 256] is 1 where a pixel counts,
+    None if all do.
     """
 
     def __init__(self, instances: Instances, like: Tensor, counting: Tensor | None) -> None:

@@ -29,8 +29,7 @@ def render(
 ) -> RenderOutput:
     """Renders by the contract; see `recon_cli.render.registry.render`.
 
-    Raises:
-        ValueError: the splats are not float32.
+    Raises ValueError unless the splats are float32.
     """
     if splats.means.dtype != torch.float32:
         raise ValueError(
@@ -64,8 +63,7 @@ class _Render(torch.autograd.Function):
         statistics.radii = projected.radii
         lists = build_tile_lists(projected, projected.ends.int(), camera, view, instances)
         background = background.contiguous()
-        image = composite_tiles(
-            lists, camera, background, counting, statistics if scores else None)
+        image = composite_tiles(lists, camera, background, counting, statistics if scores else None)
         ctx.save_for_backward(*splats.parameters().values(), view, background)
         # the outputs themselves would hold their own graph, and with it everything here, for ever
         detached = replace(image, rgb=image.rgb.detach(), alpha=image.alpha.detach(),

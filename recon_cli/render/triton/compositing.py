@@ -6,9 +6,8 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
     R <- g . background at the last fragment,  R <- R + alpha (g . c - R) after each,
     dL/dc = alpha T g,  s = alpha dL/dalpha = alpha T (g . c - R),  T <- T / (1 - alpha).
 
-s is zero where alpha was clamped. Every instance has a slot of its own for its sums over the tile,
-slots of a Gaussian lie side by side, and are added in order: no atomics, and the same bits every
-time.
+s is zero where alpha was clamped. Every instance has a slot for its sums over the tile; slots of a
+Gaussian lie side by side and are added in order: no atomics, and the same bits every time.
 """
 
 from __future__ import annotations
@@ -66,16 +65,12 @@ def composite(order, first, members, offsets, records, background, width, height
         members: [E] int32, Gaussian of each instance, by tile and depth.
         offsets: [E, 2] u and v at the tile's first pixel.
         records: [M, FLOATS].
-        background: [3].
-        width: of the image in pixels; so is height.
-        tiles_x: tiles in a row.
         rgb: [H, W, 3] out; alpha and depth are [H, W].
         final: [tiles, AREA] out, transmittance behind the last fragment.
         last: [tiles, AREA] int32 out, number in the tile of the last fragment, from 1.
         slots: [E] int64, where the scores of an instance go.
         counting: [H, W] uint8, pixels that count in the scores, with MASKED.
-        hits: [E] int32 out with SCORES; so are weights, the sum of alpha T, and peaks, the greatest
-            alpha T.
+        hits: [E] int32 out with SCORES; so are weights, the sum, and peaks, the maximum of alpha T.
     """
     tile = tl.load(order + tl.program_id(0))
     begin, end = tl.load(first + tile), tl.load(first + tile + 1)
@@ -156,18 +151,12 @@ def composite_backward(order, first, members, offsets, records, background, widt
               MASKED: tl.constexpr):
     """Sums the gradients of every instance of a tile over its pixels.
 
-    The arguments are those of `composite`, and
-
-    Args:
-        grad_rgb: [H, W, 3] dL/drgb.
-        grad_alpha: [H, W] dL/dalpha; not read with PLAIN, nor is grad_depth.
-        sums: [E, SLOT] out by slot, zeros before: dL/d(red, green, blue, depth), then the sums of
-            s times 1, u, v, uu, uv, vv, of |s y| along x and y (y the whitened offset brought back,
-            without its factor), of s^2, the fragments, and what leaving the instance out would
-            change.
-        PLAIN: the loss depends on colours alone.
-        DETAILS: also |s y|, s^2 and the fragments.
-        SCORES: also the last of these, over the pixels in `counting`.
+    The arguments are those of `composite`, and `grad_*`, dL/d(rgb, alpha, depth). With PLAIN the
+    loss depends on colours alone, and the latter two are not read. Written are `sums` [E, SLOT] by
+    slot, zeros before: dL/d(red, green, blue, depth) and the sums of s times 1, u, v, uu, uv, vv;
+    with DETAILS those of |s y| along x and y (y the whitened offset brought back, without its
+    factor) and of s^2, and the fragments; with SCORES what leaving the instance out would change,
+    over the pixels in `counting`.
     """
     tile = tl.load(order + tl.program_id(0))
     begin = tl.load(first + tile)

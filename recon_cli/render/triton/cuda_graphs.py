@@ -1,7 +1,6 @@
 """CUDA graphs: work that is started repeatedly in the same sizes is recorded and replayed.
 
-A recording holds every size and address of the first time. What differs from step to step must
-therefore lie in memory that the work reads.
+A recording holds sizes and addresses: what differs from step to step must lie in memory.
 """
 
 from __future__ import annotations
@@ -27,19 +26,11 @@ class Recorder(Protocol):
         """Frees the memory of all recordings, which are no longer referenced."""
 
     def __call__(self, work: Work) -> Work:
-        """Returns a function that replays the work; does not run it.
-
-        Raises:
-            RuntimeError: the work cannot be recorded.
-        """
+        """Returns a function that replays the work; RuntimeError if it cannot be recorded."""
 
 
 class Graphs:
-    """Records work that comes up again.
-
-    Args:
-        recorder: None runs all work unrecorded.
-    """
+    """Records work that comes up again; without a recorder all work runs unrecorded."""
 
     def __init__(self, recorder: Recorder | None) -> None:
         self._recorder = recorder
@@ -54,9 +45,7 @@ class Graphs:
     def run(self, key: Hashable, work: Work) -> None:
         """Runs the work, by its recording once there is one.
 
-        Args:
-            key: of all sizes and addresses; equal keys mean the same launches.
-            work: reads what else differs from memory.
+        `key` holds all sizes and addresses: equal keys mean the same launches.
         """
         if self._recorder is None:
             work()

@@ -1,12 +1,11 @@
 """The ellipse and the colour of a Gaussian in a view: what both passes over the Gaussians compute.
 
 EWA splatting (Zwicker et al. 2002, eqs. 24 to 31): V = J W R S, Sigma' = V V^T + 0.3 I. Positions
-are computed in float64, because an error of the mean in pixels is an error of every alpha; shapes
-in float32, in forms that do not cancel for needles.
-
-Basis, signs and order of the spherical harmonics are those of INRIA's 3DGS (after Sloan 2013,
-"Efficient Spherical Harmonic Evaluation"), as in recon_cli.scene.harmonics. Coefficients are read
-one by one: a row is used whole by one lane, so that it comes from the cache.
+are in float64, because an error of the mean in pixels is an error of every alpha; shapes in
+float32, in forms that do not cancel for needles. Spherical harmonics are those of
+recon_cli.scene.harmonics (INRIA's 3DGS, after Sloan 2013, "Efficient Spherical Harmonic
+Evaluation"); their coefficients are read one by one: a row is used whole by one lane, so that it
+comes from the cache.
 """
 
 from __future__ import annotations
@@ -83,8 +82,8 @@ def number(view, place: tl.constexpr):
 def unit_quaternion(quats, i, here):
     """Returns w, x, y, z of length 1, and what a gradient is multiplied by.
 
-    Divided by the largest entry first: the squares of small entries would vanish. A quaternion of
-    zeros stands for no rotation and has no gradient.
+    Divided by the largest entry first, as squares of small entries vanish. Zeros are no rotation
+    and have no gradient.
     """
     w = tl.load(quats + 4 * i, mask=here, other=1.0)
     x = tl.load(quats + 4 * i + 1, mask=here, other=0.0)
@@ -217,8 +216,7 @@ def slope(k: tl.constexpr, x, y, z):
 def colors(sh_dc, sh_rest, i, here, colored, x, y, z, STRIDE: tl.constexpr, TERMS: tl.constexpr):
     """Returns red, green and blue of Gaussians i towards directions of length 1, not clamped.
 
-    `here` says which rows are Gaussians, `colored` which of them have a row of STRIDE numbers in
-    sh_rest, of which TERMS a channel are in use.
+    Rows in `colored` have STRIDE numbers in sh_rest, of which TERMS a channel are in use.
     """
     red = tl.load(sh_dc + 3 * i, mask=here, other=0.0) * C0 + 0.5
     green = tl.load(sh_dc + 3 * i + 1, mask=here, other=0.0) * C0 + 0.5

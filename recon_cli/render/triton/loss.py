@@ -2,7 +2,7 @@
 
 SSIM as in `train.gradient`: 11 taps, sigma 1.5, zeros beyond the border, mean over pixels and
 channels (Wang et al. 2004, eq. 13). The window is separable: two kernels go along rows, two down
-columns. The truth is read as bytes. Each program sums its own part, and torch adds the parts.
+columns. Each program sums its own part, and torch adds the parts.
 """
 
 from __future__ import annotations
@@ -55,8 +55,7 @@ def blur_products(image, truth, mask, width, count, maps, MASKED: tl.constexpr,
                   BLOCK: tl.constexpr):
     """Blurs x, y, xx, yy and xy along rows into `maps` [5, H, W, 3]; `count` is 3 H W.
 
-    x is `image` [H, W, 3], y `truth` [H, W, 3] uint8, and `mask` [H, W] uint8 says which pixels
-    count, where there is one (MASKED).
+    x is `image` [H, W, 3], y `truth` [H, W, 3] uint8; `mask` [H, W] uint8 says which pixels count.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here, column = at < count, at // 3 % width
@@ -130,9 +129,8 @@ def gradient_of(image, truth, mask, maps, width, count, by_error, by_ssim, gradi
                 MASKED: tl.constexpr, SSIM: tl.constexpr, BLOCK: tl.constexpr):
     """Blurs `maps` [3, H, W, 3] of `blur_slopes` down columns and adds the terms of the gradient.
 
-    `by_error` and `by_ssim` are the slopes of the loss by the sums of absolute errors and of SSIM;
-    without SSIM the latter is no part of it. Written are `gradient` [H, W, 3] and `parts`
-    [programs], sums of absolute errors.
+    `by_error` and `by_ssim` are the slopes of the loss by the sums of absolute errors and of SSIM.
+    Written are `gradient` [H, W, 3] and `parts` [programs], sums of absolute errors.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = at < count
@@ -159,11 +157,8 @@ def loss_and_gradient(
 ) -> tuple[Tensor, Tensor]:
     """Returns the loss, float64, and its gradient [H, W, 3]; nothing waits for the device.
 
-    Args:
-        image: [H, W, 3] float32, contiguous.
-        truth: [H, W, 3] uint8, contiguous.
-        ssim_weight: w in [0, 1].
-        mask: [H, W] uint8, not zero where a pixel counts; None where all do.
+    `image` [H, W, 3] is float32, `truth` [H, W, 3] uint8, both contiguous; `mask` [H, W] uint8 is
+    not zero where a pixel counts, None where all do. `ssim_weight` is w in [0, 1].
     """
     count, width = image.numel(), image.shape[1]
     grid = (triton.cdiv(count, _BLOCK),)
@@ -171,8 +166,7 @@ def loss_and_gradient(
     similar, wrong = image.new_zeros(grid), image.new_empty(grid)
     gradient, masked = torch.empty_like(image), mask is not None
     if ssim_weight > 0:
-        blur_products[grid](
-            image, truth, mask, width, count, maps, MASKED=masked, BLOCK=_BLOCK)
+        blur_products[grid](image, truth, mask, width, count, maps, MASKED=masked, BLOCK=_BLOCK)
         similarity[grid](maps, width, count, slopes, similar, BLOCK=_BLOCK)
         blur_slopes[grid](slopes, width, count, maps, BLOCK=_BLOCK)
     gradient_of[grid](

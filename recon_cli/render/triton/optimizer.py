@@ -1,7 +1,6 @@
 """Adam over all parameters of all Gaussians in one launch (Kingma and Ba 2015, algorithm 1).
 
-The step count lies on the device: a step that comes to nothing there is not counted, and the host
-need not know.
+The step count lies on the device: a step that comes to nothing there is not counted.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ def move(value, gradient, first, second, i, here, rate, keep1, keep2, add1, add2
         p <- p - rate (m / c1) / (sqrt(v / c2) + epsilon)
 
     `keep` are b1 and b2, `add` 1 - b1 and 1 - b2, which would cancel in float32, `root1` 1 / c1 and
-    `root2` 1 / sqrt(c2). `here` says which numbers there are; with WHOLE all of them are, and a
-    lane takes four at a time.
+    `root2` 1 / sqrt(c2). With WHOLE all numbers are there, and a lane takes four at a time.
     """
     mask = None if WHOLE else here
     g = tl.load(gradient + i, mask=mask)
@@ -59,9 +57,9 @@ def adam(p0, p1, p2, p3, p4, p5, g0, g1, g2, g3, g4, g5, m0, m1, m2, m3, m4, m5,
          GATED: tl.constexpr, BLOCK: tl.constexpr):
     """Moves six groups; a program has a block of one of them.
 
-    For each group k: values `p`, gradients `g`, moments `m` and `v`, how many numbers `n` are to be
-    moved (all or none) and the learning rate `r`. `taken` [1] int64 counts the steps, this one
-    included. With GATED nothing moves where `counted` [1] int32 is zero. The rest is as in `move`.
+    For each group: values `p`, gradients `g`, moments `m` and `v`, how many numbers `n` move (all
+    or none) and the learning rate `r`. `taken` [1] int64 counts the steps, this one included. With
+    GATED nothing moves where `counted` [1] int32 is zero. The rest is as in `move`.
     """
     going = 1
     if GATED:
@@ -107,12 +105,10 @@ def step(
     Args:
         values: six contiguous float32 tensors, one for each group of parameters.
         gradients: of the same sizes.
-        moments: moving averages of the gradients, and of their squares.
+        moments: moving averages of the gradients, and of their squares, with the decays `betas`.
         rates: learning rate of each group; None leaves the group alone.
         taken: [1] int64, steps taken; one more where this one counts.
         counted: [1] int32, zero where the step comes to nothing; None where it counts anyway.
-        betas: decay of the two averages.
-        epsilon: keeps the quotient finite.
     """
     if len(values) != GROUPS:
         raise ValueError(f"{len(values)} groups of parameters, needed {GROUPS}")

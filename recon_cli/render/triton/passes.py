@@ -113,14 +113,10 @@ def prefix_sums(touched: Tensor) -> Tensor:
 def build_tile_lists(
     projected: ProjectedSplats, starts: Tensor, camera: Camera, view: Tensor, room: int
 ) -> TileLists:
-    """Returns the lists of a view.
+    """Returns the lists of a view, for the size of `camera`.
 
-    Args:
-        projected: into the view.
-        starts: [N + 1] int32, first slot of each Gaussian; those without slots are left out.
-        camera: whose size is taken.
-        view: see `gaussian.camera_buffer`.
-        room: instances that there is memory for; `starts` ends there or before.
+    `starts` [N + 1] int32 are the first slot of each Gaussian; those without slots are left out.
+    `room` is how many instances there is memory for; `starts` ends there or before.
     """
     tiles_x, tiles_y = triton.cdiv(camera.width, SIDE.value), triton.cdiv(camera.height, SIDE.value)
     keys, owners = list_instances(projected, starts, view, tiles_x, room)
@@ -176,14 +172,10 @@ def composite_tiles(
     lists: TileLists, camera: Camera, background: Tensor, counting: Tensor | None,
     scores: Statistics | None,
 ) -> CompositedImage:
-    """Composites all tiles.
+    """Composites all tiles, for the size of `camera`.
 
-    Args:
-        lists: of the view.
-        camera: whose size is taken.
-        background: [3], contiguous.
-        counting: [H, W] uint8, pixels that count in the scores; None where all do.
-        scores: gets hits, blend_sum and blend_max; None where they are not wanted.
+    `background` [3] is contiguous; `counting` [H, W] uint8 are the pixels that count in the scores,
+    None where all do; `scores` gets hits, blend_sum and blend_max.
     """
     like, height, width = lists.records, camera.height, camera.width
     rgb, alpha, depth = (like.new_empty(height, width, 3), like.new_empty(height, width),
@@ -213,8 +205,8 @@ def composite_tiles_backward(
 ) -> Tensor:
     """Returns the sums [E, SUMS] of every instance, see `compositing.composite_backward`.
 
-    `grad_rgb` [H, W, 3], `grad_alpha` and `grad_depth` [H, W] are contiguous; the latter two may be
-    None where `options` are plain. The other arguments are those of `composite_tiles`.
+    The gradients [H, W, 3] and [H, W] are contiguous; the last two may be None where `options` are
+    plain.
     """
     height, width = image.alpha.shape
     sums = lists.records.new_zeros(len(lists.members), SUMS)
@@ -232,14 +224,8 @@ def project_splats_backward(
 ) -> None:
     """Writes the gradients of the raw parameters, and the statistics of the backward pass.
 
-    Args:
-        source: as it was projected.
-        lists: of the view.
-        sums: of `composite_tiles_backward`.
-        options: the same.
-        gradients: tensors of the shapes of the parameters; sh_rest is left alone at degree 0.
-        statistics: changed in place.
-        counted: [1] int32; where it is zero, all is written as zero. None where it always counts.
+    The arguments are those of the passes before. sh_rest of `gradients` is left alone at degree 0.
+    Where `counted` [1] int32 is zero, all is written as zero; None always counts.
     """
     splats, n = source.splats, len(source.splats)
     if n:

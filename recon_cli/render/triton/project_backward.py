@@ -2,8 +2,8 @@
 
 With V = J W R S and Sigma' = V V^T + 0.3 I, L^T L the inverse of Sigma', M = sum s (u, v)(u, v)^T
 and P = L V, which is of order one: dL/dV = L^T M P and dL/dlog s = diag(P^T M P). By way of
-dL/dSigma' the gradient of a needle would cancel by the square of its length in pixels. What the
-forward pass computed is computed again: that is cheaper than to keep it.
+dL/dSigma' the gradient of a needle would cancel by the square of its length in pixels. The forward
+pass is computed again: cheaper than to keep it.
 """
 
 from __future__ import annotations
@@ -45,11 +45,10 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
                      DETAILS: tl.constexpr, SCORES: tl.constexpr, BLOCK: tl.constexpr):
     """Writes the gradients of all Gaussians, zero for those that no pixel shows.
 
-    Read are the parameters, `view`, `records` and `starts` as in the forward pass, and `sums`
-    [E, SLOT] of `compositing.composite_backward`. Written are the gradients `g_*` of all parameters
+    `sums` [E, SLOT] are of `compositing.composite_backward`. Written are the gradients `g_*`
     (g_sh_rest not at degree 0) and the statistics, see `contract.Statistics`: absolute_grad and
-    variance with DETAILS, loo with SCORES. With GATED all of them are zero where `counted` [1]
-    int32 is. With PLAIN `sums` hold nothing of depths.
+    variance with DETAILS, loo with SCORES. With GATED all are zero where `counted` [1] int32 is.
+    With PLAIN `sums` hold nothing of depths.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count

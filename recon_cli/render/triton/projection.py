@@ -1,8 +1,8 @@
 """From raw parameters to records, and to the list of instances: one lane a Gaussian.
 
 An instance is a Gaussian in a tile that its ellipse alpha = 1/255 meets on pixel centres. In a row
-of tiles the ellipse covers an interval, known in closed form, so that the tiles of a row are
-counted and written without a test each. Everything stays on the device.
+of tiles the ellipse covers an interval, known in closed form: its tiles are counted and written
+without a test each. Everything stays on the device.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ INFINITE = tl.constexpr(3e38)
 def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, colored, records,
             shapes, centers, depths, touched, radii, broken,
             STRIDE: tl.constexpr, TERMS: tl.constexpr, BLOCK: tl.constexpr):
-    """Projects Gaussians and counts the tiles that each meets.
+    """Projects `count` Gaussians and counts the tiles that each meets.
 
-    Read are the raw parameters of `count` Gaussians, of which `colored` have a row of STRIDE
-    numbers in sh_rest, TERMS a channel in use, and the camera buffer `view`. Written are, by row
+    The first `colored` of them have a row of STRIDE numbers in sh_rest, TERMS a channel in use.
+    Written are
 
     Args:
         records: [N, FLOATS], see `compositing`.
@@ -77,8 +77,7 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     center_x = tl.load(view + FX) * x / z + tl.load(view + CX)
     center_y = tl.load(view + FY) * y / z + tl.load(view + CY)
     per_z = (1.0 / z).to(tl.float32)
-    a0, a1, a2, b0, b1, b2 = image_axes(
-        view, (x / z).to(tl.float32), (y / z).to(tl.float32), per_z)
+    a0, a1, a2, b0, b1, b2 = image_axes(view, (x / z).to(tl.float32), (y / z).to(tl.float32), per_z)
     qw, qx, qy, qz, _ = unit_quaternion(quats, i, here)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
     v00, v01, v02 = project_axes(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
@@ -90,8 +89,7 @@ def project(means, quats, log_scales, logits, sh_dc, sh_rest, view, count, color
     # a c - b^2 cancels for needles; |vx x vy|^2 does not (Lagrange), and it is never negative
     w0, w1, w2 = v01 * v12 - v02 * v11, v02 * v10 - v00 * v12, v00 * v11 - v01 * v10
     det = w0 * w0 + w1 * w1 + w2 * w2 + (square_x + square_y + LOW_PASS) * LOW_PASS
-    sound = ((det < LARGE) & (det > 0.0) & (tl.abs(center_x) < LARGE)
-             & (tl.abs(center_y) < LARGE))
+    sound = ((det < LARGE) & (det > 0.0) & (tl.abs(center_x) < LARGE) & (tl.abs(center_y) < LARGE))
 
     to_x, to_y, to_z, _ = direction(means, view, i, here)
     red, green, blue = colors(
@@ -188,8 +186,8 @@ def list_tiles(shapes, centers, depths, starts, view, count, tiles_x, keys, owne
     """Writes the instances of each Gaussian into its slots.
 
     `starts` [N + 1] int32 is the first slot of each; without slots a Gaussian is left out. Written
-    are `keys` [E] int64: tile, and in the lower half the bits of the depth, which is positive; and
-    `owners` [E] int32, the Gaussian.
+    are `keys` [E] int64, the tile and in the lower half the bits of the depth, which is positive,
+    and `owners` [E] int32, the Gaussian.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -225,17 +223,10 @@ def place(keys, slots, owners, centers, records, starts, count, tiles_x, members
           BLOCK: tl.constexpr):
     """Writes what compositing reads of each instance, in the order of compositing.
 
-    Args:
-        keys: [E] int64, sorted.
-        slots: [E] int64, slot of each key.
-        owners: [E] int32, Gaussian by slot.
-        centers: [N, 2] float64.
-        records: [N, FLOATS].
-        starts: [N + 1] int32; the last one is how many instances there are.
-        count: N.
-        tiles_x: tiles in a row.
-        members: [E] int32 out, Gaussian.
-        offsets: [E, 2] out, u and v at the tile's first pixel.
+    `keys` [E] int64 are sorted, `slots` [E] int64 the slot of each key, `owners` [E] int32 the
+    Gaussian of each slot; the last of `starts` [count + 1] int32 is how many instances there are.
+    Written are `members` [E] int32, the Gaussian, and `offsets` [E, 2], u and v at the tile's first
+    pixel.
     """
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = e < tl.load(starts + count)

@@ -2,10 +2,10 @@
 
 How many instances a view has is known on the device alone, so buffers have room for more than are
 likely. A step that needs more is stopped there, with all that follow it, until the host looks at
-the `StepStatus`: it makes room and takes them again, so that no result depends on the room.
+the `StepStatus`, makes room and takes them again: no result depends on the room.
 
 On CUDA the launches of a step are recorded once its sizes have come up before, and replayed as a
-graph: between two densifications every size stays.
+graph.
 """
 
 from __future__ import annotations
@@ -52,18 +52,8 @@ class _DeviceTarget:
 class PhotometricStep:
     """Renders views over black, compares them with their photographs and runs the backward pass.
 
-    Attributes:
-        statistics: of the last view; its tensors are overwritten by each call. All zero where the
-            view does not count.
-        counted: [1] int32 on the device, zero where the last view does not count: its loss was not
-            finite, it saw no Gaussian, or it was stopped.
-        log_gain_gradient: [3] float64 on the device, of the last view that had a gain.
-        status: what the device records of the steps.
-
-    Args:
-        device: where everything lies.
-        graphs: records launches; None takes what suits the device.
-        room: instances that there is memory for at first; None for a likely number.
+    `graphs` records launches; None takes what suits the device. `room` is how many instances there
+    is memory for at first; None for a likely number.
     """
 
     def __init__(
@@ -72,12 +62,16 @@ class PhotometricStep:
         self._graphs = Graphs.of(device) if graphs is None else graphs
         self._room, self.status, self._most = room or 0, StepStatus(device), 0
         self._cameras: dict[int, tuple[Camera, Tensor]] = {}
+        # of the last view, overwritten by each call; all zero where the view does not count
         self.statistics = Statistics.zeros(torch.zeros(0, 3, device=device))
+        # [1] zero where the last view does not count: its loss was not finite, it saw no Gaussian,
+        # or it was stopped
         self.counted, self._fits = (
             torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
         self._background = torch.zeros(3, device=device)
         self._view = torch.zeros(25, dtype=torch.float64, device=device)
         self._pixels: dict[tuple[object, ...], Tensor] = {}
+        # of the last view that had a gain
         self.log_gain_gradient = torch.zeros(3, dtype=torch.float64, device=device)
 
     def __call__(
@@ -91,10 +85,10 @@ class PhotometricStep:
 
         Args:
             splats: N Gaussians, float32, contiguous; in the same memory from call to call.
-            gradients: tensors of the same shapes; sh_rest is left alone at degree 0.
+            gradients: of the same shapes; sh_rest is left alone at degree 0.
             camera: of the view.
             target: the photograph, in memory from which the device can read.
-            options: of the step; scores count even where the loss is not finite.
+            options: scores count even where the loss is not finite.
         """
         if len(self.statistics.radii) != len(splats):
             self.statistics = Statistics.zeros(splats.means.detach())
@@ -171,8 +165,7 @@ class PhotometricStep:
             lists = build_tile_lists(projected, starts, camera, self._view, room)
             image = composite_tiles(lists, camera, self._background, target.mask, scores)
             rgb = image.rgb if target.gain is None else image.rgb * target.gain
-            loss, grad_rgb = loss_and_gradient(
-                rgb, target.pixels, options.ssim_weight, target.mask)
+            loss, grad_rgb = loss_and_gradient(rgb, target.pixels, options.ssim_weight, target.mask)
             if target.gain is not None:
                 # y = g x: dL/dlog g = g dL/dg = sum over pixels of y dL/dy
                 self.log_gain_gradient.copy_((rgb.double() * grad_rgb).sum((0, 1)))

@@ -19,9 +19,9 @@ INFINITE = tl.constexpr(float("inf"))
 def admit_kernel(ends, count, room, status, starts, fits, BLOCK: tl.constexpr):
     """Lets a step go on if its instances fit into `room` and no step before it was stopped.
 
-    Every program decides the same; the first one writes it into `fits` [1] int32. Of `ends`
-    [count + 1] int64, see `passes.ProjectedSplats`, it makes `starts` [count + 1] int32: all zero
-    where the step is stopped. `record_kernel` stores the decision in `status` [6] float64.
+    Every program decides the same; the first one writes it into `fits` [1] int32. From `ends`
+    [count + 1] int64, see `passes.ProjectedSplats`, come `starts` [count + 1] int32, all zero where
+    the step is stopped. `record_kernel` stores the decision in `status` [6] float64.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i <= count
@@ -34,10 +34,9 @@ def admit_kernel(ends, count, room, status, starts, fits, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize=("count", "room"))
 def record_kernel(ends, count, room, loss, fits, status, counted):
-    """Records the result of a step in `status`.
+    """Records the result of a step in `status`; `loss` is [1] float64.
 
-    `loss` is [1] float64, the others are as in `admit_kernel`. `counted` [1] int32 out: the step
-    has a finite loss and saw a Gaussian.
+    `counted` [1] int32 out: the step has a finite loss and saw a Gaussian.
     """
     total, value = tl.load(ends + count), tl.load(loss)
     going = tl.load(fits) != 0
@@ -55,22 +54,15 @@ def record_kernel(ends, count, room, loss, fits, status, counted):
 
 @dataclass(frozen=True)
 class StepReport:
-    """The results of the steps since the host last looked.
+    """The results of the steps since the host last looked."""
 
-    Attributes:
-        stopped: how many of them were taken before one had too many instances; that one and those
-            after it changed nothing. None where all were taken.
-        needed: most instances of a step.
-        skipped: steps whose loss was not finite; they changed nothing.
-        instances: of the last step.
-        loss: of the last step.
-    """
-
+    # How many were taken before one had too many instances; that one and those after it changed
+    # nothing. None where all were taken.
     stopped: int | None
-    needed: int
-    skipped: int
-    instances: int
-    loss: float
+    needed: int  # most instances of a step
+    skipped: int  # steps whose loss was not finite; they changed nothing
+    instances: int  # of the last step
+    loss: float  # of the last step
 
 
 class StepStatus:
