@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recon_cli.errors import ConfigError, FormatError, InputError
-from recon_cli.evaluation.scores import Table
 from recon_cli.workspace import atomic
+
+if TYPE_CHECKING:  # it imports scipy, for which `--help` must not wait
+    from recon_cli.evaluation.scores import Table
 
 BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"
 _INSTALL = "pip install 'recon-cli[plot]'"
