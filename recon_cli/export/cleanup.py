@@ -6,13 +6,12 @@ and in each it is less than half way to what is behind it: it was fitted to thes
 *Harmful*: without it the views would be rendered better. That is exact for each Gaussian alone,
 since colour is affine in its alpha: with d = alpha T (c - B) its contribution to a pixel and e the
 error there, removing it changes the squared error by sum ||d||^2 - 2 sum e d. The first sum is
-`loo`; the second is the gradient of half the squared error by the logarithm of the opacity. Two
-that cover each other share each other's error, so the worst are removed first and the rest is
+`loo`; the second is the gradient of half the squared error by the logarithm of the opacity.
+Gaussians that cover each other share their error, so only the worst are removed before the rest is
 measured again.
 
-Islands are small groups far from the largest group of touching Gaussians, the scene. Two touch if
-their centres are no farther apart than three of their standard deviations together, both along the
-line between them.
+Islands are small groups far from the scene, the largest group of touching Gaussians. Two touch if
+their centres are within three of their standard deviations together, along the line between them.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ logger = logging.getLogger("recon")
 def drop_floaters(splats: Splats, views: Sequence[TrainView], ctx: StageContext) -> Splats:
     """Returns a scene without floaters, and logs how many of each kind are removed.
 
-    The cameras of the training views are in its world. ConfigError if nothing would be left.
+    The training views' cameras are in its world. ConfigError if nothing would be left.
     """
     on_device = splats.map(lambda tensor: tensor.to(ctx.device))
     with ctx.progress.bar("look for floaters", 3 * len(views), unit="view") as bar:
@@ -79,8 +78,8 @@ def drop_islands(
 ) -> Splats:
     """Returns a scene without small groups of Gaussians far from all others.
 
-    `scene` has the extent of the room in the world of the training, and `similarity` leads from
-    there to that of `splats` and of the training views (None if there are none).
+    `scene` has the extent of the room in the world of the training, from which `similarity` leads
+    to that of `splats` and of the training views (None if there are none).
     """
     center = similarity.points(scene.center).tolist()
     near = splats.within(center, similarity.scale * scene.reach)
@@ -118,10 +117,9 @@ def find_floaters(
     splats: Splats, views: Sequence[TrainView], *, backend: str,
     on_view: Callable[[], None] = lambda: None,
 ) -> Floaters:
-    """Returns which Gaussians are floaters.
+    """Returns which Gaussians are floaters, by training views with cameras in their world.
 
-    The views are training views, whose cameras are in the world of the Gaussians; `on_view` is
-    called after each rendered one.
+    `on_view` is called after each rendered view.
     """
     none = torch.zeros(len(splats), dtype=torch.bool, device=splats.means.device)
     seen_by = count_sightings(splats, views, backend=backend, on_view=on_view)
@@ -145,7 +143,7 @@ def measure_harm(
     splats: Splats, views: Sequence[TrainView], *, backend: str,
     on_view: Callable[[], None] = lambda: None,
 ) -> tuple[Tensor, float]:
-    """Returns the decrease of the squared error without each one [N] float64, and the error.
+    """Returns by how much the squared error shrinks without each one, [N] float64, and the error.
 
     Pixels that a mask ignores have no error.
     """
@@ -230,8 +228,8 @@ def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor
     """Returns which Gaussians belong to islands, [N] bool.
 
     `near` [N] are those near enough to be islands, `visible` [N] what a training view shows, None
-    if unknown. Groups outside the box of the scene that a view shows are no islands: they are seen
-    through a window.
+    if unknown. Groups outside the box of the scene that a view shows, through a window, are no
+    islands.
     """
     drawn = (near & (splats.opacities >= _VISIBLE)).cpu()
     rows = torch.nonzero(drawn)[:, 0]

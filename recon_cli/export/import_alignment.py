@@ -29,8 +29,8 @@ from recon_cli.workspace.summaries import WorldSummary
 
 SOURCE, WORKSPACE = "source", "workspace"
 _VIEWS = 6  # rendered in each frame, at most
-# dB above flat pictures. Three scenes in place got 15 to 24; turned by 3 degrees or a tenth too
-# large 2.5 to 9, and further off less than 2. docs/import.md
+# dB above flat pictures: three scenes got 15 to 24 in place, 2.5 to 9 if turned by 3 degrees or a
+# tenth too large, and less than 2 if further off. docs/import.md
 _DOUBTFUL, _EVIDENT = 8.0, 2.0
 
 
@@ -83,8 +83,8 @@ def align_to_views(
     """Returns the frame in which a scene fits the training views best, and how well.
 
     `world` leads from the frame of the source to that of the workspace; `frame` is one of these, or
-    auto for the better one. `max_size` is the longest side of the images in pixels.
-    ReconstructionError if no training view can be compared.
+    auto. `max_size` is the longest side of the images in pixels. ReconstructionError if no view can
+    be compared.
     """
     frames = {WORKSPACE: Similarity(), SOURCE: world}
     if frame != "auto":

@@ -1,7 +1,4 @@
-"""Reduction of a scene before export: to a box, a lower degree or a file size.
-
-Each change is logged in Gaussians, degree and PSNR.
-"""
+"""Reduction of a scene before export: to a box, a lower degree or a file size."""
 
 from __future__ import annotations
 
@@ -58,14 +55,8 @@ def fit_to_size(
     """Returns the scene reduced to a file size, by the degree and count that look best together.
 
     For each degree as many Gaussians of the highest scores as fit; of these scenes the one with the
-    highest PSNR. ConfigError if not even one Gaussian fits.
-
-    Args:
-        splats: the scene.
-        max_bytes: of the file.
-        size_of: returns the size of the file of a scene.
-        score_of: returns how much each Gaussian matters, [N]; called at most once.
-        psnr_db: returns the PSNR of a scene on views that the scores do not use.
+    highest PSNR, on views that the scores do not use. `score_of` returns how much each Gaussian
+    matters, [N], and is called at most once. ConfigError if not even one Gaussian fits.
     """
     if size_of(splats) <= max_bytes:
         return splats

@@ -37,7 +37,7 @@ def synthetic_scene(splats: Splats, *, z_up: bool, max_size: int) -> Scene:
 
     The first four stand around the bulk of the opaque Gaussians and look at its middle, the other
     four stand where there is most space inside and look outward. Up is z, or -y; `max_size` is the
-    longest side of the images in pixels.
+    longest side in pixels.
     """
     opaque = splats.opacities >= _OPAQUE
     means = splats.means[opaque if bool(opaque.any()) else ~opaque].double().cpu().numpy()
@@ -79,8 +79,8 @@ def _find_emptiest(
 class SelfPsnr:
     """PSNR of a changed scene against renders of the whole one, on the scale of photos.
 
-    It is what a scene that shows photos at ASSUMED_DB would get: the error there and the
-    difference to the renders add up as variances do. Only pixels that show something count.
+    It is that of a scene that shows photos at ASSUMED_DB: the error there and the difference to the
+    renders add up as variances do. Only pixels that show something count.
     """
 
     # cameras, what the whole scene shows there, [H, W, 3] in [0, 1], and where, [H, W]
@@ -89,10 +89,7 @@ class SelfPsnr:
 
     @staticmethod
     def of(splats: Splats, scene: Scene, ctx: StageContext) -> SelfPsnr:
-        """Renders `splats` at the training cameras of `scene`.
-
-        ReconstructionError if none of them sees anything.
-        """
+        """Renders `splats` at the cameras of `scene`; ReconstructionError if none sees anything."""
         renders = [(view.camera, *_render(splats, view.camera, ctx)) for view in scene.train]
         views = tuple(view for view in renders if view[2].any())
         if not views:

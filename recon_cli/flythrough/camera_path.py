@@ -2,8 +2,8 @@
 
 `camera_path` lists `camera_to_world` (16 numbers row by row, OpenGL axes: x right, y up, looking
 along -z) and `fov` (vertical, in degrees); `render_width` and `render_height` hold for all frames.
-Pixels are square and the principal point is the image centre, as in nerfstudio's
-cameras/camera_paths.py. Poses are in the world frame of the scene that the file was made for.
+Pixels are square and the principal point is the image centre (nerfstudio's
+cameras/camera_paths.py). Poses are in the world of the scene that the file was made for.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ from recon_cli.io.transforms import read_number
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.atomic import read_json, write_json
 
-# With a wider field of view the focal length is below a twentieth of the height, where the affine
-# approximation of a Gaussian's projection fails; a narrower one shows no room.
-_FOV_DEG = (1.0, 170.0)
+_FOV_DEG = (1.0, 170.0)  # a wider one fails the affine approximation of a Gaussian's projection
 _HINT = "Export the path again from the program that wrote it."
 
 logger = logging.getLogger("recon")
@@ -75,8 +73,7 @@ def read_camera_path(path: Path) -> CameraPath:
     entries = value.get("camera_path") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FormatError(
-            f"{path} lists no cameras: `camera_path` must be a list of at least one.",
-            hint=_HINT)
+            f"{path} lists no cameras: `camera_path` must be a list of at least one.", hint=_HINT)
     kind = value.get("camera_type", "perspective")
     if kind != "perspective":
         raise FormatError(

@@ -118,8 +118,8 @@ def _no_such_view(
 def frame_size(width: int, height: int, request: RenderRequest) -> tuple[int, int]:
     """Returns the (width, height) of frames whose own size is `width` x `height`.
 
-    A side that is not requested follows from the other; for a video it is even. ConfigError if a
-    requested side of a video is odd.
+    A side that is not requested follows from the other. For a video both are even; ConfigError if a
+    requested one is odd.
     """
     sides = (request.width, request.height)
     if request.size:

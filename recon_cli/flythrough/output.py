@@ -1,7 +1,7 @@
 """The files of a flythrough: colour, 16-bit depth and its colours, alpha, and videos of them.
 
-Videos are H.264 or AV1 in an .mp4, through PyAV. Colours are stored and tagged as BT.709 of limited
-range: without the tags, players guess from the size of the picture.
+Videos are H.264 or AV1 in an .mp4, through PyAV, tagged as BT.709 of limited range: without the
+tags, players guess from the size of the picture.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ VIDEO_FRAMES = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA}  # the frames of its
 FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,)}
 FARTHEST = 65_535  # steps; greater depths are clipped to it
 _MIN_ALPHA = 0.5  # a pixel with less has no depth
-# Depths that nearly all points lie between. Few points may cover much of a picture where a camera
-# comes close, so the colours begin at half of the first.
+# Quantiles of depth. Where a camera comes close, few points cover much of a picture: the colours
+# begin at half of the first.
 _ENDS = (0.02, 0.98)
 _BLUE = 0.08  # of the colour map; colours before that are nearly black
 ENCODERS = {"h264": ("libx264",), "av1": ("libsvtav1", "libaom-av1")}  # the first available
@@ -71,8 +71,8 @@ class DepthScale:
     def select_surfaces(self, splats: Splats) -> Splats:
         """Returns the Gaussians of the room, without the distant ones outside its windows.
 
-        Distant Gaussians are a hundred extents away: with a weight of a hundredth behind a wall,
-        they would move the wall's mean depth by an extent.
+        At a hundred extents, one with a weight of 0.01 behind a wall moves its mean depth by an
+        extent.
         """
         inside = splats.within(self.center, self.reach)
         return splats if bool(inside.all()) else splats.select(inside)
@@ -81,7 +81,7 @@ class DepthScale:
 def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
     """Returns the scale for a scene; colours span the depths that its training cameras see.
 
-    The range is that of the scene, not of each frame, so that a video does not flicker.
+    All frames share it, so that a video does not flicker.
     """
     depths = np.concatenate([visible_depths(view.camera, scene.points) for view in scene.train])
     near, far = np.quantile(depths, _ENDS) if len(depths) else (0.0, scene.extent)
@@ -180,8 +180,8 @@ def check_encoding(encoding: VideoEncoding) -> None:
 def _restore_scheduling() -> Iterator[None]:
     """Restores the scheduling of this thread at the end.
 
-    SVT-AV1 gives the thread that opens it real-time priority where the user is root, as in a
-    container, and leaves it so: what spins on that thread later would starve all others for good.
+    Where the user is root, as in a container, SVT-AV1 leaves the thread that opens it with
+    real-time priority: what spins there later would starve all others.
     """
     if not hasattr(os, "sched_getscheduler"):  # Linux alone has it
         yield

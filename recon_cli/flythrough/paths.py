@@ -1,8 +1,7 @@
 """Camera paths: a smooth path through the cameras of a hand-held capture, and an orbit.
 
-The camera centres are the control points of a cubic B-spline, which stays within their convex hull:
-the path of a walk inside a room cannot leave it through a wall. The price is that the path cuts
-corners and does not pass through the centres themselves.
+The camera centres are the control points of a cubic B-spline. It stays within their convex hull, so
+the path inside a room leaves through no wall, but cuts corners and misses the centres themselves.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ _LEAST_RADIUS = 0.05  # of the median distance from the middle: cameras may all 
 # Standard deviation of the filter before the spline: a fortieth of the path, up to three cameras.
 # With the spline it reduces the radius of a circle of 24 cameras by 2.5%, of 96 cameras by 1.4%.
 _SHARE, _MOST = 1 / 40, 3.0
-# Rotations whose mean is shorter than this as quaternions point too far apart to have one.
-_MEAN_MIN = 0.5
+_MEAN_MIN = 0.5  # length of a mean quaternion, below which rotations are too far apart to have one
 _FINE = 64  # steps from camera to camera along which lengths are measured
 _FASTER = 2.0  # times the mean turn rate of the view, above which the path slows down
 
@@ -30,8 +28,8 @@ _FASTER = 2.0  # times the mean turn rate of the view, above which the path slow
 def smooth_path(viewmats: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Returns `count` cameras [count, 4, 4] along a smooth path through cameras, at constant speed.
 
-    Where the view would turn faster than twice its mean rate, the path slows down. `viewmats` are
-    [C, 4, 4] world to camera, OpenCV axes, in the order of the path; its ends are kept.
+    Where the view would turn faster than twice its mean rate, the path slows down. `viewmats` [C,
+    4, 4] are world to camera, OpenCV axes, in the order of the path; its ends are kept.
     """
     rotations = viewmats[:, :3, :3].transpose(0, 2, 1)
     centers = -np.einsum("cij,cj->ci", rotations, viewmats[:, :3, 3])
@@ -95,9 +93,9 @@ def orbit_path(
 ) -> NDArray[np.float64]:
     """Returns `count` cameras [count, 4, 4] on a circle around a point, all of them looking at it.
 
-    The circle has the median horizontal distance and the median height of `centers` [C, 3], starts
-    on the side of the first of them and turns anticlockwise as seen from above; `up` is a unit
-    vector. It is closed: one more camera would be the first again.
+    The circle has the median horizontal distance and height of `centers` [C, 3], starts on the side
+    of the first and turns anticlockwise as seen from above; `up` is a unit vector. It is closed:
+    one more camera would be the first again.
     """
     offsets = centers - target
     heights = offsets @ up

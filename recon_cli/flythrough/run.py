@@ -1,8 +1,7 @@
 """Renders the frames of a request into a folder and encodes videos of them.
 
-render.json in the folder records the settings. Frames are written atomically, so those of the same
-settings are kept, and an interrupted run continues; with other settings everything is rendered
-again.
+Its render.json records the settings. Frames are written atomically: those of the same settings are
+kept, so an interrupted run continues; with other settings all are rendered again.
 """
 
 from __future__ import annotations
@@ -65,8 +64,8 @@ class FrameFolder:
     def prepare(self, settings: Mapping[str, Any], about: Mapping[str, Any]) -> tuple[str, ...]:
         """Prepares the folder for these settings and returns which frames are missing.
 
-        `settings` are JSON values of everything that decides what a frame shows, `about` more of
-        them for readers of the record. FormatError if the record of an earlier run is damaged.
+        `settings` are JSON values of all that decides what a frame shows, `about` more of them for
+        readers of the record. FormatError if the record of an earlier run is damaged.
         """
         settings = {"schema": _SCHEMA, **settings}
         before = self.read_record()

@@ -59,10 +59,10 @@ class TrainedScene:
 
 
 def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> TrainedScene:
-    """Returns the trained scene of a workspace.
+    """Returns the trained scene of a workspace; StageError if the model is missing or stale.
 
     `model` is auto, base or pruned; auto is the pruned one if it is fresh. `verb` is the command,
-    for messages. StageError if the model is missing or stale.
+    for messages.
     """
     inspection, folder = job.inspect(), job.workspace.folder
     origin = ImportRecord.read(folder("train"))

@@ -32,8 +32,7 @@ HELD_OUT, TRAINING, VALIDATION = "held-out", "training", "validation"
 _FOLDERS = {"pruned": "prune", "base": "train"}
 FAR = 1000.0  # world units; viser's default
 _FOV = math.radians(60)  # for a file, which has no camera
-# Cosine between the up of the image and of the world, below which a view looks up or down.
-_STEEP = 0.05
+_STEEP = 0.05  # cosine between the image's and the world's up, below which a view looks up or down
 _SHARE = 0.05  # of the Gaussians outside the initial box at either end of each axis
 _MARGIN = 0.1  # of its sides
 _CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
@@ -136,8 +135,8 @@ def move_browser(
 ) -> None:
     """Moves the camera of a browser to `target`, with the roll of `camera`.
 
-    The browser's up becomes the world's up as the camera sees it, so that dragging the mouse
-    afterwards still turns around the vertical.
+    The browser's up becomes the world's up as the camera sees it, so that dragging still turns
+    around the vertical.
     """
     right, image_up = camera.viewmat[0, :3], -camera.viewmat[1, :3]
     world_up = image_up if up is None else up - (up @ right) * right
@@ -206,9 +205,9 @@ def _format(value: float) -> str:
 
 
 class PhotoPairs:
-    """Photos of views next to recon's own renders of them, made on request.
+    """Photos of views next to recon's own renders of them; for one thread at a time.
 
-    One thread at a time may use it. `max_size` is the longest side in pixels.
+    `max_size` is the longest side in pixels.
     """
 
     def __init__(self, job: Job, max_size: int) -> None:

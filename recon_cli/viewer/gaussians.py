@@ -1,8 +1,7 @@
 """Packs Gaussians for the browser: covariances in half precision, colours of 8 bits.
 
-viser sends a covariance as six half-precision numbers, which overflow above a standard deviation of
-255 and vanish below 0.0003. Therefore everything is sent in units in which the largest Gaussian
-fits, and the scene node is scaled back to world units.
+Half-precision covariances overflow above a standard deviation of 255 and vanish below 0.0003. So
+everything is sent in units in which the largest Gaussian fits, and the scene node is scaled back.
 """
 
 from __future__ import annotations

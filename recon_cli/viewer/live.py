@@ -1,8 +1,7 @@
 """`recon train --view`: shows a training in the browser at a bounded cost.
 
-An update costs the copy, packing and sending in another thread, and the drawing by a browser on the
-same machine. All of it is waited for and measured, and the next update is due when this one has
-become a small share of the time since. Without a browser nothing is copied.
+The cost of an update, up to its drawing by the browser, is measured, and the next one is due when
+it has become a small share of the time since. Without a browser nothing is copied.
 """
 
 from __future__ import annotations

@@ -193,8 +193,7 @@ def composite_tiles(
     n = len(lists.records)
     if scores and n:
         tally[(triton.cdiv(n, BLOCK),)](
-            lists.starts, *tallied, n, scores.hits, scores.blend_sum, scores.blend_max,
-            BLOCK=BLOCK)
+            lists.starts, *tallied, n, scores.hits, scores.blend_sum, scores.blend_max, BLOCK=BLOCK)
     return CompositedImage(rgb, alpha, depth, final, last)
 
 

@@ -92,8 +92,7 @@ class StepStatus:
         _, stopped, needed, skipped, instances, loss = self.numbers.tolist()
         self.numbers.copy_(self._first)
         return StepReport(
-            None if stopped < 0 else int(stopped), int(needed), int(skipped), int(instances),
-            loss)
+            None if stopped < 0 else int(stopped), int(needed), int(skipped), int(instances), loss)
 
 
 def admit_step(ends: Tensor, room: int, status: StepStatus, fits: Tensor) -> Tensor:
