@@ -1,8 +1,6 @@
 """The contact sheet: one picture of the kept and dropped frames of a capture, with the reasons.
 
-Its size is bounded: where not all frames fit, an even sample of each kind is shown. It has 256
-colours, a quarter of a byte a pixel (measured on four captures), or fewer where the file would be
-too large.
+Its size is bounded: where not all frames fit, an even sample of each kind is shown.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """A decoded frame as it is displayed: deinterlaced, in sRGB, with square pixels, upright.
 
-Pixels that are not square are stretched along the width, as players do, so that rows are never
-mixed. A mirrored display matrix is read as its rotation.
+Pixels that are not square are stretched along the width, as players do. A mirrored display matrix
+is read as its rotation.
 
-HDR (HLG or PQ) becomes sRGB with BT.709 primaries. Display light comes from ITU-R BT.2100: the EOTF
-of PQ, or of HLG with its OOTF for a display of 1000 cd/m2. The EETF of Report BT.2408, Annex 5,
-fits it below the white of SDR. It is applied to the largest of R, G and B, which keeps the hue, and
-is the same for all frames, so that a wall keeps its colour; the peak in the metadata is ignored.
+HDR (HLG or PQ) becomes sRGB with BT.709 primaries: the EOTF of ITU-R BT.2100 (for HLG with the OOTF
+of a display of 1000 cd/m2), then the EETF of Report BT.2408, Annex 5, down to the white of SDR. It
+is applied to the largest of R, G and B, which keeps the hue, with the same peak for all frames.
 """
 
 from __future__ import annotations
@@ -29,9 +28,8 @@ from numpy.typing import NDArray
 UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
 # Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
 SD_WIDTH, SD_HEIGHT = 1280, 576
-# Without these, swscale cuts off where it should round, and repeats colours of half resolution
-# instead of interpolating them. Against the frames that a rendered video was made from: 1.0 of 255
-# too dark and 38.4 dB; with these 0.1 too bright and 39.0 dB, at 1.6 times the cost.
+# Without these, swscale truncates, and repeats chroma instead of interpolating it. Frames of a
+# rendered video: 1.0 of 255 too dark and 38.4 dB; with these 0.1 and 39.0 dB, 1.6 times the cost.
 ROUNDED = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 # One frame per frame, not per field: the rows of the first field stay as recorded.
 BWDIF = "mode=send_frame:parity=auto:deint=interlaced"
@@ -56,11 +54,9 @@ D65 = (0.3127, 0.3290)
 # Steps of the gain over the root of the light: neighbours differ by less than 0.2 %.
 GAIN_STEPS = 4096
 GAIN_REACH = 2.0  # of the peak: pure red of BT.2020 is 1.66 of it as red of BT.709
-# What swscale makes of white in limited range when it goes to 16 bits: 255 * 256. In full range it
-# is up to 0.4 % more, which clips.
+# swscale's white of limited range at 16 bits, 255 * 256; full range is up to 0.4 % more, and clips.
 WHITE = 65280
-# Pixels at a time, so that intermediate values stay in the cache: 14 ms a megapixel of HLG on one
-# core of a server CPU (AMD EPYC), 37 in one piece.
+# Pixels at a time, to stay in the cache: 14 ms a megapixel of HLG on an EPYC core, else 37.
 STRIP = 1 << 15
 
 
@@ -120,11 +116,7 @@ class DecodedPicture:
         return (height, width) if self._quarter_turns() % 2 else (width, height)
 
     def rgb(self) -> NDArray[np.uint8]:
-        """Returns the frame as it is displayed: upright, full-range RGB, [H, W, 3].
-
-        Colour matrix and range come from the frame's tags. Ten-bit frames are reduced to eight
-        bits, and HDR to SDR.
-        """
+        """Returns the frame as displayed: upright 8-bit full-range RGB [H, W, 3], HDR as SDR."""
         transfer, untagged = self.tags.transfer, self.frame.colorspace == UNSPECIFIED
         if transfer is None:
             large = self.frame.width >= SD_WIDTH or self.frame.height > SD_HEIGHT
@@ -224,8 +216,7 @@ def hlg_scene(signal: NDArray[np.float64]) -> NDArray[np.float64]:
 def tone_map(light: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns light of up to `PEAK` cd/m2 fitted below `SDR_WHITE`; BT.2408, Annex 5.
 
-    Up to 88 cd/m2 nothing changes. Above, a Hermite spline in PQ bends to the white of SDR: 203
-    cd/m2 become 159, and `PEAK` becomes 203. Black is 0 on both sides.
+    Up to 88 cd/m2 nothing changes. Above, a Hermite spline in PQ takes 203 to 159, `PEAK` to 203.
     """
     top = pq_signal(np.array(PEAK))
     x = pq_signal(np.minimum(light, PEAK)) / top
@@ -247,10 +238,7 @@ def srgb_code(light: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 @cache
 def gray_table(transfer: Transfer) -> NDArray[np.uint8]:
-    """Returns the byte that each 8-bit gray becomes, [256]: what `to_sdr` does to neutral pixels.
-
-    Colours come out as the gray of their luma: enough to measure sharpness and motion on.
-    """
+    """Returns the byte that each 8-bit gray becomes, [256]: `to_sdr` of neutral pixels."""
     signal = np.arange(256) / 255
     light = hlg_scene(signal) ** HLG_GAMMA * PEAK if transfer is Transfer.HLG else pq_light(signal)
     return srgb_code(tone_map(light) / SDR_WHITE)

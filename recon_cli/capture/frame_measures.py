@@ -25,13 +25,11 @@ BLACK, BLOWN_OUT = 16, 250
 MOST_CLIPPED = 0.5
 # More than this and nothing in the frame can be matched: it is never chosen.
 ALL_CLIPPED = 0.95
-# A frame whose areas differ by less than this many gray values (standard deviation) is flat: a
-# lens cap, a wall that fills the view. Noise is averaged out before.
+# A frame whose areas differ by a smaller standard deviation (gray values) is flat: a wall, a cap.
 FLAT = 4.0
 AREAS = 32  # along each side
 EVERY = 4  # pixels; a share is known well enough from every 16th
-# Pixels on the longest side: makes sharpness comparable and keeps sensor noise of large frames
-# from passing for detail.
+# Pixels on the longest side: sharpness is comparable and free of the sensor noise of large frames.
 SHARPNESS_SIZE = 960
 
 
@@ -46,9 +44,8 @@ class MotionMeter:
     def advance(self, gray: NDArray[np.uint8]) -> float:
         """Returns how much further from the anchor this frame is than any frame since the anchor.
 
-        That is the median displacement gained by the next frame [H, W], of constant size, as a
-        fraction of the width; 0 for the first frame and for one that moves back; NaN where too few
-        corners can be followed.
+        That is the median displacement of the next frame [H, W] as a fraction of the width; 0 for
+        the first frame and one that moves back; NaN where too few corners can be followed.
         """
         small, (height, width) = gray, gray.shape
         if width > TRACK_WIDTH:
@@ -80,8 +77,7 @@ class MotionMeter:
             self._anchor, small, self._corners, None, winSize=WINDOW, maxLevel=LEVELS)
         returned, backward, _ = cv2.calcOpticalFlowPyrLK(
             small, self._anchor, tracked, None, winSize=WINDOW, maxLevel=LEVELS)
-        # A corner counts when tracking it back ends where it began; onto a blank wall the tracker
-        # slides without an error.
+        # Tracking a corner back must end where it began; on a blank wall the tracker slides.
         error = np.linalg.norm((returned - self._corners).reshape(-1, 2), axis=1)
         good = (forward & backward)[:, 0].astype(bool) & (error <= RETURN_ERROR)
         if good.sum() < MIN_TRACKS:
@@ -114,10 +110,9 @@ def has_content(exposures: NDArray[np.float64]) -> NDArray[np.bool_]:  # [F]
 def check_exposure(
     name: str, exposures: NDArray[np.float64], *, least: int, unit: str = "frames"
 ) -> None:
-    """Raises InputError when fewer than `least` frames show anything, and says what is wrong.
+    """Raises InputError when fewer than `least` frames (or `unit`) of a capture show anything.
 
-    `name` is that of the capture, which consists of `unit`; `exposures` [F, 3] are rows of
-    `measure_exposure` for all frames that could be read.
+    `exposures` [F, 3] are rows of `measure_exposure` for all frames that could be read.
     """
     usable = int(has_content(exposures).sum())
     if usable >= least:

@@ -1,10 +1,9 @@
 """Which frames of a video or photos of a folder are chosen, and the record of the choice.
 
 From a video: locally sharp frames, spread evenly over the camera's path. Frames that are mostly
-black or blown out count as blurred: they are avoided, but where a whole stretch is like that, its
-best frames bridge the gap. Photos are all kept, except those that show nothing or the same view as
-another (copies, resaved files, bursts from one place): such a picture adds no depth, costs as much
-as any and, where one of two is held out, lets a model be tested on a view that it was trained on.
+black or blown out count as blurred; the best of them bridge gaps. Photos are all kept, except those
+that show nothing or the same view as another: where one of two equal views is held out, a model is
+tested on what it was trained on.
 """
 
 from __future__ import annotations
@@ -34,17 +33,13 @@ from recon_cli.workspace import atomic
 
 CHOICE = "choice.json"
 MIN_FRAMES = 3  # two views leave nothing to check a reconstruction with
-# A frame is compared with the 75th percentile of the 31 frames around it: a few sharp ones set the
-# level, and a dark or bare stretch of the room is measured by its own frames.
+# A frame is compared with the 75th percentile of the 31 around it: a few sharp ones set the level.
 GATE_WINDOW, GATE_PERCENTILE = 31, 75
-# Path between chosen frames in widths of the image: 94% overlap, so that many of them see a
-# point. A 10 s walk through a room (4.5 widths) gives 75 frames.
+# Path between chosen frames in widths of the image: 94% overlap; 75 frames of a 10 s walk.
 FRAME_SPACING = 0.06
-# Sharp frames further apart than this, 88% overlap, get the least blurred ones between them: a
-# fast turn is blurred throughout, and without it the reconstruction falls into two pieces.
+# Sharp frames further apart (88% overlap), as in a fast turn, get the least blurred ones between.
 MAX_GAP = 0.12
-# Beside textured views a plain one fails the test although it is sharp. It is this much sharper
-# than blurred frames of the same gap: 5 to 10 times in a rendered room.
+# A plain sharp view fails that test, but is 5 to 10 times sharper than blurred frames of its gap.
 MUCH_SHARPER = 2.0
 # Frames of a camera that hardly moves, to average out noise.
 MIN_AUTOMATIC = 24
@@ -52,13 +47,11 @@ MIN_AUTOMATIC = 24
 MAX_STEP = 0.1
 # A shorter path (a third of a pixel in 320) is tracking noise of a camera on a tripod.
 NO_MOTION = 0.001
-# A shorter path, two steps of the usual spacing, causes a notice: structure from motion starts from
-# three frames further apart.
+# A shorter path, two steps of the usual spacing, causes a notice.
 LITTLE_MOTION = 2 * FRAME_SPACING
 SIDE = 64  # pixels of a signature
-# Distance of two signatures below which they are one view. The same picture as JPEG of quality 20
-# lies at .01 to .03, with noise of 10 at .01 to .02, moved by .1% of its width at .02 to .04; the
-# closest two of 317 real photos and rendered frames lie at .08, of most captures above .2.
+# Distance of two signatures below which they are one view. A picture resaved, noisy or moved a
+# little lies at .01 to .04 from itself; the closest two of 317 photos and frames at .08.
 SAME_VIEW = 0.05
 NAMED = 8  # photos that a message lists; all are in the record of the selection
 
@@ -141,9 +134,7 @@ def check_motion(name: str, motion: NDArray[np.float64]) -> str:
     """Returns a warning where the camera of the video `name` hardly moves, else nothing.
 
     `motion` [F] is the displacement gained with each frame, in widths, NaN where unknown.
-
-    Raises:
-        InputError: the camera does not move at all, as far as its motion is known.
+    InputError if the camera does not move at all.
     """
     steps = motion[1:]
     known = steps[~np.isnan(steps)]
@@ -227,9 +218,8 @@ def choose_frames(
 
     The usable frames are cut into `count` runs of equal path length, none of them empty. Each run
     gives the sharpest frame of its middle two thirds, so that sharpness cannot push neighbours
-    together. A run gives one of the `bridges`, usable frames that are blurred or badly exposed,
-    only where it holds nothing else: few frames lie so far apart that most gaps need no bridge.
-    Then one that is much sharper may lie off the middle.
+    together. `bridges` are usable frames that are blurred or badly exposed: a run gives one, maybe
+    off the middle, only where it holds nothing else.
     """
     candidates = np.flatnonzero(usable)
     if len(candidates) <= count:
@@ -304,10 +294,7 @@ def measure_photo(rgb: NDArray[np.uint8]) -> PhotoMeasures:
 
 
 def signature(gray: NDArray[np.uint8]) -> NDArray[np.float32]:  # [SIDE * SIDE]
-    """Returns a picture [H, W] reduced by area, without its mean and of length 1; zero if flat.
-
-    The same picture at another brightness or size has nearly the same signature.
-    """
+    """Returns a picture [H, W] reduced by area, without its mean and of length 1; zero if flat."""
     small = cv2.resize(gray, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
     small -= small.mean()
     length = float(np.linalg.norm(small))
@@ -320,16 +307,8 @@ def choose_photos(
 ) -> tuple[FrameCandidate, ...]:
     """Returns which photos of a folder are kept, and why the others are not.
 
-    All are, except those that cannot be read, show nothing, or show what a sharper one shows.
-
-    Args:
-        folder: its name, for messages.
-        sources: file names of the photos.
-        names: of their frames.
-        measures: of `measure_photo`; None for a photo that cannot be read.
-
-    Raises:
-        InputError: fewer than `MIN_FRAMES` different views remain.
+    Left out are those that cannot be read (their measures are None), show nothing, or show what a
+    sharper one shows. InputError if fewer than `MIN_FRAMES` different views remain.
     """
     readable = {index: photo for index, photo in enumerate(measures) if photo is not None}
     exposures = np.array([photo.exposure for photo in readable.values()], np.float64).reshape(-1, 3)
@@ -363,8 +342,7 @@ def find_duplicates(
 ) -> dict[int, int]:
     """Returns for each redundant photo the one that replaces it, by index.
 
-    The sharpest of a group remains, the first of equally sharp ones; every other one is within
-    `SAME_VIEW` of it. A flat picture is like no other.
+    The sharpest of a group within `SAME_VIEW` remains. A flat picture is like no other.
     """
     unique: list[int] = []
     redundant: dict[int, int] = {}

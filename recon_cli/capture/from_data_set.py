@@ -28,11 +28,8 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
     """Writes the images, masks, poses and points of a data set into ingest's folder `out`.
 
     From a sequence, frames are chosen evenly; of other sets all images are used unless a number is
-    given. Views that the set holds out are all used. Frames already in `out` are kept.
-
-    Raises:
-        InputError: too few images can be read.
-        FormatError: a file of the data set is damaged or contradicts itself.
+    given. Views that the set holds out are all used. Frames already in `out` are kept. InputError
+    if too few images can be read; FormatError if a file is damaged or contradicts itself.
     """
     posed = read_posed(path)
     ctx.notice(f"{path.name} is read as {describe(posed)}.")

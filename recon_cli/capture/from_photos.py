@@ -41,11 +41,9 @@ def ingest(
 ) -> IngestedSource:
     """Writes photos into ingest's folder `out` and returns them.
 
-    `paths` are a folder with photos in it or in a subfolder, or photos. Frames already in `out` are
-    kept; `prefix` is that of their names.
-
-    Raises:
-        InputError: too few photos can be read, or show a view of their own; a mask is broken.
+    `paths` are photos, or a folder with photos in it or in a subfolder. Frames already in `out` are
+    kept; `prefix` is that of their names. InputError if too few photos can be read or show a view
+    of their own, or a mask is broken.
     """
     path, folder = _list_photos(paths, ctx)
     check_count(path, len(folder.photos), folder.broken)
@@ -153,10 +151,7 @@ def _plan_raw(photos: Sequence[Photo], record: Path, ctx: IngestContext) -> RawP
 
 
 def _drop_raw_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) -> list[Photo]:
-    """Returns the photos without those beside a RAW photo of the same name.
-
-    Such a view could be trained on and held out at once.
-    """
+    """Returns the photos without twins of RAW ones, which could be trained on and held out."""
     stems = {Path(name).stem for name in plan.shots}
     twins = [photo.path.name for photo in photos if not photo.is_raw and photo.path.stem in stems]
     if twins:

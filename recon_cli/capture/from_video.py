@@ -22,8 +22,7 @@ from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.io.records import Frame, Group
 from recon_cli.workspace import atomic
 
-# A count by the duration may be off by this much, as a share or in frames (sound that ends a little
-# later), without any loss.
+# A count by the duration may be off by this much, as a share or in frames, without any loss.
 COUNT_SHARE, COUNT_FRAMES = 0.02, 10
 
 
@@ -40,9 +39,7 @@ class ScannedVideo:
 def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
     """Returns a video after a pass over all of its frames; `scan_file` keeps it for a next run.
 
-    Raises:
-        InputError: the file is no video, gives too few whole frames, shows nothing, or was taken
-            by a camera that does not move.
+    InputError if it is no video, gives too few whole frames, shows nothing, or does not move.
     """
     if scan_file.exists():
         scan = Scan.from_json(atomic.read_json(scan_file))
@@ -70,10 +67,9 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
 
 
 def frame_counts(config: IngestConfig, sources: Sequence[ScannedVideo]) -> list[int]:
-    """Returns how many frames to choose from each video.
+    """Returns how many frames to choose from each video, at least `MIN_FRAMES`.
 
-    --frames, or what the motion needs up to --max-frames, is divided by the lengths of the paths; a
-    video gets at least `MIN_FRAMES`.
+    --frames, or what the motion needs up to --max-frames, is divided by the lengths of the paths.
     """
     wanted = [frame_selection.automatic_count(source.lengths, most=config.max_frames)
               for source in sources]
@@ -91,10 +87,8 @@ def ingest(
 ) -> IngestedSource:
     """Writes `count` frames of a video into ingest's folder `out` and returns them.
 
-    Frames already in `out` are kept; `prefix` is that of their names.
-
-    Raises:
-        InputError: too few frames are sharp, or the file has changed.
+    Frames already in `out` are kept; `prefix` is that of their names. InputError if too few frames
+    are sharp, or the file has changed.
     """
     path, scan, judgement = source.path, source.scan, source.judgement
     chosen = frame_selection.choose_frames(

@@ -1,8 +1,7 @@
 """One photo: its upright size, its lens by EXIF, and its pixels as 8-bit RGB.
 
-Pillow reads photos, and LibRaw the headers of camera RAW. A photo is read whole or refused with an
-InputError: a truncated JPEG never passes. Colour profiles are not applied, so that the photos of
-one camera stay comparable, and no metadata is carried over.
+Pillow reads photos, LibRaw the headers of camera RAW. A photo is read whole or refused with an
+InputError. Colour profiles are not applied, so that the photos of one camera stay comparable.
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PP
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
     ".ppm", ".tif", ".tiff", ".webp"}
-# What Pillow raises on damaged files, by format; OSError includes what it cannot identify, and
-# pillow_heif raises RuntimeError for what libheif refuses.
+# What Pillow and pillow_heif raise on damaged files; OSError includes unidentified ones.
 BROKEN = (
     OSError, SyntaxError, ValueError, EOFError, IndexError, OverflowError, struct.error,
     RuntimeError, Image.DecompressionBombError)
@@ -47,8 +45,7 @@ TURNS = {
     6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_90}
 QUARTER_TURNS = frozenset({5, 6, 7, 8})  # those of them that swap width and height
 RAW_QUARTER_TURNS = frozenset({5, 6})  # LibRaw: flip
-# TIFF 6.0: ImageWidth, ImageLength, BitsPerSample, and PlanarConfiguration with its value for
-# planes of their own.
+# TIFF 6.0: ImageWidth, ImageLength, BitsPerSample, PlanarConfiguration and its value for planes.
 WIDTH, LENGTH, BITS, PLANAR, APART = 256, 257, 258, 284, 2
 FILM_DIAGONAL = 43.267  # mm; CIPA DCG-001 defines the 35 mm equivalent by the diagonal
 # EXIF 2.32, FocalPlaneResolutionUnit, in mm; 4 and 5 are not in it but in TIFF/EP (ISO 12234-2).
@@ -80,11 +77,7 @@ class Photo:
 
 
 def inspect_photo(path: Path) -> Photo:
-    """Returns a photo's size, camera and focal length from its header.
-
-    Raises:
-        InputError: the header cannot be read, or promises more pixels than memory is spent on.
-    """
+    """Returns a photo's size, camera and focal length; InputError if damaged or far too large."""
     if path.suffix.lower() in RAW_SUFFIXES:
         return _inspect_raw(path)
     try:
@@ -128,10 +121,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
 
 
 def read_as_stored(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Returns a picture's RGB, [H, W, 3], and opacity, [H, W] or None, ignoring EXIF orientation.
-
-    The poses of a data set belong to the pixels as they are in the file.
-    """
+    """Returns RGB [H, W, 3] and opacity ([H, W] or None) of a picture; ignores EXIF orientation."""
     image = _decode(path, upright=False)
     return _on_black(image), _alpha(image) if image.has_transparency_data else None
 
@@ -202,8 +192,7 @@ def _size_in_file(image: Image.Image) -> tuple[int, int]:
 def _decode(path: Path, *, upright: bool) -> Image.Image:
     """Returns a picture of 8 bits a channel, in any mode, if `upright` rotated as EXIF says.
 
-    libheif has already rotated HEIC by its irot box and cleared the EXIF orientation, which has no
-    effect there (ISO 23008-12).
+    libheif has already rotated HEIC (irot, ISO 23008-12) and cleared the EXIF orientation.
     """
     try:
         with open_image(path) as image:
@@ -280,9 +269,8 @@ class ExifLens(NamedTuple):
 def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
     """Returns camera and focal length of a picture of width x height pixels, as stored.
 
-    The focal length in pixels comes from the 35 mm equivalent, by the diagonal; where that is
-    missing, from the focal length and the width of the sensor, which is the width in pixels at the
-    time of the shot over the resolution of the focal plane (EXIF 2.32, section 4.6.5).
+    The focal length in pixels comes from the 35 mm equivalent, by the diagonal, else from that in
+    mm and the resolution of the focal plane (EXIF 2.32, section 4.6.5).
     """
     detail = exif.get_ifd(ExifTags.IFD.Exif)
     focal = _positive(detail.get(ExifTags.Base.FocalLength))

@@ -2,8 +2,7 @@
 
 White counts, black is ignored. Masks lie in masks/ inside the given folder, or inside its subfolder
 that holds the photos. A mask is named after its photo, with .png or another picture's suffix in
-place of the photo's or, as for COLMAP, appended to it. Masks beside the given folder are not used:
-they are not part of the input, and changes to them would go unnoticed.
+place of the photo's or, as for COLMAP, appended to it. Masks beside the given folder are not used.
 """
 
 from __future__ import annotations
@@ -57,9 +56,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     """Returns a mask for width x height pixels, [H, W], 255 where they count, else 0.
 
     Its EXIF orientation is applied; a mask of the same shape but another size is resampled.
-
-    Raises:
-        InputError: it cannot be read, has another shape, or ignores every pixel.
+    InputError if it cannot be read, has another shape, or ignores every pixel.
     """
     try:
         gray = np.asarray(read_rgb(path).max(axis=2), np.uint8)  # its brightest channel
@@ -86,8 +83,7 @@ def opaque(
 ) -> NDArray[np.uint8] | None:
     """Returns where a picture is at least half opaque, [H, W], 255 or 0; None for everywhere.
 
-    Raises:
-        InputError: it is transparent everywhere.
+    InputError if it is transparent everywhere.
     """
     if alpha is None or alpha.min() >= HALF:
         return None
@@ -101,10 +97,8 @@ def photo_mask(
 ) -> NDArray[np.uint8] | None:
     """Returns the mask of a photo stored with width x height pixels, [H, W]; None where all counts.
 
-    It combines the mask file `path`, if there is one, with the photo's transparency.
-
-    Raises:
-        InputError: see `read_mask` and `opaque`; or the two together leave nothing.
+    It combines the mask file `path`, if there is one, with the photo's transparency. InputError if
+    the file cannot be used, or nothing is left.
     """
     opacity = opaque(read_alpha(photo), photo.path.name, width, height)
     mask = None if path is None else read_mask(path, width, height)

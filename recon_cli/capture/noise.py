@@ -1,11 +1,8 @@
 """The noise of a frame: its estimate, and the filters that remove it.
 
-The estimate uses only the flat parts of a frame. Over whole frames it reads up to 4/255 off clean
-frames of a richly textured room; over the flat parts at most 2.5/255, and 4.6 to 5.5 where noise of
-5 was added.
-
-A threshold of 3 ignores noise that a video codec has already smoothed: frames of two noisy videos
-read .8 to 2.4, and no filter gains more than .2 dB there (tests/bench/bench_denoise.py --decoded).
+The estimate uses only the flat parts of a frame, where it reads at most 2.5/255 on clean frames of
+a richly textured room (4 on whole frames). Noise below 3 is left: a codec has smoothed it already,
+and no filter gains more than .2 dB (tests/bench/bench_denoise.py --decoded).
 
 PSNR in dB and share of the edges kept at noise of 5, 10, 15 and 20 of 255: means over ten frames of
 five captures (fox, two rendered rooms, desk_monitors, snowmiku; photos halved first), each filter
@@ -17,7 +14,7 @@ at its best strength; time relative to bilateral (tests/bench/bench_denoise.py):
     guided, 1.5       39.3  .99   34.5  .96   31.5  .93   29.5  .90   2.6
     non-local means   37.6 1.00   33.7  .98   31.7  .94   30.4  .89   35
 
-joint is the default. The guided filter (He et al. 2010) and non-local means are not offered.
+joint is the default.
 """
 
 from __future__ import annotations
@@ -37,15 +34,12 @@ GRID, SMALLEST_TILE = 8, 16
 FLAT_PERCENTILE = 10
 # Tiles with more pixels than this at 0 or 255 are left out: clipping cuts the noise in half.
 CLIPPED_SHARE = 0.02
-# For bilateral, measured on four rendered frames and a photo of 430x770, noise of 15 added
-# (24.8 dB): 7 pixels and 2.0 gain 7.3 dB at four times the noise, 5 pixels 6.8 dB, 9 pixels
-# 7.4 dB for twice the time.
+# For bilateral: 7 pixels and 2.0 gain 7.3 dB at noise of 15, on four rendered frames and a photo;
+# 5 pixels gain 6.8 dB, 9 pixels 7.4 dB for twice the time.
 DIAMETER, SIGMA_SPACE = 7, 2.0
-# The first guide is this much blurred. .5 keeps more noise (-.2 dB at noise of 20), .7 blurs fine
-# texture (-.3 dB at noise of 5).
+# Blur of the first guide. .5 keeps more noise (-.2 dB at 20), .7 blurs fine texture (-.3 dB at 5).
 GUIDE_BLUR, GUIDE_BLUR_SIZE = 0.6, 5
-# The second guide comes from a small window, so that nothing far away enters it; the result from
-# 9 pixels, .5 dB more than 7 at noise of 20.
+# Window of the second guide; that of the result is 9, .5 dB more than 7 at noise of 20.
 GUIDE_DIAMETER, GUIDE_SIGMA_SPACE = 5, 1.0
 JOINT_DIAMETER, JOINT_SIGMA_SPACE = 9, 2.5
 
@@ -53,8 +47,7 @@ JOINT_DIAMETER, JOINT_SIGMA_SPACE = 9, 2.5
 def estimate_noise(rgb: NDArray[np.uint8]) -> float:
     """Returns the noise of a frame [H, W, 3] as standard deviation in 1/255, 0 where it is flat.
 
-    It is a low percentile over tiles of Donoho's median of the finest diagonal wavelet coefficients
-    (scikit-image).
+    It is a low percentile over tiles of Donoho's median of the finest diagonal wavelet terms.
     """
     rows, columns = (
         np.linspace(0, length, max(1, min(GRID, length // SMALLEST_TILE)) + 1).astype(np.int64)
@@ -104,8 +97,7 @@ def joint(
     2004): first the frame slightly blurred, then the result of that (Zhang et al. 2014, rolling
     guidance). Less noise in the weights lets the range be half as wide, which keeps edges.
     """
-    # Filtering with a kernel leaves this share of white noise: the root of its sum of squares,
-    # which for a kernel that is the same along rows and columns is the sum along one of them.
+    # Share of white noise that the separable blur leaves: the sum of squares along one axis.
     left = float(np.sum(cv2.getGaussianKernel(GUIDE_BLUR_SIZE, GUIDE_BLUR) ** 2))
     reach = strength * left * noise
     blurred = cv2.GaussianBlur(rgb, (GUIDE_BLUR_SIZE, GUIDE_BLUR_SIZE), GUIDE_BLUR)

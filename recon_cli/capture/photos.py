@@ -44,8 +44,7 @@ def list_photos(paths: Iterable[Path]) -> PhotoFolder:
 def photo_folder(folder: Path) -> Path:
     """Returns the folder that holds the photos: itself, images/ in it, or its only subfolder.
 
-    Raises:
-        InputError: it holds none, but several of its subfolders do.
+    InputError if it holds none, but several of its subfolders do.
     """
     if _holds_photos(folder):
         return folder
@@ -96,10 +95,7 @@ def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
 
 
 def make_frame_names(stems: Sequence[str]) -> list[str]:
-    """Returns a PNG name for each stem, so that the names sort in the order of the stems.
-
-    The stems stay where they are plain, unique (ignoring case) and sorted; else all are numbered.
-    """
+    """Returns PNG names: the stems if plain, unique (ignoring case) and sorted, else numbers."""
     plain = all(SAFE_STEM.fullmatch(stem) for stem in stems)
     distinct = len({stem.lower() for stem in stems}) == len(stems)
     names = [f"{stem}.png" for stem in stems]
@@ -122,10 +118,7 @@ class PhotoGroup:
 
 
 def group_photos(photos: Sequence[Photo]) -> list[PhotoGroup]:
-    """Returns the photos in groups of one size, camera and focal length, by their first photos.
-
-    Portrait and landscape photos differ in size. Photos without EXIF are one group for each size.
-    """
+    """Returns the photos in groups of one size, camera and focal length, by their first photos."""
     groups: list[list[Photo]] = []
     for photo in photos:
         home = next((group for group in groups if _same_camera(group[0], photo)), None)

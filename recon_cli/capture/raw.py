@@ -1,8 +1,7 @@
 """Camera RAW: a set of photos is developed alike, so that a point has one colour in all of them.
 
-There is one white balance and one saturation per camera, one brightness for the whole set, and
-differences of exposure are undone. LibRaw develops; what it would choose per photo (brightness,
-maximum) is switched off.
+One white balance and one saturation per camera, one brightness for the whole set, and differences
+of exposure are undone. What LibRaw would choose per photo (brightness, maximum) is switched off.
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ SATURATED = 0.99  # of the maximum; interpolation and rounding take the rest
 BLOWN_SHARE, SATURATES_ABOVE = 0.01, 0.75
 # A photo counts as clipped from this share of its pixels on; fewer are lamps and glints.
 CLIPPED_SHARE = 0.001
-# White is lowered so far that all photos clip at one radiance, but clips no more of the set than
-# this: a long exposure of a dark corner must not erase a bright room.
+# White is lowered until all photos clip at one radiance, but clips no more of the set than this.
 SACRIFICED_SHARE = 0.1
 MOST_BRIGHTENED = 8.0  # LibRaw's limit for exp_shift
 
@@ -94,11 +92,7 @@ def plan_raw(paths: Sequence[Path], *, step: Callable[[], None] = lambda: None) 
 
 
 def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
-    """Returns a RAW photo as upright sRGB, [H, W, 3].
-
-    Raises:
-        InputError: it is damaged, or was when the plan was made.
-    """
+    """Returns a RAW photo as upright sRGB, [H, W, 3]; InputError if it is, or was, damaged."""
     shot = plan.shots.get(photo.path.name)
     if shot is None:
         raise InputError(plan.broken[photo.path.name])

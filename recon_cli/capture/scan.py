@@ -16,8 +16,7 @@ from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.errors import InputError
 
-# B-frames in a row: x264 writes 3 by default and 8 at its slowest. HEVC encoders mark whole groups
-# as B, so the search for them needs a limit.
+# B-frames in a row: x264 writes at most 8; HEVC encoders mark whole groups as B.
 MAX_B_RUN = 8
 
 
@@ -33,8 +32,7 @@ class Scan:
     motion: NDArray[np.float64]  # [F], `MotionMeter.advance`
     exposure: NDArray[np.float64]  # [F, 3], rows of `measure_exposure`
     seconds: tuple[float | None, ...]  # presentation times, None where unknown
-    # [F], False from a lost or damaged packet to the next key frame: all frames between are
-    # predicted from what was lost.
+    # [F], False from a lost or damaged packet to the next key frame
     whole: NDArray[np.bool_]
     notices: tuple[str, ...]  # about conversions that the owner of the video may not expect
 
@@ -86,11 +84,8 @@ class _FrameMeasures:
 def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     """Returns the scan of a video, the same for any number of threads; calls `step` per frame.
 
-    A damaged stream is scanned again by one thread: only then are the frames around the damage
-    reproducible, here and when they are decoded again (`decode_threads`).
-
-    Raises:
-        InputError: the file is no video, or no frame of it can be decoded.
+    A damaged stream is scanned again by one thread, which alone is reproducible around the damage.
+    InputError if the file is no video, or no frame of it can be decoded.
     """
     scan = _scan_once(path, threads=threads, step=step)
     if scan.lost and threads > 1:
@@ -186,10 +181,7 @@ def _spoil(
 
 
 def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> tuple[str, ...]:
-    """Returns a sentence on each conversion that the owner of a video may not expect.
-
-    A varying frame rate needs no notice: frames are chosen by their times and the camera's path.
-    """
+    """Returns a sentence on each conversion that the owner of a video may not expect."""
     notices = []
     with video.open_video(path) as (container, _):
         videos = len(video.moving_pictures(container))

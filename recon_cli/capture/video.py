@@ -1,9 +1,8 @@
 """Video files through PyAV: whether a file is a video, its declared length, its frames in order.
 
 A packet that cannot be decoded is skipped and reported as a `Gap`. Of several videos in one file
-the first is used; sound and covers are ignored. Whatever opens a video raises what `open_video`
-does. `codec_name` and `lacks_index` read the container themselves, for the messages about files
-that FFmpeg cannot open.
+the first is used. `codec_name` and `lacks_index` read the container themselves, for messages about
+files that FFmpeg cannot open.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ from recon_cli.errors import InputError
 TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
 # A demuxer that fails this often in one file no longer makes progress.
 MAX_DEMUX_ERRORS = 100
-# How containers mark their video: MP4 and MOV in the first sample entry of a video track, Matroska
-# as V_ and capitals, AVI in the header of a video stream.
+# How containers mark video: MP4 and MOV in a sample entry, Matroska by V_, AVI in a stream header.
 MARKS = (
     re.compile(rb"hdlr.{8}vide.*?stsd.{12}([\x20-\x7e]{4})", re.DOTALL),
     re.compile(rb"(V_[A-Z0-9_/]{3,30})"),
@@ -48,12 +46,10 @@ NAMES = {
 def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """Yields the container and the video stream of a file, whatever its suffix.
 
-    Raises:
-        InputError: the file is missing, not readable, no video, or a single picture.
+    InputError if the file is missing, not readable, no video, or a single picture.
     """
     try:
-        # "file:" prevents a colon in the name from being read as a protocol, and the whitelist
-        # prevents a playlist from fetching anything.
+        # "file:" keeps a colon from naming a protocol; the whitelist keeps playlists from fetching.
         container = av.open(
             f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
     except av.error.FFmpegError as error:
@@ -146,8 +142,8 @@ def read_declared_length(path: Path) -> DeclaredLength:
 def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
     """Yields every frame of a video in presentation order, and a `Gap` for each lost packet.
 
-    The frames of an undamaged video do not depend on `threads`; around damage they do. A frame of
-    another size than the first counts as lost. Interlaced frames are deinterlaced.
+    The frames of an undamaged video do not depend on `threads`. A frame of another size than the
+    first counts as lost.
     """
     with open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
@@ -165,11 +161,7 @@ def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
 def frames_at(
     path: Path, indices: Collection[int], *, threads: int
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yields (index, RGB [H, W, 3]) of the frames at these indices, in ascending order.
-
-    Raises:
-        InputError: the file does not hold the frames that it held before.
-    """
+    """Yields (index, RGB [H, W, 3]) in ascending order; InputError if the file lacks an index."""
     missing = set(indices)
     if not missing:
         return

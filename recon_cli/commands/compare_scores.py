@@ -31,13 +31,9 @@ def compare(
 ) -> str:
     """Returns the scores of several workspaces and files, in their order.
 
-    Files are scored on the held-out views of one workspace, in whose world they must lie.
-
-    Args:
-        open_job: returns the job and the options of a workspace, its own recon.toml among them.
-        workspace: that of -w.
-        items: workspaces and files, at least one; InputError if a path is neither.
-        form: text, markdown, csv, latex or json.
+    Files are scored on the held-out views of `workspace`, in whose world they must lie. `open_job`
+    returns the job and the options of a workspace; `form` is text, markdown, csv, latex or json.
+    InputError if an item is neither a workspace nor a file.
     """
     _check_items(items)
     short = {path: path.resolve().name for path in items}

@@ -32,11 +32,7 @@ class _BarAwareHandler(logging.StreamHandler[TextIO]):
 
 
 def show_log(*, detailed: Callable[[], bool]) -> logging.Handler:
-    """Shows the log on stderr and returns the handler, to be removed at the end.
-
-    `detailed` says whether debug messages are shown too; it is asked for each of them, because the
-    log starts before the command line is parsed.
-    """
+    """Shows the log on stderr, debug messages where `detailed()`, and returns the handler."""
     handler = _BarAwareHandler()
     handler.setFormatter(_NoticeFormatter())
     handler.addFilter(lambda record: record.levelno >= logging.INFO or detailed())

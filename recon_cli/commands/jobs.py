@@ -27,15 +27,9 @@ def run_stages(
 ) -> None:
     """Runs stages one after the other, or prints their options.
 
-    Args:
-        call: what was typed.
-        verb: named to other processes that want the workspace.
-        stages: by name, in the order of the table.
-        sources: the user's files, for ingest.
-        base: defaults of the verb; recon.toml, --config and options win over them.
-        forced: settings that the verb implies; they win over everything.
-        callbacks: of the training.
-        table: of all stages; STAGES if empty.
+    `verb` is named to other processes that want the workspace; `sources` are the user's files, for
+    ingest. `base` are defaults, over which recon.toml, --config and options win; `forced` wins over
+    everything. An empty `table` stands for STAGES.
     """
     table = table or STAGES
     file_settings = explicit_settings(call)
@@ -61,8 +55,7 @@ def run_stages(
 def _of_all_processes(call: Call, file_settings: Settings) -> Settings:
     """Returns the settings that were typed, with the views that all processes together take.
 
-    `--batch-views` counts those of one process. What is recorded, and what files and --set say, are
-    the views of a step: a result does not depend on who computed it.
+    `--batch-views` counts those of one process; files, --set and the record count those of a step.
     """
     typed = call.settings.get("train", {}).get("batch_views")
     if typed is None and "batch_views" not in file_settings.get("train", {}):

@@ -71,10 +71,7 @@ class _VerbContext(click.Context):
 
 
 class Verb(click.Command):
-    """A command with a second page of help, --help-all, where some of its options are for experts.
-
-    The first page leaves out these and the ranges of numbers.
-    """
+    """A command whose --help leaves out expert options and ranges, which --help-all shows."""
 
     context_class = _VerbContext
 
@@ -160,11 +157,7 @@ print_config = _switch("--print-config", "Print options as TOML and exit.")
 
 
 def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPACE") -> Decorator:
-    """Returns a decorator that adds -w, --config and -v.
-
-    `workspace` is the folder where neither -w nor the environment variable `envvar`, if any, names
-    one.
-    """
+    """Returns a decorator that adds -w (default: `envvar`, then `workspace`), --config and -v."""
     return stack([
         click.option(
             "-w", "--workspace", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
@@ -190,10 +183,7 @@ def assignments(example: str = "train.iterations=1000") -> Decorator:
 
 
 def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
-    """Returns a decorator that adds all options of a verb that runs one stage.
-
-    If the stage `renders` it needs a rasterizer, so that device and backend can be chosen.
-    """
+    """Returns a decorator that adds a stage's options; device and backend where it `renders`."""
     compute: Decorator = of(ComputeConfig, only=() if renders else ("threads",))
     return stack([of(config), compute, again, print_config, common()])
 
@@ -204,12 +194,8 @@ def of(
 ) -> Decorator:
     """Returns a decorator that adds an option for each field of a config.
 
-    Args:
-        config: the class.
-        only: names of the fields to take; all if empty.
-        without: names of fields to leave out.
-        expert: names of fields that are for experts in this verb.
-        lead: text before each help.
+    `only` and `without` select fields by name, `expert` names those for experts in this verb, and
+    `lead` is put before each help.
     """
     decorators: list[Decorator] = []
     for item in dataclasses.fields(config):

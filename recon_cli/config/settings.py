@@ -45,10 +45,7 @@ _TRUTH = {"true": True, "false": False}
 
 
 def read_settings(path: Path) -> Settings:
-    """Returns what a recon.toml sets, with every section, field and value checked.
-
-    ConfigError if the file is missing or no TOML, or sets what does not exist or cannot be used.
-    """
+    """Returns the checked settings of a recon.toml; ConfigError if it is missing or wrong."""
     try:
         with path.open("rb") as file:
             settings = tomllib.load(file)
@@ -70,10 +67,7 @@ def read_settings(path: Path) -> Settings:
 
 
 def parse_assignment(text: str) -> Settings:
-    """Returns what `section.field=value` sets, the value typed as the field is.
-
-    ConfigError if the text has another form, names no field, or the value cannot be used.
-    """
+    """Returns what `section.field=value` sets, typed as the field is, or raises ConfigError."""
     path, equals, value = text.partition("=")
     section, dot, name = path.strip().partition(".")
     if not equals or not dot:

@@ -130,10 +130,7 @@ DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 @dataclass(frozen=True)
 class TrainConfig(StageConfig):
-    """How Gaussians are fitted: a recipe, scaled to the number of iterations.
-
-    `train.plan` decides what is left automatic, once the scene is known.
-    """
+    """How Gaussians are fitted; `train.plan` decides what is left automatic for a scene."""
 
     quality: str = option(
         "normal", "Preset: 1500, 3000 or 8000 steps at 400, 600 or 800 pixels.",
@@ -219,10 +216,7 @@ class TrainConfig(StageConfig):
 
 @dataclass(frozen=True)
 class RunConfig(TrainConfig):
-    """TrainConfig with numbers in place of what was automatic, as `train.plan` makes it.
-
-    The defaults are those of a run that nobody planned.
-    """
+    """TrainConfig with numbers in place of what was automatic, as `train.plan` makes it."""
 
     iterations: int = option(3000, "Optimization steps.", minimum=1)
     max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)

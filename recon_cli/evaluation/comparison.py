@@ -53,11 +53,7 @@ class ScoredModel:
 
 
 def read_workspace_scores(name: str, folder: Path) -> list[ScoredModel]:
-    """Returns the models of a fresh evaluate folder of the workspace `name`.
-
-    Raises:
-        FormatError: metrics.json is damaged.
-    """
+    """Returns the models in the evaluate folder of workspace `name`; FormatError if damaged."""
     try:
         metrics = Metrics.read(folder)
     except ManifestError as error:
@@ -73,11 +69,8 @@ def score_file(
 ) -> ScoredModel:
     """Returns a file of Gaussians, scored on the views of the workspace `group`.
 
-    It must lie in the world of that workspace; a file beside which an export left transform.json
-    is transformed back into it.
-
-    Raises:
-        FormatError: it holds no Gaussians that can be read.
+    It must lie in the world of that workspace, or beside the transform.json of an export of it.
+    FormatError if it holds no Gaussians that can be read.
     """
     splats = _undo_export(read_splats(path), path.with_name(_TRANSFORM))
     splats = splats.map(lambda tensor: tensor.to(ctx.device))

@@ -49,8 +49,7 @@ def psnr(
 ) -> float:
     """Returns 10 log10(1 / MSE) in dB of an image [H, W, 3], at most 100 dB.
 
-    The image is of 8 bits, or float and clamped to [0, 1]; `mask` [H, W] is True where a pixel
-    counts.
+    The image is of 8 bits, or float and clamped to [0, 1]; `mask` [H, W] is True where used.
     """
     error = _unit(image) - truth / 255.0
     if mask is not None:
@@ -79,10 +78,8 @@ def ssim(
 
     With a mask [H, W]: the mean of the map over the pixels that count, of an image that is the
     truth elsewhere. `padded` puts zeros around both images and scores every pixel, as INRIA's
-    scripts do; otherwise a border of half a window is left out.
-
-    Raises:
-        ValueError: the image is smaller than the 11-pixel window, or the mask leaves nothing.
+    scripts do; otherwise a border of half a window is left out. ValueError if the image is smaller
+    than the 11-pixel window, or the mask leaves nothing.
     """
     if min(truth.shape[:2]) < MIN_SIDE:
         raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")

@@ -1,7 +1,4 @@
-"""Reference views: photos at the size they are scored at, with masks, and scores against them.
-
-Everything is rendered on black.
-"""
+"""Reference views: photos at the size they are scored at, with masks, on black."""
 
 from __future__ import annotations
 
@@ -55,8 +52,7 @@ class RenderScores:
     """The scores of one model on reference views."""
 
     views: tuple[ViewScore, ...]
-    # Mean PSNR after the best gain per channel of each view: a model with exposures does not know
-    # the exposure of a view that it was not trained on.
+    # Mean PSNR after the best gain per channel of each view, whose exposure is unknown.
     corrected_db: float
     render_ms: float  # median milliseconds a view
 
@@ -86,10 +82,7 @@ def load_reference_views(
     """Returns views with their original pixels, without those whose mask leaves too little.
 
     `max_size` is the longest side in pixels; `ctx`, if any, gets a notice of views left out.
-
-    Raises:
-        ConfigError: they are smaller than the window of SSIM.
-        FormatError: an image cannot be read.
+    ConfigError if they are smaller than the window of SSIM, FormatError for a damaged image.
     """
     for camera in (fit_camera(view.camera, max_size) for view in views):
         if min(camera.width, camera.height) < MIN_SIDE:
@@ -122,9 +115,8 @@ def load_views(
 def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[ReferenceView]:
     """Returns the held-out views that can be scored; a notice names those that masks hide.
 
-    Raises:
-        ReconstructionError: no held-out view has a camera, or masks leave none.
-        ConfigError: they are smaller than the window of SSIM.
+    ReconstructionError if no held-out view has a camera, or masks leave none; ConfigError if they
+    are smaller than the window of SSIM.
     """
     if not scene.test:
         raise ReconstructionError(
@@ -152,8 +144,7 @@ def score_views(
 ) -> RenderScores:
     """Renders every view, at least one, of a model and returns its scores.
 
-    `perceptual` is LPIPS, where available; `on_view` gets each view and its render [H, W, 3], not
-    clamped.
+    `perceptual` is LPIPS; `on_view` gets each view and its render [H, W, 3], not clamped.
     """
     scores, milliseconds, corrected = [], [], []
     for view in views:

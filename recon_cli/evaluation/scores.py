@@ -101,12 +101,7 @@ class Metrics(JsonRecord):
 
     @classmethod
     def read(cls, evaluate: Path) -> Self:
-        """Returns the scores in a folder of evaluate.
-
-        Raises:
-            ManifestError: they are of another version.
-            FormatError: the file is missing or damaged.
-        """
+        """Returns a folder's scores; ManifestError for another version, FormatError if damaged."""
         return cls.from_json(read_json(evaluate / cls.FILE))
 
 
@@ -115,8 +110,7 @@ class SweepTrial(JsonRecord):
     """One way to prune a model, and the result."""
 
     score: str  # its name; Sweep.CONTROL for the controls
-    # Fraction that was removed; of a control with equal seconds that of the trial whose seconds it
-    # takes, None for the one with equal steps.
+    # Fraction removed; of a control with equal seconds that of its trial, None with equal steps.
     ratio: float | None
     gaussians: int  # that are left
     steps: int  # of recovery

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import MODELS, Lens
 
-# Entries written with three decimals are off by up to 5e-4, so R R^T by up to
-# 2 * sqrt(3) * 5e-4 = 1.7e-3. A scale left in a pose is far larger.
+# Entries of three decimals are off by 5e-4, so R R^T by up to 2 * sqrt(3) * 5e-4 = 1.7e-3.
 ORTHONORMAL = 2e-3
 FARTHEST = 1e9  # UTM, the largest coordinates in use, reach 1e7 metres
 MAX_SIDE = 1 << 16  # pixels; no image format in use holds a longer side
@@ -25,15 +24,10 @@ _HINT = "Export the poses again, or take the image out of the list."
 def viewmat_from_pose(value: Any, where: str, *, opengl: bool = False) -> NDArray[np.float64]:
     """Returns [4, 4] world to camera, OpenCV axes, of a camera-to-world matrix.
 
-    A rotation that is not orthonormal by rounding is replaced by the nearest rotation.
-
-    Args:
-        value: 16 numbers row by row, or [4, 4], or [3, 4] without its last row.
-        where: the matrix, for messages.
-        opengl: its camera looks along -z with y up, as in OpenGL and Blender.
-
-    Raises:
-        FormatError: it is no matrix, not finite, or not rigid.
+    `value` is 16 numbers row by row, [4, 4], or [3, 4] without its last row; `where` names it in
+    messages. With `opengl` its camera looks along -z with y up, as in OpenGL and Blender. A
+    rotation that is not orthonormal by rounding is replaced by the nearest one. FormatError if it
+    is no finite rigid matrix.
     """
     pose = _matrix(value, where)
     rotation = pose[:3, :3]
@@ -124,8 +118,7 @@ def make_lens(model: str, width: float, height: float, params: Sequence[float], 
 def lens_from_matrix(matrix: NDArray[np.float64], width: int, height: int, where: str) -> Lens:
     """Returns the PINHOLE intrinsics of a [3, 3] or [4, 4] matrix K.
 
-    In K the centre of the first pixel is at 0, here at 0.5. FormatError if K is skewed or no
-    camera's.
+    In K the centre of the first pixel is at 0, here at 0.5. FormatError if K is skewed or invalid.
     """
     if matrix.shape[0] < 3 or matrix.shape[1] < 3 or not np.isfinite(matrix).all():
         raise FormatError(f"{where} is no finite 3x3 or 4x4 matrix.")
@@ -146,10 +139,7 @@ def undistort_pixels(
     lens: Lens,
     pixels: NDArray[np.float64],  # [M, 2]
 ) -> NDArray[np.float64]:
-    """Returns [M, 2] x/z and y/z of the rays through pixels x, y, without distortion.
-
-    ValueError for a THIN_PRISM_FISHEYE, which OpenCV does not have either.
-    """
+    """Returns [M, 2] undistorted x/z and y/z of pixels; ValueError for a THIN_PRISM_FISHEYE."""
     focals, _ = MODELS[lens.model]
     focal = np.array([lens.params[0], lens.params[focals - 1]])
     distorted = (pixels - lens.params[focals:focals + 2]) / focal
@@ -169,8 +159,7 @@ def undistort_pixels(
 
 def _undo(distorted: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverts k1 k2 p1 p2 k3 k4 k5 k6 by the fixed point that cv2.undistortPoints iterates."""
-    # Not OpenCV, whose default of five steps leaves 0.04 pixels at the corners for k1 = -0.28, and
-    # whose versions 4 and 5 set their number differently.
+    # Not OpenCV, whose default of five steps leaves 0.04 pixels at the corners for k1 = -0.28.
     k1, k2, p1, p2, k3, k4, k5, k6 = k
     undone = distorted.copy()
     for _ in range(_STEPS):

@@ -1,8 +1,4 @@
-"""COLMAP models of undistorted views: checked binary readers, and a writer by pycolmap.
-
-Binary files are parsed here, so that a missing or damaged one is a FormatError that names the file
-and the fault.
-"""
+"""COLMAP models of undistorted views: checked binary readers, and a writer by pycolmap."""
 
 from __future__ import annotations
 
@@ -45,16 +41,11 @@ def read_scene(
 ) -> Scene:
     """Returns the registered views and the points of an undistorted model.
 
-    Args:
-        undistorted: folder with images/ and sparse/, as COLMAP's image_undistorter lays it out,
-            and masks/ with a gray image of the name of each masked frame.
-        held_out: names of the frames held out for the score, registered or not.
-        validation: share of the other views that becomes the validation views.
-        denoised: folder of the denoised frames; None for the denoised/ beside images/.
-
-    Raises:
-        FormatError: the model is missing, damaged, empty or not of pinhole cameras, or an image or
-            its mask is missing or not of its camera's size.
+    `undistorted` has images/ and sparse/, as COLMAP's image_undistorter lays them out, and masks/
+    with a gray image of the name of each masked frame; `denoised` defaults to denoised/ in it.
+    `held_out` are names of frames; `validation` is the share of the others for validation views.
+    FormatError if the model is missing, damaged, empty or not of pinhole cameras, or an image or
+    its mask is missing or not of its camera's size.
     """
     sparse = undistorted / "sparse"
     twins = undistorted / "denoised" if denoised is None else denoised
@@ -133,10 +124,7 @@ def read_points(path: Path, *, hint: str = _HINT) -> tuple[NDArray[np.float64], 
 
 
 def mean_point_error(path: Path) -> float | None:
-    """Returns the mean reprojection error of a points3D.bin in pixels of its images.
-
-    None if no point has any, as points from depth maps.
-    """
+    """Returns the mean reprojection error of a points3D.bin in pixels, None if no point has any."""
     errors = [float(row[7]) for row in _read_point_rows(path, _HINT) if row[7] > 0]
     return float(np.mean(errors)) if errors else None
 
@@ -173,9 +161,8 @@ def write_colmap(
 ) -> None:
     """Writes a model of pinhole cameras into a new or empty folder, whole or not at all.
 
-    Views are names below the folder of images, with their cameras; those with the same intrinsics
-    share a camera. No observations are written. InputError if there are no views, or the folder
-    holds something.
+    Views are names below the folder of images, with their cameras; equal intrinsics share one. No
+    observations are written. InputError if there are no views, or the folder holds something.
     """
     if not views:
         raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")

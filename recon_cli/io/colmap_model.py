@@ -1,9 +1,8 @@
 """Whole COLMAP models of any camera model, binary or text, with or without rigs and frames.
 
-Newer models have rigs and frames beside their images, but images.bin and images.txt still hold the
-composed pose of each image (pycolmap 4.2), so rigs and frames are read only if the images file is
-missing. Observations and tracks are skipped. The layouts are those of COLMAP's
-src/colmap/scene/reconstruction_io; errors in text name the line.
+Rigs and frames are read only if the images file is missing: images.bin and images.txt hold the
+composed pose of each image (pycolmap 4.2). Observations and tracks are skipped. The layouts are
+those of COLMAP's src/colmap/scene/reconstruction_io; errors in text name the line.
 """
 
 from __future__ import annotations
@@ -107,9 +106,6 @@ def _compose(folder: Path, *, binary: bool) -> dict[int, tuple[int, Pose]]:
     return dict(sorted(poses.items()))
 
 
-# Binary files
-
-
 def _read_lenses(path: Path) -> dict[int, Lens]:
     reader = Reader(path, _HINT)
     lenses = {}
@@ -160,9 +156,6 @@ def _take_pose(reader: Reader, path: Path) -> Pose:
     if matrix is None:
         raise model_error(path, "a pose that is not finite or has no rotation", _HINT)
     return matrix
-
-
-# Text files
 
 
 def _read_cameras_text(path: Path) -> dict[int, Lens]:

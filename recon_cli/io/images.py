@@ -41,8 +41,7 @@ def read_image(path: Path, width: int, height: int) -> NDArray[np.uint8]:
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     """Returns a mask as [height, width], True where a pixel counts.
 
-    A pixel of the reduced mask counts only if all pixels that it covers do, so that the same pixel
-    of the image holds nothing to be ignored.
+    A pixel of the reduced mask counts only if all pixels that it covers do.
     """
     data = _read(path, cv2.IMREAD_GRAYSCALE, "a mask")
     ignored = (data < _COUNTS).astype(np.float32)
@@ -62,8 +61,7 @@ def _read(path: Path, flags: int, kind: str) -> NDArray[np.uint8]:
 def fill_masked(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Returns an image [H, W, 3] whose ignored pixels have the mean colour of those that count.
 
-    SSIM compares windows, so a pixel that counts depends on its neighbours under the mask. Their
-    content must not matter, and black would be an edge stronger than all contrast around it.
+    SSIM compares windows: what is under the mask must not matter, and black would add an edge.
     """
     result = image.copy()
     result[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else 0
@@ -73,10 +71,7 @@ def fill_masked(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np
 def read_masked_image(
     path: Path, mask: Path | None, width: int, height: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Returns an image [height, width, 3], filled under its mask, and the mask [height, width].
-
-    The mask is None where every pixel counts.
-    """
+    """Returns an image [height, width, 3] filled under its mask, and the mask (None: no mask)."""
     image = read_image(path, width, height)
     if mask is None:
         return image, None

@@ -33,8 +33,7 @@ from recon_cli.scene.camera import Lens
 _COLOR = re.compile(r"frame-(\d+)\.color\.(?:png|jpg|jpeg)", re.IGNORECASE)
 _INTRINSICS = "camera-intrinsics.txt"
 _MILLIMETRE, _UNKNOWN = 1e-3, 65535.0
-# Of the Kinect at 640x480, focal length and principal point: its data set gives those of the depth
-# camera and none of the colours, which are taken to be the nominal ones.
+# fx, fy, cx, cy of the Kinect at 640x480: nominal for colours, those of the data set for depth.
 _COLOR_KINECT = (525.0, 525.0, 320.0, 240.0)
 _DEPTH_KINECT = (585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)

@@ -25,8 +25,7 @@ class Layout:
     read: Callable[[Path], PosedSet]  # returns the data set at such a path
 
 
-# The first that fits wins. transforms.json comes before COLMAP, because nerfstudio leaves the model
-# that it was made from beside it.
+# The first that fits wins: nerfstudio leaves the COLMAP model beside its transforms.json.
 LAYOUTS: tuple[Layout, ...] = (
     Layout("replica", "a Replica sequence (NICE-SLAM layout)",
            "results/frame%06d.jpg, traj.txt and cam_params.json", is_replica, read_replica),
@@ -50,10 +49,7 @@ def recognise(path: Path) -> str | None:
 
 
 def refuse_incomplete(path: Path) -> None:
-    """Raises FormatError for a data set that lacks its poses or cameras.
-
-    Read as photos it would silently lose its poses, and its depth maps would be frames.
-    """
+    """Raises FormatError for a data set without poses or cameras, rather than read it as photos."""
     if path.name == "results" and is_replica(path.parent):
         raise FormatError(
             f"{path} holds frames and depth maps of a Replica sequence, but no poses.",
@@ -72,10 +68,7 @@ def refuse_incomplete(path: Path) -> None:
 
 
 def read_posed(path: Path) -> PosedSet:
-    """Returns the data set with poses at a path.
-
-    InputError if its layout is unknown or no image exists; FormatError if a file is damaged.
-    """
+    """Returns the data set at a path; InputError if unknown or empty, FormatError if damaged."""
     layout = next((row for row in LAYOUTS if row.fits(path)), None)
     if layout is None:
         known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)

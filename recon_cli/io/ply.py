@@ -40,11 +40,9 @@ _GROUPS = {
     "log_scales": [f"scale_{i}" for i in range(3)],
     "quats": [f"rot_{i}" for i in range(4)],
 }
-# For an opacity of exactly 1 or 0, which PlayCanvas' splat-transform makes of the bytes 255 and 0:
-# the middle of such a step, as `values.decode_opacities` decodes those bytes.
+# For an opacity of exactly 1 or 0, which splat-transform makes of 255 and 0: middle of that step.
 _MAX_LOGIT = math.log(254.75 / 0.25)
-# The third log scale of a flat Gaussian, as SuperSplat sets it for files of 2D Gaussian Splatting,
-# which lack scale_2: a thousandth of a millimetre in metres.
+# The third log scale of a flat Gaussian (2D Gaussian Splatting), as SuperSplat sets it.
 _FLAT = math.log(1e-6)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
 _HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
@@ -265,8 +263,7 @@ def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
 def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
     """Returns the rows of every element by its name.
 
-    FormatError if the file is longer or shorter than its header says, or an element holds lists of
-    unknown length, as in a mesh.
+    FormatError if the size of the file is not that of its header, or an element holds lists.
     """
     for element in header.elements:
         if element.count and element.row is None:
@@ -280,10 +277,7 @@ def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
 def _read(
     header: Header, elements: tuple[Element, ...], *, exact: bool
 ) -> dict[str, NDArray[np.void]]:
-    """Returns the rows of the first elements; `exact` demands that nothing follows.
-
-    No memory is allocated for rows that the file is too small to hold.
-    """
+    """Returns the rows of the first elements; `exact` demands that nothing follows."""
     rows = [(each.name, each.count, each.row) for each in elements if each.row is not None]
     is_text = header.format == "ascii"
     try:

@@ -140,16 +140,9 @@ def find_images(
 
     Sizes are those of the pixels in the file: EXIF orientation is not applied, as COLMAP does not.
 
-    Args:
-        layout: of the data set.
-        listed: in its order.
-        where: its folder, for messages.
-        missing: names of further images that it lists, known to be missing.
-
-    Raises:
-        FormatError: two images have one name, or the sizes of files and lenses differ by more than
-            one common factor.
-        InputError: no image exists.
+    `missing` are names of further images that the set lists, and `where` is its folder, for
+    messages. InputError if no image exists; FormatError if two have one name, or the sizes of files
+    and lenses differ by more than one common factor.
     """
     names = [*(item.name for item in listed), *missing]
     if duplicates := [name for name, count in Counter(names).items() if count > 1]:
@@ -222,10 +215,9 @@ def is_file(path: Path) -> bool:
 def resolve_inside(folder: Path, name: object, where: str) -> Path:
     """Returns folder/name for a relative name that stays in the folder.
 
-    A data set may come from anywhere, so it may not name files elsewhere on the disk, not even
-    images. Links below the folder are its owner's and are followed. `name` is what the data set
-    writes, with either kind of slash, and `where` the entry for messages: FormatError if the name
-    is no text, absolute, or leads out of the folder.
+    A data set may come from anywhere, so it may not name files elsewhere on the disk; links below
+    the folder are followed. `name` has either kind of slash; `where` is its entry, for messages.
+    FormatError if `name` is no text, absolute, or leads out of the folder.
     """
     if not isinstance(name, str) or not name.strip() or "\0" in name:
         raise FormatError(f"{where} has no file name.")

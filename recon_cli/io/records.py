@@ -182,9 +182,6 @@ class ImportRecord(JsonRecord):
 
 
 def has_views(folders: Mapping[str, Path]) -> bool:
-    """Returns whether the scene was trained on, or compared with, views of the workspace.
-
-    `folders` are the finished ones of train and perhaps sfm, by stage name.
-    """
+    """Returns whether views were trained on or compared with; `folders` are by stage name."""
     record = ImportRecord.read(folders["train"])
     return (record is None or record.views) and "sfm" in folders

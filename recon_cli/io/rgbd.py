@@ -49,8 +49,7 @@ def lacks_trajectory(folder: Path) -> bool:
 def read_replica(folder: Path) -> PosedSet:
     """Returns a Replica sequence, its test/ folder held out.
 
-    InputError if no image is there; FormatError if cam_params.json or traj.txt is missing, damaged,
-    or does not fit the frames.
+    InputError if there are no images; FormatError if a file is missing, damaged or does not fit.
     """
     lens, scale = _read_params(folder)
     listed = _list_sequence(folder, lens, scale)
@@ -178,10 +177,7 @@ def tracked_sequence(
     layout: str, listed: Sequence[PosedImage], folder: Path, lost: int,
     notices: tuple[str, ...] = (),
 ) -> PosedSet:
-    """Returns the frames of a metric sequence that have a pose; `lost` others have none.
-
-    InputError if no frame has an image and a pose.
-    """
+    """Returns the `listed` frames of a metric sequence without `lost` ones; InputError if empty."""
     if not listed:
         raise InputError(
             f"{folder} has no frame with a pose: tracking was lost in all {lost}.",
@@ -207,8 +203,7 @@ def _read_lens(folder: Path, kind: str, size: tuple[int, int]) -> Lens:
         raise FormatError(
             f"{path} is missing.", hint="Export it with ScanNet's SensReader --export_intrinsics.")
     lens = lens_from_matrix(read_matrix(path), *size, str(path))
-    # ScanNet's cameras have it within 2% of the middle; images reduced after the export to half
-    # their size or less have it at the border or beyond.
+    # It is within 2% of the middle, but at the border or beyond for images reduced after export.
     shares = [center / side for center, side in zip(lens.params[2:], size, strict=True)]
     if any(abs(share - 0.5) > 0.25 for share in shares):
         raise FormatError(

@@ -51,9 +51,8 @@ _HINT = "Export it again from the program that it came from."
 def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
     """Returns the lens of a frame.
 
-    `entry` has the keys of the frame over those of the file; `size` is (width, height) of the
-    image, for where w and h are not given. FormatError if the focal length is missing, the camera
-    model is unknown, or a number is not one.
+    `entry` has the keys of the frame over those of the file; `size` is (width, height), for where w
+    and h are not given. FormatError if the focal length is missing or an entry cannot be used.
     """
     width = read_number(entry, "w", where) or float(size[0])
     height = read_number(entry, "h", where) or float(size[1])
@@ -139,13 +138,8 @@ class _Frame:
 class _FileFinder:
     """Finds the files that a list names, also by paths of the machine that it was written on.
 
-    Such a file is the one below the folder that has the same name and, among several, shares the
-    most folders at the end of its path. A file that the list names by its own path stands for no
-    other. Nothing outside the folder is ever opened.
-
-    Args:
-        folder: of the list.
-        names: all that it lists.
+    Such a file is the one below the folder that has the same name, is not listed itself and, among
+    several, shares the most folders at the end of its path. Nothing outside is ever opened.
     """
 
     def __init__(self, folder: Path, names: Sequence[object]) -> None:
@@ -221,8 +215,7 @@ def read_transforms(path: Path) -> PosedSet:
 
     If the set names test views, these are held out and its validation views are left out, as the
     literature scores it; if it names validation views alone, those are held out. InputError if no
-    image exists; FormatError if a file is damaged, or a frame lacks a rigid pose, a lens or a file
-    name.
+    image exists; FormatError if a file is damaged or a frame incomplete.
     """
     frames: list[_Frame] = []
     lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
@@ -408,10 +401,7 @@ def _read_points(
 
 
 def write_transforms(
-    path: Path,
-    views: Sequence[tuple[str, Camera]],
-    *,
-    held_out: Collection[str] = (),
+    path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = ()
 ) -> None:
     """Writes the cameras of images, by paths below the folder of the file, whole or not at all.
 

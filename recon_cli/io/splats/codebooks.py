@@ -23,8 +23,7 @@ _Float = TypeVar("_Float", np.float32, np.float64)
 def fit_codebook(values: Floats, rng: np.random.Generator) -> Floats:
     """Returns 256 ascending numbers that represent at least one value.
 
-    Lloyd's algorithm from 128 quantiles and 128 even steps, which cover the tails where quantiles
-    leave gaps; `rng` draws a sample if there are many values.
+    Lloyd's algorithm from 128 quantiles and 128 even steps; `rng` draws a sample of many values.
     """
     flat = values.ravel().astype(np.float64)  # whose squares neither underflow nor overflow
     ends = (float(flat.min()), float(flat.max()))
@@ -47,10 +46,8 @@ def fit_palette(
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Returns at most `size` representative rows [P, D] and the index of that of each row [M].
 
-    Two levels of k-means: about sqrt(size) groups first, then each group by itself, with a share of
-    the palette in proportion to its squared error. One level would compare every row with every
-    entry, which takes minutes for a million rows. Duplicate rows count once; `rng` draws the rows
-    that the search starts from.
+    Two levels of k-means: about sqrt(size) groups first, then each by itself, with a share of the
+    palette in proportion to its squared error. Duplicate rows count once; `rng` draws the starts.
     """
     rows, copies = np.unique(rows, axis=0, return_inverse=True)
     peak = max(float(np.abs(rows).max()), float(np.finfo(np.float32).tiny))
@@ -88,10 +85,7 @@ def _group_rows(
 
 
 def _choose_starts(rows: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Returns initial centres: drawn half uniformly, half by squared distance from the mean.
-
-    Uniform draws alone would leave the few distant rows without a centre near them.
-    """
+    """Returns initial centres: drawn half uniformly, half by squared distance from the mean."""
     far = ((rows - rows.mean(axis=0)) ** 2).sum(axis=1, dtype=np.float64)
     weights = far.mean() + far if far.any() else np.ones(len(far))
     count = min(count, len(rows))

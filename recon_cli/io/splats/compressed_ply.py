@@ -107,8 +107,7 @@ def _rotation_words(quats: Floats) -> Words:
 def _harmonic_bytes(sh_rest: Floats) -> Bytes:
     """Returns [N, 3 T] bytes, channel-major.
 
-    0 is between two bytes, which mean plus and minus 1/64. They alternate, otherwise all Gaussians
-    without harmonics would tint the whole scene the same way.
+    0 lies between the bytes of plus and minus 1/64, which alternate so as not to tint the scene.
     """
     steps = np.floor(sh_rest / _STEP) + 128
     turns = 127 + np.arange(len(sh_rest))[:, None, None] % 2
@@ -120,8 +119,7 @@ def _harmonic_bytes(sh_rest: Floats) -> Bytes:
 def read_compressed_ply(path: Path) -> Splats:
     """Returns the Gaussians of a compressed .ply in the file's order and degree.
 
-    Older files without bounds of colours are supported. FormatError if the file is missing,
-    damaged, or another kind of .ply.
+    Files without bounds of colours are supported. FormatError if damaged or another kind of .ply.
     """
     header = read_header(path)
     kinds = {each.name: _property_types(each) for each in header.elements}

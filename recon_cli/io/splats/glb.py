@@ -153,11 +153,9 @@ def read_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> Splats:
 
     The order is the file's; where several primitives hold Gaussians, those with coefficients come
     first. Behind the last one of a primitive that has any, Gaussians are of degree 0. `axes` are as
-    in `write_glb`; None for those that the file records, or else `Z_UP`.
-
-    Raises:
-        FormatError: the file is missing or damaged, holds no Gaussians, or needs what is not
-            supported: compression, another kernel, linear colours, nodes that stretch.
+    in `write_glb`; None for those that the file records, or else `Z_UP`. FormatError if the file is
+    missing or damaged, holds no Gaussians, or needs what is not supported: compression, another
+    kernel, linear colours, nodes that stretch.
     """
     container = Container(path)
     required = container.json.get("extensionsRequired", [])

@@ -147,10 +147,7 @@ def write_html(
 
 
 def read_html(path: Path) -> Splats:
-    """Returns the Gaussians embedded in a page of `write_html`; none of its scripts is run.
-
-    FormatError if the file is missing or damaged, or no page of that kind.
-    """
+    """Returns the Gaussians in a page of `write_html`, or raises FormatError; no script is run."""
     data = read_contents(path)
     matches = list(_OPENED.finditer(data))
     if len(matches) != 1:

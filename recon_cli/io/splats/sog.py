@@ -197,8 +197,7 @@ def pack_harmonics(
 ) -> tuple[dict[str, Any], dict[str, Bytes]]:
     """Returns the entry of meta.json and the images of coefficients [N, T, 3].
 
-    The first `colored` Gaussians have any; the others share an entry of zeros, and the codebook
-    holds 0 for it.
+    The first `colored` Gaussians have any; the others share an entry of zeros.
     """
     n, terms = sh_rest.shape[:2]
     size = min(_MAX_ENTRIES, -(-colored // _SHARE))
@@ -270,10 +269,7 @@ class Archive(UntrustedFile):
         return np.asarray(book[indices])
 
     def check_count(self, count: int) -> None:
-        """Raises FormatError for more Gaussians than a file of this size is likely to hold.
-
-        They take about 16 bytes each; images of one colour take none, however large they are.
-        """
+        """Raises FormatError for implausibly many Gaussians: each takes about 16 bytes."""
         if count > _SMALL + len(self.data):
             raise self.error(f"{count} Gaussians in {len(self.data)} bytes, as it claims")
 
@@ -330,10 +326,7 @@ class Archive(UntrustedFile):
 
 
 def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
-    """Returns the bytes of a .sog with images [H, W, 3] or [H, W, 4] by name.
-
-    The same arguments give the same bytes.
-    """
+    """Returns the bytes of a .sog with images [H, W, 3] or [H, W, 4] by name; deterministic."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
@@ -352,10 +345,7 @@ def encode_webp(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
-    """Returns (width, height) from the header of a WebP (RFC 9649); None for other images.
-
-    Pillow's decoder allocates memory when it opens a file, before it reports the size.
-    """
+    """Returns (width, height) of a WebP (RFC 9649) without decoding it; None for other images."""
     if data[8:12] != b"WEBP" or len(data) < 30:
         return None
     if data[12:16] == b"VP8L":

@@ -53,10 +53,7 @@ def write_splat(path: Path, splats: Splats) -> None:
 
 
 def read_splat(path: Path) -> Splats:
-    """Returns the Gaussians of a .splat, of degree 0, in the file's order.
-
-    FormatError if the file is missing, empty, truncated, or holds values that no Gaussian has.
-    """
+    """Returns the Gaussians of a .splat, degree 0, in the file's order; FormatError if damaged."""
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size

@@ -80,18 +80,10 @@ def spz_bytes(
 
     Log scales below -10 become -10, coefficients outside -1 to 127/128 and dc outside -3.33 to 3.33
     are clipped. Positions get the 12 fractional bits of Niantic's program, fewer in a scene that is
-    wider than 2048 units, and never fewer than 8.
-
-    Args:
-        path: of the file, for messages.
-        splats: of any degree.
-        version: 3, which all current readers support; 2, for older ones, with coarser rotations;
-            or 4.
-        harmonic_step: in 1/128; 1 is the finest.
-
-    Raises:
-        FormatError: there are no Gaussians, one is too large or too far away, or a parameter is
-            not finite.
+    wider than 2048 units, and never fewer than 8. `version` is 3, which all current readers
+    support, 2, with coarser rotations, or 4. `harmonic_step` is in 1/128; 1 is the finest. `path`
+    is for messages. FormatError if there are no Gaussians, one is too large or too far away, or a
+    parameter is not finite.
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is none of {VERSIONS}")
@@ -115,8 +107,7 @@ def spz_bytes(
 def read_spz(path: Path) -> Splats:
     """Returns the Gaussians of an SPZ file of version 2, 3 or 4, in the file's order and degree.
 
-    FormatError if the file is missing, damaged, of another format or version, or promises more than
-    it holds.
+    FormatError if the file is missing, damaged, or of another format or version.
     """
     return spz_splats(path, read_contents(path))
 
@@ -221,8 +212,7 @@ def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
 def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
     """Returns the header and the six arrays of a file.
 
-    FormatError if the data is damaged, of another format or version, promises more than a file of
-    its size can hold, or holds less or more than it promises.
+    FormatError if the data is damaged, of another format, or not what its header promises.
     """
     try:
         if data.startswith(b"\x1f\x8b"):

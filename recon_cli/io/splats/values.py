@@ -24,10 +24,7 @@ Bytes = NDArray[np.uint8]
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Returns rows of points [N, 3] along a Z-order curve (Morton 1966) through their box.
-
-    Points in the same one of its 2^63 cells keep their order.
-    """
+    """Returns the stable order of points [N, 3] along a Z-order curve (Morton 1966)."""
     exact = points.astype(np.float64)
     low, high = exact.min(axis=0), exact.max(axis=0)
     width = np.where(high > low, high - low, 1)
@@ -54,10 +51,7 @@ def read_contents(path: Path) -> bytes:
 
 
 class UntrustedFile:
-    """The bytes of a file that begins with `start`, and checks of the JSON in it.
-
-    Every method raises FormatError if the file does not hold what it promises.
-    """
+    """The bytes of a file and checks of the JSON in it, each of which raises FormatError."""
 
     def __init__(self, path: Path, start: bytes, kind: str) -> None:
         self.path = path
@@ -110,9 +104,8 @@ class UntrustedFile:
 def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
     """Returns the values of a file as float32 tensors, in the file's order.
 
-    `values` are the parameters by their names in `Splats`, of any type. Gaussians behind the last
-    one that has a coefficient other than zero are of degree 0. FormatError if a value is not
-    finite.
+    `values` are the parameters by their names in `Splats`. Gaussians behind the last one with a
+    coefficient other than zero are of degree 0. FormatError if a value is not finite.
     """
     with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
@@ -139,8 +132,7 @@ def encode_opacities(logits: Floats) -> Bytes:
 def decode_opacities(values: Bytes) -> NDArray[np.float64]:
     """Returns logits [N] of opacities in 255 steps.
 
-    The first and the last step are half as wide as the others and are decoded as their middle, not
-    as 0 and 1, whose logits are infinite.
+    The first and last step, half as wide, are decoded as their middle: 0 and 1 have no logit.
     """
     share = np.clip(values.astype(np.float64), 0.25, 254.75) / 255
     return np.asarray(np.log(share) - np.log1p(-share))
@@ -177,10 +169,7 @@ def _others(largest: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def flip_yz(splats: Splats) -> Splats:
-    """Returns the Gaussians with y and z negated, as between axes RDF and RUB; its own inverse.
-
-    Only signs change, so that nothing is rounded.
-    """
+    """Returns the Gaussians with y and z negated (RDF to RUB and back), without rounding."""
     signs = splats.means.new_tensor([1.0, -1, -1])
     direction = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)  # where no basis function is 0
     parity = (basis_rest(direction * signs, 3) / basis_rest(direction, 3)).round()
@@ -237,10 +226,7 @@ def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def logit(opacities: NDArray[np.float64], least: float) -> NDArray[np.float32]:
-    """Returns the logits of opacities in [0, 1], clipped to `least` away from both ends.
-
-    An opacity of exactly 0 or 1 has no finite logit.
-    """
+    """Returns the logits of opacities in [0, 1], clipped to `least` away from both ends."""
     inner = np.clip(opacities, least, 1 - least)
     return np.asarray(np.log(inner / (1 - inner)), np.float32)
 
