@@ -82,8 +82,7 @@ class Speed:
             **{f"{name}_iqr_ms": self.times[name].iqr_ms for name in PASSES},
             **{name: getattr(self, name) for name in _RATES},
             "stages": {name: asdict(timing) for name, timing in self.times.items()
-                       if name not in PASSES},
-        }
+                       if name not in PASSES}}
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,7 @@ class BackendResult:
         return {
             **self.speed.record(), **_finite(self.accuracy), "pairs": self.pairs,
             "memory_bytes": self.memory_bytes,
-            "one_thread": self.one_thread.record() if self.one_thread else None,
-        }
+            "one_thread": self.one_thread.record() if self.one_thread else None}
 
 
 def _finite(accuracy: Accuracy) -> dict[str, Any]:
@@ -154,8 +152,7 @@ class BenchResult:
                 "variants": [
                     {"name": variant.name, "time": asdict(variant.time) if variant.time else None,
                      **_finite(variant.accuracy)} for variant in scene.variants],
-            } for name, scene in self.scenes.items()},
-        }
+            } for name, scene in self.scenes.items()}}
 
 
 def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:

@@ -116,8 +116,7 @@ def compare_filters(job: Job, config: DenoiseConfig) -> str:
             "frames": samples,
             "reduced": "by area to half the size, before noise was added",
             "opencv_threads": cv2.getNumThreads(),
-            "scores": [asdict(score) for score in scores],
-        })
+            "scores": [asdict(score) for score in scores]})
     heading = (
         f"PSNR in dB and share of the edges kept, {len(samples)} frames at half their size with "
         "white noise added (in 1/255)")

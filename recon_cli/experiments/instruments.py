@@ -185,8 +185,7 @@ OPERATIONS_PER_PAIR = {
     "red, green, blue, depth composited, or their gradients summed": (8, 8),
     "g . c, the slope g . c - R, s = alpha T slope": (0, 11),
     "moments 1, u, v, uu, uv, vv of s": (0, 11),
-    "statistics: size of s along x and y, s^2, hits": (0, 8),
-}
+    "statistics: size of s along x and y, s^2, hits": (0, 8)}
 FLOPS_FORWARD = sum(forward for forward, _ in OPERATIONS_PER_PAIR.values())
 FLOPS_BACKWARD = sum(backward for _, backward in OPERATIONS_PER_PAIR.values())
 

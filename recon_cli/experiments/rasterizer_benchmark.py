@@ -176,25 +176,21 @@ def _figure_rows(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult
     several: list[tuple[str, Callable[[BackendResult], str]]] = [
         ("the same with 1 thread", speedup(_core)),
         (f"1 thread : {threads} threads, whole step", lambda backend: _ratio(
-            _core(backend).times["step"].ms, backend.speed.times["step"].ms)),
-    ]
+            _core(backend).times["step"].ms, backend.speed.times["step"].ms))]
     return [
         ("forward + backward, ms", lambda backend: number(backend.speed.both_ms)),
         ("whole step, ms", lambda backend: _ms(backend.speed.times["step"])),
         (f"{_REFERENCE} : this, forward + backward", speedup(lambda backend: backend.speed)),
         *(several if _has_several(scene) else []),
-        ("Gpairs/s a core, forward",
-         lambda backend: number(_core(backend).gpairs_per_s_forward)),
-        ("Gpairs/s a core, backward",
-         lambda backend: number(_core(backend).gpairs_per_s_backward)),
+        ("Gpairs/s a core, forward", lambda backend: number(_core(backend).gpairs_per_s_forward)),
+        ("Gpairs/s a core, backward", lambda backend: number(_core(backend).gpairs_per_s_backward)),
         ("of the core's peak, forward",
          lambda backend: percent(_core(backend).peak_fraction_forward)),
         ("of the core's peak, backward",
          lambda backend: percent(_core(backend).peak_fraction_backward)),
         ("evaluated Mpairs, forward", pairs(0)),
         ("evaluated Mpairs, backward", pairs(1)),
-        ("memory added, MB", lambda backend: f"{backend.memory_bytes / 1e6:.0f}"),
-    ]
+        ("memory added, MB", lambda backend: f"{backend.memory_bytes / 1e6:.0f}")]
 
 
 def _core(backend: BackendResult) -> Speed:

@@ -90,8 +90,7 @@ class CurvesResult:
             "scenes": {name: {
                 **scene.size_record(),
                 "recipes": {recipe.name: self._recipe(scene, recipe) for recipe in self.recipes},
-            } for name, scene in self.scenes.items()},
-        }
+            } for name, scene in self.scenes.items()}}
 
     def _recipe(self, scene: SceneRuns, recipe: Variant) -> dict[str, Any]:
         records, targets = scene.runs[ALL][recipe.name], self.targets_of(scene)
@@ -101,8 +100,7 @@ class CurvesResult:
                      for db in targets}
                for key, (_, clock) in (("seconds_to", _WALL), ("cpu_seconds_to", _CPU))},
             "runs": [{"seed": seed, "points": [asdict(point) for point in record.points]}
-                     for seed, record in enumerate(records)],
-        }
+                     for seed, record in enumerate(records)]}
 
 
 def run(request: RecipeRequest, progress: Progress) -> str:

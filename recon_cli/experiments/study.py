@@ -74,8 +74,7 @@ TABLE_I: dict[str, PublishedScores] = {
     "office0": (38.45, 0.925, 39.05, 0.934), "office1": (36.97, 0.938, 37.17, 0.954),
     "office2": (36.39, 0.945, 36.68, 0.962), "office3": (35.85, 0.941, 36.35, 0.958),
     "office4": (36.54, 0.939, 36.66, 0.941), "room0": (37.26, 0.915, 38.06, 0.923),
-    "room1": (36.28, 0.929, 37.75, 0.935), "room2": (34.98, 0.913, 35.14, 0.927),
-}
+    "room1": (36.28, 0.929, 37.75, 0.935), "room2": (34.98, 0.913, 35.14, 0.927)}
 _CAUTION = ("The paper names neither its frames, sizes, held-out views nor its count of runs: its "
             "figures and those of this study are no measurement of the same thing.")
 
@@ -147,8 +146,7 @@ class StudyResult:
             } for name, scene in self.scenes.items()},
             "comparisons": {
                 name: {row: self._comparison_record(row, name) for row in self.rows}
-                for name in next(iter(self.scenes.values())).runs},
-        }
+                for name in next(iter(self.scenes.values())).runs}}
 
     def _comparison_record(self, row: str, comparison: str) -> dict[str, Any]:
         def interval(pair: tuple[Variant, Variant], figure: str) -> dict[str, Any]:
@@ -161,8 +159,7 @@ class StudyResult:
                          **asdict(self.spread(row, comparison, variant, figure))}
                 for figure in FIGURES} for variant in VARIANTS},
             "differences": {f"{pair[0].name} - {pair[1].name}": {
-                figure: interval(pair, figure) for figure in _UNITS} for pair in PAIRS},
-        }
+                figure: interval(pair, figure) for figure in _UNITS} for pair in PAIRS}}
 
 
 def run(request: StudyRequest, progress: Progress) -> str:

@@ -78,8 +78,7 @@ BUDGET_PRUNED = Variant(
 KNOWN: dict[str, Variant] = {variant.name: variant for variant in (
     REFERENCE, PAPER, BUDGET, BUDGET_PRUNED,
     Variant("budget-l1", "budget-l1", {"densify": "budget", "ssim_weight": 0.0}, tries_degree=True),
-    Variant("budget-degree-1", "budget-degree-1", {"densify": "budget", "sh_degree": 1}),
-)}
+    Variant("budget-degree-1", "budget-degree-1", {"densify": "budget", "sh_degree": 1}))}
 
 
 def parse_recipe(text: str) -> Variant:

@@ -82,8 +82,7 @@ def _status(check: StageCheck) -> StageStatus:
         run.seconds if run else None,
         dict(run.summary) if run else {},
         (*(run.summary.get("notices", ()) if run else ()),
-         *(f"the input {path} is gone" for path in check.gone)),
-    )
+         *(f"the input {path} is gone" for path in check.gone)))
 
 
 def run(

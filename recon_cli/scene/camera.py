@@ -19,8 +19,7 @@ MODELS: dict[str, tuple[int, int]] = {
     "FULL_OPENCV": (2, 12),
     "SIMPLE_RADIAL_FISHEYE": (1, 4),
     "RADIAL_FISHEYE": (1, 5),
-    "THIN_PRISM_FISHEYE": (2, 12),
-}
+    "THIN_PRISM_FISHEYE": (2, 12)}
 
 
 @dataclass(frozen=True)

@@ -27,14 +27,12 @@ def basis_rest(directions: Tensor, degree: int) -> Tensor:
     if degree > 1:
         terms += [
             _C2[0] * x * y, -_C2[0] * y * z, _C2[1] * (2 * zz - xx - yy), -_C2[0] * x * z,
-            _C2[2] * (xx - yy),
-        ]
+            _C2[2] * (xx - yy)]
     if degree > 2:
         terms += [
             -_C3[0] * y * (3 * xx - yy), _C3[1] * x * y * z, -_C3[2] * y * (4 * zz - xx - yy),
             _C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -_C3[2] * x * (4 * zz - xx - yy),
-            _C3[4] * z * (xx - yy), -_C3[0] * x * (xx - 3 * yy),
-        ]
+            _C3[4] * z * (xx - yy), -_C3[0] * x * (xx - 3 * yy)]
     return torch.stack(terms, dim=-1)
 
 

@@ -109,8 +109,7 @@ class Similarity:
         """Returns scale, rotation (rows) and translation as JSON values, without loss."""
         return {
             "scale": float(self.scale), "rotation": self.rotation.tolist(),
-            "translation": self.translation.tolist(),
-        }
+            "translation": self.translation.tolist()}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Similarity:

@@ -40,8 +40,7 @@ class Splats:
         n = self.means.shape[0]
         shapes = {
             "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,),
-            "sh_dc": (n, 3),
-        }
+            "sh_dc": (n, 3)}
         for name, shape in shapes.items():
             tensor = getattr(self, name)
             if tuple(tensor.shape) != shape:

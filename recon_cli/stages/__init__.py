@@ -69,8 +69,7 @@ STAGES: tuple[Stage, ...] = (
           EvaluateSummary, 2, False, "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
           ExportSummary, 4, False, "recon_cli.stages.export", renders=True,
-          spares=("ingest", "sfm")),
-)
+          spares=("ingest", "sfm")))
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, takes="FILE")

@@ -44,15 +44,13 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
     outcomes = _process(config, names, ingest / store.FOLDER, store.prepare_frames_folder(out), ctx)
     atomic.write_json(out / NOISE, {
         outcome.name: {"sigma_255": outcome.sigma, "denoised": outcome.filtered}
-        for outcome in outcomes
-    })
+        for outcome in outcomes})
     return DenoiseSummary(
         mode=config.mode,
         filter=config.filter,
         frames=len(outcomes),
         denoised=sum(outcome.filtered for outcome in outcomes),
-        median_sigma_255=round(float(np.median([item.sigma for item in outcomes])), 4),
-    )
+        median_sigma_255=round(float(np.median([item.sigma for item in outcomes])), 4))
 
 
 def _process(

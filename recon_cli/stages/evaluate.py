@@ -111,8 +111,7 @@ class _Evaluation:
         return {
             "test_views": len(self.held_out),
             "unregistered_test": tuple(self.scene.unregistered_test),
-            "masked_out_test": tuple(sorted(hidden)) or None,
-        }
+            "masked_out_test": tuple(sorted(hidden)) or None}
 
     def note(self, lacking: str) -> str:
         """Returns what the figures of the tables mean; `lacking` is why there is no LPIPS."""
@@ -221,8 +220,7 @@ def _write(
     first = model_table(by_label)
     write_bytes(out / "table.txt", f"{first.text(rule=True)}\n{note}".encode())
     views = view_table(by_label)
-    write_bytes(
-        out / "metrics.md", f"{first.markdown()}\n{views.markdown()}\n{note}".encode())
+    write_bytes(out / "metrics.md", f"{first.markdown()}\n{views.markdown()}\n{note}".encode())
     write_bytes(out / "metrics.csv", csv_table(models).encode())
     tex = first.latex()
     if len(models) == 2:

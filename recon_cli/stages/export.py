@@ -85,5 +85,4 @@ def _write_transform(path: Path, frame: ExportFrame) -> None:
         "that was imported",
         "to": "splats.ply beside this file",
         "similarity": frame.similarity.to_json(),
-        "measurement": frame.measurement.to_json() if frame.measurement else None,
-    })
+        "measurement": frame.measurement.to_json() if frame.measurement else None})

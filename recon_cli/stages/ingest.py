@@ -62,8 +62,7 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         held_out=sum(frame.held_out for frame in frames),
         groups=len(source.groups),
         width=largest.width,
-        height=largest.height,
-    )
+        height=largest.height)
 
 
 def _choose_held_out(

@@ -55,8 +55,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
-        times=_times(frames),
-    )
+        times=_times(frames))
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
@@ -106,8 +105,7 @@ def _summary(frames: FrameList, job: MappingJob) -> SfmSummary:
         "unregistered_held_out": [name for name in unregistered if name in held_out],
         "world": results["sparse"],
         "cameras": results["undistorted"]["cameras"],
-        "seconds": {step: result["seconds"] for step, result in results.items()},
-    })
+        "seconds": {step: result["seconds"] for step, result in results.items()}})
 
 
 def _report(summary: SfmSummary, ctx: StageContext) -> None:

@@ -146,5 +146,4 @@ def splats_of(content: FarContent, sh_rest: int) -> Splats:
         log_scales=torch.full((n, 3), float(np.log(content.scale))),
         logit_opacities=torch.logit(torch.full((n,), _OPACITY)),
         sh_dc=(torch.tensor(content.colors, dtype=torch.float32) - 0.5) / SH_C0,
-        sh_rest=torch.zeros(n, sh_rest, 3),
-    )
+        sh_rest=torch.zeros(n, sh_rest, 3))

@@ -115,9 +115,7 @@ def estimate_gains(
     return _solve(*_pairs(logs), len(views))
 
 
-def _log_colors(
-    view: TrainView, points: NDArray[np.float64]
-) -> NDArray[np.float64]:  # [P, 3]
+def _log_colors(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64]:  # [P, 3]
     """Returns the logarithm of each point's colour; NaN where it is not seen or may be clipped."""
     image, block = _reduce(view)
     rows, column, line = project_points(view.camera, points)

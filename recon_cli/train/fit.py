@@ -18,10 +18,7 @@ _REPORTS = 40  # of a long run; each costs a picture of every validation view
 
 
 def fit(
-    state: TrainState,
-    task: Task,
-    until: int,
-    callbacks: Sequence[TrainCallback] = (),
+    state: TrainState, task: Task, until: int, callbacks: Sequence[TrainCallback] = (),
     importance: Importance | None = None,
 ) -> None:
     """Runs `state` on until it has done `until` steps.

@@ -74,9 +74,7 @@ class DeferredStep(GradientStep, Protocol):
     def status(self) -> StepStatus:
         """What the device records of each view."""
 
-    def start(
-        self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions
-    ) -> Statistics:
+    def start(self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions) -> Statistics:
         """Starts the work on one view and returns its statistics, zeros where it counts nothing."""
 
     def close(self) -> StepReport:
@@ -274,8 +272,7 @@ class _Ssim(torch.autograd.Function):
         by_covariance = 2 * a1 / (b1 * b2)
         by_mean = (
             2 * mu_y * a2 / (b1 * b2) - 2 * mu_x * ssim / b1
-            - 2 * mu_x * by_variance - mu_y * by_covariance
-        )
+            - 2 * mu_x * by_variance - mu_y * by_covariance)
         # the window is symmetric and the border zero: the blur is its own transpose
         mean, variance, covariance = blur(torch.stack([by_mean, by_variance, by_covariance]))
         slope = mean + 2 * x * variance + y * covariance

@@ -56,8 +56,7 @@ def splats_from_points(
         log_scales=torch.tensor(np.log(scales), dtype=torch.float32)[:, None].repeat(1, 3),
         logit_opacities=torch.logit(torch.full((n,), _OPACITY)),
         sh_dc=(torch.tensor(colors, dtype=torch.float32) / 255 - 0.5) / SH_C0,
-        sh_rest=torch.zeros(n, TERMS[sh_degree], 3),
-    )
+        sh_rest=torch.zeros(n, TERMS[sh_degree], 3))
 
 
 def first_state(

@@ -49,8 +49,7 @@ class SplatOptimizer:
             "means": config.means_rate * extent, "quats": config.quats_rate,
             "log_scales": recipe.scales_rate * config.scales_rate,
             "logit_opacities": config.opacities_rate, "sh_dc": recipe.sh_rate * config.sh_rate,
-            "sh_rest": recipe.sh_rate * config.sh_rate * _REST_FACTOR,
-        }
+            "sh_rest": recipe.sh_rate * config.sh_rate * _REST_FACTOR}
         # on the device where a step may come to nothing there without the host's knowledge
         self._taken = torch.zeros(1, dtype=torch.int64)
         if backend == "triton":
@@ -98,8 +97,7 @@ class SplatOptimizer:
                 self._reserve(name, value, room)
         self.splats = Splats(**{
             name: self._view(name, "value").detach().requires_grad_() for name in self._buffers})
-        self.gradients = Splats(**{
-            name: self._view(name, "gradient") for name in self._buffers}
+        self.gradients = Splats(**{name: self._view(name, "gradient") for name in self._buffers}
         ) if self.fused else self.splats
 
     def gradient(self, name: str) -> Tensor:

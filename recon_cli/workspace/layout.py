@@ -280,8 +280,7 @@ def hold_lock(root: Path, verb: str, *, other: str = "another workspace with -w"
     try:
         write_json(root / HOLDER, {
             "pid": os.getpid(), "host": socket.gethostname(), "verb": verb,
-            "since": datetime.now().astimezone().isoformat(timespec="seconds"),
-        })
+            "since": datetime.now().astimezone().isoformat(timespec="seconds")})
         yield
     finally:
         with contextlib.suppress(OSError):  # the error that led here says more

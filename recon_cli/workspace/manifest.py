@@ -40,8 +40,7 @@ class ResultKey:
             "version": self.version,
             "config": self.config,
             "sources": [source.contents() for source in self.sources],
-            "upstream": self.upstream,
-        })
+            "upstream": self.upstream})
 
     def to_json(self) -> dict[str, Any]:
         """Returns plain values that `from_json` takes."""
@@ -50,8 +49,7 @@ class ResultKey:
             "version": self.version,
             "config": dict(self.config),
             "inputs": [dataclasses.asdict(source) for source in self.sources],
-            "upstream": dict(self.upstream),
-        }
+            "upstream": dict(self.upstream)}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ResultKey:
@@ -92,8 +90,7 @@ class Manifest:
             "fingerprint": self.key.fingerprint,
             "outputs": {name: dataclasses.asdict(file) for name, file in self.outputs.items()},
             "digest": self.digest,
-            **dataclasses.asdict(self.run),
-        }
+            **dataclasses.asdict(self.run)}
         write_json(folder / NAME, {**content, "self": sha256_json(content)})
 
     @classmethod
@@ -140,8 +137,7 @@ class PartialRun:
         """Writes the record, whole or not at all."""
         write_json(path, {
             "fingerprint": self.key.fingerprint, **self.key.to_json(),
-            "done": self.done, "total": self.total, "seconds": self.seconds,
-        })
+            "done": self.done, "total": self.total, "seconds": self.seconds})
 
     @classmethod
     def read(cls, path: Path) -> PartialRun | None:

@@ -46,12 +46,8 @@ _STATE = "state.safetensors"
 
 
 def fit_together(
-    state: TrainState,
-    task: Task,
-    until: int,
-    callbacks: Sequence[TrainCallback] = (),
-    importance: Importance | None = None,
-    threads: int = 1,
+    state: TrainState, task: Task, until: int, callbacks: Sequence[TrainCallback] = (),
+    importance: Importance | None = None, threads: int = 1,
 ) -> None:
     """Runs `state` on like `fit`, with the help of all processes that `task.ranks` leads.
 
@@ -221,8 +217,7 @@ def pack_fit(fit: Fit) -> dict[str, NDArray[Any]]:
         "extent": task.extent, "backend": task.backend, "device": task.device.type,
         "camera_error": task.camera_error, "threads": fit.threads,
         "scores": importance and [importance.weighs, importance.leaves_out],
-        "cameras": [{name: getattr(view.camera, name) for name in _LENS} for view in views],
-    }
+        "cameras": [{name: getattr(view.camera, name) for name in _LENS} for view in views]}
     arrays: dict[str, NDArray[Any]] = {
         "said": np.frombuffer(json.dumps(said).encode(), np.uint8).copy()}
     with tempfile.TemporaryDirectory() as folder:
