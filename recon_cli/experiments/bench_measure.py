@@ -156,11 +156,7 @@ class BenchResult:
 
 
 def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
-    """Returns a function that takes one step as `recon_cli.train.fit` does and marks its parts.
-
-    The learning rates are zero, so that every step of every candidate has the same scene; Adam
-    does the same arithmetic.
-    """
+    """Returns a function that takes one training step at rates of 0 and marks its parts."""
     still = replace(
         RunConfig(), means_rate=0.0, quats_rate=0.0, scales_rate=0.0, opacities_rate=0.0,
         sh_rate=0.0)
@@ -196,11 +192,7 @@ def loss_passes(scene: BenchScene, device: str) -> dict[str, Callable[[], object
 
 
 def convolution_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor:
-    """Returns (1 - w) L1 + w (1 - SSIM) as most trainers compute it, for its time.
-
-    Five grouped convolutions with the 11x11 window, differentiated by autograd; the values are
-    those of `photometric_loss`.
-    """
+    """Returns `photometric_loss` as most trainers compute it: five convolutions and autograd."""
     line = image.new_tensor(taps())
     window = (line[:, None] * line).expand(3, 1, -1, -1)
 
@@ -293,11 +285,7 @@ class _Measurement:
             for name in plan.backends}
 
     def measure_losses(self) -> dict[str, Timing]:
-        """Returns the time of every photometric loss, of the second of two passes.
-
-        In training the images have just been written; after the pause between candidates they are
-        no longer in the caches.
-        """
+        """Returns the time of every photometric loss, its images in the caches as in training."""
         def time_second(work: Callable[[], object]) -> Mapping[str, float]:
             work()
             return self._time(work)

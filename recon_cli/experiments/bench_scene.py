@@ -67,8 +67,7 @@ def build_scene(size: SceneSize, sh_degree: int, device: str, *, seed: int = 0) 
 def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Camera]:
     """Returns N Gaussians on the walls of a room and on boxes in it, and a camera inside.
 
-    As in a trained indoor scene: flat, of all opacities, with view-dependent colours, in many
-    layers, and needles at grazing angles.
+    As in a trained scene: flat, of all opacities, view-dependent, in many layers, with needles.
     """
     rng = np.random.default_rng(seed)
     wall = rng.integers(0, 6, n)
@@ -194,11 +193,7 @@ def oracle(scene: BenchScene) -> Answer:
 
 
 def accuracy(candidate: Answer, truth: Answer) -> Accuracy:
-    """Returns the error of `candidate`; infinite, with a cosine of 0, where it is not finite.
-
-    A parameter whose true gradient is zero everywhere (the higher harmonics at SH degree 0) is
-    ignored.
-    """
+    """Returns the error of `candidate`, infinite (cosine 0) where it is not finite."""
     difference = (candidate.image - truth.image).abs()
     relative, cosine = _compare(candidate.gradients, truth.gradients)
     worst = max(relative, key=lambda name: relative[name], default="")

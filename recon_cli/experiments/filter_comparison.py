@@ -182,8 +182,7 @@ def with_noise(rgb: Pixels, noise: float, *, seed: int) -> Pixels:
 def edges_kept(truth: Pixels, image: Pixels) -> float:
     """Returns the fraction of the slope across the edges of `truth` that is left in `image`.
 
-    The mean slope of the image along the true gradient over the steepest 5% of the pixels, divided
-    by that of the truth. Noise, whose slope has a random direction, cancels out.
+    Along the true gradient of the steepest 5% of the pixels, so that noise cancels out.
     """
     across, down = _slopes(truth)
     steepness = np.hypot(across, down)
@@ -202,10 +201,7 @@ def _slopes(image: Pixels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def best(scores: Sequence[FilterScore], level: float) -> FilterScore:
-    """Returns the highest PSNR of the offered filters, or none, that lose few edges.
-
-    It is of the compared level nearest to `level`.
-    """
+    """Returns the best of the filters on offer, or none, at the level nearest to `level`."""
     near = min((score.noise_255 for score in scores), key=lambda noise: abs(noise - level))
     usable = [
         score for score in scores

@@ -78,10 +78,9 @@ def alternate(
     works: Mapping[str, Callable[[], Mapping[str, float]]], rounds: int,
     on_round: Callable[[], None],
 ) -> dict[str, Samples]:
-    """Runs all candidates in turn, A B A B, and returns the samples of each.
+    """Runs all candidates in turn, A B A B, so that a slow minute affects all alike.
 
-    A slow minute then affects all candidates alike. A first round is not counted: it compiles and
-    warms the caches.
+    Returns the samples of each. A first round that compiles and warms caches is not counted.
     """
     samples: dict[str, Samples] = {name: {} for name in works}
     for number in range(rounds + 1):
@@ -126,10 +125,9 @@ def examine(threads: int, device: str) -> Host:
 
 
 def measure_memory(work: Callable[[], object], device: str) -> int:
-    """Returns the peak bytes that `work` added.
+    """Returns the peak bytes that `work` added: on a GPU what torch allocated.
 
-    On a CPU this is resident memory, sampled every millisecond, which misses short peaks and
-    counts what an allocator keeps; on a GPU it is what torch allocated.
+    On a CPU resident memory, sampled every millisecond, with what an allocator keeps.
     """
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
@@ -271,11 +269,8 @@ class Probe:
         return collected
 
     def pairs(self, output: RenderOutput) -> tuple[int, int] | None:
-        """Returns pairs forward and backward of an output that has been through both passes.
-
-        numba counts all pixels of a row of a tile, torch all pixels of a tile.
-        """
-        if self._backend == "numba":
+        """Returns pairs (forward, backward) of an output that has been through both passes."""
+        if self._backend == "numba":  # all pixels of a row of a tile; torch: all of a tile
             view_pass = output.rgb.grad_fn.lease.view_pass  # type: ignore[union-attr]
             return view_pass.pairs_forward, view_pass.pairs_backward
         return (self._pairs[0], self._pairs[1]) if self._backend == "torch" else None

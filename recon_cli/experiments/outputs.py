@@ -1,8 +1,4 @@
-"""Files that an experiment writes: JSON, a picture, tables in a Markdown page.
-
-matplotlib is an extra and imported only while a picture is drawn. In a Markdown page only the text
-between two marks is replaced.
-"""
+"""Files that an experiment writes: JSON, a picture, tables between two marks of a page."""
 
 from __future__ import annotations
 

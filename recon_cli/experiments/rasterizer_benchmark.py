@@ -256,13 +256,10 @@ class SpeedErrorPoint:
 
 
 def list_points(scene: BenchedScene) -> list[SpeedErrorPoint]:
-    """Returns every backend, then every approximation that has a time.
-
-    The backend that rendered the approximations has the time that was taken in turn with theirs.
-    """
+    """Returns every backend, then every approximation that has a time."""
     contract, *others = scene.variants
     times = {name: backend.speed.both_ms for name, backend in scene.backends.items()}
-    if contract.time:
+    if contract.time:  # taken in turn with the approximations
         times[scene.variants_of] = contract.time.ms
     timed = [*((name, times[name], backend.accuracy) for name, backend in scene.backends.items()),
              *((other.name, other.time.ms, other.accuracy) for other in others if other.time)]
@@ -281,10 +278,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def draw(result: BenchResult, path: Path) -> None:
-    """Draws speed against error of the first scene into a .png or .svg.
-
-    Points are numbered, with their names beside the panels: many overlap.
-    """
+    """Draws speed against error of the first scene into a .png or .svg."""
     name, scene = next(iter(result.scenes.items()))
     points = list_points(scene)
     with drawing(path, 15, 6, dpi=130) as figure:
@@ -335,10 +329,7 @@ def read_record(path: Path) -> Mapping[str, Any]:
 def check_comparable(
     old: Mapping[str, Any], scene: str, settings: Mapping[str, int], threads: int
 ) -> None:
-    """Raises ConfigError unless the earlier run timed the same scene with as many threads.
-
-    `settings` are gaussians, width, height and sh_degree of this run.
-    """
+    """Raises ConfigError unless an earlier run has this scene, these settings and threads."""
     scenes = old["scenes"]
     if scene not in scenes:
         raise ConfigError(

@@ -195,10 +195,7 @@ def _table(name: str, scene: SceneRuns, result: CurvesResult) -> Table:
 
 
 def draw(result: CurvesResult, path: Path) -> None:
-    """Draws a row of panels a scene into a .png or .svg.
-
-    A line is the median over the seeds; the band reaches from the lowest to the highest.
-    """
+    """Draws each scene into a .png or .svg: median over the seeds, band from lowest to highest."""
     rows = len(result.scenes)
     with drawing(path, _INCH * len(_PANELS), _INCH * rows + 0.5) as figure:
         panels = figure.subplots(rows, len(_PANELS), squeeze=False)

@@ -1,9 +1,8 @@
 """The runner of all experiments: variants x repeats, and training runs as records that resume.
 
-`run_grid` is the loop that every experiment uses. `Runner` fills it with training runs: each is
-scored, as its .ply stores the model, on views with their original pixels that it was not trained
-on. A finished run is one line of runs.jsonl, flushed before the next run starts, so that an
-interrupted experiment loses the current run only.
+`run_grid` is the loop of every experiment. `Runner` fills it with training runs, each scored as its
+.ply stores the model, on original pixels of views that it was not trained on. A finished run is a
+line of runs.jsonl, flushed before the next run starts.
 """
 
 from __future__ import annotations
@@ -66,10 +65,7 @@ def run_grid(
     variants: Mapping[str, _Variant], repeats: Sequence[_Repeat],
     measure: Callable[[_Variant, _Repeat], _Result],
 ) -> dict[str, tuple[_Result, ...]]:
-    """Returns the measurements of each variant by its name, one for each repeat.
-
-    Repeats are the outer loop: a slow minute of the machine then affects all variants alike.
-    """
+    """Returns the measurements of each variant by its name; in each repeat all take turns."""
     results: dict[str, list[_Result]] = {name: [] for name in variants}
     for repeat in repeats:
         for name, variant in variants.items():
@@ -90,10 +86,7 @@ class ExperimentRequest:
     def load(
         self, paths: Mapping[str, Path], scratch: Path, split: str, progress: Progress
     ) -> tuple[Host, list[LoadedScene]]:
-        """Returns this machine, and the scenes of `scenes.check_scenes`, ready for training.
-
-        Data sets become workspaces in `scratch`; the views of `split` are scored.
-        """
+        """Returns this machine and the scenes, data sets opened in `scratch`; scores `split`."""
         ctx = render_context(self.compute, progress)
         host = examine(ctx.threads, ctx.device)
         return host, [load_for_training(
@@ -184,10 +177,7 @@ class SceneRuns:
 
 
 def key_of(loaded: LoadedScene, run: TrainingRun) -> str:
-    """Returns the key of a run: everything that affects its result.
-
-    Threads and the machine are left out: they affect the seconds only.
-    """
+    """Returns the key of a run: all that affects its result. Threads affect only seconds."""
     versions = [__version__, *(stage(name).version for name in ("train", "prune", "evaluate"))]
     return sha256_json({
         "scene": loaded.folders.digest, "arm": run.variant.record(),
@@ -196,11 +186,7 @@ def key_of(loaded: LoadedScene, run: TrainingRun) -> str:
 
 
 class Records:
-    """The records in a folder, by key; a last line that was cut short is dropped.
-
-    Raises:
-        FormatError: the file holds something else.
-    """
+    """The records in a folder, by key; FormatError where its file holds something else."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / RECORDS_FILE
@@ -276,8 +262,7 @@ class Runner:
     ) -> Runs:
         """Returns the runs of every variant with every seed, 0 to seeds - 1.
 
-        `steps` are by variant; `score_at` maps the steps of a run to those after which it is scored
-        in addition to its end.
+        `steps` are by variant; `score_at` maps a run's steps to those after which it is scored.
         """
         with self._progress.bar(label, seeds * sum(steps.values()), unit="step") as bar:
 

@@ -94,10 +94,7 @@ def open_scene(
     name: str, path: Path, scratch: Path, settings: Settings, compute: ComputeConfig,
     progress: Progress,
 ) -> SceneFolders:
-    """Returns the folders of a workspace, which is only read, or of a data set.
-
-    A data set is made into a workspace in `scratch`, with its own poses; fresh results are kept.
-    """
+    """Returns the folders of a workspace, or of a data set that becomes one in `scratch`."""
     workspace = Workspace(path)
     if not workspace.holds_results:
         workspace = Workspace(scratch / name)

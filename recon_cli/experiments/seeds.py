@@ -1,8 +1,7 @@
 """`recon eval --seeds N`: mean and deviation of the scores of a workspace's models over seeds.
 
-Each further seed is a workspace of its own below `seeds/`, with hard links to the frames and
-cameras of the workspace, so that it resumes like any other and takes disk space for models only.
-seeds.json lies beside the stages, so that no stage becomes stale.
+Each further seed is a workspace below `seeds/` with hard links to the frames and cameras, so that
+it resumes like any other. seeds.json lies beside the stages: no stage becomes stale.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """`recon study`: the paper's experiment, repeated over seeds, at equal steps and equal seconds.
 
-Scenes that Table I of the paper, "3D Reconstruction of Indoor Scenes Based on 3DGS Models", has as
-well are shown beside its scores.
+Compared with Table I of the paper, "3D Reconstruction of Indoor Scenes Based on 3DGS Models".
 """
 
 from __future__ import annotations
@@ -189,10 +188,7 @@ def run(request: StudyRequest, progress: Progress) -> str:
 
 
 def equal_seconds(iterations: int, seconds: Mapping[str, float]) -> dict[str, int]:
-    """Returns the steps of each variant that take as long as the slowest one's `iterations`.
-
-    A first guess: it assumes that later steps cost as much as the measured ones.
-    """
+    """Returns the steps of each variant that take as long as the slowest's, by a first guess."""
     slowest = max(seconds.values())
     return {name: max(iterations, round(iterations * slowest / own)) if own > 0 else iterations
             for name, own in seconds.items()}
@@ -446,10 +442,7 @@ def notes(result: StudyResult) -> list[str]:
 
 
 def draw(result: StudyResult, path: Path) -> None:
-    """Draws means and intervals of every scene into a .png or .svg.
-
-    A cross is the gain that the paper reports for a scene of that name.
-    """
+    """Draws means and intervals into a .png or .svg; a cross is the gain in the paper."""
     with drawing(path, 13, 2 + 1.4 * len(result.rows)) as figure:
         panels = figure.subplots(len(_UNITS), len(COMPARISONS), squeeze=False, sharey=True)
         for line, (label, name, _) in zip(panels, _COLUMNS, strict=True):

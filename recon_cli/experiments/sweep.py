@@ -83,10 +83,7 @@ def count_trials(ratios: Sequence[float]) -> int:
 def sweep(
     source: PruneSource, ratios: Sequence[float], *, on_trial: Callable[[], None]
 ) -> list[SweepTrial]:
-    """Returns the control with equal steps, then for every ratio all scores and their control.
-
-    Equal seconds are those of the configured score.
-    """
+    """Returns the control of equal steps, then for every ratio all scores and their control."""
     steps = source.until - source.first
     _run_trial(source, Sweep.CONTROL, None, min(_WARM_STEPS, steps))
     control = configured = _run_trial(source, Sweep.CONTROL, None, steps)

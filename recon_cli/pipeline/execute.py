@@ -63,9 +63,7 @@ def run_stage(
     job: Job, checks: WorkspaceCheck, row: Stage, config: StageConfig,
     sources: tuple[Source, ...] | None = None,
 ) -> Manifest:
-    """Runs one stage whose needs are fresh, commits its result and returns the manifest.
-
-    `sources` are the user's files; None stands for those of the previous run.
+    """Runs a stage whose needs are fresh and returns its manifest; no `sources` are the last ones.
 
     Raises:
         ReconError: whatever the stage raises; what it had finished is kept for the next run.
@@ -169,9 +167,7 @@ def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> S
 def render_context(
     compute: ComputeConfig, progress: Progress, ranks: ProcessGroup = SINGLE_PROCESS
 ) -> StageContext:
-    """Returns where to train and render, once the rasterizer is ready.
-
-    Each of `ranks` takes its share of the cores.
+    """Returns where to train and render, once ready; each of `ranks` takes its share of cores.
 
     Raises:
         BackendError: what was asked for is not available.
@@ -184,11 +180,7 @@ def render_context(
 
 
 def _resolve_backend(compute: ComputeConfig, ranks: ProcessGroup) -> tuple[str, str]:
-    """Returns (backend, device) to train and render with.
-
-    Raises:
-        BackendError: what was asked for is not available, or not for every process.
-    """
+    """Returns (backend, device); raises BackendError where a process lacks them."""
     backend, device = load("recon_cli.render.registry.resolve")(compute.backend, compute.device)
     if device == "cuda" and ranks.lacks_gpu:
         raise BackendError(
@@ -211,11 +203,7 @@ def _prepare_kernels(progress: Progress, backend: str) -> None:
 
 
 def refuse_missing_backend(job: Job, stages: Sequence[str]) -> None:
-    """Fails before hours of other work where a device or backend is named that is not available.
-
-    Raises:
-        BackendError: one of `stages` renders, and what it would render with is not available.
-    """
+    """Raises BackendError where one of `stages` renders with a named backend that is missing."""
     named = (job.compute.device, job.compute.backend) != ("auto", "auto")
     uncertain = named or job.ranks.lacks_gpu
     if uncertain and any(row.renders for row in job.table if row.name in stages):

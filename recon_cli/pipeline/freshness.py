@@ -71,8 +71,7 @@ def is_imported(key: ResultKey) -> bool:
 class WorkspaceCheck:
     """The checks of a workspace as it is now, each made once. Nothing is changed.
 
-    A stage behind a stale one is stale too. One behind a missing one is not: whether its input
-    changed shows once that has been made again.
+    A stage behind a stale one is stale too; one behind a missing one is not, until that is made.
     """
 
     def __init__(self, workspace: Workspace, settings: Settings, table: Sequence[Stage]) -> None:
@@ -120,10 +119,7 @@ class WorkspaceCheck:
         return self._compare(self.row(name), self._workspace.manifest(name), config, sources)
 
     def config(self, row: Stage, key: ResultKey | None) -> StageConfig:
-        """Returns the options that a result was made with, overlaid by the settings.
-
-        Options and values that this version does not know are left out.
-        """
+        """Returns the known options that a result was made with, overlaid by the settings."""
         names = {item.name for item in dataclasses.fields(row.config)} if key else set()
         stored = {
             name: value for name, value in (key.config.items() if key else ())

@@ -1,12 +1,10 @@
 """Decides which stages run, and says how each of them stands.
 
-A verb names its targets. A target that is fresh is left alone. What it needs is run first where the
-table allows that (denoise, sfm); where it does not (ingest, train), an error names the command to
-type.
+A target that is fresh is left alone. What it needs is run first where the table allows that
+(denoise, sfm); otherwise (ingest, train) an error names the command to type.
 
-Where options come from: a target takes defaults < recon.toml < --config < command line, so that a
-verb does the same whatever was typed before it. Every other stage keeps the options that its result
-was made with, unless recon.toml, --config or --set say otherwise (see `freshness`).
+A target's options are defaults < recon.toml < --config < command line. Every other stage keeps the
+options of its result, unless recon.toml, --config or --set say otherwise (see `freshness`).
 """
 
 from __future__ import annotations
@@ -90,12 +88,11 @@ def run(
 ) -> tuple[Outcome, ...]:
     """Brings every target up to date, in order, and returns what was done for each.
 
-    Targets that are fresh run only with `again`. `verb` is shown to other processes that want the
-    workspace.
+    Fresh targets run only with `again`. `verb` is shown to processes that want the workspace.
 
     Raises:
-        StageError: something that a target needs is missing or stale and is not made implicitly, or
-            a scene that another verb made would be replaced.
+        StageError: a need is not fresh and not automatic, or another verb's scene would be
+            replaced.
         WorkspaceError: the workspace is in use, full, or not writable.
         ReconError: whatever the stages raise.
     """
@@ -113,10 +110,7 @@ def run(
 
 
 def _refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
-    """Raises StageError where training would replace an imported scene, or import a trained one.
-
-    A training takes long, and there may be no other copy of an imported scene.
-    """
+    """Raises StageError where training or import would replace the scene of the other."""
     for row in [row for row in job.table if row.name == IMPORT.name and row.name in stages]:
         finished, partial = job.workspace.manifest(row.name), job.workspace.partial_run(row.name)
         importing = row.verb == IMPORT.verb
@@ -276,12 +270,9 @@ class Freed:
 
 
 def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:
-    """Removes what can be spared and returns it.
+    """Removes what can be spared and returns it; with `dry` nothing is removed.
 
-    Without `stages` that is unfinished work, replaced results, and large volatile files: what is
-    fresh stays fresh. With `stages` it is the results of those stages.
-
-    With `dry` nothing is removed.
+    That is unfinished work, replaced results and large volatile files, or the results of `stages`.
 
     Raises:
         WorkspaceError: another process holds the workspace, or it cannot be written.

@@ -41,12 +41,9 @@ class Lens:
                              f"not {len(self.params)}")
 
     def resized(self, width: int, height: int) -> Lens:
-        """Returns the intrinsics of the same image resampled to width x height pixels.
-
-        A model with one focal length takes the mean of both scales; they differ by rounding alone.
-        """
+        """Returns the intrinsics of the same image resampled to width x height pixels."""
         sx, sy = width / self.width, height / self.height
-        focals, _ = MODELS[self.model]
+        focals, _ = MODELS[self.model]  # a single one takes the mean of both scales
         scales = [(sx + sy) / 2, sx, sy] if focals == 1 else [sx, sy, sx, sy]
         inner = [value * scale for value, scale in zip(self.params, scales, strict=False)]
         return replace(
@@ -86,10 +83,7 @@ class Camera:
 def looking_at(
     eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns [4, 4] world to camera at `eye` with `target` in the middle and the horizon level.
-
-    The line of sight may not be parallel to `up`.
-    """
+    """Returns [4, 4] world to camera, level, from `eye` towards `target` (not along `up`)."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

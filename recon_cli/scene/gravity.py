@@ -1,10 +1,9 @@
 """Where up is, from how the cameras are held and from the floor below them.
 
-A hand pitches and turns a phone freely but keeps its horizon level: the x axes of the cameras lie
-in the horizontal plane, whatever they look at. Up is the direction that is at right angles to all
-of them, and the y axes say which end of it is up. Where the points show a floor near that, it is
-the better witness. Where the two do not agree, or the cameras say nothing, nothing is said: a scene
-that leans is worse than one that was left as it was.
+A hand pitches and turns a phone freely but keeps its horizon level: up is the direction at right
+angles to the x axes of the cameras, and the y axes say which end of it is up. A floor near that in
+the points is the better witness. Where the two do not agree, or the cameras say nothing, nothing is
+said: a scene that leans is worse than one that was left as it was.
 """
 
 from __future__ import annotations
@@ -33,13 +32,9 @@ def turn_onto(
     one: NDArray[np.float64],  # [3]
     other: NDArray[np.float64],  # [3]
 ) -> NDArray[np.float64]:
-    """Returns the smallest rotation [3, 3] that takes one unit vector to another.
-
-    Rodrigues' formula. Between opposite vectors it is the half turn about the axis of coordinates
-    that is most at right angles to them, so that x stays where it is for y and z.
-    """
+    """Returns the smallest rotation [3, 3] from one unit vector to another (Rodrigues)."""
     cosine = float(one @ other)
-    if cosine < -1 + 1e-9:
+    if cosine < -1 + 1e-9:  # half a turn about the axis of coordinates most at right angles
         axis = np.zeros(3)
         axis[np.argmin(np.abs(one))] = 1
         axis -= (axis @ one) * one
@@ -57,7 +52,6 @@ def upright_axes(
 
     z is 0 on the floor; where there is none, at the mean height of the cameras. x is the one of the
     four directions along and across the walls that is nearest to the cameras' mean right.
-
     `gravity.up` must be known; `points` are [P, 3], `viewmats` [C, 4, 4] world to camera.
     """
     assert gravity.up is not None, "the frame of a scene whose up is not known"
@@ -129,10 +123,7 @@ class Gravity:
 
 
 def find_gravity(points: NDArray[np.float64], viewmats: NDArray[np.float64]) -> Gravity:
-    """Returns where up is, as far as cameras and points show it.
-
-    From `points` [P, 3] and `viewmats` [C, 4, 4] world to camera, in world units.
-    """
+    """Returns where up is by points [P, 3] and `viewmats` [C, 4, 4] world to camera."""
     if len(viewmats) < MIN_CAMERAS:
         return Gravity(None, None, None, f"there are only {len(viewmats)} cameras")
     held = camera_up(viewmats)
@@ -171,10 +162,7 @@ def _loose(held: CameraUp) -> str:
 
 
 def camera_up(viewmats: NDArray[np.float64]) -> CameraUp:
-    """Returns what the axes of cameras say about up.
-
-    `viewmats` are [C, 4, 4] world to camera, at least three.
-    """
+    """Returns what the axes of three or more cameras [C, 4, 4] (world to camera) say about up."""
     right, down = viewmats[:, 0, :3], viewmats[:, 1, :3]
     up, spread, error = _normal(right)
     upright = float((down @ up < 0).mean())
@@ -192,14 +180,10 @@ def mean_up(viewmats: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _normal(axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float]:
-    """Returns the direction at right angles to most of `axes` [C, 3], and how sure it is.
+    """Returns the normal [3] of most `axes` [C, 3], their RMS across it, and its error in rad.
 
     Reweighted least squares towards the sum of absolute deviations, so that frames in which the
-    camera leans do not pull.
-
-    Returns:
-        The unit vector; the root mean square of the axes along the second direction, 0 to 0.71; the
-        standard error of the vector in radians.
+    camera leans do not pull. The RMS is along the second direction, 0 to 0.71.
     """
     weights = np.ones(len(axes))
     for _ in range(_STEPS):

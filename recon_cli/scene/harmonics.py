@@ -1,7 +1,4 @@
-"""Turning spherical harmonics with the scene that they colour.
-
-A rotation mixes the coefficients of one degree among themselves and leaves degree 0 as it is.
-"""
+"""Turning spherical harmonics with their scene: coefficients mix among those of the same degree."""
 
 from __future__ import annotations
 
@@ -85,10 +82,9 @@ def generators() -> Tensor:
 
 
 def rotate_sh(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:
-    """Returns the coefficients of the same colours in turned axes.
+    """Returns coefficients [M, T, 3] of degrees 1 and up (T one of 0, 3, 8, 15) in turned axes.
 
-    `sh_rest` [M, T, 3] are those of degrees 1 and up, T one of 0, 3, 8, 15; `rotation` [3, 3] leads
-    from old to new axes. Computed in float64, returned in the dtype of `sh_rest`.
+    `rotation` [3, 3] leads from old to new axes. Computed in float64; the dtype stays.
     """
     turned, start = torch.empty_like(sh_rest), 0
     for block in rotation_blocks(rotation):

@@ -61,10 +61,7 @@ class Scene:
 
     @property
     def reach(self) -> float:
-        """Distance from `center` within which the room lies, world units.
-
-        What is seen through windows is modelled a hundred extents away.
-        """
+        """Distance from `center` within which the room lies, world units; windows show more."""
         return _REACH * self.extent
 
     @property

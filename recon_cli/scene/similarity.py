@@ -69,8 +69,7 @@ class Similarity:
     def viewmat(self, viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the world-to-camera matrix [4, 4] of the same camera in the new world.
 
-        Camera coordinates grow with the world (depths are in new units), so that each point keeps
-        its pixel and the matrix stays a rotation and a translation.
+        Depths are in new units, so that each point keeps its pixel and the rotation stays one.
         """
         result = np.eye(4)
         result[:3, :3] = viewmat[:3, :3] @ self.rotation.T
@@ -86,8 +85,7 @@ class Similarity:
         """Returns the similarity that a matrix [4, 4] stands for; what rounding left is made good.
 
         Raises:
-            ValueError: it stretches, shears or mirrors, is not finite, or its last row is not
-                0 0 0 1.
+            ValueError: it stretches, shears or mirrors, is not finite, or is not affine.
         """
         if not np.isfinite(matrix).all():
             raise ValueError("its numbers are not finite")

@@ -88,10 +88,7 @@ class Splats:
         return apart <= distance
 
     def with_degree(self, degree: int) -> Splats:
-        """Returns the splats with the coefficients of this degree: cut, or filled up with zeros.
-
-        The same Gaussians have coefficients as before.
-        """
+        """Returns the splats with coefficients of this degree: cut, or filled up with zeros."""
         return replace(self, sh_rest=with_terms(self.sh_rest, TERMS[degree]))
 
     @property

@@ -54,10 +54,9 @@ def find_floor(
     points: NDArray[np.float64], centers: NDArray[np.float64], up: NDArray[np.float64], *,
     cone_deg: float,
 ) -> Floor | None:
-    """Returns the lowest large plane below the cameras, or None where there is none.
+    """Returns the lowest large plane below the cameras `centers` [C, 3], None where there is none.
 
-    From sparse points [P, 3] and camera centres [C, 3]. Its normal lies within `cone_deg` of the
-    unit vector `up`.
+    Its normal lies within `cone_deg` of the unit vector `up`.
     """
     near, size = _near(points)
     if len(near) < _FEWEST:
@@ -125,10 +124,7 @@ def _tilt_directions(up: NDArray[np.float64], reach: float, step: float) -> NDAr
 def _lowest_peak(
     heights: NDArray[np.float64], cameras: NDArray[np.float64], thick: float
 ) -> tuple[int, float]:
-    """Returns how many points lie in the fullest layer below the cameras, and its height.
-
-    Only layers that have next to nothing under them count.
-    """
+    """Returns count and height of the fullest layer below the cameras with little under it."""
     lowest = heights.min()
     counts = np.bincount(((heights - lowest) / thick).astype(np.int64))
     layers = counts[:-1] + counts[1:] if len(counts) > 1 else counts

@@ -1,7 +1,6 @@
 """The table of stages. A stage's module holds one `run(config, inputs, out, ctx) -> summary`.
 
-An imported scene takes the place of a trained one, in the same folder: IMPORT is the row of such a
-result. It is told by its inputs, for training reads no file of the user's.
+IMPORT is the row of an imported scene, which takes the place (and folder) of a trained one.
 """
 
 from __future__ import annotations

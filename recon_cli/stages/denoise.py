@@ -32,9 +32,7 @@ class _Outcome:
 
 
 def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> DenoiseSummary:
-    """Writes frames/*.png, twins of ingest's, and noise.json into `out`.
-
-    Frames that are already in `out` are kept; the result does not depend on the threads.
+    """Writes noise.json and frames/*.png, twins of ingest's, into `out`; keeps those there.
 
     Raises:
         FormatError: ingest's folder does not hold what its list says.

@@ -1,7 +1,4 @@
-"""ingest: from videos, photos or a data set with poses to upright 8-bit frames.
-
-Which frames are held out is frozen here, before anything is estimated.
-"""
+"""ingest: from videos, photos or a data set with poses to upright 8-bit frames."""
 
 from __future__ import annotations
 
@@ -24,9 +21,7 @@ MIN_TRAINED = 2  # one view holds no depth
 
 
 def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> IngestSummary:
-    """Writes frames/*.png and frames.json into `out`.
-
-    choice.json and contact.png show what was kept and dropped of each source.
+    """Writes frames/*.png, frames.json, choice.json and contact.png into `out`.
 
     The sources are video files and folders of photos, recognised by content, or one data set with
     poses. Each gets its own intrinsics. Frames that are already in `out` are kept.

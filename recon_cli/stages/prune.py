@@ -1,7 +1,6 @@
 """prune: removes the Gaussians that matter least to the training views, and lets the rest recover.
 
-Branches off the finished run, or off its middle (what `recon train --prune` does): then the rest
-of the run is trained with fewer and fewer Gaussians, and both models have seen as many steps. The
+Branches off the finished run, or off its middle: then both models have seen as many steps. The
 unpruned model stays in train/, so that evaluation can set them side by side.
 """
 
@@ -60,11 +59,7 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
 
 
 def _target(config: PruneConfig, splats: Splats) -> int:
-    """Returns how many of the Gaussians stay.
-
-    Raises:
-        ConfigError: not even one fits into the .ply.
-    """
+    """Returns how many of the Gaussians stay; ConfigError where not one fits into the .ply."""
     n = len(splats)
     if config.max_gaussians is not None:
         return min(n, config.max_gaussians)

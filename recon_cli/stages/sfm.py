@@ -1,7 +1,6 @@
 """sfm: finds the cameras and sparse points of the frames, and undistorts the frames.
 
-The original frames are mapped, not the denoised ones: a filter moves corners. The twins take the
-cameras of their originals.
+The original frames are mapped, as filters move corners; denoised twins take their cameras.
 """
 
 from __future__ import annotations
@@ -27,8 +26,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     The database and finished steps in `out` are kept; the model does not depend on the threads.
 
     Raises:
-        SfmError: there are too few cameras, the model cannot be trusted, the time is up, or the
-            mapping process died.
+        SfmError: there are too few cameras, an untrusted model, no time left, or a dead process.
         FormatError: the folders of ingest or denoise do not hold what they promise.
     """
     ingest, denoise = inputs.folders["ingest"].resolve(), inputs.folders["denoise"].resolve()

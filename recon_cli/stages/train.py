@@ -1,8 +1,7 @@
 """train: Gaussians from cameras and points, by a plan that is made first.
 
-Leaves splats.ply, the state at the middle of the run (where pruning branches off) and at its end,
-plan.json and config.json (what was decided before the first step), and log.jsonl with loss,
-validation PSNR, count and seconds every hundred steps.
+Leaves splats.ply, the states at the middle (where pruning branches off) and the end of the run,
+plan.json, config.json, and log.jsonl with loss, validation PSNR, count and seconds.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class _Before:
 def choose_trainer(
     state: TrainState, task: Task, importance: Importance | None, looks: Callable[[int], bool]
 ) -> Callable[[], float]:
-    """Returns a function that takes a step or several and returns the loss of the last one.
+    """Returns a function that takes one step or several and returns the loss of the last one.
 
     `looks` tells whether somebody wants to see the state after a step.
     """
@@ -158,12 +158,7 @@ class _Batch:
         return self._seen * (going & sound)
 
     def close(self) -> tuple[float, int, int | None]:
-        """Waits for the device.
-
-        Returns:
-            The loss of the last step, the steps that came to nothing for theirs, and how many steps
-            happened before one was stopped; None where all did.
-        """
+        """Waits; returns the loss, skipped steps, and steps before a stop (None without one)."""
         report = self._compute.close()
         happened = None if report.stopped is None else report.stopped // self._views
         if self._views == 1:

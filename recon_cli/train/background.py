@@ -1,9 +1,8 @@
 """What lies far outside, behind windows: Gaussians on a sphere so large that it has no parallax.
 
-Structure from motion finds few points out there, so training would paint the view on the panes,
-where it moves wrongly with the camera. Directions in which several views see no point of the scene
-get a Gaussian each, in the colour that these views show. They are ordinary Gaussians: every
-viewer draws them, and densification splits them where there is detail.
+Structure from motion finds few points out there, so training would paint the view on the panes.
+Directions in which several views see no point of the scene get an ordinary Gaussian each, in the
+colour that these views show.
 """
 
 from __future__ import annotations
@@ -52,10 +51,7 @@ class FarContent:
 def far_content(
     views: Sequence[TrainView], points: NDArray[np.float64], extent: float
 ) -> FarContent:
-    """Returns the directions in which the views see no point of the scene.
-
-    `points` are [P, 3]; the more, the better they cover the surfaces of the scene.
-    """
+    """Returns the directions in which the views see no point [P, 3] of the scene."""
     centers = np.stack([view.camera.center for view in views])
     directions = fibonacci_sphere(_DIRECTIONS)
     sphere = centers.mean(axis=0) + _RADIUS * extent * directions

@@ -107,13 +107,11 @@ def calibrate(
     clock: Clock = time.perf_counter,
     seconds: float,
 ) -> CostModel:
-    """Returns what the parts of a run take, found by a few timed steps at each level.
+    """Returns what the parts of a run take, by a few timed steps at each level, the coarsest first.
 
-    Coarse levels come first, each with its share of the time and a timed step at least. Once
-    twice the time is used up, those that are left are told from the level before them.
-
-    The cap of the schedule is the larger count that is timed, and about `seconds` are spent.
-    `scratch` is a file for a checkpoint, which is deleted again.
+    About `seconds` are spent; after twice that, the remaining levels are told from the one before.
+    The cap of the schedule is the larger count that is timed. `scratch` is a file for a checkpoint,
+    which is deleted again.
     """
     start = clock()
     factors = {factor for _, factor in task.schedule.recipe.levels}
@@ -132,11 +130,8 @@ def calibrate(
 
 
 def _scale_cost(cost: LevelCost, level: int) -> LevelCost:
-    """Returns what a finer level takes: the fixed part grows with the pixels, the other less.
-
-    On `living` a thousand Gaussians take .14 ms at a quarter of the size and .32 at the half.
-    """
-    side = cost.level / level
+    """Returns the cost of a finer level: a part grows with the pixels, the other with the side."""
+    side = cost.level / level  # `living`: .14 ms a thousand Gaussians at a quarter, .32 at half
     return LevelCost(level, cost.fixed_ms * side**2, cost.each_ms * side)
 
 

@@ -118,9 +118,9 @@ class BudgetRule:
 def densify_budget(
     splats: Splats, score: Tensor, rule: BudgetRule, generator: torch.Generator
 ) -> tuple[Splats, Tensor]:
-    """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones.
+    """Returns the new Gaussians, split with a probability proportional to `score` [N].
 
-    `score` [N] is the error that each is to blame for; the probability of a split is proportional.
+    With the old row [M] that each continues, -1 for new ones.
     """
     splats = decay_opacities(splats, rule.decay)
     alive = splats.opacities >= rule.min_opacity
@@ -143,10 +143,9 @@ def decay_opacities(splats: Splats, factor: float) -> Splats:
 
 
 def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Returns the rows [K] of a draw without replacement, ascending; chance by weight.
+    """Returns at most `count` rows [K], drawn by weight without replacement, ascending.
 
-    By the largest of log w + Gumbel noise (Efraimidis and Spirakis 2006). Rows of weight 0 are
-    never drawn, so K is at most `count`.
+    By the largest of log w + Gumbel noise (Efraimidis and Spirakis 2006); weight 0 is never drawn.
     """
     count = min(count, int((weight > 0).sum()))
     if count <= 0:
@@ -183,11 +182,7 @@ class Strategy:
 
 
 def replace_splats(state: TrainState, splats: Splats, source: Tensor) -> None:
-    """Replaces the Gaussians of a run; `source` as in `SplatOptimizer.replace`.
-
-    Raises:
-        TrainingError: none is left.
-    """
+    """Replaces the Gaussians as `SplatOptimizer.replace`; TrainingError where none is left."""
     if len(splats) == 0:
         raise TrainingError(
             f"No Gaussian is left at step {state.iteration}.",

@@ -1,8 +1,7 @@
 """What the colours of sparse points say about exposure before any training.
 
-A point shows the same surface to all views, so that the ratio of its colours in two views is the
-ratio of their gains. Occlusion is ignored: a point that lies behind something in one view gives a
-wrong ratio, and the median over all points that two views share does not mind a few.
+A point shows the same surface to all views: the ratio of its colours in two views is that of their
+gains. Occlusion makes some ratios wrong, which the median over all shared points ignores.
 """
 
 from __future__ import annotations
@@ -27,12 +26,7 @@ _PREFIX = "exposure"
 
 
 class Exposure:
-    """The log-gains of all training images, and their optimizer.
-
-    An image that is never seen keeps the gain that it started with.
-
-    `start` are log-gains [F, 3], whose mean is subtracted; None stands for zeros.
-    """
+    """The log-gains of all training images and their optimizer; `start` [F, 3] gets a mean of 0."""
 
     def __init__(self, images: int, *, start: NDArray[np.float64] | None = None) -> None:
         first = np.zeros((images, 3)) if start is None else start
@@ -50,11 +44,7 @@ class Exposure:
         return np.asarray(np.exp(self._rows.value[image].numpy()), np.float32)
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
-        """Moves the gains of one image, and all that were ever moved back to a mean of 0.
-
-        `gradient` [3] is that of its log-gains. The rate falls geometrically with the share of the
-        run that is `done`.
-        """
+        """Moves one image's gains against `gradient` [3] of their logarithms; see `Poses.step`."""
         self._rows.step(image, gradient, _RATE * (_FINAL_RATE / _RATE) ** done)
         self._rows.center()
 
@@ -104,9 +94,7 @@ def estimate_gains(
     """Returns the log-gain of each view from the colours that points have in several views.
 
     Weighted least squares over pairs: the median log-ratio of the points that two views share
-    should be the difference of their log-gains.
-
-    Of more than 4,000 points a seeded draw is taken.
+    should be the difference of their log-gains. A seeded draw of 4,000 points is taken.
     """
     if len(points) > _POINTS:
         chosen = np.random.default_rng(seed).permutation(len(points))[:_POINTS]

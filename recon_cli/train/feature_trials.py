@@ -53,10 +53,9 @@ def decide(
 ) -> TrialDecision:
     """Returns whether the second arm is better than the first.
 
-    On, if the mean gain is above the threshold and above 1.65 standard errors of it. The standard
-    error is that of paired differences: views differ by decibels, arms on one view by tenths.
-
-    Each arm, without and with the part, trains and returns the scores of the same views in dB.
+    On, if the mean gain is above the threshold and above 1.65 standard errors of the paired
+    differences. Each arm, without and with the part, trains and returns the scores of the same
+    views in dB.
 
     Raises:
         ValueError: the arms score different numbers of views, or fewer than two.
@@ -89,11 +88,8 @@ class Split:
 def split(training: int, validation: int) -> Split | None:
     """Returns the views of a trial; None where there are too few for any.
 
-    The validation views, where they are LEAST_VIEWS or more. Otherwise each sixth training view
-    (down to each third, where they would be fewer than LEAST_VIEWS), from the middle of the first
-    interval on; the final run then trains on all of them.
-
-    Training views are in the order of the capture.
+    The validation views are scored if there are LEAST_VIEWS. Otherwise each sixth training view in
+    the order of the capture is, down to each third; the final run then trains on all of them.
     """
     if validation >= LEAST_VIEWS:
         return Split(tuple(range(training)), tuple(range(validation)), own=False)

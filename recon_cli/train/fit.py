@@ -21,11 +21,10 @@ def fit(
     state: TrainState, task: Task, until: int, callbacks: Sequence[TrainCallback] = (),
     importance: Importance | None = None,
 ) -> None:
-    """Runs `state` on until it has done `until` steps.
+    """Trains `state` until it has done `until` steps, counting those already done.
 
-    Steps already done count. Callbacks are called in order after each step and every hundred steps;
-    where none needs a step, the host may run ahead of the device. `importance` gets the scores of
-    every step's view from the passes that train.
+    Callbacks are called in order; where none needs a step, the host may run ahead of the device.
+    `importance` gets the scores of every step's view from the passes that train.
 
     Raises:
         TrainingError: the loss is not finite, or no Gaussian is left.
@@ -68,10 +67,7 @@ def report_every(schedule: Schedule) -> int:
 
 
 def validation_psnr(state: TrainState, task: Task) -> float | None:
-    """Returns the mean PSNR over the validation views in dB, None where there are none.
-
-    Of a masked view the pixels that count are scored.
-    """
+    """Returns the mean PSNR in dB of the validation views (masks applied), None without any."""
     if not task.validation:
         return None
     degree = task.schedule.sh_degree(max(1, state.iteration))

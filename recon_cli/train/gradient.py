@@ -34,10 +34,7 @@ _C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
 
 
 class GradientStep(Protocol):
-    """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of one view in an optimizer.
-
-    Pixels that the view's mask ignores have no error and no gradient.
-    """
+    """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of a masked view in an optimizer."""
 
     @property
     def log_gain_gradient(self) -> NDArray[np.float64]:
@@ -46,20 +43,18 @@ class GradientStep(Protocol):
     def camera_gradient(
         self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
     ) -> NDArray[np.float64]:
-        """Returns the gradient [6] of a turn and a move of the camera of the last view.
+        """Returns `poses.camera_gradient` [6] of the last view.
 
-        As `poses.camera_gradient`; to be asked before the optimizer uses the gradients up, and only
-        where the view saw a Gaussian.
+        To be asked before the optimizer steps, and only where the view saw a Gaussian.
         """
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
         gain: NDArray[np.float32] | None = None,
     ) -> tuple[float, Statistics | None]:
-        """Returns the loss and the statistics of the view; None where it sees no Gaussian.
+        """Returns loss and statistics of a view, None where it sees no Gaussian.
 
-        The statistics are valid until the next call. The rendered channels are multiplied by
-        `gain` [3] before they are compared; None stands for ones.
+        Statistics are valid until the next call. Rendered channels are multiplied by `gain` [3].
         """
 
 
@@ -206,16 +201,11 @@ class _AutogradStep:
 def photometric_loss(
     image: Tensor, truth: Tensor, ssim_weight: float, *, mask: Tensor | None = None
 ) -> Tensor:
-    """Returns (1 - w) L1 + w (1 - SSIM) (Kerbl et al. 2023, eq. 7).
+    """Returns (1 - w) L1 + w (1 - SSIM) of images [H, W, 3] (Kerbl et al. 2023, eq. 7).
 
-    A pixel that the mask ignores counts as one without error, and gets no gradient. The truth
-    there still lies in the windows of its neighbours: paint it with something neutral.
-
-    Args:
-        image: [H, W, 3] rendered, gradients flow here.
-        truth: [H, W, 3] in [0, 1], same dtype and device.
-        ssim_weight: w in [0, 1].
-        mask: [H, W] bool, True where a pixel counts; None where all do.
+    Gradients flow to `image`; `truth` is in [0, 1], of the same dtype and device. Pixels where
+    `mask` [H, W] is False have no error and no gradient, but the truth there still lies in the
+    windows of its neighbours: paint it with something neutral.
     """
     if mask is not None:
         image = torch.where(mask[..., None], image, truth)
@@ -234,11 +224,8 @@ def _taps() -> list[float]:
 
 
 def blur(images: Tensor) -> Tensor:
-    """Returns [..., H, W] images convolved with the window; zeros lie beyond the border.
-
-    Shifted additions along whole rows: ten times faster on a CPU than a grouped convolution.
-    """
-    taps = _taps()
+    """Returns [..., H, W] images convolved with the window; zeros lie beyond the border."""
+    taps = _taps()  # shifted additions: ten times faster on a CPU than a grouped convolution
     for axis in (-1, -2):
         length = images.shape[axis]
         out = images * taps[0]

@@ -1,8 +1,7 @@
 """How much each Gaussian matters to the training views.
 
-What the rasterizer finds in a pass is added up over the views, and every score is read off the
-sums. A training step leaves the same statistics as a rendering, so that scores need no pass of
-their own where training goes on.
+What the rasterizer finds in a pass is summed over the views, and every score is read off the sums.
+Training steps leave the same statistics, so that scores need no pass of their own there.
 """
 
 from __future__ import annotations
@@ -77,10 +76,7 @@ class Importance:
     def score(
         self, name: str, splats: Splats, *, beta: float, generator: torch.Generator
     ) -> Tensor:
-        """Returns the score [N] float64 by which Gaussians are ranked; the lowest go first.
-
-        `generator` draws the random score and nothing else.
-        """
+        """Returns the score [N] float64 by which Gaussians are ranked; the lowest go first."""
         if name == "paper":
             return paper_score(self.hits, splats, beta)
         if name == "lightgaussian":
@@ -110,8 +106,7 @@ def paper_score(hits: Tensor, splats: Splats, beta: float) -> Tensor:
 def lightgaussian_score(hits: Tensor, splats: Splats) -> Tensor:
     """Returns hits_j o_j (V_j / V_k)^0.1, [N] float64, as LightGaussian's code has it.
 
-    There the volume is not clamped, so V_k (the volume at the 90th percentile) divides every score
-    by the same number V_k^0.1 and cannot change the ranking; it is kept for the scale.
+    Its volume is not clamped: V_k, that of the 90th percentile, cannot change the ranking.
     """
     log_volumes = _log_volumes(splats)
     reference = log_volumes.sort(descending=True).values[int(_PERCENTILE * len(splats))]
@@ -120,20 +115,14 @@ def lightgaussian_score(hits: Tensor, splats: Splats) -> Tensor:
 
 
 def _log_volumes(splats: Splats) -> Tensor:
-    """Returns the logarithm of the product of the scales, [N] float64.
-
-    The product itself leaves the range of float32 where the scales are 1e-15.
-    """
+    """Returns the log of the product of the scales, [N] float64; the product may underflow."""
     return splats.log_scales.detach().double().sum(-1)
 
 
 def add_views(
     found: Importance, splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str
 ) -> None:
-    """Adds what a pass over views finds, each with its mask.
-
-    Never give it validation or test views.
-    """
+    """Adds what a pass over views with their masks finds; never give it held-out views."""
     device = splats.means.device
     background = torch.zeros(3, dtype=splats.means.dtype, device=device)
     leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(found.leaves_out))

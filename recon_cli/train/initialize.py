@@ -67,11 +67,7 @@ def first_state(
     most: int,
     far: FarContent | None = None,
 ) -> TrainState:
-    """Returns the state of a run before its first step; the same for the same task and points.
-
-    `most` Gaussians begin at points, fewer where the cap must hold the background as well. `far` is
-    that background where it is known already.
-    """
+    """Returns the first state of a run: `most` Gaussians at points, and the background `far`."""
     config = task.schedule.config
     if config.far != "on":
         far = None
@@ -99,10 +95,7 @@ def restore_state(path: Path, task: Task) -> TrainState:
 
 
 def make_finished_state(splats: Splats, task: Task) -> TrainState:
-    """Returns the state of a run that ended with these Gaussians, none of whose steps were taken.
-
-    For scenes that were trained elsewhere: all that a run does early on lies behind it.
-    """
+    """Returns the state of a run that ended with these Gaussians, trained elsewhere."""
     state = new_state(
         splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.extent,
         backend=task.backend)

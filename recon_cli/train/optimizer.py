@@ -25,19 +25,11 @@ _ROW_ROLES = ("value", "exp_avg", "exp_avg_sq", "count")
 class SplatOptimizer:
     """Adam with a learning rate for each parameter (Kingma and Ba 2015, algorithm 1).
 
-    Values, gradients and moments lie in buffers with room for more Gaussians than there are;
-    memory that was never used costs nothing.
-
-    Args:
-        splats: their values are copied.
-        config: learning rates, and how many Gaussians there may be.
-        extent: of the scene in world units; scales the rate of the means.
-        backend: numba and triton write the gradients into `gradients`, and one kernel of theirs
-            moves all parameters. With torch autograd leaves them in `splats`.
-
-    Attributes:
-        splats: leaves that autograd knows; views of the buffers.
-        gradients: views of the buffers, of the same shapes.
+    Values (copied from `splats`), gradients and moments lie in buffers with room for more
+    Gaussians; memory that was never used costs nothing. `self.splats`, leaves of autograd, and
+    `self.gradients` are views of them. numba and triton write into `gradients` and move all
+    parameters by one kernel; with torch, autograd leaves the gradients in `splats`. `extent` is in
+    world units.
     """
 
     def __init__(
@@ -193,13 +185,11 @@ class SplatOptimizer:
 
     @torch.no_grad()
     def replace(self, splats: Splats, source: Tensor) -> None:
-        """Replaces the Gaussians.
+        """Replaces the Gaussians by N others of any degree.
 
-        Args:
-            splats: the new Gaussians, N of them, of any degree; views of this optimizer's own only
-                where every row stays in its place.
-            source: [N] the old row that each continues, whose moments it keeps; -1 for a new one,
-                which starts with zeros. So do coefficients that the old row did not have.
+        `source` [N] is the old row that each continues, whose moments it keeps; -1 for a new one,
+        which starts with zeros, as do coefficients that the old row did not have. `splats` may be
+        views of this optimizer's own only where every row stays in its place.
         """
         moments = {(name, role): self._view(name, role)
                    for name in self._buffers for role in _MOMENTS}
@@ -233,12 +223,7 @@ class SplatOptimizer:
 
 
 def _follow_rows(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
-    """Returns the old rows of a moment in their new places, zeros where there was none.
-
-    `moment` is [rows before, ...], `like` [K, ...] the parameter now, with more or fewer
-    coefficients. `source` [K] is the old row of each; -1, or one that has no such parameter, stands
-    for none.
-    """
+    """Returns moments of the old rows `source` [K], shaped like `like` [K, ...]; -1 gives 0."""
     if moment.shape[1:] != like.shape[1:]:
         moment = with_terms(moment, like.shape[1])
     if len(moment) == 0:
@@ -251,11 +236,8 @@ def _follow_rows(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
 class SparseAdam:
     """Adam (Kingma and Ba 2015, algorithm 1) that counts the steps of each row on its own.
 
-    A row that was stepped for the first time moves by its rate, however late that is. On the CPU
-    and in float64: the table is small, and the same whatever the device.
-
-    Attributes:
-        value: [F, D] float64.
+    A row that was stepped for the first time moves by its rate, however late that is. `value` [F,
+    D] is float64 and on the CPU, so that it is the same whatever the device.
     """
 
     def __init__(self, start: Tensor) -> None:

@@ -81,10 +81,7 @@ class Facts:
 
 
 def first_config(asked: TrainConfig) -> RunConfig:
-    """Returns the options as far as they are known before any image is read.
-
-    Iterations and cap are those of the quality and of the smallest run where they are open.
-    """
+    """Returns the options before any image is read; where open, the quality's and the least cap."""
     quality = QUALITIES[asked.quality]
     return _fill_in(
         asked, asked.iterations or quality.iterations, asked.max_gaussians or _FEWEST,
@@ -105,10 +102,7 @@ def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
 def make_plan(
     asked: TrainConfig, facts: Facts, cost: CostModel, *, spent: float = 0.0
 ) -> TrainPlan:
-    """Returns the plan: the steps asked for, those of the quality, or as many as fill the time.
-
-    With --minutes, the seconds of the calibration and those `spent` on trials count.
-    """
+    """Returns the plan; with --minutes, the calibration and the seconds `spent` on trials count."""
     def at(iterations: int) -> TrainPlan:
         most = cap(asked, facts, iterations)
         config = _fill_in(asked, iterations, most, first_config(asked).max_size)
@@ -128,13 +122,11 @@ def make_plan(
 def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
     """Returns the cap of the count: what was asked for, or what images, steps and memory bear.
 
-    A Gaussian for each pixel of a mean view that holds detail, after 3,000 steps; of shorter and
-    longer runs the square root of that, for a Gaussian that is added must still find its place.
-    No more than an eighth of the detail of all views together: who is seen by few views fits
-    each of them and nothing between. On living (104,000 such pixels) 2,000 steps give 22.6, 23.9
-    and 24.8 dB with 15, 30 and 60 thousand, on office (83,000) 25.1, 26.1 and 26.6 dB, for 15 to
-    30% more time at each doubling (docs/benchmarks.md, "The cap of the count"). The powers are
-    no more than plausible.
+    A Gaussian for each pixel of a mean view that holds detail, after 3,000 steps; in other runs by
+    the square root of the steps, as a new Gaussian must still find its place. No more than an
+    eighth of the detail of all views: what few views see fits each of them and nothing between. On
+    living and office, doubling the cap gave .5 to 1.3 dB for 15 to 30% more time
+    (docs/benchmarks.md, "The cap of the count").
     """
     if asked.max_gaussians is not None:
         return asked.max_gaussians
@@ -145,8 +137,7 @@ def first_count(config: RunConfig, points: int) -> int:
     """Returns how many Gaussians a run begins with: of many points a seeded draw is taken.
 
     A count that grows begins with half of its cap: on `living`, 3,000 steps to 100,000 Gaussians
-    end at 28.03 dB from 25,000 and at 28.28 dB from 50,000; before, 2,000 steps to 40,000 ended at
-    24.25 dB from 10,000 and at 23.63 dB from all 40,000. The reference takes all points.
+    end at 28.03 dB from 25,000 and at 28.28 dB from 50,000. The reference takes all points.
     """
     share = 1 if RECIPES[config.densify].resets else _FIRST
     return min(points, config.max_gaussians, max(_FEWEST, int(share * config.max_gaussians)))
@@ -159,10 +150,7 @@ def useful_cap(facts: Facts, iterations: int) -> int:
 
 
 def count_detail(views: Sequence[TrainView]) -> int:
-    """Returns how many pixels of a mean view hold detail: a gradient above 4 grey levels.
-
-    Pixels that a mask ignores do not count.
-    """
+    """Returns how many unmasked pixels of a mean view have a gradient above 4 grey levels."""
     chosen = np.unique(np.linspace(0, len(views) - 1, _DETAIL_VIEWS).round().astype(int))
     return round(float(np.mean([_count_detailed_pixels(views[i]) for i in chosen])))
 
@@ -237,10 +225,7 @@ def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool
 def _measure_cost(
     config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, ctx: StageContext
 ) -> CostModel:
-    """Returns the cost of a run, from timed steps.
-
-    With several processes each step is timed with the views of one, and with what they exchange.
-    """
+    """Returns the cost of a run by timed steps: one process's views, and what is exchanged."""
     seconds = CALIBRATION_SECONDS
     if config.minutes is not None:
         seconds = CALIBRATION_SHARE * 60 * config.minutes

@@ -1,12 +1,9 @@
 """Refinement of the training cameras during training: a twist on top of each one that was found.
 
 It helps where cameras are off by half a pixel and more, as those of a tracker can be, and harms
-where they are better, as those of SfM mostly are: see `worth_a_trial`.
-
-Held-out views are not refined. Scores on them take their cameras as they were found: they rise by
-what the scene gains in sharpness, and not by what their own cameras would gain. A scene that moved
-as a whole would look worse through them, which is why the mean twist is held at 0 and the size of
-the path as it was; a path that bends is not held.
+better ones, as those of SfM mostly are: see `worth_a_trial`. Held-out views are scored through
+their cameras as found. So that the scene does not move as a whole, the mean twist is held at 0 and
+the size of the path as it was; a path that bends is not held.
 """
 
 from __future__ import annotations
@@ -44,13 +41,10 @@ class Poses:
     """The twists of all training cameras, and their optimizer.
 
     A twist is a turn about the camera's own centre, as a rotation vector, and a move of that
-    centre, both in world axes: C' = exp(w) C for the camera-to-world rotation, c' = c + v.
-    The scene can turn, move and grow with its cameras without a change of any picture: so the mean
-    twist is held at 0, and moves do not widen or narrow the path. A camera that is never seen keeps
-    its place.
-
-    `centers` [F, 3] are those of the cameras as found, in world units; `visits` the steps of each
-    image; `error` how far a camera may be off, in rad.
+    centre, both in world axes: C' = exp(w) C for the camera-to-world rotation, c' = c + v. The mean
+    twist is held at 0, and moves do not widen or narrow the path. `centers` [F, 3] are those of the
+    cameras as found, in world units; `visits` the steps of each image; `error` how far a camera may
+    be off, in rad.
     """
 
     def __init__(
@@ -73,11 +67,7 @@ class Poses:
         return move_camera(camera, twist[:3], twist[3:]) if twist.any() else camera
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
-        """Moves one camera, and all that were ever moved back to a mean of 0.
-
-        `gradient` [6] is that of `camera_gradient`. The rate falls geometrically with the share of
-        the run that is `done`.
-        """
+        """Moves one camera against `gradient` [6]; the rate falls as `done` goes from 0 to 1."""
         self._rows.step(image, gradient, self._rate * _FINAL**done)
         self._rows.center()
         if self._rows.complete and self._arms.any():
@@ -94,10 +84,7 @@ class Poses:
 
 
 def worth_a_trial(error_px: float | None) -> bool:
-    """Returns whether cameras may be off far enough for a refinement to help.
-
-    `error_px` is the mean reprojection error in pixels of the training images; None if unknown.
-    """
+    """Returns whether refinement may help; `error_px` is the mean reprojection error, if known."""
     return error_px is not None and error_px > WORTH_PX
 
 
@@ -159,10 +146,7 @@ def _quat_torque(quats: Tensor, pull: Tensor) -> Tensor:
 
 
 def _color_torque(offsets: Tensor, sh_rest: Tensor, pull: Tensor, degree: int) -> Tensor:
-    """Returns the gradients [N, 3] of turning the directions that colours are seen along.
-
-    `offsets` [N, 3] begin at the camera; `pull` [N, 3] is the gradient of the colours.
-    """
+    """Returns the gradients [N, 3] of turning the `offsets` [N, 3] from camera to colours."""
     directions = torch.nn.functional.normalize(offsets, dim=1).requires_grad_()
     basis = basis_rest(directions, degree)
     weights = (sh_rest[:, : basis.shape[1]] * pull[:, None]).sum(dim=2).double()

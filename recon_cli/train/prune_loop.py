@@ -1,9 +1,8 @@
 """Pruning in rounds: which Gaussians go, how many when, and the loop that removes and fine-tunes.
 
-All by rank, never by a threshold: equal scores would otherwise go as a group. Scores of single
-Gaussians say nothing about pairs: of two that stand in for each other both look dispensable, and
-removed together they leave a hole. So each round removes a part, and the next one scores what has
-recovered. The loop works in memory; `prune_run` keeps its progress on disk.
+Gaussians are removed by rank, because a threshold would remove equal scores as a group. Two that
+stand in for each other both score low, and removing both leaves a hole: each round removes a part,
+and the next one scores what has recovered. `prune_run` keeps the progress on disk.
 """
 
 from __future__ import annotations
@@ -42,19 +41,15 @@ def remaining(n: int, ratio: float) -> int:
 
 
 def rounds_within(recovery: int, views: int) -> int:
-    """Returns how many rounds a recovery has room for: one an epoch, 3 to 8.
-
-    An epoch between two removals scores every view by its training steps alone.
-    """
+    """Returns how many rounds (3 to 8) a recovery has room for: one for each epoch."""
     return min(_MOST_ROUNDS, max(_LEAST_ROUNDS, int(LAST_ROUND * recovery) // max(1, views)))
 
 
 def plan_removals(n: int, target: int, rounds: int, recovery: int) -> tuple[Removal, ...]:
-    """Returns the rounds that lead from n Gaussians to `target`.
+    """Returns the rounds that lead from n Gaussians to `target`, each removing the same share.
 
-    Each round removes the same share of what is there. They are evenly spread up to LAST_ROUND of
-    the recovery, so that training steps come before the first one and score it; a single round
-    comes at once. Rounds that would remove nothing are left out.
+    They are evenly spread up to LAST_ROUND of the recovery; a single round comes at once. Rounds
+    that would remove nothing are left out.
     """
     plan: list[Removal] = []
     for k in range(rounds):
@@ -66,10 +61,7 @@ def plan_removals(n: int, target: int, rounds: int, recovery: int) -> tuple[Remo
 
 
 def survivors(score: Tensor, count: int) -> Tensor:
-    """Returns the rows [K] of the `count` highest scores, ascending.
-
-    Of equal scores the later rows go first. At least one row stays.
-    """
+    """Returns the rows [K] of the `count` highest scores, ascending; of equals the first rows."""
     order = torch.argsort(score, descending=True, stable=True)
     return order[: max(1, count)].sort().values
 
@@ -80,10 +72,7 @@ def remove(state: TrainState, rows: Tensor) -> None:
 
 
 class PruneRun:
-    """A model in memory that is pruned in rounds and trained in between.
-
-    `score` is one of `importance.SCORES`, `beta` the exponent of the volume in the paper's score.
-    """
+    """Prunes a model in memory in rounds; `score` and `beta` are those of `Importance.score`."""
 
     def __init__(
         self, state: TrainState, task: Task, first: int, until: int, *, rounds: int,
@@ -100,10 +89,7 @@ class PruneRun:
         fit(self.state, self.task, until, self.callbacks, importance)
 
     def score(self, until: int) -> Tensor:
-        """Trains up to a step and returns the score [N] that the last epoch's own passes give.
-
-        Every training view counts once: those that the steps at hand do not reach are rendered.
-        """
+        """Trains up to a step and returns the score [N] from one pass over each training view."""
         state, task = self.state, self.task
         device = state.splats.means.device
         importance = Importance.of_score(self._score, len(state.splats), device)

@@ -146,10 +146,7 @@ class StoredPruneRun(PruneRun):
         self._trained = (wall + time.perf_counter() - begin, cpu + time.process_time() - cpu_begin)
 
     def score(self, until: int) -> Tensor:
-        """Trains up to a step and returns the score [N].
-
-        The seconds of passes that only score go into the log, like those of training.
-        """
+        """Trains up to a step and returns the score [N]; logs the seconds of scoring as well."""
         self._trained = 0.0, 0.0
         begin, cpu_begin = time.perf_counter(), time.process_time()
         score = super().score(until)
@@ -210,10 +207,7 @@ class StoredPruneRun(PruneRun):
 
 
 def prune_while_good(run: StoredPruneRun, psnr_before: float, max_drop: float) -> None:
-    """Removes as many as cost at most `max_drop` dB; the run ends with the last good state.
-
-    A round that costs too much is taken back, and a smaller one is tried from the state before.
-    """
+    """Prunes for at most `max_drop` dB: undoes rounds that cost more and tries smaller ones."""
     steps = (run.until - run.first) // run.rounds
     while True:
         score = None

@@ -42,10 +42,7 @@ class Segment:
 
 @contextmanager
 def _defer_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yields whether Ctrl-C was pressed, so that a step is never cut in half.
-
-    A second Ctrl-C interrupts at once. Outside the main thread signals are left alone.
-    """
+    """Yields whether Ctrl-C was pressed, so that no step is cut; a second one interrupts."""
     pressed: list[int] = []
 
     def handle(number: int, _frame: object) -> None:
@@ -70,8 +67,7 @@ def run_fit(
 ) -> None:
     """Fits until `until` steps with all of `ctx.ranks`, saving the state as it goes.
 
-    `importance` gets the scores of these steps. They are in no checkpoint, so none is written
-    meanwhile.
+    No checkpoints are written while `importance` gets the scores of the steps: they hold no scores.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
@@ -161,10 +157,7 @@ class ProgressCallback(TrainCallback):
 
 
 class CheckpointThrottle:
-    """Keeps large checkpoints of fast steps from taking the time that the steps should have.
-
-    It changes when a state is saved, and never what is.
-    """
+    """Limits the time that checkpoints take; changes when a state is saved, never what is."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock, self._last, self._took = clock, clock(), 0.0
@@ -202,11 +195,7 @@ class Checkpointer(TrainCallback):
         return iteration % self._every == 0 or iteration in self._keep
 
     def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
-        """Saves the state where that is due.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
-        """
+        """Saves the state where that is due; raises KeyboardInterrupt after Ctrl-C."""
         interrupted = self._interrupted()
         if iteration in self._keep:
             save_state(self._keep[iteration], self._state)

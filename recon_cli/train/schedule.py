@@ -23,10 +23,8 @@ def next_iteration(
     """Returns the step at which the final phase begins if the run goes there now, else None.
 
     It does where the best validation PSNR of the last tenth of the run is less than .02 dB above
-    the best one before: never before densification has ended and the state for pruning is kept,
-    and never in the final phase.
-
-    `looks` are (iteration, validation PSNR in dB) so far, ascending.
+    the best one before, once densification has ended and the state for pruning is kept. `looks` are
+    (iteration, validation PSNR in dB) so far, ascending.
     """
     steps, recipe = schedule.config.iterations, schedule.recipe
     final = round(min(recipe.final_from, _LAST_FIFTH) * steps)
@@ -176,10 +174,7 @@ class Schedule:
 
 @dataclass(frozen=True, kw_only=True)
 class RecoverySchedule(Schedule):
-    """A run of its own, but for its coarse beginning: all learning rates start anew.
-
-    The rates at which training ended let no Gaussian move into the gap that its neighbour left.
-    """
+    """A recovery after pruning: images in full size, and learning rates that start anew."""
 
     first: int  # step at which the recovery begins
     until: int  # step at which it ends

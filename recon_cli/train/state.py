@@ -1,8 +1,4 @@
-"""All that a run needs to go on with the very same bytes, and its checkpoint.
-
-A checkpoint is one safetensors file: the tensors, and the scalars as JSON in its header, so that
-both are there or neither is.
-"""
+"""All that a run needs to go on with the very same bytes, and its checkpoint (safetensors)."""
 
 from __future__ import annotations
 

@@ -39,10 +39,7 @@ class _BatchResult:
 
 
 class Stepper:
-    """Takes the steps of one call of `fit.fit`.
-
-    `importance` gets the scores of the views that this process looks at.
-    """
+    """Takes the steps of a call of `fit.fit`; `importance` gets scores of this process's views."""
 
     def __init__(self, state: TrainState, task: Task, importance: Importance | None) -> None:
         self._state, self._task, self._importance = state, task, importance
@@ -153,11 +150,7 @@ def next_view(state: TrainState, task: Task) -> int:
 
 
 def skip(state: TrainState, task: Task, steps: int = 1) -> None:
-    """Counts steps whose loss is not finite; the parameters stayed as they were.
-
-    Raises:
-        TrainingError: there were too many.
-    """
+    """Counts steps whose loss is not finite; raises TrainingError where there were too many."""
     state.skipped += steps
     most = max(_SKIPPED_FLOOR, int(_SKIPPED * task.schedule.config.iterations))
     if state.skipped > most:

@@ -41,10 +41,7 @@ _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's windo
 
 
 def reduce_view(view: TrainView, factor: int) -> TrainView:
-    """Returns a view reduced by area, its camera with it; the same where it would be too small.
-
-    A reduced pixel counts only where all that it covers counts.
-    """
+    """Returns a view and its camera reduced by area; unchanged where it would be too small."""
     camera = view.camera
     width, height = round(camera.width / factor), round(camera.height / factor)
     if factor == 1 or min(width, height) < _SMALLEST:
@@ -53,6 +50,7 @@ def reduce_view(view: TrainView, factor: int) -> TrainView:
     mask = None
     if view.mask is not None:
         hidden = (~view.mask).astype(np.float32)
+        # a reduced pixel counts only where all that it covers counts
         mask = np.asarray(cv2.resize(hidden, (width, height), interpolation=cv2.INTER_AREA) == 0)
     return TrainView(camera.resized(width, height), np.ascontiguousarray(image), mask)
 

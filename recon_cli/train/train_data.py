@@ -126,11 +126,7 @@ def estimate_memory(
     *, views: int, width: int, height: int, gaussians: int, fused: bool, sh_degree: int = 3,
     masks: int = 0,
 ) -> MemoryEstimate:
-    """Returns the memory that training takes.
-
-    Of views and masks held in memory, the size in pixels of the largest. `fused`: the backend
-    computes gradients without autograd.
-    """
+    """Returns the memory for views of at most width x height; `fused` means without autograd."""
     pixels = width * height
     rest = 3 * TERMS[sh_degree]
     # and of one moment of one parameter at a time
@@ -143,10 +139,7 @@ def estimate_memory(
 
 
 def gaussians_within(one: MemoryEstimate, free: int) -> int:
-    """Returns the most Gaussians that fit into `free` bytes; 0 where not even the rest does.
-
-    `one` is an estimate with a single Gaussian.
-    """
+    """Returns how many Gaussians fit into `free` bytes; `one` is the estimate for a single one."""
     each = one.gaussians + one.gaussian_buffers
     return max(0, (free - one.total + each) // each)
 
@@ -203,11 +196,7 @@ def _free_bytes(ctx: StageContext) -> int:
 
 
 def check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
-    """Says what the run will take, and refuses what does not fit.
-
-    Raises:
-        TrainingError: there is not enough memory.
-    """
+    """Logs the memory that the run will take; raises TrainingError where that is not free."""
     needed = _memory(scene, config, ctx, gaussians=config.max_gaussians)
     free = _free_bytes(ctx)
     logger.info("training takes %s at most; %.0f MB are free", needed.describe(), free / 1e6)

@@ -16,10 +16,9 @@ LEFTOVERS = ".*.tmp*"  # files that `replacing` had not finished when it was kil
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path` that takes its place when the block succeeds.
+    """Yields a temporary path that replaces `path` when the block succeeds, else is removed.
 
-    The file reaches the disk before the rename, so that a crash leaves the old file or the new
-    one. When the block fails, the temporary file is removed and the error goes on.
+    It is flushed before the rename, so that a crash leaves the old file or the new one.
     """
     temporary = path.with_name(f".{path.name}.tmp{os.getpid()}{path.suffix}")
     try:

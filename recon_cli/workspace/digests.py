@@ -31,11 +31,7 @@ class Source:
     files: Mapping[str, FileDigest]
 
     def contents(self) -> list[str]:
-        """Returns the digests, in order, and what the files below a folder are called there.
-
-        Within a folder names tell masks from photos and give the frames theirs. The name of the
-        folder, or of a single file, and times are no part of a fingerprint.
-        """
+        """Returns what a fingerprint takes of it: digests in order, and names below a folder."""
         if len(self.files) == 1:
             return [file.sha256 for file in self.files.values()]
         return [f"{name} {file.sha256}" for name, file in self.files.items()]
@@ -60,8 +56,8 @@ def digest_file(path: Path, known: FileDigest | None = None) -> FileDigest:
 def read_source(path: Path, *, known: Source | None = None, without: Path) -> Source:
     """Returns what a file, or every file below a folder, holds.
 
-    Hidden files and folders are skipped, and so is `without`, as the workspace may lie beside the
-    photos. `known`, an earlier reading of the same path, saves time.
+    Hidden files are skipped, as is `without`, the workspace, which may lie beside the photos.
+    `known`, an earlier reading, saves time.
 
     Raises:
         InputError: the path is missing or cannot be read.

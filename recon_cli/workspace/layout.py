@@ -175,11 +175,7 @@ class Workspace:
                 remove(old)
 
     def remove(self, stage: str) -> None:
-        """Removes a stage's result: even after a crash it is there or gone, never half.
-
-        Raises:
-            WorkspaceError: the folder is no result.
-        """
+        """Removes a stage's result as a whole; raises WorkspaceError where the folder is none."""
         self._retire(stage)
         remove(self._old(stage))
 
@@ -205,11 +201,7 @@ def size_of(path: Path) -> int:
 
 @contextmanager
 def disk_errors(root: Path, doing: str) -> Iterator[None]:
-    """Turns errors of a full or read-only disk into a WorkspaceError.
-
-    Raises:
-        WorkspaceError: the block failed for want of space or of permission in the workspace.
-    """
+    """Turns errors for want of space or permission in a workspace into a WorkspaceError."""
     try:
         yield
     except OSError as error:

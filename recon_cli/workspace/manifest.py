@@ -1,8 +1,4 @@
-"""What a result was made from and how it came about: the record in each stage's folder.
-
-A result is identified by its key (stage, version, options, inputs, upstream outputs). Whatever
-else a manifest says is for people and takes no part in any decision.
-"""
+"""What a result was made from and how it came about: the record in each stage's folder."""
 
 from __future__ import annotations
 

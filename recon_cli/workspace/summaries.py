@@ -1,9 +1,8 @@
 """Typed records between stages: what a stage returns, and the JSON files that others read.
 
-A stage builds its record, the pipeline stores `to_json()` as `summary` in its manifest, and a stage
-that reads the result of another reads the same type by `from_json`. Fields are the JSON keys, in
-their order. A field whose default is None is left out of the JSON while it is None; every other
-field is always written.
+The pipeline stores a stage's record as `summary` in its manifest; later stages read it by
+`from_json`. Fields are the JSON keys, in order; one whose default is None is left out while it is
+None.
 """
 
 from __future__ import annotations
@@ -42,8 +41,7 @@ class JsonRecord:
         """Returns the record that `to_json` wrote; unknown keys are ignored.
 
         Raises:
-            ManifestError: the value is no mapping, lacks a field or holds one of another type, as
-                that of another version may.
+            ManifestError: it is no mapping, lacks a field, or holds one of another type.
         """
         if not isinstance(value, Mapping):
             raise ManifestError("the record is not a JSON object")

@@ -49,9 +49,7 @@ def fit_together(
     state: TrainState, task: Task, until: int, callbacks: Sequence[TrainCallback] = (),
     importance: Importance | None = None, threads: int = 1,
 ) -> None:
-    """Runs `state` on like `fit`, with the help of all processes that `task.ranks` leads.
-
-    Several processes call `callbacks` after every step; `importance` gets the scores of all.
+    """Runs `state` on like `fit`, with all processes of `task.ranks`; `callbacks` see every step.
 
     Raises:
         TrainingError: as `fit`, or the processes no longer hold the same Gaussians.
@@ -123,11 +121,7 @@ def dismiss(ranks: ProcessGroup) -> None:
 
 
 def follow(ranks: ProcessGroup) -> None:
-    """Takes part in what the leader begins until it says that it is done.
-
-    Raises:
-        LostError: the leader is gone.
-    """
+    """Takes part in the leader's work until it is done; raises LostError where it is gone."""
     ready: set[str] = set()
     try:
         while (word := ranks.broadcast_int(_DONE)) != _DONE:
@@ -200,9 +194,7 @@ class Fit:
 
 
 def pack_fit(fit: Fit) -> dict[str, NDArray[Any]]:
-    """Returns arrays that say all about a fit; the first one is JSON.
-
-    Views that all processes hold already are left out.
+    """Returns arrays that say all about a fit, JSON first, without views that all processes hold.
 
     Raises:
         TrainingError: a parameter is not finite.

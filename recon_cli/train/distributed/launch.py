@@ -1,7 +1,4 @@
-"""Processes that torchrun started: the first one runs the command line, the others train along.
-
-torchrun tells each its place in the environment. Who was not started by it pays nothing here.
-"""
+"""Processes that torchrun started: the first one runs the command line, the others train along."""
 
 from __future__ import annotations
 
@@ -52,10 +49,7 @@ def leading() -> Iterator[ProcessGroup]:
 
 
 def follow() -> int:
-    """Trains along until the leader is done; returns the exit code.
-
-    Ctrl-C is the leader's: it saves the state first. Where the leader is gone there is nothing to
-    say that it did not say itself.
+    """Trains along until the leader is done; returns the exit code. Ctrl-C is left to the leader.
 
     Raises:
         BackendError: the processes cannot be connected.

@@ -1,7 +1,4 @@
-"""Processes that torch.distributed connects: the only place that knows of it.
-
-Tensors on the CPU go by gloo, those on GPUs by NCCL. Nothing is pickled.
-"""
+"""Processes that torch.distributed connects: gloo on the CPU, NCCL on GPUs, no pickling."""
 
 from __future__ import annotations
 
@@ -26,10 +23,7 @@ _SMALL = 1 << 16  # numbers; sending fewer costs about as much as sending one
 
 @dataclass(eq=False)
 class TorchProcessGroup(ProcessGroup):
-    """This process among those that torchrun started; all must call the same methods in turn.
-
-    Any method raises LostError where another process is gone.
-    """
+    """One of torchrun's processes; all call the same methods, which may raise LostError."""
 
     @staticmethod
     def join() -> TorchProcessGroup:
