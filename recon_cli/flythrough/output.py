@@ -71,8 +71,7 @@ class DepthScale:
     def select_surfaces(self, splats: Splats) -> Splats:
         """Returns the Gaussians of the room, without the distant ones outside its windows.
 
-        At a hundred extents, one with a weight of 0.01 behind a wall moves its mean depth by an
-        extent.
+        At 100 extents a weight of 0.01 behind a wall would move its mean depth by an extent.
         """
         inside = splats.within(self.center, self.reach)
         return splats if bool(inside.all()) else splats.select(inside)

@@ -61,8 +61,7 @@ class TrainedScene:
 def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> TrainedScene:
     """Returns the trained scene of a workspace; StageError if the model is missing or stale.
 
-    `model` is auto, base or pruned; auto is the pruned one if it is fresh. `verb` is the command,
-    for messages.
+    `model` is auto (the pruned one if it is fresh), base or pruned; `verb` is for messages.
     """
     inspection, folder = job.inspect(), job.workspace.folder
     origin = ImportRecord.read(folder("train"))

@@ -35,8 +35,7 @@ class Approximation:
 
     alpha_min: float = ALPHA_MIN  # fragments below it are dropped
     transmittance_min: float = TRANSMITTANCE_MIN  # a pixel stops before it falls below; 0: never
-    # Choose tiles by the square around three standard deviations of the longer axis, as INRIA's
-    # rasterizer does, and not by the ellipse.
+    # Tiles by the square of 3 standard deviations of the longer axis (INRIA), not by the ellipse.
     square: bool = False
 
 
@@ -84,7 +83,7 @@ class RenderOutput:
     rgb: Tensor  # [H, W, 3] over the background, not clamped
     alpha: Tensor  # [H, W] coverage, 1 minus the final transmittance
     depth: Tensor  # [H, W] sum of alpha T z, world units; over alpha it is the expected depth
-    # hits, blend_sum, blend_max and loo stay zero without `scores=True`; with the torch backend
+    # Without `scores=True` hits, blend weights and loo stay zero, and with the torch backend
     # absolute_grad and variance too.
     statistics: Statistics
 

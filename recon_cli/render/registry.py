@@ -68,9 +68,7 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
 
     On CUDA `auto` takes triton only where its kernels passed the self-check on this GPU. A backend
     that was named runs even where it failed, with a warning: it may be the check that is wrong.
-
-    Raises:
-        BackendError: what was named cannot run; nothing else is used instead.
+    BackendError if what was named cannot run; nothing else is used instead.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendError(

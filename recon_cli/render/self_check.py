@@ -140,8 +140,7 @@ def check(
 ) -> Verdict:
     """Compares a backend with the torch backend in float64 and returns the verdict.
 
-    Whatever the backend raises is a verdict too. `count` is of Gaussians in a scene, `width` and
-    `height` are in pixels.
+    Whatever the backend raises is a verdict too. Scenes have `count` Gaussians.
     """
     start, errors = time.perf_counter(), {}
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
@@ -181,13 +180,9 @@ def _scenes(count: int, width: int, height: int) -> Iterator[tuple[str, Splats, 
 def _random_splats(count: int, seed: int) -> Splats:
     rng = np.random.default_rng(seed)
     values = (
-        rng.uniform([-1.8, -1.4, 1.0], [1.8, 1.4, 5.0], (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.normal(-2.3, 0.6, (count, 3)),
-        rng.normal(0.5, 2.0, count),
-        rng.normal(0, 0.8, (count, 3)),
-        rng.normal(0, 0.1, (count, 15, 3)),
-    )
+        rng.uniform([-1.8, -1.4, 1.0], [1.8, 1.4, 5.0], (count, 3)), rng.normal(size=(count, 4)),
+        rng.normal(-2.3, 0.6, (count, 3)), rng.normal(0.5, 2.0, count),
+        rng.normal(0, 0.8, (count, 3)), rng.normal(0, 0.1, (count, 15, 3)))
     return Splats(*(torch.from_numpy(value.astype(np.float32)) for value in values))
 
 
@@ -294,8 +289,7 @@ _verdicts: dict[Path, Verdict] = {}  # of this process, also where nothing can b
 def verdict_for(backend: str, device: torch.device) -> Verdict:
     """Returns the kept verdict of a backend; checks it now where there is none.
 
-    Raises:
-        BackendError: the check left the device unusable for this process.
+    BackendError if the check left the device unusable for this process.
     """
     key = _key(backend, device)
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]

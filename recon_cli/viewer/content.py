@@ -135,8 +135,7 @@ def move_browser(
 ) -> None:
     """Moves the camera of a browser to `target`, with the roll of `camera`.
 
-    The browser's up becomes the world's up as the camera sees it, so that dragging still turns
-    around the vertical.
+    Up becomes the world's as the camera sees it: dragging still turns around the vertical.
     """
     right, image_up = camera.viewmat[0, :3], -camera.viewmat[1, :3]
     world_up = image_up if up is None else up - (up @ right) * right

@@ -20,15 +20,13 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.contract import (
-    EXACT, Approximation, RenderOutput, Statistics, StepOptions, TargetImage
-)
+    EXACT, Approximation, RenderOutput, Statistics, StepOptions, TargetImage)
 from recon_cli.render.numba.kernel import cache_folder
 from recon_cli.render.numba.optimizer import step
 from recon_cli.render.numba.step import PhotometricStep, camera_gradient
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.numba.view_pass import (
-    ImageBuffers, Lease, PackedSplats, RenderSettings, flat
-)
+    ImageBuffers, Lease, PackedSplats, RenderSettings, flat)
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
@@ -142,10 +140,7 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
 
 @contextmanager
 def _without_scipy() -> Iterator[None]:
-    """Keeps numba from importing scipy.linalg to look for BLAS, which no kernel needs.
-
-    The import takes longer than loading all kernels.
-    """
+    """Keeps numba from importing scipy.linalg, slowly, for a BLAS that no kernel needs."""
     if _SCIPY in sys.modules:
         yield
         return

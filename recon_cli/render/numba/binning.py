@@ -15,8 +15,7 @@ from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd_functions import fetch_add
 from recon_cli.render.numba.soa import (
     BLOCK, EXTENT_X, EXTENT_Y, FAR, MEAN_X, MEAN_Y, RECORD, SLOPE_Y, TILE_HEIGHT, TILE_WIDTH, U_X,
-    U_Y, V_Y
-)
+    U_Y, V_Y)
 
 _MARGIN = np.float32(1e-3)  # pixels
 _U = np.uint64  # an index that is never negative needs no test for counting from the end

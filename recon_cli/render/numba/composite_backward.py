@@ -19,17 +19,14 @@ import numpy as np
 
 from recon_cli.render.numba.compositing import (
     BATCH_FLOATS, END_ROW, FIRST_ROW, L_BLUE, L_DEPTH, L_GREEN, L_RED, L_U_X, L_U_Y, L_V_Y, LOCAL,
-    load_batch, log2_alpha
-)
+    load_batch, log2_alpha)
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     absolute, broadcast, exp2, fetch_add, fill, fma, lane_numbers, largest, load, minimum, select,
-    store, totals
-)
+    store, totals)
 from recon_cli.render.numba.soa import (
-    BATCH, LOG2_ALPHA_MAX, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
-)
+    BATCH, LOG2_ALPHA_MAX, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH)
 
 _T, _R, _LAST, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH = (i * TILE_PIXELS for i in range(7))
 _BEHIND_RED, _BEHIND_GREEN, _BEHIND_BLUE = (i * TILE_PIXELS for i in range(7, 10))

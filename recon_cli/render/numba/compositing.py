@@ -17,13 +17,11 @@ from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     bits, broadcast, count_bits, exp2, fetch_add, fill, floor, fma, lane_numbers, largest, load,
-    lowest_bit, maximum, minimum, select, square_root, store, total
-)
+    lowest_bit, maximum, minimum, select, square_root, store, total)
 from recon_cli.render.numba.soa import (
     BATCH, BLUE, DEPTH, EXTENT_X, EXTENT_Y, FAR, GREEN, HALF_Y, LOG2_ALPHA_MAX, LOG2_OPACITY,
     MEAN_X, MEAN_X_LOW, MEAN_Y, MEAN_Y_LOW, RECORD, RED, SLOPE_Y, TILE_HEIGHT, TILE_PIXELS,
-    TILE_WIDTH, U_X, U_Y, V_Y
-)
+    TILE_WIDTH, U_X, U_Y, V_Y)
 
 # An instance of a batch: u = U_X i + U_Y r + U_0 and v = V_Y r + V_0 at column i and row r of the
 # tile; the rest is the record's own.

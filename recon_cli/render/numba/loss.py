@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute, broadcast, fetch_add, fill, fma, lane_numbers, load, load_bytes, select, store, total
-)
+    absolute, broadcast, fetch_add, fill, fma, lane_numbers, load, load_bytes, select, store, total)
 from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, pool
 
 RADIUS = 5

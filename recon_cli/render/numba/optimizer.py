@@ -14,8 +14,7 @@ from torch import Tensor
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute, fetch_add, fill, fma, load, select, square_root, store
-)
+    absolute, fetch_add, fill, fma, load, select, square_root, store)
 from recon_cli.render.numba.thread_pool import pool
 
 BLOCK = 1 << 14  # numbers that a thread takes at a time

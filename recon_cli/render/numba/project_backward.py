@@ -13,14 +13,12 @@ from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.projection import C0, direction_gradient, write_basis
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    exp2, fetch_add, fill, fma, load, maximum, minimum, select, square_root, store, transpose
-)
+    exp2, fetch_add, fill, fma, load, maximum, minimum, select, square_root, store, transpose)
 from recon_cli.render.numba.soa import (
     ABS_X, ABS_Y, BLOCK, BLUE, COUNT, GRAD_BLUE, GRAD_DEPTH, GRAD_GREEN, GRAD_RED, GREEN,
     LEAVE_ONE_OUT, LOG2_E, P_BASIS, P_DX, P_DY, P_DZ, P_LOGIT, P_REST, P_S0, P_S1, P_S2, P_X, P_Y,
     P_Z, PROJECTION_FLOATS, RECORD, RED, S_SQUARED, S_U, S_UU, S_UV, S_V, S_VV, SLOT, SQUARE, U_X,
-    U_Y, V_Y, S, gather, image_axes, planes_to_rows, terms_of_group, unit_quaternion
-)
+    U_Y, V_Y, S, gather, image_axes, planes_to_rows, terms_of_group, unit_quaternion)
 
 _F = np.float32
 _WHITE = _F(2 / LOG2_E)  # u and v hold sqrt(log2(e) / 2)

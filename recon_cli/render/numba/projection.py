@@ -17,15 +17,13 @@ from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     absolute, bits, count_bits, exp2, fetch_add, fill, lane_numbers, load, log2, lowest_bit,
-    maximum, minimum, square_root, store, transpose
-)
+    maximum, minimum, square_root, store, transpose)
 from recon_cli.render.numba.soa import (
     BLOCK, BLUE, DEPTH, EXTENT_X, EXTENT_Y, FAR, GREEN, HALF_Y, LOG2_E, LOG2_OPACITY, MEAN_X,
     MEAN_X_LOW, MEAN_Y, MEAN_Y_LOW, OUT, P_BASIS, P_DC, P_DX, P_DY, P_DZ, P_LOGIT, P_MEAN_X,
     P_MEAN_X_LOW, P_MEAN_Y, P_MEAN_Y_LOW, P_QW, P_QX, P_QY, P_QZ, P_REST, P_S0, P_S1, P_S2, P_Z,
     RECORD, RED, SLOPE_Y, SQUARE, TILE_HEIGHT, U_X, U_Y, V_Y, gather, image_axes, terms_of_group,
-    unit_quaternion
-)
+    unit_quaternion)
 
 INFINITE = np.float32(3e38)
 _CULL_SLACK = 1e-3  # culling keeps what rounding leaves in doubt

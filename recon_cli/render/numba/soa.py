@@ -16,8 +16,7 @@ import numpy as np
 from recon_cli.render.numba.kernel import inlined
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute, fill, load, maximum, minimum, select, square_root, store, transpose
-)
+    absolute, fill, load, maximum, minimum, select, square_root, store, transpose)
 
 TILE_WIDTH = LANES  # one vector is one row of pixels of a tile
 TILE_HEIGHT = 16
@@ -39,8 +38,7 @@ MEAN_X_LOW, MEAN_Y_LOW = 14, 15
 FAR = 1e9  # pixels; the half of an ellipse that only its box cuts
 BATCH = 32  # instances of a tile that are prepared at a time
 
-# What the backward pass sums over the pixels of an instance, one slot of 16 numbers for each;
-# s = alpha dL/dalpha.
+# What the backward pass sums over the pixels of an instance, in its slot; s = alpha dL/dalpha.
 SLOT = 16
 (GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_DEPTH, S, S_U, S_V, S_UU, S_UV, S_VV,
  ABS_X, ABS_Y, S_SQUARED, COUNT, LEAVE_ONE_OUT) = range(15)
@@ -120,8 +118,7 @@ def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, 
 def unit_quaternion(scratch):
     """Returns w, x, y, z of length 1, and what a gradient is multiplied by.
 
-    Divided by the largest entry first, as squares of small entries vanish. Zeros are no rotation
-    and have no gradient.
+    The largest entry is divided out first: small squares vanish. Zeros: no rotation, no gradient.
     """
     w, x = load(scratch, P_QW * LANES), load(scratch, P_QX * LANES)
     y, z = load(scratch, P_QY * LANES), load(scratch, P_QZ * LANES)
@@ -140,8 +137,7 @@ def unit_quaternion(scratch):
 def image_axes(scratch, view):
     """Returns the rows of J W, [6], and the clamped x/z and y/z.
 
-    The linearisation blows up at grazing angles, so x/z and y/z are held near the image (INRIA's
-    3DGS).
+    At grazing angles the linearisation blows up: x/z and y/z are held near the image (INRIA 3DGS).
     """
     per_z = 1.0 / load(scratch, P_Z * LANES)
     u, v = load(scratch, P_X * LANES) * per_z, load(scratch, P_Y * LANES) * per_z

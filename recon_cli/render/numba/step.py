@@ -17,8 +17,7 @@ from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.render.numba.simd_functions import fetch_add
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.numba.view_pass import (
-    ImageBuffers, PackedSplats, RenderSettings, ViewPass, flat
-)
+    ImageBuffers, PackedSplats, RenderSettings, ViewPass, flat)
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import generators
 from recon_cli.scene.splats import Splats

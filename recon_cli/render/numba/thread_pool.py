@@ -83,8 +83,7 @@ class ThreadPool:
     def _wait(self, ended: list[BaseException | None], count: int) -> BaseException | None:
         """Waits until `count` threads have ended; returns the Ctrl-C that came meanwhile.
 
-        No thread may still write when the caller goes on. The list decides; a message on the queue
-        only wakes, because an interrupt may lose one.
+        The list decides; a message on the queue only wakes, because an interrupt may lose one.
         """
         interrupt: BaseException | None = None
         while len(ended) < count:

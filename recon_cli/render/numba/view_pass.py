@@ -21,8 +21,7 @@ from recon_cli.render.numba.compositing import FORWARD_FLOATS, composite, tally
 from recon_cli.render.numba.project_backward import GRADIENT_FLOATS, project_backward
 from recon_cli.render.numba.projection import compact, cull, project
 from recon_cli.render.numba.soa import (
-    BLOCK, PROJECTION_FLOATS, RECORD, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Viewpoint
-)
+    BLOCK, PROJECTION_FLOATS, RECORD, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Viewpoint)
 from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, empty_aligned, pool
 from recon_cli.scene.camera import Camera
 

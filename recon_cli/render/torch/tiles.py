@@ -214,8 +214,8 @@ def _write_scores(
 class _Tally:
     """Counts hits and blend weights of the instances while they are composited.
 
-    `like` has the dtype and device to count in; `counting` [tiles, 256] is 1 where a pixel counts,
-    None if all do.
+    `like` has the dtype and device; `counting` [tiles, 256] is 1 where a pixel counts, None for
+    all.
     """
 
     def __init__(self, instances: Instances, like: Tensor, counting: Tensor | None) -> None:

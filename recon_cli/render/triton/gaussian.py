@@ -82,8 +82,7 @@ def number(view, place: tl.constexpr):
 def unit_quaternion(quats, i, here):
     """Returns w, x, y, z of length 1, and what a gradient is multiplied by.
 
-    Divided by the largest entry first, as squares of small entries vanish. Zeros are no rotation
-    and have no gradient.
+    The largest entry is divided out first: small squares vanish. Zeros: no rotation, no gradient.
     """
     w = tl.load(quats + 4 * i, mask=here, other=1.0)
     x = tl.load(quats + 4 * i + 1, mask=here, other=0.0)

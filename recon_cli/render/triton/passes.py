@@ -204,8 +204,8 @@ def composite_tiles_backward(
 ) -> Tensor:
     """Returns the sums [E, SUMS] of every instance, see `compositing.composite_backward`.
 
-    The gradients [H, W, 3] and [H, W] are contiguous; the last two may be None where `options` are
-    plain.
+    The gradients [H, W, 3] and [H, W] are contiguous; the last two may be None with
+    `options.plain`.
     """
     height, width = image.alpha.shape
     sums = lists.records.new_zeros(len(lists.members), SUMS)

@@ -2,10 +2,8 @@
 
 How many instances a view has is known on the device alone, so buffers have room for more than are
 likely. A step that needs more is stopped there, with all that follow it, until the host looks at
-the `StepStatus`, makes room and takes them again: no result depends on the room.
-
-On CUDA the launches of a step are recorded once its sizes have come up before, and replayed as a
-graph.
+the `StepStatus`, makes room and takes them again: no result depends on the room. On CUDA the
+launches of a step are recorded once its sizes have come up before, and replayed as a graph.
 """
 
 from __future__ import annotations
@@ -52,8 +50,7 @@ class _DeviceTarget:
 class PhotometricStep:
     """Renders views over black, compares them with their photographs and runs the backward pass.
 
-    `graphs` records launches; None takes what suits the device. `room` is how many instances there
-    is memory for at first; None for a likely number.
+    `graphs` None takes what suits the device, `room` None a likely number of instances at first.
     """
 
     def __init__(
@@ -64,8 +61,7 @@ class PhotometricStep:
         self._cameras: dict[int, tuple[Camera, Tensor]] = {}
         # of the last view, overwritten by each call; all zero where the view does not count
         self.statistics = Statistics.zeros(torch.zeros(0, 3, device=device))
-        # [1] zero where the last view does not count: its loss was not finite, it saw no Gaussian,
-        # or it was stopped
+        # [1] 0 where the last view does not count: stopped, no Gaussian seen, or loss not finite
         self.counted, self._fits = (
             torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
         self._background = torch.zeros(3, device=device)
