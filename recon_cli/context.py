@@ -41,27 +41,17 @@ class TrainCallback:
     def on_begin(self, label: str, until: int, cameras: Sequence[Camera], splats: Splats) -> None:
         """Is called before the first step of a run that begins or is resumed.
 
-        Args:
-            label: what is trained, as the progress bar names it.
-            until: steps at its end.
-            cameras: of the training views.
-            splats: to begin with.
+        `label` names what is trained, `until` is its last step, `cameras` are of training views.
         """
 
     def on_step(self, iteration: int, splats: Splats) -> None:
-        """Is called after steps, at least those that `needs_step` names.
-
-        The next step changes the Gaussians in place.
-        """
+        """Is called after steps, at least those of `needs_step`; the next changes the Gaussians."""
 
     def on_report(self, report: TrainReport) -> None:
         """Is called every hundred steps or so and at the end, before `on_step`."""
 
     def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
-        """Returns whether `on_step` must be called after this step.
-
-        Between such steps the host may run ahead of the device.
-        """
+        """Returns whether `on_step` must be called after this step; else the host may run ahead."""
         return False
 
 
@@ -125,8 +115,7 @@ def _ignore(done: int, total: int) -> None:
 class StageInputs:
     """What a stage may read."""
 
-    # finished folder of each stage named in `needs`, and of those in `uses` that are fresh, by
-    # stage name
+    # finished folder by stage name: of all in `needs`, and of those in `uses` that are fresh
     folders: Mapping[str, Path] = field(default_factory=dict)
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
 
@@ -139,17 +128,13 @@ class StageContext:
     device: str = "cpu"  # "cpu" or "cuda", already resolved
     backend: str = "torch"  # name of a rasterizer, already resolved
     threads: int = 1  # CPU threads to use
-    # called with (done, total) whenever that much would survive a crash; `recon status` shows it as
-    # partial (412/600)
+    # called with (done, total) whenever that would survive a crash; shown by `recon status`
     record: Callable[[int, int], None] = _ignore
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
     ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
 
     def notice(self, text: str) -> None:
-        """Tells the user something that is no error but must not be missed, in one line.
-
-        It may hold file names, and those may hold whatever moves a terminal's cursor.
-        """
+        """Tells the user one line that must not be missed; unprintable characters are escaped."""
         logger.warning("%s", "".join(
             one if one.isprintable() else repr(one)[1:-1] for one in text))
 

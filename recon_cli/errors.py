@@ -9,12 +9,7 @@ from collections.abc import Sequence
 
 
 class ReconError(Exception):
-    """A failure that the user can act on.
-
-    Args:
-        message: what was found and what was needed.
-        hint: what to type or change next; empty when there is nothing to say.
-    """
+    """A failure that the user can act on; `hint` says what to type or change next, or is empty."""
 
     exit_code = 1
 

@@ -89,13 +89,9 @@ def cache_root() -> Path:
 
 
 class Meter:
-    """Measures the time and the peak memory of a block of work.
+    """Measures the time and the peak memory in bytes of a block of work.
 
-    Memory is the resident set of this process and its children together, sampled twice a second:
-    the operating system's own peak covers the whole life of a process, not one stage of it.
-
-    Attributes:
-        peak_memory_bytes: largest sum of all samples.
+    Memory is the resident set of this process and its children, sampled twice a second.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,4 @@
-"""How long work reports its progress: a protocol, tqdm for terminals, a null for all else.
-
-Also how times and sizes are written for people.
-"""
+"""How work reports its progress (protocol, tqdm, null), and how times and sizes are written."""
 
 from __future__ import annotations
 

@@ -49,15 +49,9 @@ _TEXT_PER_VIEW = 1_000  # bytes around a view's pictures, at most
 def write_report(job: Job, out: Path | None) -> str:
     """Writes the report of a workspace, which is only read, and returns its path and size.
 
-    Args:
-        job: its workspace.
-        out: the file; None is report.html in the workspace.
-
-    Raises:
-        StageError: ingest has not run yet.
-        ConfigError: the file is no HTML file, or would change a result or an input.
-        ManifestError: the manifest of ingest cannot be trusted.
-        WorkspaceError: the file cannot be written.
+    `out` is report.html in the workspace by default. StageError if ingest has not run yet,
+    ManifestError if its manifest cannot be trusted; ConfigError if `out` is no HTML file, or would
+    change a result or an input; WorkspaceError if it cannot be written.
     """
     path = (job.workspace.root / FILE if out is None else out).absolute()
     _check_path(job, path)

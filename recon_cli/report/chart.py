@@ -1,7 +1,4 @@
-"""Charts as inline SVG: linear or logarithmic axes with units, lines, marks, a legend.
-
-matplotlib is optional, and its figures do not follow the page's light and dark colours.
-"""
+"""Charts as inline SVG: linear or logarithmic axes with units, lines, marks, a legend."""
 
 from __future__ import annotations
 

@@ -103,10 +103,7 @@ def draw_rounds(prune: StageReport) -> Markup | None:
 
 
 def draw_prune_curve(root: Path, stages: StageReports) -> PruneCurve:
-    """Returns PSNR on validation views against Gaussians and megabytes, from a workspace's sweep.
-
-    The trained and pruned models of the workspace are marked by their own validation PSNR.
-    """
+    """Returns validation PSNR against Gaussians and megabytes of a sweep, its models marked."""
     path = root / Sweep.FILE
     if not path.is_file():
         return PruneCurve()

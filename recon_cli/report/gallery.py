@@ -1,7 +1,6 @@
 """The held-out views for the slider: truth, render and difference, within a budget of bytes.
 
-Pictures are WebP in data URIs of one HTML file that is small enough for e-mail; sizes and then
-qualities are reduced until they fit.
+Pictures are WebP in data URIs of one HTML file; sizes and then qualities shrink until they fit.
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ class Encoding:
     quality: int
 
 
-# Tried in this order until the budget holds. Quality 86 looks lossless; sizes are reduced before
-# qualities, because a slider compares blur, not pixels.
+# Tried in this order: sizes before qualities, because a slider compares blur, not pixels.
 ENCODINGS = (
     Encoding(1600, 86), Encoding(1200, 84), Encoding(900, 82), Encoding(680, 80),
     Encoding(560, 78), Encoding(480, 75), Encoding(420, 73), Encoding(360, 70), Encoding(300, 66),
@@ -219,8 +217,8 @@ def draw_difference(
 ) -> NDArray[np.uint8]:
     """Returns the error of a render in colours, RGB [h, w, 3], with a longest side of `longest`.
 
-    The mean absolute difference of the channels is computed at full size, then reduced by area, so
-    that a picture of any size shows the same error. `hidden` [H, W] are the masked pixels.
+    The mean absolute difference of the channels is reduced by area, so that a picture of any size
+    shows the same error. `hidden` [H, W] are the masked pixels.
     """
     difference = cv2.absdiff(truth, render)
     # channel by channel: a mean over the last axis takes six times as long

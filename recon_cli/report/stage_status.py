@@ -70,10 +70,8 @@ StageReports = Mapping[str, StageReport]  # by the name of the stage
 def inspect_stages(job: Job) -> dict[str, StageReport]:
     """Returns the status of every stage by name.
 
-    Raises:
-        StageError: ingest has not run yet.
-        ManifestError: the manifest of ingest cannot be trusted.
-        ConfigError: the settings hold a value that cannot be used.
+    StageError if ingest has not run yet, ManifestError if its manifest cannot be trusted,
+    ConfigError if a setting cannot be used.
     """
     inspection = job.inspect()
     first = inspection.check("ingest")

@@ -4,7 +4,6 @@
 it is native code that can abort, and then only that process is gone.
 """
 
-# The pycolmap wheel brings a zlib whose functions get mixed up with those of the system's zlib
-# where pycolmap happens to load that one first: the next PNG that Pillow, OpenCV or Python packs
-# then aborts with "free(): invalid pointer". Loading zlib before pycolmap keeps the two apart.
+# pycolmap's wheel brings a zlib that gets mixed up with the system's where pycolmap loads first:
+# packing a PNG then aborts with "free(): invalid pointer". Loading zlib before keeps them apart.
 import zlib as zlib

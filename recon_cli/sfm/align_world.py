@@ -23,11 +23,9 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
 
 ARBITRARY, DATA_SET, MEASURED = "arbitrary", "data set", "measured"  # where the scale comes from
-# How far from a pixel a sparse point may lie, as a share of the image's width. In two rendered
+# Largest distance of a sparse point from a pixel, as a share of the image's width. In two rendered
 # rooms picks within two pixels of a corner had a depth 0.5% and 0.7% off in the middle, 5% in the
-# worst tenth; picks anywhere found a point within 3 pixels in a third of the cases, 1% off in the
-# middle, and one of another surface in a sixth. Taking the foremost of all points around, rather
-# than the nearest pixel, did worse: 8% in the worst tenth of the corners.
+# worst tenth; of picks anywhere a third found a point within 3 pixels, a sixth another surface.
 _REACH = 0.005
 _LEAST_REACH = 4.0  # pixels
 _EQUAL = 1e-6  # share of the distance to the origin; nearer than this is the same point
@@ -100,10 +98,7 @@ def world_transform(
 
     Up and the floor are used where cameras and points agree on them; otherwise the axes stay, and
     the evidence says why. The scale is that of `scale_between`, whose points x,y,z are in the
-    turned frame, as a viewer shows it. The origin stays where it is when the scale changes.
-
-    Raises:
-        ConfigError: a place of `scale_between` is unknown.
+    turned frame, as a viewer shows it; the origin stays. ConfigError if a place is unknown.
     """
     names = sorted(viewmats)
     matrices = np.array([viewmats[name] for name in names]).reshape(-1, 4, 4)
@@ -172,8 +167,7 @@ def _describe_scale(source: str, measured: Measurement | None, metric: bool) -> 
 def parse_place(text: str, names: Collection[str]) -> Place:
     """Returns the place that a text names: a frame (with or without its suffix), point or pixel.
 
-    Raises:
-        ConfigError: it is none of the three, or there is no such frame among `names`.
+    ConfigError if it is none of the three, or there is no such frame among `names`.
     """
     if (name := _frame(text, names)) is not None:
         return Place(name)
@@ -193,11 +187,7 @@ def measure(
     viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera of each frame
     pinholes: Mapping[str, Pinhole],  # needed only of frames that are named with a pixel
 ) -> Measurement:
-    """Returns how many metres one world unit is.
-
-    Raises:
-        ConfigError: a place is unknown, or both are the same.
-    """
+    """Returns the metres of a world unit; ConfigError if a place is unknown or both are equal."""
     a, b = (
         _locate(parse_place(text.strip(), viewmats.keys()), points, viewmats, pinholes)
         for text in (request.a, request.b))

@@ -14,12 +14,10 @@ from recon_cli.errors import SfmError, list_names
 MIN_FRAMES = 3
 # COLMAP accepts a pair of images from 15 inliers on.
 MIN_KEYPOINTS = 15
-# Share of the verified matches that lie in pairs explained by one homography, which is what a
-# camera turning on the spot, or one flat surface, gives. Measured: 0.03 to 0.38 in photos and walks
-# around rooms, 0.50 in a short walk with small steps, 0.99 and 1.00 in two turns on the spot.
+# Share of verified matches in pairs explained by one homography: a turn on the spot, a flat wall.
+# Measured: 0.03 to 0.38 around rooms, 0.50 in a short walk, 0.99 and 1.00 in turns on the spot.
 MAX_FLAT_SHARE = 0.9
-# COLMAP drops points below 1.5 degrees, so that no median lies under that. Measured medians: 13 and
-# 14 in the rendered rooms, 23 around an object, 7.2 in a short walk, 3.9 in a capture that failed.
+# COLMAP drops points below 1.5. Medians: 7 to 23 in good captures, 3.9 in one that failed.
 MIN_ANGLE_DEG = 2.0
 
 _MOVE = (

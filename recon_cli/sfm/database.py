@@ -35,10 +35,7 @@ def is_sound(path: Path, names: Sequence[str], cameras: int) -> bool:
 
 
 def progress(path: Path, step: str) -> int:
-    """Returns how many images ("features") or pairs ("matches") are finished.
-
-    That is 0 where the file cannot be read: it is locked, broken or not there yet.
-    """
+    """Returns how many images ("features") or pairs ("matches") are finished; 0 if unreadable."""
     try:
         with closing(_connect(path)) as connection:
             (count,), = connection.execute(f"SELECT count(*) FROM {_TABLES[step]}")
@@ -57,8 +54,7 @@ def keypoint_counts(path: Path) -> dict[str, int]:
 def keep_coarsest(path: Path, most: int) -> None:
     """Removes the finest keypoints of images that have more than `most`, in one transaction.
 
-    The coarsest ones are seen from the most places. Of equal ones the first stay, so that an image
-    always keeps the same ones.
+    The coarsest are seen from the most places; of equal ones the first stay, reproducibly.
     """
     with closing(_connect(path)) as connection, connection:
         many = connection.execute(
@@ -119,9 +115,5 @@ def remove(path: Path) -> None:
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """Returns a connection that creates no file.
-
-    It may write: the last connection to close removes SQLite's side files, which a read-only one
-    would leave.
-    """
+    """Returns a connection that creates no file, but may write, to remove SQLite's side files."""
     return sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=1.0)

@@ -17,9 +17,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-# A match counts as agreeing below the Sampson error at which COLMAP accepted it: pixels,
-# TwoViewGeometryOptions.ransac.max_error. The poses of all images then explain it as well as the
-# best geometry of its pair alone did.
+# A match agrees below the Sampson error, in pixels, at which COLMAP accepted it
+# (TwoViewGeometryOptions.ransac.max_error).
 MAX_ERROR = 4.0
 
 
@@ -35,8 +34,7 @@ class MatchEvidence:
     tried: NDArray[np.bool_]  # [N, N], symmetric: pairs that were matched, successfully or not
     pairs: NDArray[np.int64]  # [P, 2], verified pairs of images, first < second, sorted
     matches: NDArray[np.int64]  # [P], verified matches of each pair
-    # [P], those within MAX_ERROR of the epipolar lines that the poses give; zero where one of the
-    # two has no camera.
+    # [P], those within MAX_ERROR of the epipolar lines of the poses; zero where a camera is missing
     agreeing: NDArray[np.int64]
 
     @property
@@ -61,11 +59,7 @@ class MatchEvidence:
 def gather_evidence(
     model: pycolmap.Reconstruction, database: Path, names: Sequence[str]
 ) -> MatchEvidence:
-    """Returns what the database and the model say about the images `names`.
-
-    Raises:
-        ValueError: the database lacks one of the names, or the model holds another.
-    """
+    """Returns what database and model say about images; ValueError if their names disagree."""
     row = {name: index for index, name in enumerate(names)}
     images = [model.image(i) for i in model.reg_image_ids()]
     unknown = sorted(image.name for image in images if image.name not in row)

@@ -1,11 +1,10 @@
 """The mappers that are tried for a capture, from the quickest to the last resort.
 
-A good capture stops at the first. The next one is tried only where the model before it was not good
-enough, and where it is expected to end in time. Matches stay in the database, and a further attempt
-adds pairs to them. The best of all models is the result.
+A good capture stops at the first. The next one is tried where the model was not good enough, and it
+is expected to end in time; matches stay in the database. The best of all models is the result.
 
 Each finished attempt is recorded, so that an interrupted run continues after it. An interrupted
-mapping starts again: continued from a snapshot of COLMAP, the sample got other cameras and points.
+mapping starts again: continued from COLMAP's snapshot, its result would differ.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
-# Exhaustive matching grows with the square: 4950 pairs of 100 images are about a minute on two
-# cores at 600x340 and still the whole graph, so that a walk around a room closes.
+# Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
 EXHAUSTIVE_MAX = 100
 # Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
 # held all of them; a slow walk that fell into four to seven models 76 to 82%.
@@ -94,11 +92,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
 
 
 def match_first(job: MappingJob, report: Reporter) -> Result:
-    """Matches the pairs of the first fallback and returns how many there are.
-
-    Raises:
-        SfmError: no pair matches, or none of them shows depth.
-    """
+    """Matches the pairs of the first fallback; SfmError if none matches, or none shows depth."""
     matching.match_pairs(job, list_fallbacks(job)[0].choose_pairs(job), report)
     matching.check_motion(job)
     return matching.count_matches(job)
@@ -108,11 +102,8 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
     """Writes the best model of all attempts that were needed into out/model.
 
     The matches of the first fallback are in the database. At `deadline`, in monotonic seconds, the
-    process is ended.
-
-    Raises:
-        SfmError: too few frames have a camera, they see the points from one place, or the parts of
-            the model are too weakly connected.
+    process is ended. SfmError if too few frames have a camera, they see the points from one place,
+    or the parts of the model are too weakly connected.
     """
     log = StepLog(job.attempts)
     attempts: list[MapperAttempt] = []

@@ -1,8 +1,7 @@
 """What the mapping process and its parent share: the job, the log of finished steps, the events.
 
-The parent writes a job, the process works on it step by step and records each finished step. On its
-standard output it reports one JSON object a line: a phase begins, so many of its units are done, or
-an error that the parent raises.
+The parent writes a job; the process records each finished step, and reports one JSON object a line
+on its standard output: a phase begins, so many of its units are done, or an error.
 """
 
 from __future__ import annotations

@@ -28,8 +28,7 @@ from recon_cli.sfm.verdict import check_weak_link, examine
 from recon_cli.workspace import atomic
 
 NEAREST = 20  # cameras that each one is matched with, as in `matching.similar_pairs`
-# Axes that differ by more leave little in common: the wider side of a phone's picture spans 65 to
-# 80 degrees.
+# Axes further apart share little: the wider side of a phone's picture spans 65 to 80 degrees.
 MAX_TURN_DEG = 75.0
 # Share of the verified matches that the points must confirm. Nine rendered frames gave 0.76
 # with their true poses and at most 0.06 with axes of another convention or the names swapped.
@@ -40,8 +39,7 @@ NEIGHBOURS = (0, 5)
 FEATURES = 1000  # keypoints an image
 MIN_MATCHES = 60  # fewer, in all pairs together, say nothing
 # Share of the matches that must lie on the epipolar lines of the poses. A room and a desk gave
-# .997 and more with their poses; with flipped axes, inverted matrices, poses of other images or of
-# those four frames on .07 to .36 (tests/bench/bench_spot_check.py).
+# .997 and more, wrong axes or other images .07 to .36 (tests/bench/bench_spot_check.py).
 MIN_SPOT_AGREEING = 0.5
 
 Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
@@ -80,11 +78,7 @@ def neighbours(
 
 
 def build_known_model(job: MappingJob, report: Reporter) -> Result:
-    """Writes the model of the given cameras into out/model and returns what it holds.
-
-    Raises:
-        SfmError: too few frames have a pose, or the poses do not fit the images.
-    """
+    """Writes the model of the given cameras into out/model; SfmError if few or they do not fit."""
     known = _read_poses(job)
     checks.check_registered(job.names, list(known.viewmats), 0.0)
     report.phase("mapping", len(job.names))

@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
 
-# Threads add floating-point sums in any order: two runs then differ from the third digit of the
-# principal point on. One thread gives the same bytes every time, at 5% more time on two cores.
+# Threads add sums in any order; one gives the same bytes every time, for 5% more time on two cores.
 THREADS = 1
-# Growth after which everything is adjusted again. COLMAP's 1.1 took 20.0 s on the sample, 1.2 takes
-# 16.2 s; the camera centres came out 0.30 and 0.28 cm from the truth.
+# Growth after which all is adjusted again: 16.2 s on the sample, 20.0 s with COLMAP's 1.1.
 GLOBAL_RATIO = 1.2
-# Images of a camera from which its principal point is free in the last adjustment: COLMAP calls
-# a model of fewer small (min_model_size), and a few images cannot tell it from a turn.
+# Fewer images of a camera cannot tell its principal point from a turn (COLMAP: min_model_size).
 MIN_IMAGES_PRINCIPAL = 10
 # COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
 MAX_ERROR, MIN_ANGLE = 4.0, 1.5
@@ -63,8 +60,7 @@ def extend_model(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Re
 def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the models of the global mapper, which places all images at once.
 
-    Where a focal length is unknown, those of all cameras are estimated from the matches first, in a
-    copy of the database: it changes the cameras and the geometry of the pairs.
+    Unknown focal lengths are estimated from the matches first, in a copy of the database.
     """
     report.phase("mapping", len(job.names))
     copy = job.attempts / "global.db"
@@ -85,9 +81,8 @@ def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruct
 def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) -> None:
     """Adjusts a model in place with the principal point free; drops points that got lost.
 
-    The mapper keeps it in the middle, because a few images cannot tell it from a shift. All of them
-    can: on the fox photos it comes out 2 px from the published value, 16 px off the middle. The
-    intrinsics of the cameras `constant` stay as they are.
+    All images together determine it: on the fox photos it comes out 2 px from the published value,
+    16 px off the middle. The intrinsics of the cameras `constant` stay as they are.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
@@ -162,8 +157,7 @@ def _options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
 def _relax(options: pycolmap.IncrementalPipelineOptions) -> None:
     """Halves COLMAP's thresholds for the first pair and each further image, and tries more often.
 
-    The angle falls to a quarter: COLMAP itself tries 4 degrees last for the first pair of a capture
-    with short steps, when all other thresholds have been lowered too.
+    The angle falls to a quarter, which COLMAP itself tries last for a capture with short steps.
     """
     mapper = options.mapper
     mapper.init_min_num_inliers = 50  # of 100

@@ -22,15 +22,13 @@ from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, Result
 CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
 # COLMAP's default. With the powers of two an image also meets those 16, 32, ... 512 further on.
 SEQUENTIAL_OVERLAP = 10
-# COLMAP tries 10000 samples before it gives up on a pair, and most of its time goes to pairs that
-# show nothing in common. 2000 took a third off the verification of five captures; of their 5700
-# verified pairs 8 got lost, all with few matches, and every model kept its images.
+# Of COLMAP's 10000, mostly spent on pairs without anything in common. 2000 took a third off the
+# verification of five captures and lost 8 of 5700 verified pairs, but no image.
 MAX_TRIALS = 2000
 # Share of the verified matches above which pairs at some distance show whether there is depth.
 MIN_SHARE = 0.01
-# Similar images per image beside its neighbours. Of all pairs that are no neighbours and have 50 or
-# more verified matches they hold 41% in a slow walk of 160 frames (10 hold 25%, and 20 that may be
-# neighbours 9%), 67% of 76 frames of a room, 80% of 50 photos.
+# Similar images per image beside its neighbours. They hold 41% (10 hold 25%) of the other pairs
+# with 50 or more verified matches in a slow walk, 67% in a room, 80% in 50 photos.
 NEAREST = 20
 WORDS = 64  # 32, or all keypoints in place of the coarsest 1000, chose no better pairs
 COARSEST = 1000  # keypoints of an image, largest scale first: they are seen from more places
@@ -44,11 +42,8 @@ Pair = tuple[str, str]  # file names in order
 def extract_features(job: MappingJob, report: Reporter) -> Result:
     """Fills the database with the features of all frames and returns how many there are.
 
-    Images that an interrupted run has finished are kept.
-
-    Raises:
-        FormatError: a frame cannot be read.
-        SfmError: too few frames hold any texture.
+    Images that an interrupted run has finished are kept. FormatError if a frame cannot be read,
+    SfmError if too few hold any texture.
     """
     report.phase("features", len(job.names), done=database.progress(job.database, "features"))
     with _open_for_polling(job) as opened:
@@ -77,8 +72,7 @@ def _extract_group(job: MappingJob, group: CameraGroup) -> None:
 def _open_for_polling(job: MappingJob) -> pycolmap.Database:
     """Returns a connection that shows how far pycolmap is; to be open longer than its own.
 
-    SQLite locks the file for a moment when its last connection closes. Another process that looked
-    at it could do so just when pycolmap opens the file, which gives up on a lock at once.
+    SQLite locks the file when its last connection closes, maybe just as pycolmap opens it.
     """
     return pycolmap.Database.open(job.database)
 
@@ -86,11 +80,8 @@ def _open_for_polling(job: MappingJob) -> pycolmap.Database:
 def create_database(job: MappingJob) -> None:
     """Writes a database with one camera per group and every image, whole or not at all.
 
-    The images get their ids here, in the order of their names: extraction in several threads would
-    number them in the order in which it finishes.
-
-    Raises:
-        FormatError: frames cannot be read or differ in size.
+    The images get their ids here, in the order of their names, which extraction in several threads
+    would not keep. FormatError if frames cannot be read or differ in size.
     """
     temporary = job.database.with_suffix(".partial")
     database.remove(job.database)
@@ -144,10 +135,7 @@ def exhaustive_pairs(names: Sequence[str]) -> set[Pair]:
 
 
 def sequential_pairs(names: Sequence[str]) -> set[Pair]:
-    """Returns the pairs of near images in the order of their names, and of those 2, 4, ... apart.
-
-    The powers of two reach from one round through a room to the next.
-    """
+    """Returns the pairs of near images by name, and of those 2, 4, ... apart, to close rounds."""
     ordered = sorted(names)
     near = range(1, SEQUENTIAL_OVERLAP + 1)
     far = (2**power for power in range(SEQUENTIAL_OVERLAP))
@@ -155,17 +143,10 @@ def sequential_pairs(names: Sequence[str]) -> set[Pair]:
 
 
 def similar_pairs(
-    database: Path,
-    names: Sequence[str],
-    *,
-    seed: int,
-    nearest: int = NEAREST,
+    database: Path, names: Sequence[str], *, seed: int, nearest: int = NEAREST,
     besides: Collection[Pair] = (),
 ) -> set[Pair]:
-    """Returns each image of `names` paired with the `nearest` ones that look most like it.
-
-    The known pairs `besides` are left out; the next ones take their place.
-    """
+    """Returns each image paired with the `nearest` ones most like it, the known `besides` apart."""
     ordered = sorted(names)
     row = {name: index for index, name in enumerate(ordered)}
     features = _features(database, ordered)
@@ -270,10 +251,9 @@ def count_matches(job: MappingJob) -> Result:
 def check_motion(job: MappingJob) -> None:
     """Raises SfmError when no pair matches, or none of them shows depth.
 
-    Pairs of near frames in a slow video always look flat and outweigh the others. So pairs are
-    grouped by their distance in the order of names, and the group with most depth decides: in a
-    walk with small steps 0.91 of all matches were flat, 0.22 of those 64 frames apart; in a turn on
-    the spot all are.
+    Pairs of near frames in a slow video always look flat, so pairs are grouped by their distance in
+    the order of names, and the group with most depth decides. In a walk with small steps 0.91 of
+    all matches were flat, 0.22 of those 64 frames apart; in a turn on the spot all are.
     """
     groups = database.count_inliers(job.database)
     total = sum(matches for _, matches, _ in groups)

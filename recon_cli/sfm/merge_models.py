@@ -20,17 +20,14 @@ from recon_cli.sfm.checks import MIN_FRAMES
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.verdict import ModelVerdict
 
-# COLMAP's thresholds for the pose of an image (abs_pose_min_num_inliers, _min_inlier_ratio): a
-# model is placed by its points just as an image is.
+# COLMAP's thresholds for the pose of an image (abs_pose_min_num_inliers, _min_inlier_ratio).
 MIN_INLIERS = 30
 MIN_INLIER_SHARE = 0.25
-# Distance of two points that are one, as a share of the median distance of a point from a camera.
-# A depth is known to the reprojection error (up to 4 px of some 1000 px focal length) over the
-# angle between two rays (7 to 23 degrees in real captures): 1 to 3%.
+# Distance of two equal points, as a share of the median distance of a point from a camera. Depth is
+# known to 1 to 3%: up to 4 px of some 1000 px focal length over 7 to 23 degrees between rays.
 MAX_ERROR = 0.03
 MAX_TRIALS = 10_000
-# Share of the images that may be taken out of a model as wrong. Where the verdict suspects more,
-# the model is wrong, and taking out the smaller part would hide it.
+# With a larger share of suspected images the model is wrong; removing them would hide it.
 MAX_REJECTED = 0.2
 
 
@@ -102,7 +99,6 @@ def merge(
     """Returns `base` with the images of `other`, adjusted together, or None.
 
     None if `other` brings fewer than three further images or shares too few points with `base`.
-    Whether the result can be trusted is for the caller to judge.
     """
     new = set(mapper.list_registered(other)) - set(mapper.list_registered(base))
     if len(new) < MIN_FRAMES:

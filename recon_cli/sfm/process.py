@@ -100,11 +100,9 @@ class Monitor:
 def run_job(job: MappingJob, *, progress: Progress, record: Callable[[int, int], None]) -> None:
     """Runs a job in a process of its own; its results are in the step log. See also `Monitor`.
 
-    Raises:
-        SfmError: there is no model to trust, the time is up, or the process died.
-        FormatError: a frame cannot be read.
-        WorkspaceError: another process works in the same folder.
-        OSError: as met in the process: the disk is full or not writable.
+    SfmError if there is no model to trust, the time is up, or the process died; FormatError if a
+    frame cannot be read; WorkspaceError if another process works in the folder; OSError as met in
+    the process: the disk is full or not writable.
     """
     max_minutes = job.max_minutes
     deadline = time.monotonic() + 60 * max_minutes

@@ -38,8 +38,7 @@ def keep_trusted_part(
 ) -> TrustedPart | None:
     """Returns the part of a broken model to keep; None if it is not broken, or must stay whole.
 
-    Raises:
-        SfmError: no part that can be trusted has --min-registered of the frames.
+    SfmError if no part that can be trusted has --min-registered of the frames.
     """
     if not job.partial or job.accept_weak or not (
             is_broken(verdict.weakest_cut) or is_aliased(verdict.aliasing)):

@@ -1,8 +1,7 @@
 """The model in the world frame, and its frames without lens distortion.
 
 Originals and denoised twins get the same pinhole camera. COLMAP scales it so that no pixel of the
-result lies outside the frame (blank_pixels = 0): there are no black borders that a model would
-learn.
+result lies outside the frame (blank_pixels = 0): a model learns no black borders.
 """
 
 from __future__ import annotations
@@ -31,11 +30,8 @@ IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 def place_model(job: MappingJob) -> Result:
     """Writes the mapper's model, moved into the world frame, into out/sparse.
 
-    The axes of a data set with poses are left as they are: others build on them. Returns a
-    `WorldSummary` as JSON values.
-
-    Raises:
-        ConfigError: a place of --scale-between is unknown.
+    The axes of a data set with poses are left as they are. Returns a `WorldSummary` as JSON values;
+    ConfigError if a place of --scale-between is unknown.
     """
     model = pycolmap.Reconstruction(job.model)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
@@ -105,10 +101,7 @@ def _write_twins(job: MappingJob, names: Sequence[str], work: Path) -> None:
 
 
 def _write_masks(job: MappingJob, masked: Sequence[str], work: Path) -> None:
-    """Writes the masks of masked frames through the same cameras: 255 where a pixel counts.
-
-    A pixel that mixes one that counts and one that does not takes the value of the larger part.
-    """
+    """Writes the undistorted masks of masked frames: 255 where most of a pixel counts."""
     if job.masks is None or not masked:  # an empty list would mean all
         return
     (work / MASKS).mkdir()

@@ -31,26 +31,22 @@ from recon_cli.sfm.weakest_cut import (
     find_weakest_cut,
 )
 
-# A step is a jump from this multiple of the usual step on, the median of those around it: a camera
-# goes slower along a shelf than across the room. Longest steps measured: 1.1 to 2.8 in good models,
-# 9 to 20 where cameras are displaced.
+# A jump is a step of this multiple of the usual one, the median of those around it. Longest steps
+# measured: 1.1 to 2.8 in good models, 9 to 20 where cameras are displaced.
 MAX_STEP = 6.0
 WINDOW = 15  # steps; a median over fewer follows the jump itself
 MIN_STEPS = 5  # fewer say nothing about what is usual
-# Steps this much longer than the usual one cannot be a cut in a video: displaced cameras gave 9 to
-# 20, a walk that ends at rest 6.
+# Longer steps cannot be a cut in a video: displaced cameras gave 9 to 20, a walk's end at rest 6.
 MAX_LEAP = 100.0
 # COLMAP gives an image a camera from 30 inliers on, and in six of eight captures 19 of 20 images
 # had a fifth of their keypoints or more in the model. The fewest of any image with a camera: 450.
 MIN_KEYPOINTS = 150
-# Share of the median sharpness below which an image is called blurred: the bound of `recon ingest`
-# (IngestConfig.sharpness).
+# Share of the median sharpness below which an image is called blurred, as in IngestConfig.
 BLURRED = 0.5
 MOST_LINES = 5  # for images without a camera; all of them are in the verdict
 BINS = 10
-# Shift of the principal point as a share of the longer side. Measured: 0 to 0.025 in rooms, walks
-# and photos of ten and more frames, 0.032 with three; 0.114 in a walk that was torn in two places,
-# 0.97 of whose matches agreed with the cameras.
+# Shift of the principal point as a share of the longer side. Measured: 0 to 0.025 in sound models
+# of ten and more frames, 0.032 with three; 0.114 in a walk that was torn in two places.
 MAX_SHIFT = 0.06
 
 Names = tuple[str, ...]
@@ -91,8 +87,7 @@ class ModelVerdict:
 
     images: int  # that were given to the mapper
     registered: int  # images with a camera
-    # Cameras that see points in common, directly or through others; the largest part first. A sound
-    # model is one part.
+    # Cameras that see points in common, directly or through others; the largest first.
     model_parts: tuple[Names, ...]
     # The same of all images and verified matches: what could be mapped together.
     match_parts: tuple[Names, ...]
@@ -149,11 +144,7 @@ def examine(
     sharpness: Mapping[str, float | None] | None = None,  # variance of the Laplacian, where known
     times: Mapping[str, float | None] | None = None,  # seconds in the video, where known
 ) -> ModelVerdict:
-    """Returns the verdict on a finished model, which is not changed.
-
-    Raises:
-        ValueError: the database lacks an image, or the model holds one that is not in `names`.
-    """
+    """Returns the verdict on a finished model, or raises ValueError if its names do not match."""
     evidence = gather_evidence(model, database, names)
     overlap = visual_aliasing.measure_overlap(model, evidence)
     weakest_cut, outliers = find_weakest_cut(evidence, overlap)

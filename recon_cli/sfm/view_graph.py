@@ -17,11 +17,9 @@ Weights = NDArray[np.float64]  # [N, N], symmetric, zero on the diagonal
 Order = NDArray[np.int64]  # [N], a permutation of the images
 Cut = NDArray[np.bool_]  # [N], the images of one side
 
-# Eigenvectors that are swept. One finds the worst cut of a model that broke once; the others look
-# for a second break.
+# Eigenvectors that are swept: one finds the worst cut, the others look for a second break.
 VECTORS = 4
-# Share of the mean weight of an image that is added to each, so that the generalised problem is
-# defined where images have no weight. Rounding is 1e-16; one match among a thousand is 1e-3.
+# Share of the mean weight of an image that is added to each, so that none is 0.
 RIDGE = 1e-6
 
 
@@ -66,10 +64,7 @@ def sweep(matrix: Weights, order: Order) -> NDArray[np.float64]:
 
 
 def loose_orders(matrix: Weights) -> Iterator[Order]:
-    """Yields orders in which a cut parts what is loosely tied for its weight.
-
-    The eigenvectors of the normalised Laplacian, after the first (Shi and Malik 2000, eq. 11).
-    """
+    """Yields orders by eigenvectors of the normalised Laplacian (Shi and Malik 2000, eq. 11)."""
     yield from _orders(matrix, np.diag(matrix.sum(axis=1)))
 
 

@@ -1,13 +1,12 @@
 """Visual aliasing: two places that look alike and were laid over each other (doppelgangers).
 
 Two equal doors, seen by images that nothing else connects, can be merged without a single match
-that disagrees. The missing matches reveal such a model: the two groups of cameras now seem to stand
-in one place and look the same way, but all they have in common is the door.
-(Zach, Irschara and Bischof 2008: missing correspondences.) Halves that are off by a degree or by a
-fiftieth of the extent show as well: COLMAP has dropped the points that fit one of them only.
+that disagrees. The missing matches reveal such a model (Zach, Irschara and Bischof 2008): the two
+groups of cameras seem to stand in one place, but have only the door in common. Halves that are off
+by a degree or by a fiftieth of the extent show as well.
 
-The images are compared by the cells of a grid, not by points, because most points lie on whatever
-is rich in texture, which may be the very thing that looks alike.
+The images are compared by the cells of a grid, not by points, most of which may lie on the very
+thing that looks alike.
 """
 
 from __future__ import annotations
@@ -22,27 +21,23 @@ from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
 from recon_cli.sfm.view_graph import Weights
 
-# A point is expected in an image that sees it from nearly the same direction and distance as
-# another: SIFT finds it again there, while at 20 degrees one in six is lost (Lowe 2004, fig. 9).
-# With 15 degrees and 1.5 a good model of a video of low resolution fell from .78 to .66.
+# A point is expected in an image that sees it as nearly as another does: SIFT finds it again, while
+# at 20 degrees one in six is lost (Lowe 2004, fig. 9).
 MAX_ANGLE_DEG = 10.0
 MAX_RATIO = 1.3
-# Cells along each side of an image, and points that a cell must expect to count. Of such points 55
-# to 65% were found in good models, so that all six are missed by chance one time in two hundred.
+# Cells along each side of an image, and points that a cell must expect to count. Of those 55 to 65%
+# are found in good models: all six are missed by chance one time in two hundred.
 GRID, MIN_POINTS = 6, 6
 # Points sampled per image, evenly; 1000 are 28 a cell.
 MAX_POINTS = 1000
-# A pair counts where each of the two expects this share of its cells in the other. One of them
-# alone may look through a wall, on which the other one's points then lie.
+# A pair counts where each expects this share of its cells in the other: one may see through walls.
 MIN_SHARE = 0.25
 MIN_CELLS = 100  # between two groups of images: a handful of pairs
-# Share of the expected cells that must be found between two groups. The least of each model was .93
-# to .98 in photos and walks, .78 in a video of low resolution and .76 where screens changed between
-# the photos of a desk; .11 to .53 where two places with the same poster lay over each other.
+# Share of the expected cells that must be found between two groups. Least measured: .76 to .98 in
+# good models, .11 to .53 where two places with the same poster lay over each other.
 MIN_OVERLAP = 0.65
 MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
-# A group of less than this share of the cameras is not half of a doubled place; a few images that
-# are blurred or show people match badly too.
+# A smaller share of the cameras is no half of a doubled place: blurred images match badly too.
 MIN_SIDE = 0.1
 
 
@@ -134,8 +129,8 @@ def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
 def _project(image: pycolmap.Image, positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns where points [M, 3] lie in an image, [M, 2], 0 to 1 across and down; NaN outside.
 
-    Distortion is ignored, because its polynomial brings far points back into the image: its frame
-    is the rectangle that the undistorted middles of its edges span.
+    Distortion is ignored, because its polynomial brings far points back into the image: the frame
+    spans the undistorted middles of its edges.
     """
     camera = image.camera
     width, height = camera.width, camera.height

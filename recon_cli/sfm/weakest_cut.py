@@ -1,12 +1,11 @@
 """Where a model is most likely broken: the cut whose matches agree least with the poses.
 
-A mapper that goes wrong at one frame builds two good halves and places them wrongly to each other.
-Every image has a camera then, and the reprojection error, taken over the matches that the mapper
-kept, is small. The matches that it rejected show the break: those across it disagree with the
-poses.
+A mapper that goes wrong at one frame builds two good halves and places them wrongly to each other,
+with a small reprojection error over the matches that it kept. Those that it rejected show the
+break: across it, matches disagree with the poses.
 
-Matches can also be rejected rightly, because two places that look alike match each other. So a cut
-is ignored when its two sides show the same surfaces (`visual_aliasing`).
+Matches of two places that look alike are rejected rightly, so a cut is ignored when its two sides
+show the same surfaces (`visual_aliasing`).
 """
 
 from __future__ import annotations
@@ -23,14 +22,11 @@ from recon_cli.sfm.visual_aliasing import Overlap, is_confirmed
 
 # Least share measured in each model: 0.73 to 0.99 where no camera was off by 1% of the extent;
 # 0.03, 0.35 and 0.49 where 9, 7 and 8 of 50 cameras were off by two thirds of it, at reprojection
-# errors of 1.0 and 0.3 pixels. The cut that is loosest by its points alone held 0.89 in the first
-# of these: it ran elsewhere. The other two are a room with two equal posters.
+# errors of 1.0 and 0.3 pixels.
 MIN_AGREEING = 0.5
-# COLMAP gives an image a camera from 30 inliers on (abs_pose_min_num_inliers), so that no part of a
-# model hangs on fewer.
+# COLMAP gives an image a camera from 30 inliers on (abs_pose_min_num_inliers).
 MIN_MATCHES = 30
-# Sides of up to this share of the cameras are outliers, which can be dropped; a larger one is half
-# a model, and nothing says which half is right.
+# Sides of up to this share of the cameras are outliers, which can be dropped.
 MAX_OUTLIERS = 0.1
 
 
@@ -61,8 +57,7 @@ def find_weakest_cut(
 ) -> tuple[WeakestCut, tuple[OutlierCamera, ...]]:
     """Returns the weakest cut of the cameras that are no outliers, and the outliers.
 
-    Small sides of broken cuts are removed one after the other, so that a wrong camera does not hide
-    behind a wrong neighbour, nor is a right one blamed for it.
+    Small sides of broken cuts are removed one by one, so that a wrong camera hides behind no other.
     """
     links = _Links.of(evidence, overlap)
     inliers = evidence.registered.copy()
@@ -116,8 +111,7 @@ def _worst_side(links: _Links, inliers: Cut) -> Cut | None:
     alone = _shares(*(matrix.sum(axis=1) for matrix in (
         inner.agreeing, inner.matches, inner.expected, inner.confirmed)))
     best, least = np.array([alone.argmin()]), alone.min()
-    # A model breaks between parts that share few points, but not only there, so the cuts with the
-    # least agreement are swept too.
+    # A model also breaks elsewhere than between parts that share few points.
     for order in (*view_graph.loose_orders(inner.shared),
                   *view_graph.disagreement_orders(inner.agreeing, inner.matches)):
         shares = _shares(*(view_graph.sweep(matrix, order) for matrix in (

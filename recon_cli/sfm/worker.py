@@ -29,12 +29,7 @@ _FOLDERS = ("model", "sparse", "undistorted")  # steps that write a folder of th
 
 
 def work(job: MappingJob, report: Reporter) -> None:
-    """Runs every step that is not finished yet.
-
-    Raises:
-        SfmError: no model came out, or none to trust.
-        FormatError: a frame cannot be read.
-    """
+    """Runs unfinished steps; SfmError if no model can be trusted, FormatError for a bad frame."""
     deadline = time.monotonic() + 60 * job.max_minutes
     actions: dict[str, Callable[[], Result]] = {
         "features": lambda: matching.extract_features(job, report),
