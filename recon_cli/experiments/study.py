@@ -1,6 +1,6 @@
 """`recon study`: the paper's experiment, repeated over seeds, at equal steps and equal seconds.
 
-Compared with Table I of the paper, "3D Reconstruction of Indoor Scenes Based on 3DGS Models".
+Shown beside Table I of the paper, "3D Reconstruction of Indoor Scenes Based on 3DGS Models".
 """
 
 from __future__ import annotations

@@ -84,12 +84,9 @@ def run_stage(
     outputs = workspace.seal(row.name)
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
-        peak_memory_bytes=meter.peak_memory_bytes,
-        summary=summary.to_json(),
-        versions=machine.versions(),
-        device=ctx.device if row.renders else None,
-        backend=ctx.backend if row.renders else None,
-        threads=ctx.threads,
+        peak_memory_bytes=meter.peak_memory_bytes, summary=summary.to_json(),
+        versions=machine.versions(), device=ctx.device if row.renders else None,
+        backend=ctx.backend if row.renders else None, threads=ctx.threads,
         finished=datetime.now().astimezone().isoformat(timespec="seconds"))
     manifest = Manifest(key, outputs, digest_outputs(outputs, row.volatile), run)
     workspace.commit(manifest)

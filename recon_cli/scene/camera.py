@@ -10,16 +10,9 @@ from numpy.typing import NDArray
 # Number of focal lengths that the parameters begin with, and of all parameters, by COLMAP's names
 # (src/colmap/sensor/models.h). The principal point follows the focal lengths.
 MODELS: dict[str, tuple[int, int]] = {
-    "SIMPLE_PINHOLE": (1, 3),
-    "PINHOLE": (2, 4),
-    "SIMPLE_RADIAL": (1, 4),
-    "RADIAL": (1, 5),
-    "OPENCV": (2, 8),
-    "OPENCV_FISHEYE": (2, 8),
-    "FULL_OPENCV": (2, 12),
-    "SIMPLE_RADIAL_FISHEYE": (1, 4),
-    "RADIAL_FISHEYE": (1, 5),
-    "THIN_PRISM_FISHEYE": (2, 12)}
+    "SIMPLE_PINHOLE": (1, 3), "PINHOLE": (2, 4), "SIMPLE_RADIAL": (1, 4), "RADIAL": (1, 5),
+    "OPENCV": (2, 8), "OPENCV_FISHEYE": (2, 8), "FULL_OPENCV": (2, 12),
+    "SIMPLE_RADIAL_FISHEYE": (1, 4), "RADIAL_FISHEYE": (1, 5), "THIN_PRISM_FISHEYE": (2, 12)}
 
 
 @dataclass(frozen=True)

@@ -78,18 +78,15 @@ def _flat(direction: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np
 
 
 MIN_CAMERAS = 3
-# Frames whose rolls are independent, as far as the error is concerned: a hand that leans leans for
-# many frames. In two rendered walks of 75 frames with rolls of 0.65 degrees the direction was off
-# by 0.40 and 0.45 degrees, as of 2.5 independent frames; five is between that and all.
+# Frames whose rolls count as independent: a hand leans for many frames. The errors of two rendered
+# walks of 75 frames were those of 2.5 independent frames.
 _INDEPENDENT = 5
 # Standard error up to which the cameras are believed without a floor, and up to which they are good
-# enough to look for one. Measured: 0.4 degrees in rendered walks; 1.1 along a desk, whose screens
-# then stand upright; 2.8 around a toy on a bed, which then leans by about five; 6.6 in a
-# photographed half circle with rolls of 4.5.
+# enough to look for one. Measured: 0.4 degrees in rendered walks, 1.1 along a desk (then upright),
+# 2.8 around a toy on a bed (then leaning by about five), 6.6 in a half circle with rolls of 4.5.
 _MAX_ALONE_DEG = 2.0
-# Where the cameras turn by less, their common roll passes for a slope: twelve neighbouring frames
-# of a rendered walk that turn by 10.7 degrees, rolled by 2, said an error of 1.9 degrees and were
-# off by 5.2.
+# Where the cameras turn by less, a common roll passes for a slope: twelve frames that turn by 10.7
+# degrees, rolled by 2, said an error of 1.9 degrees and were off by 5.2.
 _MIN_SPREAD_ALONE_DEG = 12.0
 _MAX_WITH_FLOOR_DEG = 10.0
 _MIN_UPRIGHT = 0.7  # share; a phone that was turned over halfway is no witness of which end is up

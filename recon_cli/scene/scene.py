@@ -37,8 +37,7 @@ class Scene:
     unregistered_test: tuple[str, ...]  # names of held-out frames that have no camera
     points: NDArray[np.float64]  # [P, 3] float64 sparse points in world units
     colors: NDArray[np.uint8]  # [P, 3] uint8 their RGB colours
-    # mean reprojection error of the points in pixels of the undistorted images; None where it is
-    # not known, as of points that come from depth maps
+    # mean reprojection error of the points in pixels of the undistorted images; None if not known
     error_px: float | None = None
 
     @property

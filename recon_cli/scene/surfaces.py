@@ -19,9 +19,7 @@ _THICKNESS = 0.015
 _FLOOR_SAMPLE, _WALL_SAMPLE = 4_000, 20_000
 _FEWEST = 100  # points; of fewer a share of 4% is a few, and no surface
 _REACH = 4.0  # median distances beyond which a point is taken for a stray
-# A floor has next to nothing under it. Measured: 0.2% and 0.3% in the rendered rooms; the rest is
-# room for what a glossy floor mirrors.
-_MAX_BELOW = 0.05
+_MAX_BELOW = 0.05  # share under a floor; 0.2% and 0.3% in rendered rooms, more if it mirrors
 _MIN_SHARE = 0.04  # of the points; 23% and 28% in the rendered rooms
 _MIN_CONTRAST = 2.0  # times as dense as the space right above; 14 and 11 in the rendered rooms
 _MIN_WIDTH = 0.2  # of the median distance, across its narrow side: a shelf or edge is no floor

@@ -17,9 +17,7 @@ class TrainView:
     """One view in the form that training reads."""
 
     camera: Camera  # at the size of the image
-    # [H, W, 3] uint8; a fourth of the memory of float32. Under the mask it holds one colour that
-    # stands for nothing (`io.images.fill_masked`)
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  # [H, W, 3]; one colour under the mask (`io.images.fill_masked`)
     mask: NDArray[np.bool_] | None = None  # [H, W], True where a pixel counts; None where all do
 
     def __post_init__(self) -> None:

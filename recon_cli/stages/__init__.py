@@ -44,8 +44,7 @@ class Stage:
     version: int  # goes up when its output changes meaning; every older result is then stale
     auto: bool  # it may be started because another stage needs it; training never is
     module: str  # of its run()
-    # patterns of outputs that hold times or logs, or only serve to resume, and so take no part in
-    # the fingerprints of later stages
+    # patterns of outputs (times, logs, for resuming) that later stages' fingerprints leave out
     volatile: tuple[str, ...] = ()
     renders: bool = False  # it needs a rasterizer, and so torch and a device
     takes: str = ""  # input from the user, as in usage; empty for stages that only read others

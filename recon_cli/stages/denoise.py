@@ -44,9 +44,7 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
         outcome.name: {"sigma_255": outcome.sigma, "denoised": outcome.filtered}
         for outcome in outcomes})
     return DenoiseSummary(
-        mode=config.mode,
-        filter=config.filter,
-        frames=len(outcomes),
+        mode=config.mode, filter=config.filter, frames=len(outcomes),
         denoised=sum(outcome.filtered for outcome in outcomes),
         median_sigma_255=round(float(np.median([item.sigma for item in outcomes])), 4))
 

@@ -45,19 +45,12 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     poses = source.poses
     largest = max(source.groups, key=lambda group: group.width * group.height)
     return IngestSummary(
-        kind=source.kind,
-        declared_frames=source.declared,
-        decoded_frames=source.decoded,
-        lost_frames=source.lost,
-        dropped_blurred=source.blurred,
-        skipped=source.skipped,
+        kind=source.kind, declared_frames=source.declared, decoded_frames=source.decoded,
+        lost_frames=source.lost, dropped_blurred=source.blurred, skipped=source.skipped,
         metric=None if poses is None else poses.metric,
         points=None if poses is None or poses.points is None else len(poses.points),
-        frames=len(frames),
-        held_out=sum(frame.held_out for frame in frames),
-        groups=len(source.groups),
-        width=largest.width,
-        height=largest.height)
+        frames=len(frames), held_out=sum(frame.held_out for frame in frames),
+        groups=len(source.groups), width=largest.width, height=largest.height)
 
 
 def _choose_held_out(

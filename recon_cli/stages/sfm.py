@@ -33,23 +33,14 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     frames = store.read_frame_list(ingest)
     poses = ingest / POSES
     job = MappingJob(
-        frames=ingest / store.FOLDER,
-        denoised=denoise / store.FOLDER,
-        out=out.resolve(),
+        frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER, out=out.resolve(),
         groups=_groups(frames),
         masks=ingest / store.MASKS if any(frame.masked for frame in frames.frames) else None,
-        poses=poses if poses.exists() else None,
-        pose_use=config.poses,
-        given_points=poses.exists() and read_poses(poses).points is not None,
-        pairs=config.pairs,
-        max_features=config.max_features,
-        min_registered=config.min_registered,
-        accept_weak=config.accept_weak,
-        partial=config.partial,
-        gravity=config.gravity == "auto",
-        scale_between=config.scale_between,
-        max_minutes=config.max_minutes,
-        seed=config.seed,
+        poses=poses if poses.exists() else None, pose_use=config.poses,
+        given_points=poses.exists() and read_poses(poses).points is not None, pairs=config.pairs,
+        max_features=config.max_features, min_registered=config.min_registered,
+        accept_weak=config.accept_weak, partial=config.partial, gravity=config.gravity == "auto",
+        scale_between=config.scale_between, max_minutes=config.max_minutes, seed=config.seed,
         threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
@@ -96,13 +87,10 @@ def _summary(frames: FrameList, job: MappingJob) -> SfmSummary:
     unregistered = sorted({frame.name for frame in frames.frames} - set(model["registered"]))
     held_out = {frame.name for frame in frames.frames if frame.held_out}
     return SfmSummary.from_json({
-        **model,
-        "frames": len(frames.frames),
-        "registered": len(model["registered"]),
+        **model, "frames": len(frames.frames), "registered": len(model["registered"]),
         "unregistered": unregistered,
         "unregistered_held_out": [name for name in unregistered if name in held_out],
-        "world": results["sparse"],
-        "cameras": results["undistorted"]["cameras"],
+        "world": results["sparse"], "cameras": results["undistorted"]["cameras"],
         "seconds": {step: result["seconds"] for step, result in results.items()}})
 
 

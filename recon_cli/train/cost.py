@@ -31,9 +31,8 @@ from recon_cli.train.state import (
 )
 from recon_cli.train.task import Task
 
-# Of the Gaussians that stand for trained ones. With .3 a step takes what a real one of the same
-# level and count takes, within 10%, with the .1 that training begins with up to 25% less (room
-# `living`, CPU milliseconds of one thread).
+# Of Gaussians that stand for trained ones: with .3 a step takes what a real one does within 10%,
+# with the .1 that training begins with up to 25% less (room `living`, one thread).
 _OPACITY = 0.3
 _STEPS = 6  # timed at each level and count; views differ by a third in what they take
 _WARM = 1  # steps before them: the first one makes buffers

@@ -30,8 +30,7 @@ _MAX_RADIUS = 20.0  # pixels on the screen
 _LARGE_SCALE = 0.1  # x extent; larger Gaussians are deleted once opacities were reset
 # of `budget`
 _GROWTH = 0.5  # of the count, at most, at once: children need some steps to find their place
-# of the parent's: two halves at +-.5 sigma. A prototype tuned the four numbers together; they were
-# not varied since
+# of the parent's: two halves at +-.5 sigma; a prototype tuned the four numbers together
 _OFFSET = 0.5
 _LONG = 0.5
 _SHORT = 0.85

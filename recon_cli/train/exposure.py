@@ -18,8 +18,7 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train.background import project_points
 from recon_cli.train.optimizer import SparseAdam
 
-# Falling to a tenth as in INRIA 3DGS (exposure_lr_init .01, exposure_lr_final .001), but lower: in
-# 2,000 steps on two phone videos, from gains that were estimated, held-out views gained .72 and
+# Falling to a tenth as in INRIA 3DGS, but lower: on two phone videos, held-out views gained .72 and
 # .25 dB with .003, but .17 and -.01 dB with .01 (after the best gain of each view).
 _RATE, _FINAL_RATE = 0.003, 0.0003
 _PREFIX = "exposure"
@@ -61,9 +60,8 @@ _SIDE = 100  # pixels of the longer side; a small view is denoised and does not 
 _POINTS = 4000  # enough for medians of hundreds of points in two views that share a tenth
 _LEAST = 40  # points that two views must share; their median is known to a fifth of their spread
 _DARK, _BRIGHT = 12 / 255, 243 / 255  # means over a block; beyond, pixels of it may be clipped
-# Spread from which a capture drifts. Measured: .003 to .0194 in clean room videos (the larger ones
-# from gloss), .0326 to .0519 in rooms whose gain drifts by .82 to 1.42, .06 in photos from a phone
-# video, .14 and more in a walk from a window and in loose photos.
+# Spread from which a capture drifts. Measured: up to .0194 in clean room videos (from gloss), .0326
+# to .0519 in rooms whose gain drifts by .82 to 1.42, .06 and more in photos.
 _DRIFTS = 0.025
 _FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known better
 
@@ -74,8 +72,7 @@ class Estimate:
 
     # [F, 3] RGB, natural logarithm, of mean 0; zeros for a view without evidence
     log_gains: NDArray[np.float64]
-    # standard deviation of the log-gains over the views that have evidence, of the channel where it
-    # is largest; 0 where no two views can be compared
+    # largest standard deviation of a channel over the views with evidence; 0 without comparisons
     spread: float
     compared: int  # pairs of views that share enough points
 

@@ -108,9 +108,8 @@ _POINTS = 5000
 _CAP = 10_000
 _FAR_SHARE = 0.003  # of the directions; the window of one room is .012, that of another .045
 PARTS = ("far", "exposure", "poses", "images")
-# Gain from which higher harmonics are worth 45 of 59 parameters. Trials gave .24 dB on photos of a
-# glossy thing (.59 dB in the whole run) and .08 to .12 dB in two rooms (.07 dB in the whole run),
-# where a tenth more Gaussians give as much for less.
+# Gain from which higher harmonics are worth 45 of 59 parameters: trials gave .24 dB on photos of a
+# glossy thing, and .08 to .12 dB in two rooms, where a tenth more Gaussians give as much for less.
 _HARMONICS_DB = 0.15
 
 
@@ -134,8 +133,7 @@ class Candidate:
     task: Task  # views at the training size, and the plan
     points: NDArray[np.float64]  # [P, 3] sparse points in world units
     colors: NDArray[np.uint8]  # [P, 3] uint8
-    # reads the training and validation views from the denoised images, where the task holds the
-    # originals; None where both are the same
+    # reads the denoised training and validation views; None where the task's views are the same
     twins: Callable[[], tuple[list[TrainView], list[TrainView]]] | None
     harmonics: bool = False  # the degree of the colours is left to a trial
 

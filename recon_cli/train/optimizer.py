@@ -81,8 +81,7 @@ class SplatOptimizer:
         self._capacity = max(self._capacity, len(like))
         self._rows = {name: len(value) for name, value in like.parameters().items()}
         for name, value in like.parameters().items():
-            # higher SH coefficients that only some have get no room that stays empty: on a GPU it
-            # would cost, and giving it back is why they are few
+            # no empty room for SH coefficients that only some have: they are few to spare a GPU
             room = self._capacity if len(value) == len(like) else len(value)
             held = self._buffers.get(name, {}).get("value")
             if held is None or held.shape != (room, *value.shape[1:]):

@@ -49,8 +49,7 @@ _FULL_AT = 3000  # steps after which there may be a Gaussian for each pixel with
 _VIEWS_EACH = 8  # views that must show a Gaussian, about, to tell where it is
 _FIRST = 0.5  # of the cap, at the start
 _FEWEST = 5000
-# Real Gaussians cover more tiles than those that are timed: ten runs on living, office and fox took
-# 1% less to 17% more than was told without this, 9% more on the mean.
+# Real Gaussians cover more tiles than timed ones: ten runs took -1 to 17% longer, 9% on the mean
 _LONGER = 1.09
 _ROUND = 100  # counts are multiples of this
 

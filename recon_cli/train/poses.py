@@ -22,17 +22,15 @@ from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.optimizer import SparseAdam
 
 # First rate times steps of a camera, in units of the expected error; over the run a camera can go
-# .39 of that. Measured on a room of 100 views, 10 to 12 steps each: of 1 degree .005 (3.4) left .21
-# and .001 left .81; of .3 degrees .002 (3.8) left .11 and novel views within .02 dB of those that
-# true cameras give, .005 left .14 and .17 dB.
+# .39 of that. In a room of 100 views, 10 to 12 steps each, 3.4 left .21 of 1 degree and 3.8 left
+# .11 of .3 degrees, with novel views within .02 dB of those that true cameras give.
 _REACH = 4.0
 _FINAL = 0.1  # of the first rate, at the end of the run; .01 left .31 of 1 degree
 # Share of the scene's extent that a camera moves while it turns by a rad. A turn and a move across
 # the view look alike, and 1 left a centimetre as 1.5 centimetres.
 _MOVE = 0.3
-# Mean reprojection error, in training pixels. Measured as above: cameras off by .17 pixels gained
-# nothing, by .5 pixels .27 dB, by 1.7 pixels 2 dB and more. Cameras of SfM lost: 50 photos .65 dB
-# at a rate of 2e-4, a room's video .7 dB at 1e-3.
+# Mean reprojection error in training pixels. In that room cameras off by .17 pixels gained nothing,
+# by .5 pixels .27 dB, by 1.7 pixels 2 dB and more. Cameras of SfM lost .65 and .7 dB.
 WORTH_PX = 0.5
 _PREFIX = "poses"
 

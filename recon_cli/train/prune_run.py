@@ -41,8 +41,7 @@ ROUNDS = "rounds.json"
 GOOD = "good.safetensors"  # the last state whose validation PSNR was good enough
 _END_RECOVERY = 6  # the reference recovers for 5,000 steps after 30,000
 _END_EPOCHS = 6  # three rounds in its first half, each scored by an epoch of its own
-# Share that a round of the search removes at first; halved whenever that was too much, down to the
-# least, which bounds how far from the largest possible ratio the search may end.
+# Share that a round of the search removes at first; halved when too much, down to the least
 _SEARCH_SHARE = 0.25
 _LEAST_SHARE = 0.05
 

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from recon_cli.config.stages import RunConfig
 
 _LAST_FIFTH = 0.8  # where a recipe names no final phase of its own
-# dB; from one report to the next the PSNR goes up and down by .03, and the final phase gives .2
-# to .4 (office and fox, 3,000 steps, which never stop early: they gain .4 and .2 in that tenth)
-_GAIN = 0.02
+_GAIN = 0.02  # dB; the PSNR varies by .03 between reports, and the final phase gives .2 to .4
 _WINDOW = 0.1  # of the run's steps, in which so much must be gained
 
 
@@ -46,19 +44,16 @@ class Recipe:
     densify_from: float  # share from which Gaussians are added and deleted
     densify_until: float  # share up to which
     full_at: float  # share at which the count reaches its cap
-    # (share, factor): up to that share images are reduced by the factor
-    levels: tuple[tuple[float, int], ...]
+    levels: tuple[tuple[float, int], ...]  # (share, factor): reduces images up to that share
     sh_at: tuple[float, float, float]  # shares at which the degree of the colours rises by one
     sh_every: int  # the higher degrees are moved every so many steps
     opacity_decay: float  # opacities are multiplied by this at each densification
     resets: bool  # opacities are lowered to .01 now and then, as in the reference
-    # factor of the option of that name, and so on: a run of some thousand steps has to go as far as
-    # the reference's 30,000
+    # factors of the options of these names: short runs have to go as far as the reference's 30,000
     means_rate: float = 1.0
-    scales_rate: float = 1.0  # likewise
-    sh_rate: float = 1.0  # likewise
-    # rate of the means at the end, of that at the start; exponential between
-    means_final: float = 0.01
+    scales_rate: float = 1.0
+    sh_rate: float = 1.0
+    means_final: float = 0.01  # last rate of the means over the first; exponential between
     final_from: float = 1.0  # share from which all other rates fall
     final_rate: float = 1.0  # to which they fall at the end, of their own; exponential
 

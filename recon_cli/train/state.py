@@ -30,8 +30,7 @@ _VERSION = 5
 class DensificationStats:
     """Gradient statistics of each Gaussian since the last densification."""
 
-    # [N] sum over steps of the length of the projected mean's gradient, in normalised device
-    # coordinates
+    # [N] sum over steps of |gradient of the projected mean|, in normalised device coordinates
     pull: Tensor
     count: Tensor  # [N] steps in which the Gaussian was seen
     radius: Tensor  # [N] largest radius on the screen, pixels
@@ -89,9 +88,7 @@ class TrainState:
     skipped: int = 0  # steps whose loss was not finite, and that changed nothing
     # (iteration, validation PSNR in dB) at each regular report so far
     looks: list[tuple[int, float]] = field(default_factory=list)
-    # (iteration, iteration at which it went on) of an early stop; None where there was none. The
-    # steps between were never taken
-    jump: tuple[int, int] | None = None
+    jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it went on
     exposure: Exposure | None = None  # gains of the training images; None where that part is off
     poses: Poses | None = None  # refinement of their cameras; None where that part is off
 

@@ -25,9 +25,7 @@ class Task:
     extent: float  # of the scene, world units
     backend: str  # name of the rasterizer
     device: torch.device  # where the tensors live
-    # (iteration, iteration at which it goes on) of the run that this one branches off; this one
-    # does the same
-    jump: tuple[int, int] | None = None
+    jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
     ranks: ProcessGroup = SINGLE_PROCESS  # this process among those that take the steps together
 

@@ -32,8 +32,7 @@ _FLOATS = 14  # of a Gaussian, its higher SH coefficients apart
 _LARGEST = 4  # numbers of the largest parameter, these apart: a quaternion
 # values, gradients and two moments, and a copy of the values while densification rebuilds them
 _COPIES = 4 + 1
-# a record, indices and the gradient sums of about six tiles
-_BUFFERS_PER_GAUSSIAN = 128 + 6 * 72
+_BUFFERS_PER_GAUSSIAN = 128 + 6 * 72  # a record, indices and the gradient sums of about six tiles
 _BUFFERS_PER_PIXEL = 96  # image, its gradient, three maps of the loss, transmittance
 _PROGRAM = 350 << 20  # Python, torch and the kernels
 _TORCH_FACTOR = 4  # autograd keeps what the fused kernels compute again

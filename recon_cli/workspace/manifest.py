@@ -32,11 +32,8 @@ class ResultKey:
     def fingerprint(self) -> str:
         """SHA-256 over all of it; of the sources only the contents count."""
         return sha256_json({
-            "stage": self.stage,
-            "version": self.version,
-            "config": self.config,
-            "sources": [source.contents() for source in self.sources],
-            "upstream": self.upstream})
+            "stage": self.stage, "version": self.version, "config": self.config,
+            "sources": [source.contents() for source in self.sources], "upstream": self.upstream})
 
     def to_json(self) -> dict[str, Any]:
         """Returns plain values that `from_json` takes."""
@@ -81,12 +78,9 @@ class Manifest:
     def write(self, folder: Path) -> None:
         """Writes the manifest into a stage's folder, whole or not at all."""
         content = {
-            "schema": SCHEMA,
-            **self.key.to_json(),
-            "fingerprint": self.key.fingerprint,
+            "schema": SCHEMA, **self.key.to_json(), "fingerprint": self.key.fingerprint,
             "outputs": {name: dataclasses.asdict(file) for name, file in self.outputs.items()},
-            "digest": self.digest,
-            **dataclasses.asdict(self.run)}
+            "digest": self.digest, **dataclasses.asdict(self.run)}
         write_json(folder / NAME, {**content, "self": sha256_json(content)})
 
     @classmethod

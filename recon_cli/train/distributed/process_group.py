@@ -15,8 +15,7 @@ from torch import Tensor
 from recon_cli.context import ProcessGroup
 from recon_cli.errors import BackendError, LostError
 
-# The others wait while the leader maps a capture, which takes hours; a process that is gone is
-# noticed by its connection, however long this is.
+# The others wait while the leader maps a capture; a lost process is noticed by its connection
 _PATIENCE = timedelta(days=7)
 _SMALL = 1 << 16  # numbers; sending fewer costs about as much as sending one
 
