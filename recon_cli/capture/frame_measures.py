@@ -110,7 +110,7 @@ def has_content(exposures: NDArray[np.float64]) -> NDArray[np.bool_]:  # [F]
 def check_exposure(
     name: str, exposures: NDArray[np.float64], *, least: int, unit: str = "frames"
 ) -> None:
-    """Raises InputError when fewer than `least` frames (or `unit`) of a capture show anything.
+    """Raises InputError when fewer than `least` of the `unit` of a capture show anything.
 
     `exposures` [F, 3] are rows of `measure_exposure` for all frames that could be read.
     """

@@ -124,8 +124,7 @@ def judge_frames(
     good, possible = sharp & exposed & filled, whole & filled
     usable = bridge_gaps(lengths, sharpness, good, possible)
     reasons = np.select(
-        [usable, ~whole, ~(exposed & filled)],
-        ["", Reason.DAMAGED, Reason.CLIPPED], Reason.BLURRED)
+        [usable, ~whole, ~(exposed & filled)], ["", Reason.DAMAGED, Reason.CLIPPED], Reason.BLURRED)
     refused = tuple(Reason(reason) if reason else None for reason in reasons.tolist())
     return Judgement(usable, usable & ~good, refused)
 

@@ -39,7 +39,7 @@ class ScannedVideo:
 def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
     """Returns a video after a pass over all of its frames; `scan_file` keeps it for a next run.
 
-    InputError if it is no video, gives too few whole frames, shows nothing, or does not move.
+    InputError if it is no video, has too few whole frames, shows nothing, or shows no motion.
     """
     if scan_file.exists():
         scan = Scan.from_json(atomic.read_json(scan_file))

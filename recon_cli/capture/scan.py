@@ -16,7 +16,7 @@ from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.errors import InputError
 
-# B-frames in a row: x264 writes at most 8; HEVC encoders mark whole groups as B.
+# B-frames in a row: x264's presets write up to 8. HEVC encoders mark whole groups as B.
 MAX_B_RUN = 8
 
 

@@ -74,14 +74,12 @@ def sfm(call: Call) -> None:
 
 @verb("train")
 @click.option(
-    "--prune", "with_prune", is_flag=True,
-    help="Also prune in mid-training.  [default: off]")
+    "--prune", "with_prune", is_flag=True, help="Also prune in mid-training.  [default: off]")
 @options.of(
     PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"),
     expert=("max_mb", "rounds", "score", "recovery"), lead="With --prune: ")
 @click.option(
-    "--view", "with_view", is_flag=True,
-    help="Show the training in the browser.  [default: off]")
+    "--view", "with_view", is_flag=True, help="Show the training in the browser.  [default: off]")
 @options.stage(TrainConfig, renders=True)
 @pass_call
 def train(call: Call, with_prune: bool, with_view: bool) -> None:

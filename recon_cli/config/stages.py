@@ -378,8 +378,7 @@ class ComputeConfig(StageConfig):
     """Where the numerical work runs. Recorded in the manifest, never part of a fingerprint."""
 
     device: str = option(
-        "auto", "Device; auto: CUDA if available.",
-        choices=("auto", "cpu", "cuda"), hashed=False)
+        "auto", "Device; auto: CUDA if available.", choices=("auto", "cpu", "cuda"), hashed=False)
     backend: str = option(
         "auto", "Rasterizer; auto: the fastest.",
         choices=("auto", "triton", "numba", "torch"), hashed=False)

@@ -58,7 +58,6 @@ class RenderScores:
 
 
 
-
 def held_out_names(ingest: Path) -> frozenset[str]:
     """Returns the names of the frames that ingest held out for the score."""
     return frozenset(frame.name for frame in read_frame_list(ingest).frames if frame.held_out)

@@ -263,7 +263,7 @@ def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
 def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
     """Returns the rows of every element by its name.
 
-    FormatError if the size of the file is not that of its header, or an element holds lists.
+    FormatError if the size is not what the header says, or an element holds lists, as in a mesh.
     """
     for element in header.elements:
         if element.count and element.row is None:

@@ -177,7 +177,10 @@ def tracked_sequence(
     layout: str, listed: Sequence[PosedImage], folder: Path, lost: int,
     notices: tuple[str, ...] = (),
 ) -> PosedSet:
-    """Returns the `listed` frames of a metric sequence without `lost` ones; InputError if empty."""
+    """Returns the frames of a metric sequence that have a pose; `lost` others have none.
+
+    InputError if no frame has an image and a pose.
+    """
     if not listed:
         raise InputError(
             f"{folder} has no frame with a pose: tracking was lost in all {lost}.",

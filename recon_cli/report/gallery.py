@@ -116,8 +116,7 @@ def build_gallery(
 
 
 def _encode_all(
-    folder: Path, order: Sequence[_ViewScores], encoding: Encoding, budget: int,
-    progress: Progress,
+    folder: Path, order: Sequence[_ViewScores], encoding: Encoding, budget: int, progress: Progress
 ) -> Gallery:
     """Returns as many views as fit, all stored in one way."""
     views: list[GalleryView] = []

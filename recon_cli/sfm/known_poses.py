@@ -78,7 +78,10 @@ def neighbours(
 
 
 def build_known_model(job: MappingJob, report: Reporter) -> Result:
-    """Writes the model of the given cameras into out/model; SfmError if few or they do not fit."""
+    """Writes the model of the given cameras into out/model and returns what it holds.
+
+    SfmError if too few frames have a pose, or the poses do not fit the images.
+    """
     known = _read_poses(job)
     checks.check_registered(job.names, list(known.viewmats), 0.0)
     report.phase("mapping", len(job.names))
@@ -187,8 +190,7 @@ def align_to_given(refined: Poses, given: Poses) -> pycolmap.Sim3d:
     size = float((spread**2).sum())
     scale = float((spread * aim).sum()) / size if size > 0 else 1.0
     return pycolmap.Sim3d(
-        scale, pycolmap.Rotation3d(turn.as_quat()),
-        theirs.mean(axis=0) - scale * ours.mean(axis=0))
+        scale, pycolmap.Rotation3d(turn.as_quat()), theirs.mean(axis=0) - scale * ours.mean(axis=0))
 
 
 def measure_movement(refined: Poses, given: Poses) -> dict[str, float]:

@@ -72,7 +72,7 @@ def _extract_group(job: MappingJob, group: CameraGroup) -> None:
 def _open_for_polling(job: MappingJob) -> pycolmap.Database:
     """Returns a connection that shows how far pycolmap is; to be open longer than its own.
 
-    SQLite locks the file when its last connection closes, maybe just as pycolmap opens it.
+    SQLite locks the file when its last connection closes, perhaps just as pycolmap opens it.
     """
     return pycolmap.Database.open(job.database)
 
