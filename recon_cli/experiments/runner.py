@@ -86,7 +86,7 @@ class ExperimentRequest:
     def load(
         self, paths: Mapping[str, Path], scratch: Path, split: str, progress: Progress
     ) -> tuple[Host, list[LoadedScene]]:
-        """Returns this machine and the scenes, data sets opened in `scratch`; scores `split`."""
+        """Returns this machine and the scenes; data sets become workspaces in `scratch`."""
         ctx = render_context(self.compute, progress)
         host = examine(ctx.threads, ctx.device)
         return host, [load_for_training(

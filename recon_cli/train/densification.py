@@ -117,9 +117,9 @@ class BudgetRule:
 def densify_budget(
     splats: Splats, score: Tensor, rule: BudgetRule, generator: torch.Generator
 ) -> tuple[Splats, Tensor]:
-    """Returns the new Gaussians, split with a probability proportional to `score` [N].
+    """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones.
 
-    With the old row [M] that each continues, -1 for new ones.
+    The probability of a split is proportional to `score` [N], the error that each is to blame for.
     """
     splats = decay_opacities(splats, rule.decay)
     alive = splats.opacities >= rule.min_opacity

@@ -91,7 +91,7 @@ def estimate_gains(
     """Returns the log-gain of each view from the colours that points have in several views.
 
     Weighted least squares over pairs: the median log-ratio of the points that two views share
-    should be the difference of their log-gains. A seeded draw of 4,000 points is taken.
+    should be the difference of their log-gains. Of more than 4,000 points a seeded draw is taken.
     """
     if len(points) > _POINTS:
         chosen = np.random.default_rng(seed).permutation(len(points))[:_POINTS]

@@ -67,7 +67,7 @@ def first_state(
     most: int,
     far: FarContent | None = None,
 ) -> TrainState:
-    """Returns the first state of a run: `most` Gaussians at points, and the background `far`."""
+    """Returns the first state of a run: `most` Gaussians, some of them the background `far`."""
     config = task.schedule.config
     if config.far != "on":
         far = None

@@ -235,8 +235,8 @@ def _follow_rows(moment: Tensor, source: Tensor, like: Tensor) -> Tensor:
 class SparseAdam:
     """Adam (Kingma and Ba 2015, algorithm 1) that counts the steps of each row on its own.
 
-    A row that was stepped for the first time moves by its rate, however late that is. `value` [F,
-    D] is float64 and on the CPU, so that it is the same whatever the device.
+    A row that was stepped for the first time moves by its rate, however late that is. The table
+    `value` is [F, D] float64 on the CPU, so that it is the same whatever the device.
     """
 
     def __init__(self, start: Tensor) -> None:

@@ -101,7 +101,7 @@ def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
 def make_plan(
     asked: TrainConfig, facts: Facts, cost: CostModel, *, spent: float = 0.0
 ) -> TrainPlan:
-    """Returns the plan; with --minutes, the calibration and the seconds `spent` on trials count."""
+    """Returns the plan; --minutes include the calibration and the seconds `spent` on trials."""
     def at(iterations: int) -> TrainPlan:
         most = cap(asked, facts, iterations)
         config = _fill_in(asked, iterations, most, first_config(asked).max_size)
