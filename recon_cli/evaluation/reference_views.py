@@ -57,7 +57,6 @@ class RenderScores:
     render_ms: float  # median milliseconds a view
 
 
-
 def held_out_names(ingest: Path) -> frozenset[str]:
     """Returns the names of the frames that ingest held out for the score."""
     return frozenset(frame.name for frame in read_frame_list(ingest).frames if frame.held_out)
