@@ -14,6 +14,8 @@ import pytest
 
 from recon_cli.io.ply import read_ply
 
+pytestmark = pytest.mark.integration
+
 SETTINGS = """
 [ingest]
 frames = 24
@@ -100,7 +102,6 @@ def test_a_second_run_has_nothing_to_do(finished):
     assert (finished / "train" / "manifest.json").stat().st_mtime_ns == before
 
 
-@pytest.mark.integration
 def test_killed_in_every_stage_it_ends_with_the_same_scene(finished, tmp_path, sample_video):
     workspace = make_workspace(tmp_path / "workspace")
     killed = []

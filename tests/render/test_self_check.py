@@ -28,6 +28,7 @@ def test_the_numba_kernels_pass_far_from_what_is_allowed():
         assert any(key.startswith(name) for key in verdict.errors), name
 
 
+@pytest.mark.slow
 def test_the_triton_kernels_pass():
     pytest.importorskip("triton", reason="triton is not installed")
     verdict = check(

@@ -14,6 +14,8 @@ from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import _parts
 from recon_cli.train.schedule import RecoverySchedule
 
+pytestmark = pytest.mark.integration
+
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 every_strategy = pytest.mark.parametrize("name", STRATEGIES)
 two = pytest.mark.parametrize("others", [2], indirect=True)
@@ -191,7 +193,6 @@ def test_processes_that_part_are_stopped(others, densify_every):
     others.fit(first_state(config), tiny_task(config), 3)
 
 
-@pytest.mark.integration
 @three
 def test_a_process_may_have_no_view_of_a_step(others):
     config = batched(2)
