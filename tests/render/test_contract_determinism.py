@@ -30,6 +30,12 @@ def everything(case, splats, camera):
     return {name: value.detach().cpu() for name, value in found.items()}
 
 
+def scene_for(case):
+    """Returns a scene and its camera, smaller for an interpreter, which takes minutes else."""
+    count, width, height = (600, 45, 35) if case.interpreted else (3000, 90, 70)
+    return random_splats(count, seed=2), camera_at(width, height)
+
+
 @pytest.fixture
 def threads():
     """Sets the number of threads, and puts it back."""
@@ -48,7 +54,7 @@ def test_the_same_input_gives_the_same_bits(case):
 
 @pytest.mark.parametrize("case", at_size([c for c in CASES if c.device == "cpu"]), ids=str)
 def test_the_number_of_threads_changes_nothing(case, threads):
-    splats, camera = random_splats(3000, seed=2), camera_at(90, 70)
+    splats, camera = scene_for(case)
     found = {}
     for count in THREADS:
         threads(count)
@@ -80,7 +86,7 @@ def test_the_order_of_the_gaussians_does_not_matter(case):
 def test_a_picture_does_not_remember_the_one_before_it(case):
     splats, small = random_splats(100, seed=4), camera_at(20, 20)
     alone = everything(case, splats, small)
-    everything(case, random_splats(800, seed=5), camera_at(120, 90))  # leaves larger buffers
+    everything(case, *scene_for(case))  # leaves larger buffers
     again = everything(case, splats, small)
     for name, value in alone.items():
         assert torch.equal(value, again[name]), name

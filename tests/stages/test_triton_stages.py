@@ -25,8 +25,8 @@ pytestmark = pytest.mark.slow
 
 ON_TRITON = replace(CONTEXT, backend="triton", device=DEVICE)
 CONFIG = RunConfig(
-    iterations=12, densify_every=4, max_gaussians=80, sh_degree=0, far="off", exposure="off",
-    poses="off", images="original", checkpoint_every=5, early_stop=False)
+    iterations=8, densify_every=4, max_gaussians=80, sh_degree=0, far="off", exposure="off",
+    poses="off", images="original", checkpoint_every=3, early_stop=False)
 FILES = ("splats.ply", "mid.safetensors", "final.safetensors")
 
 
