@@ -189,7 +189,8 @@ def _restore_scheduling() -> Iterator[None]:
     try:
         yield
     finally:
-        os.sched_setscheduler(0, policy, parameters)
+        if os.sched_getscheduler(0) != policy:
+            os.sched_setscheduler(0, policy, parameters)
 
 
 def _configure(context: VideoCodecContext, encoding: VideoEncoding) -> None:
