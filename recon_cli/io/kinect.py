@@ -83,8 +83,9 @@ def read_seven_scenes(folder: Path) -> PosedSet:
     """
     colors = {int(match[1]): path for path in sorted(folder.iterdir())
               if (match := _COLOR.fullmatch(path.name))}
-    poses = {number: path for number in colors
-             if (path := folder / f"frame-{number:06d}.pose.txt").is_file()}
+    stems = {number: path.name.split(".")[0] for number, path in colors.items()}
+    poses = {number: path for number, stem in stems.items()
+             if (path := folder / f"{stem}.pose.txt").is_file()}
     if not poses:
         raise InputError(
             f"{folder} has {len(colors)} frames like frame-000000.color.png, none of them with a "
@@ -95,7 +96,7 @@ def read_seven_scenes(folder: Path) -> PosedSet:
         viewmat = read_pose(poses[number])
         if viewmat is None:
             continue
-        path = folder / f"frame-{number:06d}.depth.png"
+        path = folder / f"{stems[number]}.depth.png"
         depth = DepthFile(path, _MILLIMETRE, lens, depth_lens, unknown=_UNKNOWN)
         listed.append(PosedImage(
             colors[number].name, colors[number], lens, viewmat,

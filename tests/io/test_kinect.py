@@ -26,6 +26,16 @@ def test_depth_is_in_millimetres_and_unknown_where_it_is_65535(tmp_path):
     np.testing.assert_allclose(depth[2:, 3:], expected[2:, 3:], atol=0.0006)
 
 
+def test_numbers_may_have_any_count_of_digits(tmp_path):
+    folder = posed_sets.make_seven_scenes(tmp_path)
+    for path in list(folder.glob("frame-*")):
+        path.rename(folder / path.name.replace("frame-0000", "frame-"))
+    posed = read_seven_scenes(folder)
+    assert [image.name for image in posed.images] == [
+        "frame-00.color.png", "frame-02.color.png", "frame-03.color.png"]
+    assert all(image.depth is not None for image in posed.images)
+
+
 def test_intrinsics_may_lie_one_level_up(tmp_path):
     folder = posed_sets.make_seven_scenes(tmp_path / "seq-01")
     (folder / "camera-intrinsics.txt").rename(tmp_path / "camera-intrinsics.txt")
