@@ -215,6 +215,7 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
     part = keep_trusted_part(job, model, verdict)
     if part is not None:
         model, verdict = part.candidate.model, part.candidate.verdict
+        folder = fresh_folder(job.attempts / "trusted")
         model.write(folder)
     described = mapper.describe_model(model)
     checks.check_parallax(described["median_triangulation_angle_deg"])

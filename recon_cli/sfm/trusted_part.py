@@ -68,7 +68,8 @@ def _describe_runs(job: MappingJob, names: Collection[str]) -> list[str]:
     for inside, run in itertools.groupby(job.names, key=lambda name: name in names):
         if not inside:
             continue
-        first, *_, last = *(listed := list(run)), listed[-1]
+        stretch = list(run)
+        first, last = stretch[0], stretch[-1]
         text = first if first == last else f"{first} to {last}"
         seconds = [job.times[name] % CLIP_SECONDS for name in (first, last) if name in job.times]
         stretches.append(
