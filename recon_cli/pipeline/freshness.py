@@ -155,7 +155,8 @@ class WorkspaceCheck:
         reasons += differences(manifest.key, expected, section=layers.section_of(row.config))
         reasons += find_changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)
         try:  # another version may have written another record
-            row.summary.from_json(manifest.run.summary)
+            summary = row.summary.from_json(manifest.run.summary)
+            reasons += summary.contradictions(dataclasses.asdict(config))
         except ManifestError as error:
             reasons.append(error.message)
         return StageCheck(row, manifest, tuple(reasons), gone, self._resumable(row))

@@ -27,6 +27,10 @@ _SCALARS: Mapping[Any, tuple[type, ...]] = {
 class JsonRecord:
     """A frozen dataclass of JSON values, tuples of them and other such records."""
 
+    def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG002
+        """Returns why `options` that take no part in the fingerprint would give another result."""
+        return ()
+
     def to_json(self) -> dict[str, Any]:
         """Returns JSON values that `from_json` reads; tuples become lists."""
         value = {}
@@ -210,6 +214,14 @@ class SfmSummary(JsonRecord):
     world: WorldSummary
     cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
     left_out: tuple[str, ...] = ()  # names of the frames whose part of the model is not trusted
+
+    def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:
+        """Returns a reason if a part of a broken model was kept, but the options forbid that.
+
+        They are not hashed, so that a refused run can go on with other ones.
+        """
+        forbids = options["accept_weak"] or not options["partial"]
+        return ("it keeps a part of a broken model",) if self.left_out and forbids else ()
 
     @property
     def trusted(self) -> bool | None:

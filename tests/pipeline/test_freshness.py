@@ -100,6 +100,17 @@ def test_a_result_whose_record_another_version_wrote_is_stale(job: Job) -> None:
     assert reason.startswith("the record lacks kind, declared_frames")
 
 
+def test_an_option_that_a_result_contradicts_makes_it_stale_though_it_is_not_hashed(
+    job: Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fake_stages.FakeSummary, "contradictions", lambda _, options: (
+        ("it is only a part",) if options.get("accept_weak") else ()))
+    assert stale(job) == {}
+    changed = stale(job_at(job.workspace.root, {"sfm": {"accept_weak": True}}))
+    assert list(changed) == AFTER["sfm"]
+    assert changed["sfm"] == ("it is only a part",)
+
+
 def test_an_option_that_no_longer_exists_makes_its_stage_stale(job: Job) -> None:
     record_options(job, swarm_size=0.1)
     changed = stale(job)

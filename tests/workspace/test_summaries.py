@@ -71,3 +71,14 @@ def test_the_world_is_read_from_the_folder_of_sfm(tmp_path):
     assert WorldSummary.read(tmp_path) is None
     (tmp_path / "world.json").write_text(json.dumps(summaries.WORLD.to_json()))
     assert WorldSummary.read(tmp_path) == summaries.WORLD
+
+
+@pytest.mark.parametrize(("options", "contradicted"), [
+    ({"accept_weak": False, "partial": True}, False),
+    ({"accept_weak": True, "partial": True}, True),
+    ({"accept_weak": False, "partial": False}, True)])
+def test_a_part_of_a_broken_model_contradicts_options_that_keep_all_or_nothing(
+    options, contradicted
+):
+    assert bool(replace(MAPPED, left_out=("d.png",)).contradictions(options)) == contradicted
+    assert MAPPED.contradictions(options) == ()
