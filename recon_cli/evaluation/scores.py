@@ -98,6 +98,20 @@ class Metrics(JsonRecord):
     unregistered_test: tuple[str, ...]  # held-out frames without a camera
     masked_out_test: tuple[str, ...] | None = None  # held-out frames whose masks leave too little
     imported_from: str | None = None  # name of the file of an imported scene
+    frames: int | None = None  # of ingest; None, as the next two, in files of older versions
+    training_views: int | None = None  # None for an imported scene, too
+    unregistered: tuple[str, ...] | None = None  # names of all frames without a camera
+
+    @property
+    def coverage(self) -> str:
+        """How much of the capture the scores stand for; empty if all of it, or if not known."""
+        if self.frames is None or not self.unregistered:
+            return ""
+        trained = "" if self.training_views is None else (
+            f"trained on {self.training_views} of {self.frames} frames; ")
+        left_out, held_out = len(self.unregistered), len(self.unregistered_test)
+        return (f"{trained}{left_out} frames left out, as they have no camera that can be trusted, "
+                f"{held_out or 'none'} of them held out{' and so not scored' * bool(held_out)}")
 
     @classmethod
     def read(cls, evaluate: Path) -> Self:

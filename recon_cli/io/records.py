@@ -8,7 +8,8 @@ writes import.json beside the scene. A masked frame has a mask of its name in ma
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,29 @@ def read_frame_list(stage: Path) -> FrameList:
         return FrameList(**value, groups=groups, frames=frames)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{stage / LIST} is no list of frames.", hint=AGAIN) from error
+
+
+def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[str]:
+    """Returns the runs of frames in a row that have one of these names, with their seconds.
+
+    A run ends with its video; where there are several videos, each is named.
+    """
+    videos = {frame.source for frame in frames if frame.time_seconds is not None}
+    runs = itertools.groupby(frames, key=lambda frame: (
+        frame.name in names, frame.source if frame.source in videos else ""))
+    stretches = []
+    for (named, video), run in runs:
+        if not named:
+            continue
+        stretch = list(run)
+        first, last = stretch[0], stretch[-1]
+        text = first.name if first is last else f"{first.name} to {last.name}"
+        if first.time_seconds is not None and last.time_seconds is not None:
+            seconds = (f"{first.time_seconds:.1f}" if first is last
+                       else f"{first.time_seconds:.1f} to {last.time_seconds:.1f}")
+            text += f" ({seconds} s{f' of {video}' if len(videos) > 1 else ''})"
+        stretches.append(text)
+    return stretches
 
 
 def _group(value: dict[str, Any]) -> Group:

@@ -18,10 +18,10 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from recon_cli.config.stages import TrainConfig
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, list_names
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fit_image, read_png
-from recon_cli.io.records import FOLDER, Frame, read_frame_list
+from recon_cli.io.records import FOLDER, Frame, describe_stretches, read_frame_list
 from recon_cli.report.chart import draw_mark, legend_item
 from recon_cli.report.gallery import data_uri, encode_sheet
 from recon_cli.report.stage_status import StageReports
@@ -31,6 +31,7 @@ from recon_cli.workspace.summaries import SfmSummary
 
 _SHEETS = 4  # contact sheets on the page; a capture may have many sources
 _THUMBS, _THUMB_SIDE, _THUMB_QUALITY = 24, 220, 72
+_STRETCHES = 30  # of frames that are left out, by name
 _STRIP_HEIGHT = 34  # pixels of the strip of frames
 WIDTH = 640  # pixels of plan and strip; the page scales them
 _MAX_HEIGHT = 560
@@ -42,7 +43,7 @@ _MANY_CAMERAS = 150  # from which on marks are smaller
 _BAR = 0.25  # of the width that the scale bar takes at most
 # (color, mark) of the page's charts; green and blue are those of the contact sheet
 PARTS = {"training": (2, "circle"), "validation": (5, "square"), "held out": (0, "diamond")}
-LOST = (3, "cross")
+MISSING = {"left out": (1, "plus"), "lost": (3, "cross")}
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class Capture:
     plan: Markup | None  # None without a mapping to draw
     notes: tuple[str, ...]  # on the plan
     strip: Markup | None  # all frames in order
+    left_out: str  # which frames are left out with a part that is not trusted; empty if none
     legend: Markup | None  # of plan and strip
     damaged: tuple[str, ...]  # why something is not shown
 
@@ -82,15 +84,26 @@ def read_capture(stages: StageReports) -> Capture:
             scene = _read_scene(stages, frames)
         except (FormatError, OSError) as error:
             damaged.append(f"The plan is not shown: {error}")
-    plan, notes = _draw_plan(scene, stages["sfm"].read_summary(SfmSummary)) if scene else (None, ())
+    sfm = stages["sfm"].read_summary(SfmSummary)
+    left_out = sfm.left_out if sfm else ()
+    plan, notes = _draw_plan(scene, sfm) if scene else (None, ())
     by_name = {view.name: part for part, views in by_part(scene).items()
                for view in views} if scene else {
         frame.name: "held out" if frame.held_out else "training" for frame in frames}
-    parts = [by_name.get(frame.name, "lost") for frame in frames]
+    missing = dict.fromkeys(left_out, "left out")
+    parts = [by_name.get(frame.name, missing.get(frame.name, "lost")) for frame in frames]
     return Capture(
         tuple(sheets), more, tuple(thumbs), plan, notes,
-        _draw_strip(frames, parts) if frames else None, _draw_legend(parts) if frames else None,
-        tuple(damaged))
+        _draw_strip(frames, parts) if frames else None, _describe_left_out(frames, left_out),
+        _draw_legend(parts) if frames else None, tuple(damaged))
+
+
+def _describe_left_out(frames: Sequence[Frame], names: Sequence[str]) -> str:
+    """Returns where in the capture the frames are that have no camera to trust."""
+    held_out = sum(frame.held_out for frame in frames if frame.name in names)
+    stretches = list_names(describe_stretches(frames, names), _STRETCHES)
+    return (f"{len(names):,} frames are left out, as their cameras could not be trusted, "
+            f"{held_out or 'none'} of them held out: {stretches}.") if stretches else ""
 
 
 def _read_scene(stages: StageReports, frames: Sequence[Frame]) -> Scene:
@@ -119,14 +132,14 @@ def _draw_plan(scene: Scene, sfm: SfmSummary | None) -> tuple[Markup, tuple[str,
 def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
     """Returns one bar for each frame in order; held-out and lost frames are taller."""
     step, bars = WIDTH / len(frames), []
-    heights = {"training": 14, "validation": 20, "held out": 28, "lost": 28}
+    heights = {"training": 14, "validation": 20, "held out": 28, "left out": 28, "lost": 28}
     for i, (frame, part) in enumerate(zip(frames, parts, strict=True)):
-        color = (PARTS.get(part) or LOST)[0]
+        color = {**PARTS, **MISSING}[part][0]
         time = "" if frame.time_seconds is None else f", {frame.time_seconds:g} s"
         bars.append(Markup(
             '<rect class="part c{}{}" x="{:.2f}" y="{}" width="{:.2f}" height="{}">'
             "<title>{}</title></rect>").format(
-                color, " hollow" if part == "lost" else "", i * step,
+                color, " hollow" if part in MISSING else "", i * step,
                 _STRIP_HEIGHT - heights[part], max(0.6, 0.8 * step), heights[part],
                 f"{frame.name} ({part}{time})"))
     return Markup(
@@ -138,8 +151,9 @@ def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
 def _draw_legend(parts: Sequence[str]) -> Markup:
     counts = Counter(parts)
     texts = {"training": "training", "validation": "validation (never trained on, steers progress)",
-             "held out": "held out (only scored)", "lost": "without a camera"}
-    marks = {**PARTS, "lost": LOST}
+             "held out": "held out (only scored)", "lost": "without a camera",
+             "left out": "left out, with a camera that is not trusted"}
+    marks = {**PARTS, **MISSING}
     return Markup('<ul class="legend">{}</ul>').format(Markup("").join(
         legend_item(f"{counts[part]:,} {texts[part]}", draw_mark(shape, 13, 7, 4.5, color))
         for part, (color, shape) in marks.items() if part in counts))

@@ -72,8 +72,11 @@ def judge_poses(sfm: StageReport) -> PosesVerdict:
     if summary is None:
         return PosesVerdict("unknown", "The camera poses are from another version of recon.")
     count = f"{summary.registered:,} of {summary.frames:,} frames have a camera"
-    lines = (*summary.lines, *(f"{name} was removed from the model: {reason}."
-                               for name, reason in summary.rejected.items()))
+    left_out = len(summary.left_out)
+    # the first line repeats the verdict, except where it says why only a part is kept
+    repeated = 1 if summary.verdict is not None and not left_out else 0
+    lines = (*summary.lines[repeated:], *(f"{name} was removed from the model: {reason}."
+                                          for name, reason in summary.rejected.items()))
     if summary.apart:
         counts = ", ".join(str(len(part)) for part in summary.apart)
         lines += (f"The capture has disconnected parts; left out are parts of {counts} frames.",)
@@ -81,9 +84,13 @@ def judge_poses(sfm: StageReport) -> PosesVerdict:
     if summary.trusted is None:
         whose = "; the poses came with the data set" if summary.poses else ""
         return PosesVerdict("unknown", f"{count}{whose}.", lines)
-    if summary.trusted:
-        return PosesVerdict("good", f"The camera poses can be trusted: {count}.", lines[1:])
-    return PosesVerdict("warn", f"The camera poses cannot be trusted, although {count}.", lines[1:])
+    if not summary.trusted:
+        return PosesVerdict("warn", f"The camera poses cannot be trusted, although {count}.", lines)
+    if left_out:
+        return PosesVerdict("warn", (
+            f"Only a part of the capture is kept, whose camera poses can be trusted: {count}; "
+            f"{left_out:,} are left out whose cameras could not be trusted."), lines)
+    return PosesVerdict("good", f"The camera poses can be trusted: {count}.", lines)
 
 
 def _build_tiles(stages: StageReports, metrics: Metrics | None) -> Iterator[Tile]:
@@ -95,6 +102,8 @@ def _build_tiles(stages: StageReports, metrics: Metrics | None) -> Iterator[Tile
     cameras = sfm.read_summary(SfmSummary)
     share = (f"{cameras.registered / cameras.frames:.0%} of the frames"
              if cameras and cameras.frames else "")
+    if cameras and cameras.left_out:
+        share += f", {len(cameras.left_out):,} left out"
     yield _stage_tile(
         sfm, "registered", f"{cameras.registered:,}" if cameras else _LACKING, share)
     pruned = f"pruned {_count(prune, PruneSummary)}" if prune.there else ""

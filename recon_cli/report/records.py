@@ -70,7 +70,7 @@ class Scores:
 def build_scores(metrics: Metrics) -> Scores:
     """Returns the tables of the scores of evaluate."""
     models = {key: metrics.models[key] for key in MODELS if key in metrics.models}
-    notes = []
+    notes = [f"{metrics.coverage[0].upper()}{metrics.coverage[1:]}."] if metrics.coverage else []
     if metrics.unregistered_test:
         notes.append(f"{len(metrics.unregistered_test)} held-out frames have no camera and are not "
                      f"scored: {', '.join(metrics.unregistered_test)}.")

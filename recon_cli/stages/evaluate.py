@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import EvaluateConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.errors import list_names
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
     CONVENTION_LINES,
@@ -50,7 +51,7 @@ from recon_cli.evaluation.scores import (
 )
 from recon_cli.io.images import to_uint8, write_png
 from recon_cli.io.ply import read_ply
-from recon_cli.io.records import ImportRecord
+from recon_cli.io.records import Frame, ImportRecord, describe_stretches, read_frame_list
 from recon_cli.scene.scene import Scene
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
@@ -61,6 +62,7 @@ _GAIN = 4  # of the difference images
 _ANY_ITERATION = 1 << 62  # beyond the last
 _SEEN_VIEWS = 20  # training and validation views that are also scored, at most
 _STAGES = {"base": "train", "pruned": "prune"}  # by model
+_STRETCHES = 5  # of frames that are left out, in the tables
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class _Evaluation:
     folders: Mapping[str, Path]  # of train and prune, by model
     config: RunConfig  # of the training
     import_record: ImportRecord | None
+    frames: Sequence[Frame]  # all of ingest
     scene: Scene
     held_out: Sequence[ReferenceView]
     training_views: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
@@ -112,6 +115,16 @@ class _Evaluation:
             "test_views": len(self.held_out),
             "unregistered_test": tuple(self.scene.unregistered_test),
             "masked_out_test": tuple(sorted(hidden)) or None}
+
+    def coverage(self) -> dict[str, Any]:
+        """Returns how many frames there are and were trained on, and which have no camera."""
+        scene = self.scene
+        registered = {view.name for view in (*scene.train, *scene.validation, *scene.test)}
+        return {
+            "frames": len(self.frames),
+            "training_views": None if self.import_record else len(scene.train),
+            "unregistered": tuple(
+                frame.name for frame in self.frames if frame.name not in registered)}
 
     def note(self, lacking: str) -> str:
         """Returns what the figures of the tables mean; `lacking` is why there is no LPIPS."""
@@ -168,8 +181,8 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
     folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
     return _Evaluation(
-        out, folders, train_config, ImportRecord.read(inputs.folders["train"]), scene, held_out,
-        training_views, ctx)
+        out, folders, train_config, ImportRecord.read(inputs.folders["train"]),
+        read_frame_list(inputs.folders["ingest"]).frames, scene, held_out, training_views, ctx)
 
 
 def _save_pictures(out: Path, model: str, view: ReferenceView, image: NDArray[np.float32]) -> None:
@@ -197,7 +210,7 @@ def _write(
     differences = {key: _difference(models, key) for key in ("psnr_db", "ssim")} if len(
         models) == 2 else {}
     masked = any(view.mask is not None for view in held_out)
-    write_json(out / Metrics.FILE, Metrics(
+    metrics = Metrics(
         models=models,
         pruned_minus_base=differences or None,
         **CONVENTIONS,
@@ -206,9 +219,13 @@ def _write(
         truth_digest=reference_digest(held_out),
         **size_summary([view.camera for view in held_out]), **evaluation.counts(),
         imported_from=evaluation.import_record.file if evaluation.import_record else None,
-    ).to_json())
+        **evaluation.coverage())
+    write_json(out / Metrics.FILE, metrics.to_json())
     by_label = {LABELS[name]: model for name, model in models.items()}
     note = evaluation.note(lacking)
+    if metrics.coverage:
+        stretches = describe_stretches(evaluation.frames, metrics.unregistered or ())
+        note += f"{metrics.coverage}: {list_names(stretches, _STRETCHES)}\n"
     for label, model in by_label.items():
         if model.gain_psnr_db is not None:
             note += (f"{label}, after the best gain per channel of each view: "

@@ -13,6 +13,7 @@ from recon_cli.io.records import (
     FrameList,
     Group,
     choose_held_out,
+    describe_stretches,
     prepare_frames_folder,
     read_frame_list,
 )
@@ -82,3 +83,18 @@ def test_leftovers_of_a_killed_run_are_cleared_and_frames_are_kept(tmp_path):
     (tmp_path / ".frames.json.tmp123.json").write_bytes(b"half")
     assert prepare_frames_folder(tmp_path) == folder
     assert [path.name for path in tmp_path.rglob("*")] == ["frames", "000001.png"]
+
+
+def test_stretches_end_where_a_frame_is_not_named_or_its_video_ends():
+    def frame(name, seconds, source="a.mp4"):
+        return Frame(name, seconds, source, None, held_out=False)
+
+    first = [frame(f"{i}.png", i / 2) for i in range(5)]
+    assert describe_stretches(first, ["1.png", "2.png", "4.png", "gone.png"]) == [
+        "1.png to 2.png (0.5 to 1.0 s)", "4.png (2.0 s)"]
+    both = [*first, frame("5.png", 0.0, "b.mp4"), frame("6.png", 0.5, "b.mp4")]
+    assert describe_stretches(both, ["4.png", "5.png", "6.png"]) == [
+        "4.png (2.0 s of a.mp4)", "5.png to 6.png (0.0 to 0.5 s of b.mp4)"]
+    photos = [frame(f"{i}.png", None, f"{i}.jpg") for i in range(3)]
+    assert describe_stretches(photos, ["1.png", "2.png"]) == ["1.png to 2.png"]
+    assert describe_stretches(photos, []) == []

@@ -189,6 +189,36 @@ def test_frames_without_a_camera_are_lost_in_the_legend(workspace):
     assert "000099.png (lost" in capture
 
 
+def test_a_part_that_was_left_out_is_said_with_its_place_in_the_video(workspace):
+    added = [f"00009{i}.png" for i in range(4)]
+
+    def add_frames(value):
+        value["frames"] += [
+            {**value["frames"][-1], "name": name, "time_seconds": 9 + i / 2, "held_out": i == 1}
+            for i, name in enumerate(added)]
+
+    change(workspace / "ingest" / "frames.json", add_frames)
+    manifest = Manifest.read(workspace / "sfm")
+    broken = "The model is broken between 000008.png and 000090.png."
+    summary = {**manifest.run.summary, "left_out": added[:3],
+               "lines": [broken, *manifest.run.summary["lines"]]}
+    dataclasses.replace(
+        manifest, run=dataclasses.replace(manifest.run, summary=summary)).write(workspace / "sfm")
+    change(workspace / "evaluate" / "metrics.json", lambda value: value.update(
+        frames=16, training_views=8, unregistered=added, unregistered_test=added[1:2]))
+    page = page_of(workspace)
+    assert "3 left out</dd>" in page
+    assert broken in section(page, "overview")
+    capture = section(page, "capture")
+    assert ("3 frames are left out, as their cameras could not be trusted, 1 of them held out: "
+            "000090.png to 000092.png (9.0 to 10.0 s).") in capture
+    assert "3 left out, with a camera that is not trusted" in capture
+    assert "1 without a camera" in capture
+    assert "000091.png (left out, 9.5 s)" in capture
+    assert ("Trained on 8 of 16 frames; 4 frames left out, as they have no camera that can be "
+            "trusted, 1 of them held out and so not scored.") in section(page, "scores")
+
+
 @pytest.mark.parametrize("place", ["train/report.html", "evaluate/truth/a.html", ".partial/a.html"])
 def test_a_page_in_the_folder_of_a_stage_is_refused(workspace, place, capsys):
     assert report(workspace, "-o", workspace / place) == 2

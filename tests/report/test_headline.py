@@ -47,6 +47,17 @@ def test_what_was_left_out_of_the_model_is_said():
     assert "The capture has disconnected parts; left out are parts of 2 frames." in verdict.lines
 
 
+def test_a_part_that_is_kept_is_warned_of_with_what_was_broken():
+    broken = "The model is broken. Left out are 3: b.png to d.png."
+    verdict = judge_poses(sfm(
+        verdict={"trusted": True}, lines=[broken, "9 of 12 images have a camera."],
+        left_out=["b.png", "c.png", "d.png"]))
+    assert verdict.level == "warn"
+    assert "Only a part of the capture is kept" in verdict.text
+    assert "9 of 12 frames have a camera; 3 are left out" in verdict.text
+    assert verdict.lines[0] == broken
+
+
 @pytest.mark.parametrize(("name", "value", "expected"), [
     ("validation_psnr_db", 31.9637, ("validation PSNR", "31.96 dB")),
     ("validation_psnr_db_before", 31.9637, ("validation PSNR before", "31.96 dB")),

@@ -120,6 +120,34 @@ def test_a_held_out_frame_without_a_camera_is_named(inputs, tmp_path, caplog):
     assert "999999.png" in caplog.text
 
 
+def test_frames_that_sfm_left_out_are_counted_and_placed(inputs, tmp_path):
+    folder = tmp_path / "ingest"
+    shutil.copytree(inputs.folders["ingest"], folder)
+    frames = json.loads((folder / "frames.json").read_text())
+    added = [f"99999{i}.png" for i in range(3)]
+    frames["frames"] += [
+        {**frames["frames"][0], "name": name, "time_seconds": 20 + i, "held_out": i == 2}
+        for i, name in enumerate(added)]
+    (folder / "frames.json").write_text(json.dumps(frames))
+    run(evaluate, EvaluateConfig(), StageInputs({**inputs.folders, "ingest": folder}),
+        tmp_path / "out")
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    train = VIEWS - VIEWS // 4 - 1  # one is for validation
+    assert (metrics["frames"], metrics["training_views"]) == (VIEWS + 3, train)
+    assert metrics["unregistered"] == added
+    line = (f"trained on {train} of {VIEWS + 3} frames; 3 frames left out, as they have no camera "
+            "that can be trusted, 1 of them held out and so not scored: "
+            "999990.png to 999992.png (20.0 to 22.0 s)\n")
+    for name in ("table.txt", "metrics.md"):
+        assert line in (tmp_path / "out" / name).read_text()
+
+
+def test_where_every_frame_has_a_camera_nothing_is_said_to_be_left_out(inputs, tmp_path):
+    run(evaluate, EvaluateConfig(), inputs, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["unregistered"] == []
+    assert "left out" not in (tmp_path / "out" / "table.txt").read_text()
+
+
 def test_views_too_small_to_score_are_a_usage_error(inputs, tmp_path, monkeypatch):
     monkeypatch.setattr(reference_views, "MIN_SIDE", 13)  # 16 pixels wide are 12 high here
     with pytest.raises(ConfigError, match="16x12 pixels are too small") as caught:
