@@ -40,6 +40,7 @@ class MotionMeter:
         self._anchor: NDArray[np.uint8] | None = None
         self._corners: NDArray[np.float32] | None = None
         self._reached = 0.0  # furthest displacement from the anchor so far
+        self.followed = 0.0  # share of the anchor's corners that the last frame shows
 
     def advance(self, gray: NDArray[np.uint8]) -> float:
         """Returns how much further from the anchor this frame is than any frame since the anchor.
@@ -71,6 +72,7 @@ class MotionMeter:
 
     def _displacement(self, small: NDArray[np.uint8]) -> float:
         """Returns the median displacement of the anchor's corners, NaN where most are lost."""
+        self.followed = 0.0
         if self._corners is None or len(self._corners) < MIN_TRACKS:
             return float("nan")
         tracked, forward, _ = cv2.calcOpticalFlowPyrLK(
@@ -80,6 +82,7 @@ class MotionMeter:
         # Tracking a corner back must end where it began; on a blank wall the tracker slides.
         error = np.linalg.norm((returned - self._corners).reshape(-1, 2), axis=1)
         good = (forward & backward)[:, 0].astype(bool) & (error <= RETURN_ERROR)
+        self.followed = float(good.mean())
         if good.sum() < MIN_TRACKS:
             return float("nan")
         steps = np.linalg.norm((tracked - self._corners)[good].reshape(-1, 2), axis=1)

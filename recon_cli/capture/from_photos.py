@@ -1,9 +1,14 @@
-"""Frames of photos: all that can be read and show a view of their own."""
+"""Frames of photos: all that can be read and show a view of their own.
+
+Photos that are plainly the frames of a video are chosen like those, in `photo_sequence`.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +16,12 @@ from numpy.typing import NDArray
 
 from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
+from recon_cli.capture.frame_selection import FrameCandidate, Reason
 from recon_cli.capture.from_video import report_reduced
 from recon_cli.capture.images import Photo, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
+from recon_cli.capture.photo_sequence import PhotoSequence, choose_from_sequence, find_sequence
 from recon_cli.capture.photos import (
     PhotoFolder,
     PhotoGroup,
@@ -34,6 +41,8 @@ from recon_cli.io.records import Frame, Group
 from recon_cli.workspace import atomic
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
+SCAN = "scan.json"  # the measures of photos that are frames of a video, for the next run
+Record = tuple[FrameCandidate, ...]  # what became of every photo, in order
 
 
 def ingest(
@@ -50,29 +59,24 @@ def ingest(
     plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _drop_raw_twins(folder.photos, plan, ctx)
     masks = _find_masks(paths, photos, ctx)
-    names = [f"{prefix}{name}" for name in make_frame_names([photo.path.stem for photo in photos])]
-    measures, unreadable = _write_photos(
-        dict(zip(names, photos, strict=True)), masks.by_photo, plan, out, config.max_size, ctx)
-    broken = folder.broken | unreadable
-    readable = sum(photo is not None for photo in measures)
-    check_count(path, readable, broken)
-    for reason in list(broken.values())[:frame_selection.NAMED]:
-        ctx.notice(f"A photo is left out: {reason}")
-    if (more := len(broken) - frame_selection.NAMED) > 0:
-        ctx.notice(f"{more} more photos are left out for similar reasons.")
-    record = frame_selection.choose_photos(
-        path.name, [photo.path.name for photo in photos], names, measures)
-    for text in frame_selection.describe_dropped(record):
-        ctx.notice(text)
-    sheet = _make_sheet(path.name, record, names, out)
+    stems = make_frame_names([photo.path.stem for photo in photos])
+    source = _PhotoSource(path, tuple(photos), tuple(f"{prefix}{stem}" for stem in stems),
+                          masks.by_photo, plan, folder.broken)
+    sequence = find_sequence(config, photos, out / f"{prefix}{SCAN}", ctx)
+    record, broken = (_take_all(source, config, out, ctx) if sequence is None
+                      else _take_from_sequence(source, sequence, config, out, ctx))
+    sheet = _make_sheet(source, record, broken, out)
     frame_of = {photos[candidate.index]: candidate.name for candidate in record
                 if candidate.name is not None}
-    dropped = {candidate.source for candidate in record if candidate.name is None}
     groups = group_photos(list(frame_of))
     for notice in group_notices(groups):
         ctx.notice(notice)
     for width, height in dict.fromkeys((group.first.width, group.first.height) for group in groups):
         report_reduced(width, height, config.max_size, ctx)
+    # of a video's frames it is no news that most are dropped
+    dropped = {candidate.source for candidate in record
+               if candidate.name is None and sequence is None}
+    count = len(photos) + len(folder.broken)
     return IngestedSource(
         "photos",
         _frame_groups(groups, path, config.max_size),
@@ -81,8 +85,63 @@ def ingest(
                   masked=(out / store.MASKS / frame_of[photo]).exists())
             for index, group in enumerate(groups) for photo in group.photos),
             key=lambda frame: frame.name)),
-        declared=readable + len(broken), decoded=readable, lost=len(broken),
+        declared=count, decoded=count - len(broken), lost=len(broken),
+        blurred=0 if sequence is None else sum(
+            candidate.reason in (Reason.BLURRED, Reason.CLIPPED) for candidate in record),
         skipped=tuple(sorted(dropped | broken.keys())), selection=Selection(record, sheet, prefix))
+
+
+@dataclass(frozen=True)
+class _PhotoSource:
+    """The photos to choose from, in order."""
+
+    path: Path  # represents them in messages
+    photos: tuple[Photo, ...]
+    names: tuple[str, ...]  # of their frames
+    masks: Mapping[str, Path]  # by file name
+    plan: RawPlan
+    broken: Mapping[str, str]  # why other files are no photos, by file name
+
+
+def _take_all(
+    source: _PhotoSource, config: IngestConfig, out: Path, ctx: IngestContext
+) -> tuple[Record, dict[str, str]]:
+    """Writes all photos; returns which are kept, and why some are broken, by file name."""
+    measures, unreadable = _write_photos(source, range(len(source.photos)), out, config, ctx)
+    broken = {**source.broken, **unreadable}
+    check_count(source.path, len(source.photos) - len(unreadable), broken)
+    _report_broken(broken, ctx)
+    record = frame_selection.choose_photos(
+        source.path.name, [photo.path.name for photo in source.photos], source.names, measures)
+    for text in frame_selection.describe_dropped(record):
+        ctx.notice(text)
+    return record, broken
+
+
+def _take_from_sequence(
+    source: _PhotoSource, sequence: PhotoSequence, config: IngestConfig, out: Path,
+    ctx: IngestContext,
+) -> tuple[Record, dict[str, str]]:
+    """Writes the frames that are chosen from a video's; returns the same as `_take_all`."""
+    record = choose_from_sequence(
+        config, source.path.name, source.photos, source.names, sequence, ctx)
+    chosen = [candidate.index for candidate in record if candidate.name is not None]
+    _, unreadable = _write_photos(source, chosen, out, config, ctx)
+    broken = {**source.broken, **unreadable, **{
+        source.photos[index].path.name: reason for index, reason in sequence.broken.items()}}
+    check_count(source.path, len(chosen) - len(unreadable), broken)
+    _report_broken(broken, ctx)
+    return tuple(
+        replace(candidate, reason=Reason.DAMAGED, name=None) if candidate.source in unreadable
+        else candidate for candidate in record), broken
+
+
+def _report_broken(broken: Mapping[str, str], ctx: IngestContext) -> None:
+    """Says which photos cannot be read, and why."""
+    for reason in list(broken.values())[:frame_selection.NAMED]:
+        ctx.notice(f"A photo is left out: {reason}")
+    if (more := len(broken) - frame_selection.NAMED) > 0:
+        ctx.notice(f"{more} more photos are left out for similar reasons.")
 
 
 def _list_photos(paths: Sequence[Path], ctx: IngestContext) -> tuple[Path, PhotoFolder]:
@@ -119,19 +178,22 @@ def _find_masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestConte
 
 
 def _make_sheet(
-    title: str, record: Sequence[frame_selection.FrameCandidate], names: Sequence[str], out: Path
+    source: _PhotoSource, record: Record, broken: Mapping[str, str], out: Path
 ) -> ContactSheet:
     """Returns the contact sheet, and removes the files of photos that are not selected."""
-    files = {candidate.index: out / store.FOLDER / names[candidate.index]
-             for candidate in record if candidate.reason is not frame_selection.Reason.DAMAGED}
-    height, width = read_png(next(iter(files.values()))).shape[:2]
-    sheet = ContactSheet(title, record, width, height)
+    files = {candidate.index: out / store.FOLDER / source.names[candidate.index]
+             for candidate in record if candidate.source not in broken}
+    written = {index: file for index, file in files.items() if file.exists()}
+    height, width = read_png(next(iter(written.values()))).shape[:2]
+    sheet = ContactSheet(source.path.name, record, width, height)
     for index in sorted(sheet.wanted & files.keys()):
-        sheet.add(index, read_png(files[index]))
+        with suppress(InputError):  # only of a photo that is not needed
+            sheet.add(index, read_png(written[index]) if index in written
+                      else read_photo(source.photos[index]))
     for candidate in record:
-        if candidate.index in files and candidate.name is None:
+        if candidate.index in written and candidate.name is None:
             for folder in (store.FOLDER, store.MASKS):
-                (out / folder / names[candidate.index]).unlink(missing_ok=True)
+                (out / folder / source.names[candidate.index]).unlink(missing_ok=True)
     return sheet
 
 
@@ -162,23 +224,24 @@ def _drop_raw_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) 
 
 
 def _write_photos(
-    photos: Mapping[str, Photo], masks: Mapping[str, Path], plan: RawPlan, out: Path, max_size: int,
+    source: _PhotoSource, indices: Sequence[int], out: Path, config: IngestConfig,
     ctx: IngestContext,
 ) -> tuple[list[frame_selection.PhotoMeasures | None], dict[str, str]]:
-    """Writes photos by frame name; returns their measures, and why some cannot be read."""
+    """Writes some photos; returns their measures, and why some cannot be read, by file name."""
     measures: list[frame_selection.PhotoMeasures | None] = []
     unreadable: dict[str, str] = {}
-    with ctx.progress.bar("photos", len(photos), unit="photo") as bar:
-        for name, photo in photos.items():
-            mask = masks.get(photo.path.name)
+    with ctx.progress.bar("photos", len(indices), unit="photo") as bar:
+        for index in indices:
+            photo, name = source.photos[index], source.names[index]
+            mask = source.masks.get(photo.path.name)
             try:
-                rgb = _write_photo(photo, mask, plan, out, name, max_size)
+                rgb = _write_photo(photo, mask, source.plan, out, name, config.max_size)
                 measures.append(frame_selection.measure_photo(rgb))
             except InputError as error:
                 unreadable[photo.path.name] = f"{error.message} {error.hint}".rstrip()
                 measures.append(None)
             bar.advance()
-            ctx.record(len(measures), len(photos))
+            ctx.record(len(measures), len(indices))
     return measures, unreadable
 
 

@@ -130,3 +130,16 @@ def test_tracking_starts_again_behind_a_blank_wall():
     steps = measured([*pan(3, 4), blank, *pan(3, 4)])
     assert np.isnan(steps[3:5]).all()
     np.testing.assert_allclose(steps[5:], 4 / 320, atol=TOLERANCE)
+
+
+def test_the_share_of_followed_corners_tells_a_step_from_another_place():
+    wide = texture(96, 200, coarseness=12)[:, :, 0]
+    other = texture(96, 128, seed=5, coarseness=12)[:, :, 0]
+    shares = []
+    for after in (wide[:, 2:130], other):
+        meter = MotionMeter()
+        meter.advance(wide[:, :128])
+        meter.advance(after)
+        shares.append(meter.followed)
+    assert shares[0] > 0.9
+    assert shares[1] < 0.3

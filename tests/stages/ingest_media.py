@@ -3,6 +3,7 @@
 import json
 
 import av
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -56,4 +57,15 @@ def write_photos(folder, count, *, size=(64, 48), suffix=".jpg"):
     for index in range(count):
         rgb = blocks(size[1], size[0], seed=index)
         Image.fromarray(rgb).save(folder / f"IMG_{index:04d}{suffix}")
+    return folder
+
+
+def write_sequence(folder, count):
+    """Writes every frame of a camera that moves sideways past a smooth wall, 2 of 256 pixels."""
+    folder.mkdir()
+    colours = np.random.default_rng(0).integers(30, 226, (4, 6 + 2 * count // 48, 3), np.uint8)
+    wide = cv2.GaussianBlur(np.kron(colours, np.ones((48, 48, 1), np.uint8)), None, 2.0)
+    for index in range(count):
+        Image.fromarray(wide[:, 2 * index:2 * index + 256]).save(
+            folder / f"frame_{index:04d}.jpg", quality=95)
     return folder

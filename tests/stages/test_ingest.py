@@ -6,7 +6,16 @@ import media
 import numpy as np
 import pytest
 from facts import assert_facts
-from ingest_media import blocks, files, listed, take, walk, write_photos, write_video
+from ingest_media import (
+    blocks,
+    files,
+    listed,
+    take,
+    walk,
+    write_photos,
+    write_sequence,
+    write_video,
+)
 from PIL import Image
 
 from recon_cli.capture import from_photos, from_video
@@ -190,10 +199,12 @@ def test_no_metadata_is_carried_over_and_the_focal_length_is_scaled(tmp_path):
 # Crashes
 
 
-@pytest.mark.parametrize("kind", ["video", "photos"])
+@pytest.mark.parametrize("kind", ["video", "photos", "sequence"])
 def test_an_interrupted_run_goes_on_where_it_was_and_ends_the_same(
         video, tmp_path, monkeypatch, kind):
-    source = video if kind == "video" else write_photos(tmp_path / "room", 20)
+    source = {
+        "video": lambda: video, "photos": lambda: write_photos(tmp_path / "room", 20),
+        "sequence": lambda: write_sequence(tmp_path / "room", 110)}[kind]()
     take(source, tmp_path / "whole")
     written = []
     write = images.write_png

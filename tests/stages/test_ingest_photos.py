@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dng import Shot, linear, write_shot
 from facts import assert_facts
-from ingest_media import blocks, listed, take, write_photos
+from ingest_media import blocks, listed, take, write_photos, write_sequence
 from PIL import Image
 
 from recon_cli.config.stages import IngestConfig
@@ -209,3 +209,61 @@ def test_photos_of_one_name_are_not_told_apart(tmp_path):
         paths += sorted(write_photos(tmp_path / name, 2).iterdir())
     with pytest.raises(InputError, match=r"2 photos are called IMG_0000\.jpg"):
         take(tuple(paths), tmp_path / "out")
+
+
+def test_a_folder_of_all_frames_of_a_video_is_thinned_like_one(tmp_path, notices):
+    folder = write_sequence(tmp_path / "dump", 110)
+    summary = take(folder, tmp_path / "out")
+    frames = listed(tmp_path / "out")["frames"]
+    # 109 steps of 2 / 256 widths need fewer than the least number of frames
+    assert (summary.kind, summary.frames, summary.decoded_frames) == ("photos", 24, 110)
+    assert summary.skipped == ()
+    places = [int(frame["name"][6:10]) for frame in frames]
+    assert max(np.diff(places)) <= 8
+    assert [frame["source"] for frame in frames] == [f"frame_{place:04d}.jpg" for place in places]
+    assert sorted(path.name for path in (tmp_path / "out" / "frames").iterdir()) == [
+        frame["name"] for frame in frames]
+    notice, = notices()
+    assert_facts(notice, "dump", "24 of 110", "--frames 110 keeps all")
+    record = json.loads((tmp_path / "out" / "choice.json").read_text())
+    assert record["counts"] == {"kept": 24, "close": 86}
+    assert [one["name"] for one in record["candidates"] if one["reason"] == "kept"] == [
+        frame["name"] for frame in frames]
+    assert record["candidates"][1]["source"] == "frame_0001.jpg"
+    assert all(one["like"] in places for one in record["candidates"] if one["reason"] == "close")
+    sheet = np.asarray(Image.open(tmp_path / "out" / "contact.png").convert("RGB"))
+    assert (sheet[-200:] != 255).any(axis=2).mean() > 0.3  # dropped photos have pictures, too
+
+
+def test_the_number_of_frames_of_a_sequence_can_be_set_up_to_all(tmp_path, notices):
+    folder = write_sequence(tmp_path / "dump", 60)
+    assert take(folder, tmp_path / "few", config=IngestConfig(frames=40)).frames == 40
+    assert_facts(notices()[0], "40 of 60", "--frames 60 keeps all")
+    every = take(folder, tmp_path / "all", config=IngestConfig(frames=60, max_frames=30))
+    assert every.frames == 60
+    assert take(folder, tmp_path / "default").frames == 60
+    assert len(notices()) == 1
+
+
+def test_a_broken_photo_of_a_sequence_is_left_out_and_named(tmp_path, notices):
+    folder = write_sequence(tmp_path / "dump", 60)
+    damaged = folder / "frame_0030.jpg"
+    damaged.write_bytes(damaged.read_bytes()[:2000])
+    summary = take(folder, tmp_path / "out", config=IngestConfig(frames=59))
+    assert (summary.frames, summary.lost_frames, summary.decoded_frames) == (59, 1, 59)
+    assert summary.skipped == ("frame_0030.jpg",)
+    assert any("frame_0030.jpg cannot be read" in notice for notice in notices())
+    record = json.loads((tmp_path / "out" / "choice.json").read_text())["candidates"][30]
+    assert (record["reason"], record["name"], record["sharpness"]) == ("damaged", None, None)
+
+
+def test_a_mask_that_does_not_fit_its_frame_of_a_sequence_costs_that_frame(tmp_path):
+    folder = write_sequence(tmp_path / "dump", 60)
+    for index in range(60):
+        mask_of(folder / "masks", f"frame_{index:04d}.png",
+                np.full((192, 256) if index != 20 else (8, 8), 255, np.uint8))
+    summary = take(folder, tmp_path / "out", config=IngestConfig(frames=59, sharpness=0.0))
+    assert "frame_0020.jpg" in summary.skipped
+    assert summary.frames == 58
+    record = json.loads((tmp_path / "out" / "choice.json").read_text())["candidates"][20]
+    assert (record["reason"], record["name"]) == ("damaged", None)
