@@ -36,6 +36,8 @@ class MatchEvidence:
     matches: NDArray[np.int64]  # [P], verified matches of each pair
     # [P], those within MAX_ERROR of the epipolar lines of the poses; zero where a camera is missing
     agreeing: NDArray[np.int64]
+    traced: NDArray[np.int64]  # [P], matches of which both keypoints show a point of the model
+    joined: NDArray[np.int64]  # [P], those of them that show one and the same point
 
     @property
     def placed(self) -> NDArray[np.bool_]:
@@ -79,15 +81,20 @@ def gather_evidence(
         centers[index] = image.projection_center()
     rows = {image.image_id: index for index, image in placed.items()}
     visible = np.zeros((len(names), model.num_points3D()), np.bool_)
+    shown = {index: np.full(len(keypoints[index]), -1) for index in placed}
     for column, (_, point) in enumerate(sorted(model.points3D.items())):
-        visible[[rows[element.image_id] for element in point.track.elements], column] = True
+        for element in point.track.elements:
+            index = rows[element.image_id]
+            visible[index, column] = True
+            shown[index][element.point2D_idx] = column
+    traced, joined = _count_joined(shown, pairs, matches)
     return MatchEvidence(
         names=tuple(names), centers=centers, visible=visible, tried=tried,
         registered=np.isin(np.arange(len(names)), list(placed)),
         keypoints=np.array([len(keypoints[index]) for index in range(len(names))], np.int64),
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
-        agreeing=_count_agreeing(placed, keypoints, pairs, matches))
+        agreeing=_count_agreeing(placed, keypoints, pairs, matches), traced=traced, joined=joined)
 
 
 def _read_matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
@@ -140,3 +147,20 @@ def _count_agreeing(
         # Not "<": two cameras in one place have no epipolar lines (NaN) and contradict nothing.
         agreeing[pair] = len(rows) - np.count_nonzero(squares > (MAX_ERROR / focal) ** 2)
     return agreeing
+
+
+def _count_joined(
+    shown: Mapping[int, NDArray[np.int64]],  # which point each keypoint of an image shows, or -1
+    pairs: Sequence[tuple[int, int]],
+    matches: Sequence[NDArray[np.uint32]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # [P], [P]
+    """Returns how many matches of each pair join two points of the model, and how many one."""
+    traced, joined = np.zeros((2, len(pairs)), np.int64)
+    for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
+        if first not in shown or second not in shown:
+            continue
+        ours, theirs = shown[first][rows[:, 0]], shown[second][rows[:, 1]]
+        both = (ours >= 0) & (theirs >= 0)
+        traced[pair] = np.count_nonzero(both)
+        joined[pair] = np.count_nonzero(both & (ours == theirs))
+    return traced, joined

@@ -1,8 +1,8 @@
 """Whether a finished model can be trusted, and everything known about why not.
 
 The share of registered images and the reprojection error do not see the worst failures: two good
-halves placed wrongly to each other (`weakest_cut`), and two places laid over each other
-(`visual_aliasing`). Where only neighbours were matched, neither sees a half of wrong scale.
+halves placed wrongly to each other (`weakest_cut`), two places laid over each other
+(`visual_aliasing`), and a text over bare walls (`still_points`).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import SfmError, list_names
 from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
+from recon_cli.sfm.still_points import MAX_STILL, find_still_share
 from recon_cli.sfm.visual_aliasing import VisualAliasing
 from recon_cli.sfm.weakest_cut import (
     MIN_AGREEING,
@@ -99,6 +100,7 @@ class ModelVerdict:
     keypoints: Histogram  # of each image
     points: Histogram  # of the model that each camera sees
     neighbours: Histogram  # of each camera, those with which it shares MIN_MATCHES points
+    still: float  # share of the points in three or more images that do not move in them
     problems: tuple[str, ...]  # why the model cannot be trusted, a sentence each
 
     @property
@@ -123,11 +125,11 @@ class ModelVerdict:
     def _reassurances(self) -> Iterator[str]:
         cut, aliasing = self.weakest_cut, self.aliasing
         if cut.share is not None:
-            yield (f"Weakest link: {cut.share:.0%} of {cut.matches} matches between "
-                   f"{_sides(cut.sides)} agree with the cameras.")
+            yield (f"Weakest link: {cut.share:.0%} of what the closest images of "
+                   f"{_sides(cut.sides)} have in common is one point in both.")
         if aliasing.share is not None:
-            yield (f"Least overlap: {aliasing.share:.0%} of what two groups of cameras should both "
-                   "show is found in both.")
+            yield (f"Least overlap: two groups of cameras find {aliasing.share:.0%} as much of "
+                   "what both should show as cameras of one group do.")
 
     def to_json(self) -> dict[str, Any]:
         """Returns JSON values: the fields, some under their older keys, and `trusted`."""
@@ -146,14 +148,15 @@ def examine(
 ) -> ModelVerdict:
     """Returns the verdict on a finished model, or raises ValueError if its names do not match."""
     evidence = gather_evidence(model, database, names)
+    weakest_cut, outliers = find_weakest_cut(evidence, find_order(evidence, times or {}))
     overlap = visual_aliasing.measure_overlap(model, evidence)
-    weakest_cut, outliers = find_weakest_cut(evidence, overlap)
     aliasing = visual_aliasing.find_aliasing(evidence, overlap)
     rows = evidence.registered
     placed = [name for name, has_camera in zip(names, rows, strict=True) if has_camera]
     model_parts = _parts(placed, evidence.shared[np.ix_(rows, rows)].astype(np.float64))
     match_parts = _parts(names, view_graph.weights(len(names), evidence.pairs, evidence.matches))
     jumps = find_jumps(evidence, times or {})
+    still = find_still_share(model)
     return ModelVerdict(
         images=len(names), registered=int(np.count_nonzero(rows)),
         model_parts=model_parts, match_parts=match_parts,
@@ -162,12 +165,14 @@ def examine(
         keypoints=Histogram.of(evidence.keypoints),
         points=Histogram.of(evidence.points[rows]),
         neighbours=Histogram.of(np.count_nonzero(evidence.shared[rows] >= MIN_MATCHES, axis=1)),
+        still=still,
         problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
+                  *_describe_still(still),
                   *describe_shifted_centres(model, database)))
 
 
 def is_broken(cut: WeakestCut) -> bool:
-    """Returns whether too few matches across a cut agree with the cameras."""
+    """Returns whether too few matches across a cut show the same points on both sides."""
     return cut.share is not None and cut.share < MIN_AGREEING
 
 
@@ -177,12 +182,11 @@ def is_aliased(aliasing: VisualAliasing) -> bool:
 
 
 def check_weak_link(verdict: ModelVerdict, accept: bool) -> None:
-    """Raises SfmError for a model that is put together wrongly, unless `accept` (--accept-weak)."""
-    sentences = [*_describe_break(verdict.weakest_cut), *_describe_aliasing(verdict.aliasing)]
-    if accept or not sentences:
+    """Raises SfmError for a model that cannot be trusted, unless `accept` (--accept-weak)."""
+    if accept or verdict.trusted:
         return
     raise SfmError(
-        " ".join(sentences),
+        " ".join(verdict.problems),
         hint="Use more frames between the two parts (recon ingest --frames N), match all of them "
         "(--pairs exhaustive), or keep the model as it is with --accept-weak.")
 
@@ -209,21 +213,30 @@ def _describe_problems(
         for jump in jumps if jump.ratio > MAX_LEAP]
 
 
+def _describe_still(share: float) -> list[str]:
+    if share <= MAX_STILL:
+        return []
+    return [
+        f"{share:.0%} of the points stay where they are in the images while the camera moves, at "
+        f"most {MAX_STILL:.0%} may: text, a logo or dirt on the lens holds the model together."]
+
+
 def _describe_break(cut: WeakestCut) -> list[str]:
     if not is_broken(cut):
         return []
     return [
-        f"The model is broken: only {cut.share:.0%} of the {cut.matches} matches between "
-        f"{_sides(cut.sides)} agree with the cameras, but {MIN_AGREEING:.0%} are needed."]
+        f"The model is broken: of what the closest images of {_sides(cut.sides)} have in common, "
+        f"only {cut.share:.0%} is one point in both, but {MIN_AGREEING:.0%} is needed."]
 
 
 def _describe_aliasing(aliasing: VisualAliasing) -> list[str]:
     if not is_aliased(aliasing):
         return []
     return [
-        f"{_sides(aliasing.sides)} should see the same surfaces, but only {aliasing.share:.0%} of "
-        f"them are found in both and {visual_aliasing.MIN_OVERLAP:.0%} are needed: the model is "
-        "broken between them, or two places that look alike lie over each other."]
+        f"{_sides(aliasing.sides)} should see the same surfaces, but find only "
+        f"{aliasing.share:.0%} as much of them in both as images on one side do, and "
+        f"{visual_aliasing.MIN_OVERLAP:.0%} is needed: the model is broken between them, or two "
+        "places that look alike lie over each other."]
 
 
 def _sides(sides: tuple[Names, Names]) -> str:
@@ -252,6 +265,15 @@ def find_jumps(evidence: MatchEvidence, times: Mapping[str, float | None]) -> tu
         if ratio > MAX_STEP:
             jumps.append(Jump(evidence.names[before], evidence.names[after], float(ratio)))
     return tuple(jumps)
+
+
+def find_order(
+    evidence: MatchEvidence, times: Mapping[str, float | None]
+) -> NDArray[np.int64] | None:
+    """Returns the images with a camera as they were taken; None where that is not known."""
+    rows = np.flatnonzero(evidence.registered)
+    moments = _moments([evidence.names[row] for row in rows], times)
+    return None if moments is None else rows[np.argsort(moments, kind="stable")]
 
 
 def _moments(names: Sequence[str], times: Mapping[str, float | None]) -> NDArray[np.float64] | None:

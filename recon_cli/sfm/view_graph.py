@@ -1,7 +1,7 @@
 """Graphs of images as symmetric weight matrices [N, N]: their pieces, and where they come apart.
 
-A cut parts the images in two. Those tried here come from sweeps: the images in some order, cut
-after each of them but the last.
+A cut parts the images in two. Those tried here come from sweeps (the images in some order, cut
+after each of them but the last) and from the edges of a tree.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 Weights = NDArray[np.float64]  # [N, N], symmetric, zero on the diagonal
 Order = NDArray[np.int64]  # [N], a permutation of the images
@@ -61,6 +61,34 @@ def sweep(matrix: Weights, order: Order) -> NDArray[np.float64]:
     sums = ordered.cumsum(axis=0).cumsum(axis=1)
     head = np.arange(len(order) - 1)
     return np.asarray(sums[head, -1] - sums[head, head])
+
+
+def spanning_forest(matrix: Weights) -> NDArray[np.bool_]:  # [N, N], symmetric
+    """Returns the edges of the trees that hold the images together by the strongest ties.
+
+    Between the two sides of any of its edges there is no stronger tie than that edge.
+    """
+    lengths = np.divide(1.0, matrix, out=np.zeros_like(matrix), where=matrix > 0)
+    tree = minimum_spanning_tree(lengths).toarray() > 0
+    return np.asarray(tree | tree.T)
+
+
+def strongest_ties(matrix: Weights, count: int) -> NDArray[np.bool_]:  # [N, N], symmetric
+    """Returns which images are among the `count` strongest ties of one of the two, or in a tree."""
+    ties = spanning_forest(matrix)
+    partners = np.argsort(-matrix, axis=1, kind="stable")[:, :count]
+    np.put_along_axis(ties, partners, values=True, axis=1)
+    return np.asarray((ties | ties.T) & (matrix > 0))
+
+
+def tree_cuts(forest: NDArray[np.bool_]) -> Iterator[Cut]:
+    """Yields, for each edge of a forest, the images that it ties to the rest of its tree."""
+    rest = forest.copy()
+    for first, second in np.argwhere(np.triu(forest)):
+        rest[first, second] = rest[second, first] = False
+        _, labels = connected_components(rest, directed=False)
+        yield np.asarray(labels == labels[first])
+        rest[first, second] = rest[second, first] = True
 
 
 def loose_orders(matrix: Weights) -> Iterator[Order]:

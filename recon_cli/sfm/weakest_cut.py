@@ -1,15 +1,19 @@
-"""Where a model is most likely broken: the cut whose matches agree least with the poses.
+"""Where a model is most likely broken: the cut across which its points do not hold together.
 
 A mapper that goes wrong at one frame builds two good halves and places them wrongly to each other,
-with a small reprojection error over the matches that it kept. Those that it rejected show the
-break: across it, matches disagree with the poses.
+with a small reprojection error over what it kept. The matches across the break show it: each half
+has triangulated its own points, so the two keypoints of a match show two points in place of one.
+Unlike the distance from epipolar lines, that shows a half of wrong scale too.
 
-Matches of two places that look alike are rejected rightly, so a cut is ignored when its two sides
-show the same surfaces (`visual_aliasing`).
+Places that look alike are matched as well, and rightly do not show the same points. So only the
+strongest ties count: of each image the few that it has most matches with, and, where the order of
+the images is known, those next to each other. The median of the pairs across a cut bears single
+mistakes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +22,17 @@ from numpy.typing import NDArray
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
 from recon_cli.sfm.view_graph import Cut, Weights
-from recon_cli.sfm.visual_aliasing import Overlap, is_confirmed
 
-# Least share measured in each model: 0.73 to 0.99 where no camera was off by 1% of the extent;
-# 0.03, 0.35 and 0.49 where 9, 7 and 8 of 50 cameras were off by two thirds of it, at reprojection
-# errors of 1.0 and 0.3 pixels.
-MIN_AGREEING = 0.5
+# Share of the matches of a pair that must show one point. See `tests/bench/bench_verdict.py`.
+MIN_AGREEING = 0.65
+# Images that each one has most matches with.
+STRONGEST = 5
+# Of the ties of a wrong camera so many at least contradict it; beside a break it is half of them.
+WRONG = 0.75
+# Images that stand at most so many apart in their order are next to each other.
+REACH = 2
+# COLMAP verifies a pair from 15 inliers on (TwoViewGeometryOptions.min_num_inliers).
+MIN_TRACED = 15
 # COLMAP gives an image a camera from 30 inliers on (abs_pose_min_num_inliers).
 MIN_MATCHES = 30
 # Sides of up to this share of the cameras are outliers, which can be dropped.
@@ -32,9 +41,11 @@ MAX_OUTLIERS = 0.1
 
 @dataclass(frozen=True)
 class WeakestCut:
-    """The cut through a model whose matches agree least with the poses."""
+    """The cut through a model across which matches least show the same points."""
 
-    share: float | None  # of the matches across, those that agree with the poses; None if unknown
+    # Of the matches of a pair of images across, those that show one point of the model, as far as
+    # their keypoints show any: the median of the pairs that count; None if unknown.
+    share: float | None
     reason: str  # why it is unknown; empty otherwise
     sides: tuple[tuple[str, ...], tuple[str, ...]]  # names of the images, the smaller side first
     pairs: int  # verified, across
@@ -53,21 +64,24 @@ class OutlierCamera:
 
 
 def find_weakest_cut(
-    evidence: MatchEvidence, overlap: Overlap
+    evidence: MatchEvidence, order: NDArray[np.int64] | None = None
 ) -> tuple[WeakestCut, tuple[OutlierCamera, ...]]:
     """Returns the weakest cut of the cameras that are no outliers, and the outliers.
 
-    Small sides of broken cuts are removed one by one, so that a wrong camera hides behind no other.
+    `order` are the images with a camera as they were taken, where that is known. Wrong cameras and
+    other small sides of broken cuts are removed one by one, so that none hides behind another.
     """
-    links = _Links.of(evidence, overlap)
-    inliers = evidence.registered.copy()
-    allowed = max(1, int(MAX_OUTLIERS * np.count_nonzero(inliers)))
-    while (side := _worst_side(links, inliers)) is not None:
+    links = _Links.of(evidence)
+    allowed = max(1, int(MAX_OUTLIERS * np.count_nonzero(evidence.registered)))
+    inliers = _drop_wrong_cameras(links, evidence.registered, allowed)
+    while (weakest := _weakest_side(links, inliers, order)) is not None:
+        side, share = weakest
         count = np.count_nonzero(evidence.registered & ~inliers) + np.count_nonzero(side)
-        if links.share(side, inliers) >= MIN_AGREEING or count > allowed:
-            return _cut(evidence, links, side, inliers), _outliers(evidence, links, inliers)
+        if share >= MIN_AGREEING or count > allowed:
+            return (_cut(evidence, links, side, inliers, share),
+                    _outliers(evidence, links, inliers))
         inliers &= ~side
-    reason = f"no two parts have {MIN_MATCHES} verified matches between them"
+    reason = f"no two parts have a pair of images with {MIN_TRACED} matched points between them"
     return WeakestCut(None, reason, ((), ()), 0, 0, 0, 0.0), _outliers(evidence, links, inliers)
 
 
@@ -78,76 +92,95 @@ class _Links:
     matches: Weights
     agreeing: Weights
     shared: Weights
-    expected: Weights
-    confirmed: Weights
+    shares: Weights  # of the matches, those that show one point; NaN where too few show any
 
     @classmethod
-    def of(cls, evidence: MatchEvidence, overlap: Overlap) -> _Links:
+    def of(cls, evidence: MatchEvidence) -> _Links:
         """Returns the matrices; matches of images without a camera are left out."""
         count, placed = len(evidence.names), evidence.placed
         pairs = evidence.pairs[placed]
-        return cls(
-            view_graph.weights(count, pairs, evidence.matches[placed]),
-            view_graph.weights(count, pairs, evidence.agreeing[placed]),
-            evidence.shared.astype(np.float64), overlap.expected, overlap.confirmed)
+        matches, agreeing, traced, joined = (
+            view_graph.weights(count, pairs, values[placed]) for values in (
+                evidence.matches, evidence.agreeing, evidence.traced, evidence.joined))
+        shares = np.divide(
+            joined, traced, out=np.full_like(traced, np.nan), where=traced >= MIN_TRACED)
+        # A camera far from where it belongs sees no points at all; its matches speak all the same.
+        blind = evidence.points < MIN_TRACED
+        shares[(blind[:, None] | blind) & (matches >= MIN_MATCHES)] = 0.0
+        return cls(matches, agreeing, evidence.shared.astype(np.float64), shares)
 
-    def among(self, rows: NDArray[np.int64]) -> _Links:
-        """Returns the links of some images alone."""
+
+def _drop_wrong_cameras(links: _Links, registered: Cut, allowed: int) -> Cut:  # [N]
+    """Returns the images without those that nearly all of their strongest ties contradict.
+
+    Returns all where there are too many of those: then a part of the model is wrong.
+    """
+    inliers = registered.copy()
+    for _ in range(allowed + 1):
+        rows = np.flatnonzero(inliers)
         inner = np.ix_(rows, rows)
-        return _Links(*(matrix[inner] for matrix in vars(self).values()))
+        ties = view_graph.strongest_ties(links.matches[inner], STRONGEST)
+        shares = [_quantile(links.shares[inner][image, row], WRONG)
+                  for image, row in enumerate(ties)]
+        worst = int(np.argmin(shares)) if shares else 0
+        if not shares or shares[worst] >= MIN_AGREEING:
+            return inliers
+        inliers[rows[worst]] = False
+    return registered.copy()
 
-    def share(self, side: Cut, inliers: Cut) -> float:
-        """Returns the share of the matches from a side to the rest that agree."""
-        rest = np.ix_(side, inliers & ~side)
-        return float(self.agreeing[rest].sum() / max(self.matches[rest].sum(), 1.0))
+
+def _quantile(shares: NDArray[np.float64], quantile: float) -> float:
+    """Returns a quantile of those that are known, infinity without any."""
+    known = shares[~np.isnan(shares)]
+    return float(np.quantile(known, quantile)) if len(known) else np.inf
 
 
-def _worst_side(links: _Links, inliers: Cut) -> Cut | None:
+def _weakest_side(
+    links: _Links, inliers: Cut, order: NDArray[np.int64] | None
+) -> tuple[Cut, float] | None:
     """Returns the smaller side, [N], of the cut with the least share; None where none is known."""
     rows = np.flatnonzero(inliers)
     if len(rows) < 2:
         return None
-    inner = links.among(rows)
-    alone = _shares(*(matrix.sum(axis=1) for matrix in (
-        inner.agreeing, inner.matches, inner.expected, inner.confirmed)))
-    best, least = np.array([alone.argmin()]), alone.min()
-    # A model also breaks elsewhere than between parts that share few points.
-    for order in (*view_graph.loose_orders(inner.shared),
-                  *view_graph.disagreement_orders(inner.agreeing, inner.matches)):
-        shares = _shares(*(view_graph.sweep(matrix, order) for matrix in (
-            inner.agreeing, inner.matches, inner.expected, inner.confirmed)))
-        if shares.min() < least:
-            best, least = order[:int(shares.argmin()) + 1], shares.min()
-    if np.isinf(least):
+    inner = np.ix_(rows, rows)
+    best, least = None, np.inf
+    for cut, pairs in _cuts(links.matches[inner], None if order is None else np.searchsorted(
+            rows, order[inliers[order]])):
+        share = _quantile(links.shares[inner][pairs], 0.5)
+        if share < least:
+            best, least = cut, share
+    if best is None:
         return None
     side = np.zeros_like(inliers)
-    side[rows[best]] = True
-    return side if 2 * len(best) <= len(rows) else inliers & ~side
+    side[rows[best if 2 * np.count_nonzero(best) <= len(rows) else ~best]] = True
+    return side, least
 
 
-def _shares(
-    agreeing: NDArray[np.float64],  # [C]
-    matches: NDArray[np.float64],  # [C]
-    expected: NDArray[np.float64],  # [C]
-    confirmed: NDArray[np.float64],  # [C]
-) -> NDArray[np.float64]:  # [C]
-    """Returns the share of each cut, infinite where it says nothing.
+def _cuts(
+    matches: Weights, order: NDArray[np.int64] | None
+) -> Iterator[tuple[Cut, NDArray[np.bool_]]]:
+    """Yields cuts, [N], and the pairs of images, [N, N], that count across each."""
+    ties = np.triu(view_graph.strongest_ties(matches, STRONGEST))
+    for cut in view_graph.tree_cuts(view_graph.spanning_forest(matches)):
+        yield cut, ties & (cut[:, None] ^ cut)
+    if order is None:
+        return
+    place = np.argsort(order)
+    near = np.triu(np.abs(place[:, None] - place) <= REACH, 1)
+    for count in range(1, len(order)):
+        cut = place < count
+        yield cut, near & (cut[:, None] ^ cut)
 
-    That is so where too few matches lie across, and where they disagree although the two sides show
-    what they should: then the matches of places that look alike were rightly rejected.
-    """
-    shares = agreeing / np.maximum(matches, 1)
-    alike = (shares < MIN_AGREEING) & is_confirmed(expected, confirmed)
-    return np.where((matches >= MIN_MATCHES) & ~alike, shares, np.inf)
 
-
-def _cut(evidence: MatchEvidence, links: _Links, side: Cut, inliers: Cut) -> WeakestCut:
+def _cut(
+    evidence: MatchEvidence, links: _Links, side: Cut, inliers: Cut, share: float
+) -> WeakestCut:
     other = inliers & ~side
     across = np.ix_(side, other)
     rows = np.flatnonzero(inliers)
     names = np.array(evidence.names)
     return WeakestCut(
-        share=links.share(side, inliers), reason="",
+        share=share, reason="",
         sides=(tuple(names[side].tolist()), tuple(names[other].tolist())),
         pairs=int(np.count_nonzero(links.matches[across])),
         matches=int(links.matches[across].sum()), points=int(links.shared[across].sum()),

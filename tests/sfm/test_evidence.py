@@ -70,3 +70,21 @@ def test_only_pairs_that_were_matched_count_as_tried(tmp_path):
     found = gather_evidence(world.model(), world.write_database(tmp_path / "db"), world.names)
     assert found.tried.tolist() == [
         [False, True, False], [True, False, True], [False, True, False]]
+
+
+def test_matches_join_one_point_or_two(tmp_path):
+    """First the third camera has points of its own; then the points on the left are gone."""
+    world = made(landmark=lambda image, point: (image == 2, point))
+    found = gather_evidence(world.model(), world.write_database(tmp_path / "db"), world.names)
+    assert found.traced.tolist() == found.matches.tolist()
+    assert found.joined.tolist() == [found.matches[0], 0, 0]
+    (tmp_path / "db").unlink()
+    model = made().model()
+    left = [number for number, point in model.points3D.items() if point.xyz[0] < 0]
+    for number in left:
+        model.delete_point3D(number)
+    world = made()
+    found = gather_evidence(model, world.write_database(tmp_path / "db"), world.names)
+    assert (found.traced < found.matches).all()
+    assert found.joined.tolist() == found.traced.tolist()
+    assert left

@@ -62,3 +62,24 @@ def test_a_single_image_cannot_be_cut(count):
 def test_images_without_any_weight_are_ordered_all_the_same():
     order = next(view_graph.disagreement_orders(np.zeros((4, 4)), np.zeros((4, 4))))
     assert sorted(order.tolist()) == [0, 1, 2, 3]
+
+
+def test_a_forest_holds_each_group_by_its_strongest_ties():
+    pairs = np.array([[0, 1], [1, 2], [0, 2], [3, 4]])
+    forest = view_graph.spanning_forest(view_graph.weights(5, pairs, np.array([9, 5, 7, 1])))
+    assert np.argwhere(np.triu(forest)).tolist() == [[0, 1], [0, 2], [3, 4]]
+    assert (forest == forest.T).all()
+
+
+def test_the_strongest_ties_are_those_of_either_image_and_the_forest():
+    star = view_graph.weights(4, np.array([[0, 1], [0, 2], [0, 3], [1, 2]]), np.array([9, 8, 7, 1]))
+    assert np.argwhere(np.triu(view_graph.strongest_ties(star, 1))).tolist() == [
+        [0, 1], [0, 2], [0, 3]]
+    assert (view_graph.strongest_ties(star, 4) == (star > 0)).all()
+
+
+def test_every_edge_of_a_forest_is_a_cut_into_two_trees():
+    forest = view_graph.spanning_forest(TRIANGLES)
+    cuts = list(view_graph.tree_cuts(forest))
+    assert len(cuts) == 5
+    assert any((cut == HALVES).all() or (cut == ~HALVES).all() for cut in cuts)

@@ -1,0 +1,283 @@
+"""What the verdict finds in good and broken models: `python tests/bench/bench_verdict.py DATA OUT`.
+
+DATA is the folder of test data. Each capture is mapped once, and good and broken models are made
+from it (`verdict_captures`, `verdict_variants`); all stay in OUT, so that a second run only judges.
+A line of the table: the capture, how the model was made, its cameras, the largest displacement of
+one (share of the extent, after the similarity that fits most) and the share of cameras off by more
+than a twentieth, both against the reference or the good model that it was made from; then what was
+found, and the decision. A model is broken if a camera is off by more than DISPLACED, and good if
+none is off by SOUND and nothing was done to it; others count as neither. Behind it, each bound as
+it comes out of all captures but one, tried on that one.
+
+Name captures behind OUT to run only those; --map only maps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from pose_errors import reference_poses, similarity
+from verdict_captures import CAPTURES, MODEL, Capture, prepare
+from verdict_variants import BROKEN, GOOD, Variant, make, ordered_poses
+
+from recon_cli.io import records
+from recon_cli.sfm import mapper
+from recon_cli.sfm.job import MappingJob
+from recon_cli.sfm.verdict import ModelVerdict, examine, is_aliased, is_broken
+
+SOUND = 0.02  # of the extent: no camera of a good model is further off
+DISPLACED = 0.05  # of the extent: a model with a camera further off is broken
+TRIALS = 2000  # samples of four cameras; with half of them right, one in 16 is good
+PER_CAPTURE = 7  # broken models made of each capture, taken in turn from all kinds
+STEP = 5  # from one capture's first kind to the next one's
+Centers = Mapping[str, NDArray[np.float64]]  # [3] by name
+
+
+@dataclass(frozen=True)
+class Row:
+    """A model and what was found about it."""
+
+    capture: str
+    made: str
+    farthest: float | None  # share of the extent; None where the truth is not known
+    displaced: float | None  # share of the cameras
+    label: str  # good, broken or "" for neither
+    verdict: ModelVerdict
+    angle: float  # median triangulation angle, degrees
+    error: float  # reprojection, px
+    seconds: float
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The two shares that a bound decides on; 1 where they are unknown."""
+        known = {"points": self.verdict.weakest_cut.share, "overlap": self.verdict.aliasing.share}
+        return {name: 1.0 if share is None else share for name, share in known.items()}
+
+    @property
+    def otherwise(self) -> bool:
+        """Whether anything but the two shares speaks against the model."""
+        return len(self.verdict.problems) > (
+            is_broken(self.verdict.weakest_cut) + is_aliased(self.verdict.aliasing))
+
+    def cells(self) -> list[str]:
+        """The cells of its line."""
+        jumps = max((jump.ratio for jump in self.verdict.jumps), default=0.0)
+        return [
+            self.capture, self.made, f"{self.verdict.registered}/{self.verdict.images}",
+            *("-" if value is None else f"{value:.3f}" for value in (
+                self.farthest, self.displaced, self.verdict.weakest_cut.share,
+                self.verdict.aliasing.share)),
+            str(len(self.verdict.outliers)), str(len(self.verdict.model_parts)), f"{jumps:.0f}",
+            f"{self.verdict.still:.2f}", f"{self.angle:.1f}", f"{self.error:.2f}",
+            f"{self.seconds:.1f}", self.label or "-",
+            "trusted" if self.verdict.trusted else "refused", self._remark()]
+
+    def _remark(self) -> str:
+        wrong = {"good": not self.verdict.trusted, "broken": self.verdict.trusted}
+        return "WRONG" if wrong.get(self.label, False) else ""
+
+
+HEADS = ("capture", "made", "cameras", "farthest", "displaced", "points", "overlap", "outliers",
+         "parts", "jump", "still", "angle", "error", "s", "label", "verdict", "")
+
+
+def reference(capture: Capture, data: Path, folder: Path) -> Centers:
+    """True centres of a capture's cameras; empty where they are not known.
+
+    The folder tells which photo became which frame.
+    """
+    room = capture.name.split("_")[0]
+    if room in ("living", "office"):
+        return _places(reference_poses(data / "rooms" / room / "traj.txt"))
+    if capture.name == "fox":
+        return _places(reference_poses(data / "fox"))
+    if capture.name == "trident":
+        return {name: pose.inverse().translation for name, pose in trident_poses(data).items()}
+    if capture.name == "lockers":
+        model = pycolmap.Reconstruction(data / "walks/club_room_lockers/sparse/0")
+        centers = {image.name: image.projection_center()
+                   for image in map(model.image, model.reg_image_ids())}
+        return {frame.name: centers[frame.source]
+                for frame in records.read_frame_list(folder).frames if frame.source in centers}
+    if capture.name == "one_poster":
+        apart: dict[str, NDArray[np.float64]] = {}
+        for offset, name in enumerate(("living", "office")):
+            poses = reference_poses(data / "rooms" / name / "traj.txt")
+            apart |= {f"{1000 * offset + int(Path(key).stem):06d}.png":
+                        pose[:3, 3] + [100 * offset, 0, 0] for key, pose in poses.items()}
+        return apart
+    return {}
+
+
+def _places(poses: Mapping[str, NDArray[np.float64]]) -> Centers:
+    return {name: pose[:3, 3] for name, pose in poses.items()}
+
+
+def trident_poses(data: Path) -> dict[str, pycolmap.Rigid3d]:
+    """World to camera by name; file k + 1 is frame k, with OpenGL's axes."""
+    frames = json.loads((data / "walks/trident_desk/transforms_train.json").read_text("utf-8"))
+    poses = {}
+    for frame in frames["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 1:3] *= -1
+        viewmat = np.linalg.inv(pose)
+        poses[f"{int(Path(frame['file_path']).stem) - 1:06d}.png"] = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(viewmat[:3, :3]), viewmat[:3, 3])
+    return poses
+
+
+def displacements(found: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of each centre from the truth as a share of the extent, [F]; both [F, 3]."""
+    extent = float(np.linalg.norm(np.ptp(truth, axis=0)))
+    generator = np.random.default_rng(0)
+    best = np.full(len(found), np.inf)
+    for _ in range(TRIALS):
+        some = generator.choice(len(found), 4, replace=False)
+        scale, motion = similarity(found[some], truth[some])
+        off = np.linalg.norm(
+            scale * found @ motion[:3, :3].T + motion[:3, 3] - truth, axis=1) / extent
+        if np.minimum(off, DISPLACED).sum() < np.minimum(best, DISPLACED).sum():
+            best = off
+    return best
+
+
+def judge(
+    capture: Capture, made: str, model: pycolmap.Reconstruction, job: MappingJob,
+    names: Sequence[str], truth: Centers, label: str = ""
+) -> Row:
+    """A line of the table."""
+    start = time.process_time()
+    verdict = examine(model, job.database, names, times=job.times)
+    seconds = time.process_time() - start
+    centers = {image.name: image.projection_center()
+               for image in map(model.image, model.reg_image_ids())}
+    known = sorted(set(centers) & set(truth))
+    farthest = displaced = None
+    if len(known) > 5:
+        off = displacements(np.array([centers[name] for name in known]),
+                            np.array([truth[name] for name in known]))
+        farthest, displaced = float(off.max()), float((off > DISPLACED).mean())
+        if not label:
+            label = "good" if farthest <= SOUND else "broken" if farthest > DISPLACED else ""
+    return Row(
+        capture.name, made, farthest, displaced, label, verdict,
+        float(np.median(mapper.triangulation_angles(model))),
+        model.compute_mean_reprojection_error(), seconds)
+
+
+def rows_of(capture: Capture, number: int, data: Path, out: Path) -> Iterator[Row]:
+    """The lines of a capture's own model and of those made from it."""
+    job = prepare(capture, data, out)
+    if not json.loads((job.out / MODEL).read_text(encoding="utf-8")):
+        click.echo(f"{capture.name}: no model")
+        return
+    base, truth = pycolmap.Reconstruction(job.out / "mapped0"), reference(capture, data, job.out)
+    own = judge(capture, "mapped", base, job, job.names, truth, capture.label)
+    yield own
+    if capture.name == "trident":
+        known = trident_poses(data)
+        poses = {name: known[name] for name in job.names}
+        yield from _made(capture, Variant("true poses", lambda _: poses), job, base, truth)
+    if own.label != "good":
+        return
+    poses = ordered_poses(job, base)
+    found = {name: pose.inverse().translation for name, pose in poses.items()}
+    kinds = [BROKEN[(STEP * number + index) % len(BROKEN)] for index in range(PER_CAPTURE)]
+    for variant in (*GOOD, *kinds):
+        yield from _made(capture, variant, job, base, found)
+
+
+def _made(
+    capture: Capture, variant: Variant, job: MappingJob, base: pycolmap.Reconstruction,
+    truth: Centers
+) -> Iterator[Row]:
+    folder = job.out / "variants" / variant.name.replace(" ", "_").replace("%", "").replace(",", "")
+    model = make(job, base, variant, folder)
+    if model is None or model.num_points3D() == 0:
+        click.echo(f"{capture.name}, {variant.name}: no points are left")
+        return
+    names = json.loads((folder / "done.json").read_text(encoding="utf-8"))
+    row = judge(capture, variant.name, model, dataclasses.replace(job, out=folder), names, truth)
+    # What the adjustment has moved back halfway is neither.
+    mended = variant in BROKEN and row.label == "good"
+    yield dataclasses.replace(row, label="") if mended else row
+
+
+def choose_bounds(rows: Sequence[Row]) -> dict[str, float]:
+    """For each share, the middle between the lowest of a good model and the next broken one."""
+    bounds = {}
+    for name in ("points", "overlap"):
+        lowest = min(row.shares[name] for row in rows if row.label == "good")
+        below = [row.shares[name] for row in rows
+                 if row.label == "broken" and row.shares[name] < lowest]
+        bounds[name] = (lowest + max(below, default=0.0)) / 2
+    return bounds
+
+
+def leave_one_out(rows: Sequence[Row]) -> Iterator[str]:
+    """A line for each capture: the bounds that the others give, and where they are wrong on it."""
+    errors = 0
+    for capture in sorted({row.capture for row in rows}):
+        bounds = choose_bounds([row for row in rows if row.capture != capture])
+        own = [row for row in rows if row.capture == capture and row.label]
+        wrong = [row.made for row in own if (row.label == "broken") != (row.otherwise or any(
+            row.shares[name] < bound for name, bound in bounds.items()))]
+        errors += len(wrong)
+        told = ", ".join(f"{name} {bound:.3f}" for name, bound in bounds.items())
+        yield f"without {capture}: {told}; {len(wrong)} of {len(own)} wrong {', '.join(wrong)}"
+    yield f"{errors} errors"
+
+
+@click.command()
+@click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("out", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("names", nargs=-1)
+@click.option("--map", "only_map", is_flag=True, help="Only map the captures.")
+def main(data: Path, out: Path, names: tuple[str, ...], *, only_map: bool) -> None:
+    """Prints the table, the bounds, and what leaving one capture out gives."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    pycolmap.logging.minloglevel = 2
+    rows: list[Row] = []
+    print_cells(HEADS)
+    for number, capture in enumerate(CAPTURES):
+        if names and capture.name not in names:
+            continue
+        if only_map:
+            job = prepare(capture, data, out)
+            click.echo(f"{capture.name} {(job.out / MODEL).read_text(encoding='utf-8')}")
+            continue
+        for row in rows_of(capture, number, data, out):
+            rows.append(row)
+            print_cells(row.cells())
+    if not any(row.label == "good" for row in rows):
+        return
+    for label in ("good", "broken"):
+        own = [row for row in rows if row.label == label]
+        wrong = sum(row.verdict.trusted != (label == "good") for row in own)
+        click.echo(f"{label}: {len(own)} models, {wrong} decided wrongly")
+    click.echo("bounds from all captures: " + ", ".join(
+        f"{name} {bound:.3f}" for name, bound in choose_bounds(rows).items()))
+    if len({row.capture for row in rows if row.label == "good"}) > 1:
+        for line in leave_one_out(rows):
+            click.echo(line)
+
+
+def print_cells(cells: Sequence[str]) -> None:
+    """Prints one line of the table."""
+    widths = (13, 21, 8, 9, 10, 7, 8, 9, 6, 5, 6, 6, 6, 5, 7, 8, 5)
+    click.echo(" ".join(
+        f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)).rstrip())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,264 @@
+"""The captures whose models `bench_verdict` judges: frames, features, matches and a model of each.
+
+What is found stays in a folder for each capture, so that a second run reads it from there.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.config.stages import IngestConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.io import records
+from recon_cli.progress import NullProgress
+from recon_cli.sfm import mapper, matching
+from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, Reporter
+from recon_cli.stages import ingest
+
+FEATURES = 2000  # of an image; two thirds of the default take half of the time
+MODEL = "model.done"  # in a capture's folder
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One capture of the table.
+
+    Attributes:
+        name: as printed.
+        source: makes or names what is ingested, given DATA and the capture's folder.
+        frames: chosen from a video; photos are taken every `stride`.
+        size: longest side of a frame, pixels.
+        features: most keypoints of an image.
+        exhaustive: match all pairs; else neighbours and images that look alike.
+        label: what its model is where no reference tells: good or broken, by eye.
+    """
+
+    name: str
+    source: Callable[[Path, Path], Path]
+    frames: int = 60
+    stride: int = 1
+    size: int = 800
+    features: int = FEATURES
+    exhaustive: bool = True
+    label: str = ""
+
+
+def given(path: str) -> Callable[[Path, Path], Path]:
+    """A capture that lies in the data."""
+    return lambda data, _folder: data / path
+
+
+def every(path: str, stride: int) -> Callable[[Path, Path], Path]:
+    """Every so many photos of a folder."""
+    def link(data: Path, folder: Path) -> Path:
+        photos = folder / "photos"
+        photos.mkdir(exist_ok=True)
+        for photo in sorted((data / path).iterdir())[::stride]:
+            if not (photos / photo.name).exists():
+                (photos / photo.name).symlink_to(photo.resolve())
+        return photos
+    return link
+
+
+def reduced(path: str, count: int, size: int) -> Callable[[Path, Path], Path]:
+    """A video of `count` of a video's frames, reduced: mapping every frame would take hours."""
+    def write(data: Path, folder: Path) -> Path:
+        photos = folder / "photos"
+        photos.mkdir(exist_ok=True)
+        stream = cv2.VideoCapture(str(data / path))
+        total = int(stream.get(cv2.CAP_PROP_FRAME_COUNT))
+        wanted = set(np.linspace(0, total - 1, count).astype(int).tolist())
+        for index in range(total):
+            ok, frame = stream.read()
+            if ok and index in wanted:
+                scale = min(1.0, size / max(frame.shape[:2]))
+                frame = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+                cv2.imwrite(str(photos / f"{index:06d}.png"), frame)
+        return photos
+    return write
+
+
+POSTER = 1.2  # metres across
+SEEN_FROM = {"living": 50, "office": 50}  # the frame in whose middle the poster hangs
+
+
+def rooms_with_one_poster(data: Path, folder: Path) -> Path:
+    """Frames of two rooms, numbered on, in both of which the same poster hangs.
+
+    Nothing else ties the rooms together: a mapper lays one poster over the other.
+    """
+    photos = folder / "photos"
+    photos.mkdir(exist_ok=True)
+    poster = cv2.imread(str(sorted((data / "snowmiku_photos").glob("*.[jJ]*"))[0]))
+    for offset, (room, middle) in enumerate(SEEN_FROM.items()):
+        frames = data / "rooms" / room
+        lens = json.loads((frames / "cam_params.json").read_text(encoding="utf-8"))["camera"]
+        poses = np.loadtxt(frames / "traj.txt").reshape(-1, 4, 4)
+        matrix = np.array([[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]])
+        corners = _poster_corners(frames, middle, poses[middle], lens)
+        for index in range(0, len(poses), 2):
+            image = cv2.imread(str(frames / "results" / f"frame{index:06d}.jpg"))
+            _hang(image, poster, corners, np.linalg.inv(poses[index]), matrix)
+            cv2.imwrite(str(photos / f"{1000 * offset + index:06d}.png"), image)
+    return photos
+
+
+def _poster_corners(
+    frames: Path, index: int, pose: NDArray[np.float64], lens: dict[str, float]
+) -> NDArray[np.float64]:  # [4, 3], clockwise from the top left
+    """Where a poster hangs: before what a frame shows in its middle, towards the camera."""
+    depth = cv2.imread(str(frames / "results" / f"depth{index:06d}.png"), cv2.IMREAD_UNCHANGED)
+    near = np.median(depth[120:220, 200:400]) / lens["scale"] - 0.1
+    half = POSTER / 2
+    local = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    return np.column_stack([local, np.full(4, near)]) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _hang(
+    image: NDArray[np.uint8], poster: NDArray[np.uint8], corners: NDArray[np.float64],
+    world_to_camera: NDArray[np.float64], matrix: NDArray[np.float64]
+) -> None:
+    """Paints the poster into an image, before everything else."""
+    local = corners @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    if local[:, 2].min() < 0.2:
+        return
+    places = local @ matrix.T
+    places = (places[:, :2] / places[:, 2:]).astype(np.float32)
+    height, width = 400, 400
+    small = cv2.resize(poster, (width, height), interpolation=cv2.INTER_AREA)
+    source = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    warp = cv2.getPerspectiveTransform(source, places)
+    size = (image.shape[1], image.shape[0])
+    painted = cv2.warpPerspective(small, warp, size, flags=cv2.INTER_AREA)
+    inside = cv2.warpPerspective(np.full((height, width), 255, np.uint8), warp, size)
+    image[inside > 127] = painted[inside > 127]
+
+
+def overlay(path: str, count: int, blur: float) -> Callable[[Path, Path], Path]:
+    """Frames of a video that are nearly bare, all under one text that does not move."""
+    def write(data: Path, folder: Path) -> Path:
+        photos = reduced(path, count, 640)(data, folder)
+        draws = np.random.default_rng(0)
+        for photo in sorted(photos.iterdir()):
+            image = cv2.imread(str(photo))
+            image = cv2.GaussianBlur(image, (0, 0), blur) // 2 + 60
+            image = image + draws.normal(0, 2, image.shape)
+            image = np.clip(image, 0, 255).astype(np.uint8)
+            for line, text in enumerate(("CAM 04  LIVE 1080p", "Main St. entrance #27")):
+                cv2.putText(image, text, (20, 40 + 30 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.9,
+                            (255, 255, 255), 2)
+            cv2.imwrite(str(photo), image)
+        return photos
+    return write
+
+
+def turning(data: Path, folder: Path) -> Path:
+    """A camera that turns on the spot before a far, flat picture."""
+    photos = folder / "photos"
+    photos.mkdir(exist_ok=True)
+    picture = cv2.imread(str(sorted((data / "desk_monitors").rglob("*.[jJ]*"))[0]))
+    height, width = picture.shape[:2]
+    draws = np.random.default_rng(0)
+    wide = np.array([[0.6 * width, 0, width / 2], [0, 0.6 * width, height / 2], [0, 0, 1]])
+    narrow = np.array([[500.0, 0, 240], [0, 500.0, 180], [0, 0, 1]])
+    for index in range(40):
+        angle = np.radians(-25 + 50 * index / 39)
+        tilt = np.radians(5 * np.sin(index / 4))
+        turn = cv2.Rodrigues(np.array([tilt, angle, 0.02 * np.cos(index / 3)]))[0]
+        warp = narrow @ turn @ np.linalg.inv(wide)
+        image = cv2.warpPerspective(picture, warp, (480, 360), flags=cv2.INTER_AREA)
+        noisy = image + draws.normal(0, 2, image.shape)
+        cv2.imwrite(str(photos / f"{index:06d}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
+    return photos
+
+
+CAPTURES = (
+    Capture("fox", given("fox/images")),
+    Capture("living", given("rooms/living/video.mp4")),
+    Capture("office", given("rooms/office/video.mp4")),
+    Capture("office_noisy", given("rooms/office/video_noisy.mp4")),
+    Capture("living_noisy", given("rooms/living/video_noisy.mp4")),
+    Capture("bedroom", given("video_bedroom/room.mp4"), frames=52, label="good"),
+    Capture("trident", given("walks/trident_desk/video.mp4"), frames=80),
+    Capture("redkitchen", given("walks/redkitchen/video.mp4"), frames=30, label="good"),
+    Capture("house_entry", given("video_house_entry/video.mp4"), frames=80),
+    Capture("tum_rpy", given("walks/tum_fr1_rpy/video.mp4"), frames=70),
+    Capture("lobby_walk", given("walks/forward_walks/lobby_walk.mp4"), label="good"),
+    Capture("kitchen_walk", given("walks/forward_walks/kitchen_walk.mp4"), frames=50, label="good"),
+    Capture("study_walk", given("walks/forward_walks/study_walk.mp4"), frames=50, label="good"),
+    Capture("dining_walk", given("walks/forward_walks/dining_walk.mp4"), frames=50, label="good"),
+    Capture("snowmiku", every("snowmiku_photos", 2), label="good"),
+    Capture("desk", given("desk_monitors"), size=1000, label="good"),
+    Capture("tello", every("walks/tello_lab/images", 3)),
+    Capture("lockers", every("walks/club_room_lockers/images", 2)),
+    Capture("corridor", every("walks/office_corridor_plants/images", 4), label="good"),
+    Capture("loop", given("walks/living_room_loop/video.mp4"), frames=90, label="good"),
+    Capture("one_poster", rooms_with_one_poster),
+    Capture("overlay_bare", overlay("rooms/office/video.mp4", 60, 12.0), label="broken"),
+    Capture("overlay_dim", overlay("walks/forward_walks/lobby_walk.mp4", 60, 4.0), label="broken"),
+    Capture("turning", turning, label="broken"),
+    Capture("bonsai", given("walks/bonsai/images"), features=3000, exhaustive=False, label="good"),
+)
+
+
+def quiet() -> Reporter:
+    """A reporter that nobody listens to."""
+    return Reporter(io.BytesIO())
+
+
+def job_of(capture: Capture, folder: Path) -> MappingJob:
+    """The job of a capture whose frames are chosen; its database lies in the folder."""
+    frames = records.read_frame_list(folder)
+    groups = tuple(
+        CameraGroup(tuple(frame.name for frame in frames.frames if frame.group == index),
+                    group.width, group.height, group.focal_px, group.lens)
+        for index, group in enumerate(frames.groups))
+    return MappingJob(
+        frames=folder / records.FOLDER, denoised=folder / records.FOLDER, out=folder,
+        groups=groups, masks=None, poses=None, pose_use="ignore", given_points=False, pairs="auto",
+        max_features=capture.features, min_registered=0.5, accept_weak=True, partial=False,
+        gravity=False, scale_between=None, max_minutes=60, seed=0, threads=1,
+        sharpness={},
+        times={frame.name: frame.time_seconds + CLIP_SECONDS * frame.group
+               for frame in frames.frames if frame.time_seconds is not None})
+
+
+def prepare(capture: Capture, data: Path, out: Path) -> MappingJob:
+    """Frames, features, matches and the models of a capture; quick where they are there."""
+    folder = (out / capture.name).resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / records.LIST).exists():
+        source = capture.source(data, folder)
+        config = IngestConfig(frames=capture.frames, max_size=capture.size, holdout="none")
+        ctx = StageContext(threads=1, progress=NullProgress())
+        ingest.run(config, StageInputs(sources=(source,)), folder, ctx)
+    job = job_of(capture, folder)
+    job.attempts.mkdir(exist_ok=True)
+    if not (folder / "matched").exists():
+        job.database.unlink(missing_ok=True)
+        matching.create_database(job)
+        matching.extract_features(job, quiet())
+        pairs = matching.exhaustive_pairs(job.names)
+        if not capture.exhaustive:
+            pairs = matching.sequential_pairs(job.names)
+            pairs |= matching.similar_pairs(job.database, job.names, seed=0, besides=pairs)
+        matching.match_pairs(job, pairs, quiet())
+        (folder / "matched").touch()
+    if not (folder / MODEL).exists():
+        models = sorted(
+            mapper.map_incrementally(job, quiet()), key=mapper.model_size, reverse=True)
+        for index, model in enumerate(models):
+            mapper.adjust(model)
+            (folder / f"mapped{index}").mkdir(exist_ok=True)
+            model.write(folder / f"mapped{index}")
+        (folder / MODEL).write_text(
+            json.dumps([model.num_reg_images() for model in models]), encoding="utf-8")
+    return job
