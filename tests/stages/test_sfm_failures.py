@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from sfm_inputs import run, texture, turning, write_inputs
 
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, SfmError
+from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.sfm import database
+from recon_cli.sfm.job import StepLog
 from recon_cli.stages import sfm
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary
 
@@ -128,3 +131,19 @@ def test_a_problem_of_the_model_before_goes_on_within_the_sentence():
     line, = sfm._attempts([attempt("exhaustive"), broken])
     assert_facts(line, "global was tried", "the model is broken", 9)
     assert ".:" not in line
+
+
+def test_held_out_frames_of_a_part_that_is_left_out_are_counted(tmp_path):
+    names = [f"{index}.png" for index in range(6)]
+    frames = FrameList("video", (Group("a.mp4", 64, 48),), tuple(
+        Frame(name, None, "a.mp4", None, held_out=name in ("0.png", "4.png")) for name in names))
+    known = summaries.SFM.to_json()
+    log = StepLog(tmp_path)
+    log.finish("model", {**known, "registered": names[:3], "left_out": names[3:5], "seconds": 1.0})
+    log.finish("sparse", {**known["world"], "seconds": 1.0})
+    log.finish("undistorted", {"cameras": [], "seconds": 1.0})
+    steps = ("model", "sparse", "undistorted")
+    summary = sfm._summary(frames, SimpleNamespace(out=tmp_path, steps=steps))
+    assert summary.left_out == ("3.png", "4.png")
+    assert summary.unregistered == ("3.png", "4.png", "5.png")  # no mapper found a place for 5
+    assert summary.unregistered_held_out == ("4.png",)
