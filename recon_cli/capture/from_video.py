@@ -20,7 +20,6 @@ from recon_cli.errors import InputError
 from recon_cli.io import records as store
 from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.io.records import Frame, Group
-from recon_cli.workspace import atomic
 
 # A count by the duration may be off by this much, as a share or in frames, without any loss.
 COUNT_SHARE, COUNT_FRAMES = 0.02, 10
@@ -42,12 +41,12 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     InputError if it is no video, has too few whole frames, shows nothing, or shows no motion.
     """
     if scan_file.exists():
-        scan = Scan.from_json(atomic.read_json(scan_file))
+        scan = Scan.read(scan_file)
     else:
         claim = read_declared_length(path)
         with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
             scan = scan_video(path, threads=ctx.threads, step=bar.advance)
-        atomic.write_json(scan_file, scan.to_json())
+        scan.write(scan_file)
     for notice in scan.notices:
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
@@ -108,7 +107,7 @@ def ingest(
         "video", (Group(path.name, width, height),), frames,
         declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
         blurred=int((scan.whole & ~judgement.usable).sum()),
-        selection=Selection(record, sheet, prefix))
+        selection=Selection(record, sheet, prefix), tracks=scan.tracks.select(names))
 
 
 def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:

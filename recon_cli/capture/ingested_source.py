@@ -10,6 +10,7 @@ from typing import Protocol
 from recon_cli.capture.contact_sheet import SHEET, ContactSheet
 from recon_cli.capture.frame_selection import CHOICE, FrameCandidate, write_choice
 from recon_cli.io.records import Frame, Group, KnownPoses
+from recon_cli.io.tracks import Tracks, merge_tracks
 from recon_cli.progress import Progress
 
 
@@ -60,6 +61,7 @@ class IngestedSource:
     splits: bool = False  # the source itself says which frames are held out
     poses: KnownPoses | None = None  # by the names of the frames
     selection: Selection | None = None  # None where all frames are used
+    tracks: Tracks | None = None  # through the frames of a video
 
 
 def merge_sources(parts: Sequence[IngestedSource]) -> IngestedSource:
@@ -72,6 +74,7 @@ def merge_sources(parts: Sequence[IngestedSource]) -> IngestedSource:
         frames += [replace(frame, group=frame.group + len(groups)) for frame in part.frames]
         groups += part.groups
     kinds = {part.kind for part in parts}
+    tracks = [part.tracks for part in parts if part.tracks is not None]
     return IngestedSource(
         kind=kinds.pop() if len(kinds) == 1 else "mixed", groups=tuple(groups),
         frames=tuple(sorted(frames, key=lambda frame: frame.name)),
@@ -79,4 +82,5 @@ def merge_sources(parts: Sequence[IngestedSource]) -> IngestedSource:
         decoded=sum(part.decoded for part in parts),
         lost=sum(part.lost for part in parts),
         blurred=sum(part.blurred for part in parts),
-        skipped=tuple(name for part in parts for name in part.skipped))
+        skipped=tuple(name for part in parts for name in part.skipped),
+        tracks=merge_tracks(tracks) if tracks else None)

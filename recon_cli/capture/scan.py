@@ -1,4 +1,4 @@
-"""One pass over all frames of a video: their measures, and which of them are whole."""
+"""One pass over all frames of a video: their measures, tracks, and which of them are whole."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from recon_cli.capture import video
 from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
+from recon_cli.capture.tracker import Tracker
 from recon_cli.errors import InputError
+from recon_cli.io.tracks import Tracks
+from recon_cli.workspace import atomic
 
 # B-frames in a row: x264's presets write up to 8. HEVC encoders mark whole groups as B.
 MAX_B_RUN = 8
@@ -34,6 +37,7 @@ class Scan:
     seconds: tuple[float | None, ...]  # presentation times, None where unknown
     # [F], False from a lost or damaged packet to the next key frame
     whole: NDArray[np.bool_]
+    tracks: Tracks  # of corners through all frames
     notices: tuple[str, ...]  # about conversions that the owner of the video may not expect
 
     @property
@@ -46,19 +50,22 @@ class Scan:
         """How many frames are missing or broken."""
         return self.expected - int(self.whole.sum())
 
-    def to_json(self) -> dict[str, Any]:
-        """Returns the scan as JSON values; NaN becomes null."""
+    def write(self, path: Path) -> None:
+        """Writes the measures as JSON, NaN as null, and the tracks beside them."""
         values = {
             name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(self).items()}
+            for name, value in vars(self).items() if name != "tracks"}
         motion = [None if np.isnan(step) else step for step in values["motion"]]
-        return {**values, "motion": motion}
+        self.tracks.write(path.with_suffix(".safetensors"))
+        atomic.write_json(path, {**values, "motion": motion})
 
     @classmethod
-    def from_json(cls, value: dict[str, Any]) -> Scan:
-        """Returns the scan that `to_json` wrote."""
+    def read(cls, path: Path) -> Scan:
+        """Returns the scan that `write` wrote."""
+        value: dict[str, Any] = atomic.read_json(path)
         return cls(**{
             **value,
+            "tracks": Tracks.read(path.with_suffix(".safetensors")),
             "sharpness": np.array(value["sharpness"], np.float64),
             "motion": np.array(value["motion"], np.float64),  # null becomes NaN
             "exposure": np.array(value["exposure"], np.float64).reshape(-1, 3),
@@ -102,13 +109,15 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     measures: list[_FrameMeasures] = []
     gaps: list[tuple[int, int | None]] = []  # (frames before it, pts)
     first: DecodedPicture | None = None
-    meter = MotionMeter()
+    meter, tracker = MotionMeter(), Tracker()
     for item in video.decode(path, threads=threads):
         if isinstance(item, Gap):
             gaps.append((len(measures), item.pts))
             continue
         first = first or item
-        measures.append(_measure(item, meter))
+        gray = item.gray()
+        measures.append(_measure(item, gray, meter))
+        tracker.advance(gray)
         step()
     if first is None:
         with video.open_video(path) as (_, stream):
@@ -125,12 +134,14 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         motion=np.array([frame.motion for frame in measures], np.float64),
         exposure=np.round([frame.exposure for frame in measures], 4),
         seconds=tuple(frame.seconds for frame in measures),
-        whole=_find_whole(measures, gaps),
+        whole=_find_whole(measures, gaps), tracks=tracker.tracks(),
         notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))
 
 
-def _measure(picture: DecodedPicture, meter: MotionMeter) -> _FrameMeasures:
-    gray, frame = picture.gray(), picture.frame
+def _measure(
+    picture: DecodedPicture, gray: NDArray[np.uint8], meter: MotionMeter
+) -> _FrameMeasures:
+    frame = picture.frame
     return _FrameMeasures(
         sharpness=measure_sharpness(gray), motion=meter.advance(gray),
         exposure=measure_exposure(gray), seconds=frame.time, pts=frame.pts,

@@ -15,13 +15,14 @@ from recon_cli.errors import InputError
 from recon_cli.io import records as store
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.io.records import FrameList
+from recon_cli.io.tracks import TRACKS
 from recon_cli.workspace.summaries import IngestSummary
 
 MIN_TRAINED = 2  # one view holds no depth
 
 
 def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> IngestSummary:
-    """Writes frames/*.png, frames.json, choice.json and contact.png into `out`.
+    """Writes frames/*.png, frames.json, choice.json, contact.png and tracks into `out`.
 
     The sources are video files and folders of photos, recognised by content, or one data set with
     poses. Each gets its own intrinsics. Frames that are already in `out` are kept.
@@ -41,6 +42,8 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     for part in parts:
         if part.selection is not None:
             part.selection.write(out, held)
+    if source.tracks is not None:
+        source.tracks.write(out / TRACKS)
     FrameList(source.kind, source.groups, frames).write(out)
     poses = source.poses
     largest = max(source.groups, key=lambda group: group.width * group.height)
