@@ -8,26 +8,34 @@ from __future__ import annotations
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 # A point says something from three images on; two that follow each other may be alike.
 MIN_IMAGES = 3
-# Of the image's longer side: the box around all places where a point was found in the images.
+# Of the image's longer side: the diagonal of the box around all spots where a point was found.
 MAX_SPREAD = 0.005
 MAX_STILL = 0.1
 
 
 def find_still_share(model: pycolmap.Reconstruction) -> float:
     """Returns the share of the points in three or more images that do not move in them."""
-    images = {i: model.image(i) for i in model.reg_image_ids()}
-    places = {i: np.array([point.xy for point in image.points2D]) for i, image in images.items()}
-    sizes = {i: max(image.camera.width, image.camera.height) for i, image in images.items()}
-    still = total = 0
-    for point in model.points3D.values():
-        elements = point.track.elements
-        if len({element.image_id for element in elements}) < MIN_IMAGES:
-            continue
-        found = np.array([places[element.image_id][element.point2D_idx] for element in elements])
-        spread = float(np.linalg.norm(np.ptp(found, axis=0))) / sizes[elements[0].image_id]
-        total += 1
-        still += spread < MAX_SPREAD
-    return still / max(total, 1)
+    points: list[int] = []
+    spots: list[NDArray[np.float64]] = []
+    for index in model.reg_image_ids():
+        image = model.image(index)
+        size = max(image.camera.width, image.camera.height)
+        for spot in image.points2D:
+            if spot.has_point3D():
+                points.append(spot.point3D_id)
+                spots.append(spot.xy / size)
+    if not points:
+        return 0.0
+    numbers = np.array(points)
+    order = np.argsort(numbers, kind="stable")
+    sorted_spots = np.array(spots)[order]
+    _, starts, counts = np.unique(numbers[order], return_index=True, return_counts=True)
+    spread = np.linalg.norm(
+        np.maximum.reduceat(sorted_spots, starts) - np.minimum.reduceat(sorted_spots, starts),
+        axis=1)
+    still = spread[counts >= MIN_IMAGES] < MAX_SPREAD
+    return float(still.mean()) if len(still) else 0.0

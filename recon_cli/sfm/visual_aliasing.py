@@ -194,18 +194,18 @@ def _likely_angles(
     other: int,
 ) -> NDArray[np.float64]:  # [S]
     """Returns the angle, in degrees, at which another image should find samples; NaN if not."""
-    rays = positions[samples.point] - center
-    near = np.linalg.norm(samples.rays, axis=1)
-    far = np.linalg.norm(rays, axis=1)
-    cosine = np.einsum("sk,sk->s", rays, samples.rays) / np.maximum(near * far, 1e-300)
-    angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    angles = np.full(len(samples.point), np.nan)
+    rows = np.flatnonzero(~np.isnan(frame[samples.point, 0]) & (samples.image != other))
+    theirs = samples.rays[rows]
+    ours = positions[samples.point[rows]] - center
+    near, far = (np.sqrt(np.einsum("sk,sk->s", rays, rays)) for rays in (theirs, ours))
+    cosines = np.einsum("sk,sk->s", ours, theirs) / np.maximum(near * far, 1e-300)
     likely = (
-        ~np.isnan(frame[samples.point, 0])
-        & (samples.image != other)
-        & (angles < MAX_ANGLE_DEG)
+        (cosines > np.cos(np.radians(MAX_ANGLE_DEG)))
         & (near < MAX_RATIO * far)
         & (far < MAX_RATIO * near))
-    return np.where(likely, angles, np.nan)
+    angles[rows[likely]] = np.degrees(np.arccos(np.minimum(cosines[likely], 1.0)))
+    return angles
 
 
 def _bands(

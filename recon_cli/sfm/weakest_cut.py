@@ -113,10 +113,16 @@ class _Links:
 def _drop_wrong_cameras(links: _Links, registered: Cut, allowed: int) -> Cut:  # [N]
     """Returns the images without those that nearly all of their strongest ties contradict.
 
-    Returns all where there are too many of those: then a part of the model is wrong.
+    Those that share no point with the others go first. Returns all where there are too many: then a
+    part of the model is wrong.
     """
     inliers = registered.copy()
+    rows = np.flatnonzero(registered)
+    for piece in view_graph.components(links.shared[np.ix_(rows, rows)])[1:]:
+        inliers[rows[piece]] = False
     for _ in range(allowed + 1):
+        if np.count_nonzero(registered & ~inliers) > allowed:
+            break
         rows = np.flatnonzero(inliers)
         inner = np.ix_(rows, rows)
         ties = view_graph.strongest_ties(links.matches[inner], STRONGEST)

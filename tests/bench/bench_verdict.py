@@ -27,18 +27,20 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from pose_errors import reference_poses, similarity
-from verdict_captures import CAPTURES, MODEL, Capture, prepare
+from verdict_captures import CAPTURES, MODEL, ROOMS, Capture, prepare
 from verdict_variants import BROKEN, GOOD, Variant, make, ordered_poses
 
 from recon_cli.io import records
 from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
+from recon_cli.sfm.merge_models import drop_outliers
 from recon_cli.sfm.verdict import ModelVerdict, examine, is_aliased, is_broken
 
 SOUND = 0.02  # of the extent: no camera of a good model is further off
 DISPLACED = 0.05  # of the extent: a model with a camera further off is broken
 TRIALS = 2000  # samples of four cameras; with half of them right, one in 16 is good
 PER_CAPTURE = 7  # broken models made of each capture, taken in turn from all kinds
+MOST_CAMERAS = 120  # nothing is made of a larger model: each takes minutes
 STEP = 5  # from one capture's first kind to the next one's
 Centers = Mapping[str, NDArray[np.float64]]  # [3] by name
 
@@ -109,9 +111,9 @@ def reference(capture: Capture, data: Path, folder: Path) -> Centers:
                    for image in map(model.image, model.reg_image_ids())}
         return {frame.name: centers[frame.source]
                 for frame in records.read_frame_list(folder).frames if frame.source in centers}
-    if capture.name == "one_poster":
+    if capture.name.startswith("one_poster"):
         apart: dict[str, NDArray[np.float64]] = {}
-        for offset, name in enumerate(("living", "office")):
+        for offset, name in enumerate(ROOMS):
             poses = reference_poses(data / "rooms" / name / "traj.txt")
             apart |= {f"{1000 * offset + int(Path(key).stem):06d}.png":
                         pose[:3, 3] + [100 * offset, 0, 0] for key, pose in poses.items()}
@@ -155,7 +157,8 @@ def judge(
     capture: Capture, made: str, model: pycolmap.Reconstruction, job: MappingJob,
     names: Sequence[str], truth: Centers, label: str = ""
 ) -> Row:
-    """A line of the table."""
+    """A line of the table, once images that contradict the others are taken out as sfm does."""
+    model = drop_outliers(job, model).model
     start = time.process_time()
     verdict = examine(model, job.database, names, times=job.times)
     seconds = time.process_time() - start
@@ -192,6 +195,8 @@ def rows_of(capture: Capture, number: int, data: Path, out: Path) -> Iterator[Ro
         return
     poses = ordered_poses(job, base)
     found = {name: pose.inverse().translation for name, pose in poses.items()}
+    if len(poses) > MOST_CAMERAS:
+        return
     kinds = [BROKEN[(STEP * number + index) % len(BROKEN)] for index in range(PER_CAPTURE)]
     for variant in (*GOOD, *kinds):
         yield from _made(capture, variant, job, base, found)
@@ -214,12 +219,16 @@ def _made(
 
 
 def choose_bounds(rows: Sequence[Row]) -> dict[str, float]:
-    """For each share, the middle between the lowest of a good model and the next broken one."""
-    bounds = {}
+    """For each share, the middle between the lowest of a good model and the next broken one.
+
+    What the share of points shows, the overlap need not show again.
+    """
+    bounds: dict[str, float] = {}
     for name in ("points", "overlap"):
         lowest = min(row.shares[name] for row in rows if row.label == "good")
         below = [row.shares[name] for row in rows
-                 if row.label == "broken" and row.shares[name] < lowest]
+                 if row.label == "broken" and row.shares[name] < lowest
+                 and not any(row.shares[other] < bound for other, bound in bounds.items())]
         bounds[name] = (lowest + max(below, default=0.0)) / 2
     return bounds
 

@@ -86,38 +86,42 @@ def reduced(path: str, count: int, size: int) -> Callable[[Path, Path], Path]:
     return write
 
 
-POSTER = 1.2  # metres across
-SEEN_FROM = {"living": 50, "office": 50}  # the frame in whose middle the poster hangs
+ROOMS = ("living", "office")
 
 
-def rooms_with_one_poster(data: Path, folder: Path) -> Path:
-    """Frames of two rooms, numbered on, in both of which the same poster hangs.
+def rooms_with_one_poster(
+    size: float, middles: tuple[int, int], step: int
+) -> Callable[[Path, Path], Path]:
+    """Frames of two rooms, numbered on, in both of which the same poster hangs, `size` metres wide.
 
-    Nothing else ties the rooms together: a mapper lays one poster over the other.
+    It hangs in the middle of one frame of each. Nothing else ties the rooms together: a mapper lays
+    one poster over the other.
     """
-    photos = folder / "photos"
-    photos.mkdir(exist_ok=True)
-    poster = cv2.imread(str(sorted((data / "snowmiku_photos").glob("*.[jJ]*"))[0]))
-    for offset, (room, middle) in enumerate(SEEN_FROM.items()):
-        frames = data / "rooms" / room
-        lens = json.loads((frames / "cam_params.json").read_text(encoding="utf-8"))["camera"]
-        poses = np.loadtxt(frames / "traj.txt").reshape(-1, 4, 4)
-        matrix = np.array([[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]])
-        corners = _poster_corners(frames, middle, poses[middle], lens)
-        for index in range(0, len(poses), 2):
-            image = cv2.imread(str(frames / "results" / f"frame{index:06d}.jpg"))
-            _hang(image, poster, corners, np.linalg.inv(poses[index]), matrix)
-            cv2.imwrite(str(photos / f"{1000 * offset + index:06d}.png"), image)
-    return photos
+    def write(data: Path, folder: Path) -> Path:
+        photos = folder / "photos"
+        photos.mkdir(exist_ok=True)
+        poster = cv2.imread(str(sorted((data / "snowmiku_photos").glob("*.[jJ]*"))[0]))
+        for offset, (room, middle) in enumerate(zip(ROOMS, middles, strict=True)):
+            frames = data / "rooms" / room
+            lens = json.loads((frames / "cam_params.json").read_text(encoding="utf-8"))["camera"]
+            poses = np.loadtxt(frames / "traj.txt").reshape(-1, 4, 4)
+            matrix = np.array([[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]])
+            corners = _poster_corners(frames, middle, poses[middle], lens, size)
+            for index in range(0, len(poses), step):
+                image = cv2.imread(str(frames / "results" / f"frame{index:06d}.jpg"))
+                _hang(image, poster, corners, np.linalg.inv(poses[index]), matrix)
+                cv2.imwrite(str(photos / f"{1000 * offset + index:06d}.png"), image)
+        return photos
+    return write
 
 
 def _poster_corners(
-    frames: Path, index: int, pose: NDArray[np.float64], lens: dict[str, float]
+    frames: Path, index: int, pose: NDArray[np.float64], lens: dict[str, float], size: float
 ) -> NDArray[np.float64]:  # [4, 3], clockwise from the top left
     """Where a poster hangs: before what a frame shows in its middle, towards the camera."""
     depth = cv2.imread(str(frames / "results" / f"depth{index:06d}.png"), cv2.IMREAD_UNCHANGED)
     near = np.median(depth[120:220, 200:400]) / lens["scale"] - 0.1
-    half = POSTER / 2
+    half = size / 2
     local = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
     return np.column_stack([local, np.full(4, near)]) @ pose[:3, :3].T + pose[:3, 3]
 
@@ -201,9 +205,11 @@ CAPTURES = (
     Capture("lockers", every("walks/club_room_lockers/images", 2)),
     Capture("corridor", every("walks/office_corridor_plants/images", 4), label="good"),
     Capture("loop", given("walks/living_room_loop/video.mp4"), frames=90, label="good"),
-    Capture("one_poster", rooms_with_one_poster),
+    Capture("one_poster", rooms_with_one_poster(1.2, (50, 50), 2)),
+    Capture("one_poster_large", rooms_with_one_poster(1.8, (80, 0), 3)),
     Capture("overlay_bare", overlay("rooms/office/video.mp4", 60, 12.0), label="broken"),
-    Capture("overlay_dim", overlay("walks/forward_walks/lobby_walk.mp4", 60, 4.0), label="broken"),
+    Capture("office_faint_text", overlay("rooms/office/video.mp4", 60, 3.0)),
+    Capture("office_text", overlay("rooms/office/video.mp4", 60, 0.6)),
     Capture("turning", turning, label="broken"),
     Capture("bonsai", given("walks/bonsai/images"), features=3000, exhaustive=False, label="good"),
 )

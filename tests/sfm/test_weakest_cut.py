@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -95,6 +97,15 @@ def test_a_break_between_images_that_follow_each_other_is_not_hidden_by_a_closed
     assert link.share == 0
     first, second = link.sides
     assert ("j" in first) == ("k" in second), "it is cut where it is broken"
+
+
+def test_an_image_that_shares_no_point_with_the_others_is_astray():
+    made = evidence(lambda _a, _b: 1.0)
+    visible = np.ones((COUNT, 50), bool)
+    visible[6], visible[:, 0] = False, np.arange(COUNT) == 6
+    link, astray = weakest_cut.find_weakest_cut(dataclasses.replace(made, visible=visible))
+    assert [item.name for item in astray] == ["g"]
+    assert link.share == 1
 
 
 def test_pairs_that_show_no_points_say_nothing():
