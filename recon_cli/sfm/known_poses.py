@@ -105,7 +105,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
             raise _misfit(share, MIN_AGREEING)
         verdict = examine(
             model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times)
-        check_weak_link(verdict, job.accept_weak)
+        check_weak_link(verdict, job.accept_weak, given=True)
         atomic.write_json(job.out / VERDICT, verdict.to_json())
         lines = verdict.lines()
     folder = fresh_folder(job.out / "model.partial")

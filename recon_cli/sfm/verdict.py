@@ -182,12 +182,17 @@ def is_aliased(aliasing: VisualAliasing) -> bool:
     return aliasing.share is not None and aliasing.share < visual_aliasing.MIN_OVERLAP
 
 
-def check_weak_link(verdict: ModelVerdict, accept: bool) -> None:
-    """Raises SfmError for a model that cannot be trusted, unless `accept` (--accept-weak)."""
-    if accept or verdict.trusted:
+def check_weak_link(verdict: ModelVerdict, accept: bool, *, given: bool = False) -> None:
+    """Raises SfmError for a model that cannot be trusted, unless `accept` (--accept-weak).
+
+    Cameras that were `given` may leap, and need no points in common: only matches refute them.
+    """
+    refuted = [*_describe_break(verdict.weakest_cut), *_describe_aliasing(verdict.aliasing)]
+    problems = refuted if given else verdict.problems
+    if accept or not problems:
         return
     raise SfmError(
-        " ".join(verdict.problems),
+        " ".join(problems),
         hint="Use more frames between the two parts (recon ingest --frames N), match all of them "
         "(--pairs exhaustive), or keep the model as it is with --accept-weak.")
 

@@ -125,6 +125,9 @@ def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
     verdict = verdict_on(made, tmp_path)
     assert not verdict.trusted
     assert any(f"leaps from {made.names[4]}" in problem for problem in verdict.problems)
+    with pytest.raises(SfmError, match="leaps from"):
+        check_weak_link(verdict, accept=False)
+    check_weak_link(verdict, accept=False, given=True)
 
 
 def test_parts_that_share_no_point_are_a_problem(tmp_path):
