@@ -30,7 +30,6 @@ from pose_errors import reference_poses, similarity
 from verdict_captures import CAPTURES, MODEL, ROOMS, Capture, prepare
 from verdict_variants import BROKEN, GOOD, Variant, make, ordered_poses
 
-from recon_cli.io import records
 from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import drop_outliers
@@ -93,11 +92,8 @@ HEADS = ("capture", "made", "cameras", "farthest", "displaced", "points", "overl
          "parts", "jump", "still", "angle", "error", "s", "label", "verdict", "")
 
 
-def reference(capture: Capture, data: Path, folder: Path) -> Centers:
-    """True centres of a capture's cameras; empty where they are not known.
-
-    The folder tells which photo became which frame.
-    """
+def reference(capture: Capture, data: Path) -> Centers:
+    """True centres of a capture's cameras; empty where they are not known."""
     room = capture.name.split("_")[0]
     if room in ("living", "office"):
         return _places(reference_poses(data / "rooms" / room / "traj.txt"))
@@ -105,12 +101,6 @@ def reference(capture: Capture, data: Path, folder: Path) -> Centers:
         return _places(reference_poses(data / "fox"))
     if capture.name == "trident":
         return {name: pose.inverse().translation for name, pose in trident_poses(data).items()}
-    if capture.name == "lockers":
-        model = pycolmap.Reconstruction(data / "walks/club_room_lockers/sparse/0")
-        centers = {image.name: image.projection_center()
-                   for image in map(model.image, model.reg_image_ids())}
-        return {frame.name: centers[frame.source]
-                for frame in records.read_frame_list(folder).frames if frame.source in centers}
     if capture.name.startswith("one_poster"):
         apart: dict[str, NDArray[np.float64]] = {}
         for offset, name in enumerate(ROOMS):
@@ -184,7 +174,7 @@ def rows_of(capture: Capture, number: int, data: Path, out: Path) -> Iterator[Ro
     if not json.loads((job.out / MODEL).read_text(encoding="utf-8")):
         click.echo(f"{capture.name}: no model")
         return
-    base, truth = pycolmap.Reconstruction(job.out / "mapped0"), reference(capture, data, job.out)
+    base, truth = pycolmap.Reconstruction(job.out / "mapped0"), reference(capture, data)
     own = judge(capture, "mapped", base, job, job.names, truth, capture.label)
     yield own
     if capture.name == "trident":

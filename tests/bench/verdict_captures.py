@@ -38,7 +38,9 @@ class Capture:
         size: longest side of a frame, pixels.
         features: most keypoints of an image.
         exhaustive: match all pairs; else neighbours and images that look alike.
-        label: what its model is where no reference tells: good or broken, by eye.
+        label: what its model is where no reference tells: good or broken, by eye. tum_rpy hardly
+            moves and is good by its rotations, off by 1.2 degrees in the median. Of lockers one
+            camera is 6% off the poses of others, which fewer of its matches agree with.
     """
 
     name: str
@@ -194,7 +196,7 @@ CAPTURES = (
     Capture("trident", given("walks/trident_desk/video.mp4"), frames=80),
     Capture("redkitchen", given("walks/redkitchen/video.mp4"), frames=30, label="good"),
     Capture("house_entry", given("video_house_entry/video.mp4"), frames=80),
-    Capture("tum_rpy", given("walks/tum_fr1_rpy/video.mp4"), frames=70),
+    Capture("tum_rpy", given("walks/tum_fr1_rpy/video.mp4"), frames=70, label="good"),
     Capture("lobby_walk", given("walks/forward_walks/lobby_walk.mp4"), label="good"),
     Capture("kitchen_walk", given("walks/forward_walks/kitchen_walk.mp4"), frames=50, label="good"),
     Capture("study_walk", given("walks/forward_walks/study_walk.mp4"), frames=50, label="good"),
@@ -202,7 +204,7 @@ CAPTURES = (
     Capture("snowmiku", every("snowmiku_photos", 2), label="good"),
     Capture("desk", given("desk_monitors"), size=1000, label="good"),
     Capture("tello", every("walks/tello_lab/images", 3)),
-    Capture("lockers", every("walks/club_room_lockers/images", 2)),
+    Capture("lockers", every("walks/club_room_lockers/images", 2), label="good"),
     Capture("corridor", every("walks/office_corridor_plants/images", 4), label="good"),
     Capture("loop", given("walks/living_room_loop/video.mp4"), frames=90, label="good"),
     Capture("one_poster", rooms_with_one_poster(1.2, (50, 50), 2)),
