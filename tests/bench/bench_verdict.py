@@ -33,7 +33,7 @@ from verdict_variants import BROKEN, GOOD, Variant, make, ordered_poses
 from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import drop_outliers
-from recon_cli.sfm.verdict import ModelVerdict, examine, is_aliased, is_broken
+from recon_cli.sfm.verdict import ModelVerdict, is_aliased, is_broken
 
 SOUND = 0.02  # of the extent: no camera of a good model is further off
 DISPLACED = 0.05  # of the extent: a model with a camera further off is broken
@@ -145,12 +145,12 @@ def displacements(found: NDArray[np.float64], truth: NDArray[np.float64]) -> NDA
 
 def judge(
     capture: Capture, made: str, model: pycolmap.Reconstruction, job: MappingJob,
-    names: Sequence[str], truth: Centers, label: str = ""
+    truth: Centers, label: str = ""
 ) -> Row:
     """A line of the table, once images that contradict the others are taken out as sfm does."""
-    model = drop_outliers(job, model).model
     start = time.process_time()
-    verdict = examine(model, job.database, names, times=job.times)
+    candidate = drop_outliers(job, model)
+    model, verdict = candidate.model, candidate.verdict
     seconds = time.process_time() - start
     centers = {image.name: image.projection_center()
                for image in map(model.image, model.reg_image_ids())}
@@ -175,7 +175,7 @@ def rows_of(capture: Capture, number: int, data: Path, out: Path) -> Iterator[Ro
         click.echo(f"{capture.name}: no model")
         return
     base, truth = pycolmap.Reconstruction(job.out / "mapped0"), reference(capture, data)
-    own = judge(capture, "mapped", base, job, job.names, truth, capture.label)
+    own = judge(capture, "mapped", base, job, truth, capture.label)
     yield own
     if capture.name == "trident":
         known = trident_poses(data)
@@ -185,7 +185,7 @@ def rows_of(capture: Capture, number: int, data: Path, out: Path) -> Iterator[Ro
         return
     poses = ordered_poses(job, base)
     found = {name: pose.inverse().translation for name, pose in poses.items()}
-    if len(poses) > MOST_CAMERAS:
+    if len(poses) > MOST_CAMERAS or capture.turning:
         return
     kinds = [BROKEN[(STEP * number + index) % len(BROKEN)] for index in range(PER_CAPTURE)]
     for variant in (*GOOD, *kinds):
@@ -201,11 +201,11 @@ def _made(
     if model is None or model.num_points3D() == 0:
         click.echo(f"{capture.name}, {variant.name}: no points are left")
         return
-    names = json.loads((folder / "done.json").read_text(encoding="utf-8"))
-    row = judge(capture, variant.name, model, dataclasses.replace(job, out=folder), names, truth)
-    # What the adjustment has moved back halfway is neither.
-    mended = variant in BROKEN and row.label == "good"
-    yield dataclasses.replace(row, label="") if mended else row
+    row = judge(capture, variant.name, model, dataclasses.replace(job, out=folder), truth)
+    # What the adjustment has moved back halfway is neither, nor are cameras of a good model that
+    # nothing ties together once the others are gone.
+    neither = variant in BROKEN or len(row.verdict.model_parts) > 1
+    yield dataclasses.replace(row, label="") if neither and row.label == "good" else row
 
 
 def choose_bounds(rows: Sequence[Row]) -> dict[str, float]:
@@ -273,7 +273,7 @@ def main(data: Path, out: Path, names: tuple[str, ...], *, only_map: bool) -> No
 
 def print_cells(cells: Sequence[str]) -> None:
     """Prints one line of the table."""
-    widths = (13, 21, 8, 9, 10, 7, 8, 9, 6, 5, 6, 6, 6, 5, 7, 8, 5)
+    widths = (17, 21, 8, 9, 10, 7, 8, 9, 6, 5, 6, 6, 6, 5, 7, 8, 5)
     click.echo(" ".join(
         f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)).rstrip())
 
