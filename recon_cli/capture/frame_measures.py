@@ -34,9 +34,14 @@ SHARPNESS_SIZE = 960
 
 
 class MotionMeter:
-    """Follows corners through a video, one gray frame at a time."""
+    """Follows corners through a video, one gray frame at a time.
 
-    def __init__(self) -> None:
+    Args:
+        hidden: [h, w] where a frame, at any size, shows nothing of the scene; None for nowhere.
+    """
+
+    def __init__(self, hidden: NDArray[np.bool_] | None = None) -> None:
+        self._hidden = hidden
         self._anchor: NDArray[np.uint8] | None = None
         self._corners: NDArray[np.float32] | None = None
         self._reached = 0.0  # furthest displacement from the anchor so far
@@ -67,7 +72,9 @@ class MotionMeter:
 
     def _drop_anchor(self, small: NDArray[np.uint8]) -> None:
         self._anchor = small
-        self._corners = cv2.goodFeaturesToTrack(small, MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING)
+        self._corners = cv2.goodFeaturesToTrack(
+            small, MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING,
+            mask=None if self._hidden is None else _visible(self._hidden, small.shape))
         self._reached = 0.0
 
     def _displacement(self, small: NDArray[np.uint8]) -> float:
@@ -134,9 +141,22 @@ def check_exposure(
         f"anything that can be matched, but at least {least} are needed.", hint=hint)
 
 
-def measure_sharpness(gray: NDArray[np.uint8]) -> float:
-    """Returns the variance of the Laplacian of a gray frame [H, W] at a common size."""
+def measure_sharpness(
+    gray: NDArray[np.uint8], hidden: NDArray[np.bool_] | None = None
+) -> float:
+    """Returns the variance of the Laplacian of a gray frame [H, W] at a common size.
+
+    `hidden` [h, w], at any size, leaves out what shows nothing of the scene.
+    """
     scale = SHARPNESS_SIZE / max(gray.shape)
     if scale < 1:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+    edges = np.asarray(cv2.Laplacian(gray, cv2.CV_32F))
+    return float((edges if hidden is None else edges[_visible(hidden, gray.shape) > 0]).var())
+
+
+def _visible(hidden: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Returns 255 where a frame of `shape` shows the scene, else 0."""
+    seen = np.where(hidden, 0, 255).astype(np.uint8)
+    return np.asarray(cv2.resize(
+        seen, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST), np.uint8)

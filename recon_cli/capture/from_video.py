@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,9 @@ from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_measures import check_exposure, well_exposed
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
-from recon_cli.capture.scan import Scan, decode_threads, scan_video
+from recon_cli.capture.masks import write_mask
+from recon_cli.capture.scan import Scan, decode_threads, measure_scene, scan_video
+from recon_cli.capture.static_overlay import MOST, PICTURE, draw_overlay, mask_overlay
 from recon_cli.capture.video import frames_at, read_declared_length
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
@@ -21,6 +23,7 @@ from recon_cli.io import records as store
 from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.io.records import Frame, Group
 
+SCAN = "scan.json"  # a scan for the next run; the prefix of the video's frames comes before it
 # A count by the duration may be off by this much, as a share or in frames, without any loss.
 COUNT_SHARE, COUNT_FRAMES = 0.02, 10
 
@@ -43,10 +46,14 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     if scan_file.exists():
         scan = Scan.read(scan_file)
     else:
-        claim = read_declared_length(path)
-        with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
-            scan = scan_video(path, threads=ctx.threads, step=bar.advance)
+        scan = _scan(config, path, ctx)
         scan.write(scan_file)
+    if scan.overlay is not None:
+        picture = scan_file.name.replace(SCAN, PICTURE)
+        ctx.notice(
+            f"{float(scan.overlay.mean()):.1%} of the picture of {path.name} is fixed to the "
+            "camera (text, a logo, dirt on the lens) and is masked in all of its frames; "
+            f"{picture} in the folder of ingest shows where. --overlays keep leaves it in.")
     for notice in scan.notices:
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
@@ -63,6 +70,23 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     lengths = frame_selection.path_length(scan.motion)
     return ScannedVideo(path, scan, lengths, frame_selection.judge_frames(
         lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness))
+
+
+def _scan(config: IngestConfig, path: Path, ctx: IngestContext) -> Scan:
+    """Returns the scan of a video; with an overlay that is to be masked, of what else it shows."""
+    claim = read_declared_length(path)
+    with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
+        scan = scan_video(path, threads=ctx.threads, step=bar.advance)
+    if config.overlays == "keep" or scan.overlay is None:
+        return replace(scan, overlay=None)
+    share = float(scan.overlay.mean())
+    if share > MOST:
+        return replace(scan, overlay=None, notices=(
+            *scan.notices,
+            f"{share:.0%} of the picture of {path.name} stays where it is while the rest moves; an "
+            "overlay covers less, so that nothing is masked."))
+    with ctx.progress.bar("scan without overlay", len(scan.whole), unit="frame") as bar:
+        return measure_scene(path, scan, threads=ctx.threads, step=bar.advance)
 
 
 def frame_counts(config: IngestConfig, sources: Sequence[ScannedVideo]) -> list[int]:
@@ -99,15 +123,24 @@ def ingest(
         path.name, scan.sharpness, judgement.refused, source.lengths, names)
     sheet = ContactSheet(path.name, record, scan.width, scan.height)
     _write(source, names, sheet, config.max_size, out, ctx)
-    frames = tuple(
-        Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False)
-        for index, name in names.items())
     width, height = fit_size(scan.width, scan.height, config.max_size)
+    tracks = scan.tracks
+    if scan.overlay is not None:
+        tracks = tracks.outside(scan.overlay)
+        mask = mask_overlay(scan.overlay, width, height)
+        for name in names.values():
+            write_mask(out / store.MASKS / name, mask)
+        middle = list(names.values())[len(names) // 2]
+        draw_overlay(out / store.FOLDER / middle, mask, out / f"{prefix}{PICTURE}")
+    frames = tuple(
+        Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False,
+              masked=scan.overlay is not None)
+        for index, name in names.items())
     return IngestedSource(
         "video", (Group(path.name, width, height),), frames,
         declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
         blurred=int((scan.whole & ~judgement.usable).sum()),
-        selection=Selection(record, sheet, prefix), tracks=scan.tracks.select(names))
+        selection=Selection(record, sheet, prefix), tracks=tracks.select(names))
 
 
 def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:

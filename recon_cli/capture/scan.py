@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from av.video.frame import PictureType
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from recon_cli.capture import video
 from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
+from recon_cli.capture.static_overlay import OverlayMeter
 from recon_cli.capture.tracker import Tracker
 from recon_cli.errors import InputError
 from recon_cli.io.tracks import Tracks
@@ -38,6 +40,8 @@ class Scan:
     # [F], False from a lost or damaged packet to the next key frame
     whole: NDArray[np.bool_]
     tracks: Tracks  # of corners through all frames
+    # [h, w] at a reduced size, where something is fixed to the camera; None if nowhere
+    overlay: NDArray[np.bool_] | None
     notices: tuple[str, ...]  # about conversions that the owner of the video may not expect
 
     @property
@@ -51,20 +55,28 @@ class Scan:
         return self.expected - int(self.whole.sum())
 
     def write(self, path: Path) -> None:
-        """Writes the measures as JSON, NaN as null, and the tracks beside them."""
+        """Writes the measures as JSON, NaN as null, and tracks and overlay beside them."""
         values = {
             name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(self).items() if name != "tracks"}
+            for name, value in vars(self).items() if name not in ("tracks", "overlay")}
         motion = [None if np.isnan(step) else step for step in values["motion"]]
         self.tracks.write(path.with_suffix(".safetensors"))
-        atomic.write_json(path, {**values, "motion": motion})
+        if self.overlay is not None:
+            _, data = cv2.imencode(".png", self.overlay * np.uint8(255))
+            atomic.write_bytes(path.with_suffix(".png"), data.tobytes())
+        atomic.write_json(
+            path, {**values, "motion": motion, "overlay": self.overlay is not None})
 
     @classmethod
     def read(cls, path: Path) -> Scan:
         """Returns the scan that `write` wrote."""
         value: dict[str, Any] = atomic.read_json(path)
+        overlay = None
+        if value["overlay"]:
+            data = np.frombuffer(path.with_suffix(".png").read_bytes(), np.uint8)
+            overlay = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)) > 0
         return cls(**{
-            **value,
+            **value, "overlay": overlay,
             "tracks": Tracks.read(path.with_suffix(".safetensors")),
             "sharpness": np.array(value["sharpness"], np.float64),
             "motion": np.array(value["motion"], np.float64),  # null becomes NaN
@@ -100,6 +112,27 @@ def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     return scan
 
 
+def measure_scene(
+    path: Path, scan: Scan, *, threads: int, step: Callable[[], None]
+) -> Scan:
+    """Returns a scan whose sharpness and motion leave out its overlay, after another pass.
+
+    An overlay is always sharp and never moves, which hides that the scene is blurred or moves.
+    """
+    meter = MotionMeter(scan.overlay)
+    sharpness, motion = [], []
+    for item in video.decode(path, threads=decode_threads(scan, threads)):
+        if not isinstance(item, Gap):
+            gray = item.gray()
+            sharpness.append(measure_sharpness(gray, scan.overlay))
+            motion.append(meter.advance(gray))
+            step()
+    if len(motion) != len(scan.motion):
+        raise InputError(
+            f"{path} has changed while it was read.", hint="Run `recon ingest` again.")
+    return replace(scan, sharpness=np.array(sharpness), motion=np.array(motion))
+
+
 def decode_threads(scan: Scan, threads: int) -> int:
     """Returns the number of threads with which a video gives the frames of its scan again."""
     return 1 if scan.lost else threads
@@ -109,7 +142,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     measures: list[_FrameMeasures] = []
     gaps: list[tuple[int, int | None]] = []  # (frames before it, pts)
     first: DecodedPicture | None = None
-    meter, tracker = MotionMeter(), Tracker()
+    meter, tracker, overlay = MotionMeter(), Tracker(), OverlayMeter()
     for item in video.decode(path, threads=threads):
         if isinstance(item, Gap):
             gaps.append((len(measures), item.pts))
@@ -118,6 +151,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         gray = item.gray()
         measures.append(_measure(item, gray, meter))
         tracker.advance(gray)
+        overlay.advance(gray, *tracker.corners)
         step()
     if first is None:
         with video.open_video(path) as (_, stream):
@@ -134,7 +168,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         motion=np.array([frame.motion for frame in measures], np.float64),
         exposure=np.round([frame.exposure for frame in measures], 4),
         seconds=tuple(frame.seconds for frame in measures),
-        whole=_find_whole(measures, gaps), tracks=tracker.tracks(),
+        whole=_find_whole(measures, gaps), tracks=tracker.tracks(), overlay=overlay.overlay(),
         notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))
 
 

@@ -61,6 +61,14 @@ class Tracker:
         size = np.array(gray.shape[::-1], np.float32)
         self._seen.append((self._numbers, (self._corners + np.float32(0.5)) / size))
 
+    @property
+    def corners(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """The tracks in the last frame: sorted numbers [K], and shares of width and height [K, 2].
+
+        IndexError before the first frame.
+        """
+        return self._seen[-1]
+
     def tracks(self) -> Tracks:
         """Returns the tracks through all frames so far; a frame is named by its number."""
         counts = [len(numbers) for numbers, _ in self._seen]

@@ -29,6 +29,9 @@ class IngestConfig(StageConfig):
     sharpness: float = option(
         0.5, "Minimum sharpness of a video frame relative to its neighbours.", unit="share",
         minimum=0.0, maximum=1.0)
+    overlays: str = option(
+        "mask", "What is fixed to the camera in a video (text, logos, dirt on the lens, a car's "
+        "bonnet): mask it or keep it.", choices=("mask", "keep"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -43,6 +43,13 @@ class Tracks:
         names = tuple(chosen[index] for index in order)
         return Tracks(names, image[rows], numbers[self.track[rows]], self.xy[rows])
 
+    def outside(self, area: NDArray[np.bool_]) -> Tracks:  # [h, w], at any size
+        """Returns the tracks without their observations in an area that all images share."""
+        size = np.array(area.shape[::-1])
+        x, y = np.clip((self.xy * size).astype(int), 0, size - 1).T
+        rows = ~area[y, x]
+        return Tracks(self.names, self.image[rows], self.track[rows], self.xy[rows])
+
     def matches(self, first: int, second: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Returns the observations, by row, of the tracks that two images share, [M] each."""
         rows = [np.arange(*np.searchsorted(self.image, (index, index + 1)))

@@ -99,8 +99,8 @@ def _ingest(
     prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
     videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)
               if not _is_photos(part[0])]
-    scans = [
-        from_video.scan(config, path, out / f"{prefix}scan.json", ctx) for path, prefix in videos]
+    scans = [from_video.scan(config, path, out / f"{prefix}{from_video.SCAN}", ctx)
+             for path, prefix in videos]
     counts = dict(zip(
         (prefix for _, prefix in videos),
         zip(scans, from_video.frame_counts(config, scans), strict=True), strict=True))

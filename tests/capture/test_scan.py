@@ -11,7 +11,7 @@ from media import set_display_matrix, spoil_packets, texture, write_luma, write_
 
 from recon_cli.capture.decoded_picture import DecodedPicture
 from recon_cli.capture.frame_measures import measure_sharpness
-from recon_cli.capture.scan import Scan, decode_threads, scan_video
+from recon_cli.capture.scan import Scan, decode_threads, measure_scene, scan_video
 from recon_cli.capture.video import decode, frames_at
 from recon_cli.errors import InputError
 
@@ -78,6 +78,29 @@ def test_a_scan_is_read_as_it_was_written(video, tmp_path):
     scan = dataclasses.replace(scan, notices=("It is so.", "And so."))
     scan.write(tmp_path / "scan.json")
     assert_equal(Scan.read(tmp_path / "scan.json"), scan)
+    overlay = np.random.default_rng(0).random((54, 90)) > .5
+    scan = dataclasses.replace(scan, overlay=overlay)
+    scan.write(tmp_path / "scan.json")
+    assert_equal(Scan.read(tmp_path / "scan.json"), scan)
+
+
+def test_an_overlay_hides_neither_motion_nor_blur(tmp_path):
+    """Beside a sharp picture that stays, a plain scene moves, and is blurred in one frame."""
+    frames = [np.full((96, 160, 3), 128, np.uint8) for _ in range(20)]
+    for index, (frame, view) in enumerate(zip(frames, walk(20), strict=True)):
+        frame[:, :40] = cv2.GaussianBlur(view, (0, 0), 4 if index == 10 else .5)[:, :40]
+        frame[:, 60:] = texture(96, 100, seed=3)
+    overlay = np.zeros((48, 80), np.bool_)
+    overlay[:, 25:] = True
+    video = write_video(tmp_path / "walk.mp4", frames)
+    scan = scan_video(video, threads=1, step=quiet)
+    assert np.nansum(scan.motion) < .01
+    assert scan.sharpness[10] > .5 * np.median(scan.sharpness)
+    scan = measure_scene(
+        video, dataclasses.replace(scan, overlay=overlay), threads=1, step=quiet)
+    # The corners of the blurred frame are lost.
+    assert np.nansum(scan.motion) == pytest.approx(19 * 2 / 160, rel=.2)
+    assert scan.sharpness[10] < .2 * np.median(scan.sharpness)
 
 
 @pytest.mark.parametrize("erase", [False, True])

@@ -30,6 +30,15 @@ def test_a_selection_keeps_the_tracks_that_reach_two_of_its_images():
     np.testing.assert_allclose(chosen.xy, np.array(seen) / 100)
 
 
+def test_observations_in_an_area_are_left_out():
+    area = np.zeros((40, 4), np.bool_)
+    area[1, 0] = True  # .025 to .05 of the height: tracks 3 and 4
+    tracks = make_tracks(SEEN).outside(area)
+    assert tracks.names == make_tracks(SEEN).names
+    assert list(zip(tracks.image.tolist(), tracks.track.tolist(), strict=True)) == [
+        (0, 0), (0, 1), (1, 0), (1, 1), (1, 2), (2, 1), (2, 2), (3, 2)]
+
+
 def test_matches_of_two_images_show_the_same_tracks():
     tracks = make_tracks(SEEN)
     first, second = tracks.matches(1, 2)

@@ -2,6 +2,7 @@ import json
 import logging
 from fractions import Fraction
 
+import cv2
 import media
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from PIL import Image
 from recon_cli.capture import from_photos, from_video
 from recon_cli.config.stages import IngestConfig
 from recon_cli.io import images
+from recon_cli.io.tracks import Tracks
 
 
 @pytest.fixture
@@ -242,6 +244,83 @@ def test_a_second_try_does_not_scan_the_video_again(video, tmp_path, monkeypatch
     monkeypatch.setattr(from_video, "scan_video", None)
     take(video, tmp_path / "out")
     assert files(tmp_path / "out") == before
+
+
+# What is fixed to the camera
+
+
+def marked_walk(frames=60):
+    """A walk with a grid of crosses in every frame, which holds most of its corners."""
+    marked = [frame.copy() for frame in walk(frames, step=12, height=180, width=320)]
+    for frame in marked:
+        for x in range(20, 300, 40):
+            cv2.drawMarker(frame, (x, 160), (255, 255, 255), cv2.MARKER_CROSS, 14, 5)
+            cv2.drawMarker(frame, (x, 160), (0, 0, 0), cv2.MARKER_CROSS, 12, 3)
+    return marked
+
+
+@pytest.fixture
+def marked(tmp_path):
+    return write_video(tmp_path / "marked.mp4", marked_walk())
+
+
+def test_an_overlay_is_masked_in_every_frame_and_drawn_and_told(marked, tmp_path, notices):
+    take(marked, tmp_path / "out")
+    frames = listed(tmp_path / "out")["frames"]
+    assert all(frame["masked"] for frame in frames)
+    masks = {path.name: images.read_mask(path, 320, 180)
+             for path in (tmp_path / "out" / "masks").iterdir()}
+    assert set(masks) == {frame["name"] for frame in frames}
+    mask = masks[frames[0]["name"]]
+    assert all((other == mask).all() for other in masks.values())
+    assert not mask[157:164, 20:261:40].any()
+    assert mask[:135].all()
+    picture = images.read_png(tmp_path / "out" / "overlay.png").astype(int)
+    assert picture[~mask][:, 0].min() >= 127
+    tracks = Tracks.read(tmp_path / "out" / "tracks.safetensors")
+    x, y = (tracks.xy * (320, 180)).astype(int).T
+    assert len(x) > 100
+    assert mask[y, x].mean() > .99  # the mask is rounded to pixels
+    assert sum("is fixed to the camera" in notice and "overlay.png" in notice
+               for notice in notices()) == 1
+
+
+def test_an_overlay_is_kept_on_request(marked, tmp_path, notices):
+    take(marked, tmp_path / "out", config=IngestConfig(overlays="keep"))
+    assert not any(frame["masked"] for frame in listed(tmp_path / "out")["frames"])
+    assert not (tmp_path / "out" / "masks").exists()
+    assert not any("fixed" in notice for notice in notices())
+
+
+def test_a_walk_without_an_overlay_gets_no_mask(tmp_path):
+    video = write_video(tmp_path / "walk.mp4", walk(60, step=12, height=180, width=320))
+    take(video, tmp_path / "out")
+    assert not any(frame["masked"] for frame in listed(tmp_path / "out")["frames"])
+    assert not (tmp_path / "out" / "overlay.png").exists()
+
+
+def test_a_second_try_finds_the_overlay_of_the_first_scan(marked, tmp_path, monkeypatch, notices):
+    take(marked, tmp_path / "out")
+    before = files(tmp_path / "out")
+    for name in ("frames.json", "overlay.png"):
+        (tmp_path / "out" / name).unlink()
+    (tmp_path / "out" / "masks" / listed_names(before)[0]).unlink()
+    for name in ("scan_video", "measure_scene"):
+        monkeypatch.setattr(from_video, name, None)
+    take(marked, tmp_path / "out")
+    assert files(tmp_path / "out") == before
+    assert len(set(notices())) * 2 == len(notices())
+
+
+def listed_names(written):
+    return sorted(name.removeprefix("masks/") for name in written if name.startswith("masks/"))
+
+
+def test_what_covers_too_much_of_the_picture_is_not_masked(marked, tmp_path, monkeypatch, notices):
+    monkeypatch.setattr(from_video, "MOST", 0.01)
+    take(marked, tmp_path / "out")
+    assert not any(frame["masked"] for frame in listed(tmp_path / "out")["frames"])
+    assert any("nothing is masked" in notice for notice in notices())
 
 
 def test_progress_that_would_survive_a_crash_is_recorded(video, tmp_path):
