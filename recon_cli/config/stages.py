@@ -104,7 +104,9 @@ class SfmConfig(StageConfig):
         "it; off keeps the axes of the mapper.", choices=("auto", "off"))
     scale_between: tuple[str, str, float] | None = option(
         None, SCALE_BETWEEN, metavar="A B METRES", automatic="arbitrary scale")
-    max_minutes: float = option(20.0, "Time limit.", unit="minutes", minimum=0.01, hashed=False)
+    max_minutes: float | None = option(
+        None, "Time limit.", unit="minutes", minimum=0.01, hashed=False,
+        automatic="20, and 12 s more for each image above 100")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import pycolmap
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import checks, database, mapper, matching, merge_models
+from recon_cli.sfm import checks, database, mapper, matching, merge_models, skeleton
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, StepLog, fresh_folder, publish
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.trusted_part import keep_trusted_part
@@ -43,7 +43,7 @@ class Fallback:
 
     name: str
     reason: str  # why a capture begins with it
-    choose_pairs: Callable[[MappingJob], set[matching.Pair]]
+    choose_pairs: Callable[[MappingJob, Reporter], set[matching.Pair]]
     find_models: Callable[[MappingJob, Reporter], list[pycolmap.Reconstruction]]
 
 
@@ -84,16 +84,18 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     every = _incremental("exhaustive", f"{count} frames are few enough to match all pairs")
     begin = (every,) if count <= EXHAUSTIVE_MAX else (
         _incremental("retrieval", f"{count} frames are too many to match all pairs at once"), every)
+    if skeleton.is_continuous(job):
+        begin = (Fallback("tracks", "the frames of a video are tracked from one to the next",
+                          skeleton.choose_pairs, skeleton.complete), *begin)
     return (
         *begin,
-        Fallback("relaxed", "", lambda _: set(),
-                 lambda *to: mapper.map_incrementally(*to, relaxed=True)),
-        Fallback("global", "", lambda _: set(), mapper.map_globally))
+        Fallback("relaxed", "", lambda *_: set(), mapper.map_relaxed),
+        Fallback("global", "", lambda *_: set(), mapper.map_globally))
 
 
 def match_first(job: MappingJob, report: Reporter) -> Result:
     """Matches the pairs of the first fallback; SfmError if none matches, or none shows depth."""
-    matching.match_pairs(job, list_fallbacks(job)[0].choose_pairs(job), report)
+    matching.match_pairs(job, list_fallbacks(job)[0].choose_pairs(job, report), report)
     matching.check_motion(job)
     return matching.count_matches(job)
 
@@ -174,7 +176,8 @@ def _try_fallback(
     """Writes the model of a fallback into its folder and returns what became of it."""
     folder = fresh_folder(job.attempts / fallback.name)
     start = time.monotonic()
-    wanted = fallback.choose_pairs(job) if before else set()  # those of the first are matched
+    # Those of the first are matched.
+    wanted = fallback.choose_pairs(job, report) if before else set()
     matched = StepLog(job.out).result("matches") or {"seconds": 0.0, "rows": 0}
     per_pair = float(matched["seconds"]) / max(1, int(matched["rows"]))
     expected = (len(wanted - database.pair_names(job.database)) * per_pair
@@ -184,6 +187,7 @@ def _try_fallback(
             fallback.name, reason, skipped=f"it would take about {expected / 60:.0f} minutes")
     if wanted:
         matching.match_pairs(job, wanted, report)
+    job = _linked_job(job, fallback.name)
     candidate = merge_models.best_model(job, fallback.find_models(job, report))
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
@@ -209,18 +213,18 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
             f"{attempt.name} found {len(attempt.registered)}" for attempt in attempts)
         raise SfmError(f"{error.message} Cameras by mapper: {counts}.", hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
-    folder = job.attempts / chosen.name / "model"
-    model = pycolmap.Reconstruction(folder)
+    job = _linked_job(job, chosen.name)
+    model = mapper.sharpen(pycolmap.Reconstruction(job.attempts / chosen.name / "model"))
     verdict = examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
     part = keep_trusted_part(job, model, verdict)
     if part is not None:
         model, verdict = part.candidate.model, part.candidate.verdict
-        folder = fresh_folder(job.attempts / "trusted")
-        model.write(folder)
     described = mapper.describe_model(model)
     checks.check_parallax(described["median_triangulation_angle_deg"])
     check_weak_link(verdict, job.accept_weak)
     atomic.write_json(job.out / VERDICT, verdict.to_json())
+    folder = fresh_folder(job.attempts / "sharp")
+    model.write(folder)
     publish(folder, job.model)
     shutil.rmtree(job.attempts)
     return {
@@ -234,17 +238,23 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
         "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}
 
 
+def _linked_job(job: MappingJob, name: str) -> MappingJob:
+    """Returns a job that maps from the database of an attempt that has its own."""
+    own = job.attempts / name / skeleton.LINKED
+    return dataclasses.replace(job, linked=own) if name == "tracks" else job
+
+
 def _incremental(pairs: str, reason: str) -> Fallback:
     return Fallback(pairs, reason, _PAIRS[pairs], mapper.map_incrementally)
 
 
-def _near_or_similar(job: MappingJob) -> set[matching.Pair]:
+def _near_or_similar(job: MappingJob, _: Reporter) -> set[matching.Pair]:
     """Returns the neighbours among the frames of each camera, and frames that look alike."""
     near = set().union(*(matching.sequential_pairs(group.names) for group in job.groups))
     return near | matching.similar_pairs(job.database, job.names, seed=job.seed, besides=near)
 
 
-_PAIRS: dict[str, Callable[[MappingJob], set[matching.Pair]]] = {
-    "exhaustive": lambda job: matching.exhaustive_pairs(job.names),
-    "sequential": lambda job: matching.sequential_pairs(job.names),
+_PAIRS: dict[str, Callable[[MappingJob, Reporter], set[matching.Pair]]] = {
+    "exhaustive": lambda job, _: matching.exhaustive_pairs(job.names),
+    "sequential": lambda job, _: matching.sequential_pairs(job.names),
     "retrieval": _near_or_similar}

@@ -66,6 +66,8 @@ class MappingJob:
     threads: int
     sharpness: Mapping[str, float]  # by name, where known
     times: Mapping[str, float]  # presentation times in seconds by name, where known
+    tracks: Path | None = None  # file of tracks through a video, see `io.tracks`
+    linked: Path | None = None  # database to map from, where it is not that of the features
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,7 +77,7 @@ class MappingJob:
     @property
     def database(self) -> Path:
         """COLMAP's database of features and matches."""
-        return self.out / "database.db"
+        return self.linked or self.out / "database.db"
 
     @property
     def model(self) -> Path:
@@ -115,7 +117,7 @@ class MappingJob:
     def read(cls, path: Path) -> MappingJob:
         """Returns the job that `write` wrote."""
         value: dict[str, Any] = atomic.read_json(path)
-        for name in ("frames", "denoised", "out", "masks", "poses"):
+        for name in ("frames", "denoised", "out", "masks", "poses", "tracks", "linked"):
             value[name] = None if value[name] is None else Path(value[name])
         for group in value["groups"]:
             if (lens := group["lens"]) is not None:

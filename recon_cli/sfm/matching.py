@@ -230,13 +230,26 @@ def match_pairs(job: MappingJob, pairs: Iterable[Pair], report: Reporter) -> Non
         pairing, matching = pycolmap.ImportedPairingOptions(), pycolmap.FeatureMatchingOptions()
         pairing.match_list_path = listed
         matching.num_threads = job.threads
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed = job.seed
-        verification.ransac.max_num_trials = MAX_TRIALS
         with _open_for_polling(job) as opened, report.polling(opened.num_verified_image_pairs):
             pycolmap.match_image_pairs(
-                job.database, matching, pairing, verification, pycolmap.Device.cpu)
+                job.database, matching, pairing, _verification_options(job), pycolmap.Device.cpu)
     listed.unlink()
+
+
+def verify_pairs(job: MappingJob, pairs: Iterable[Pair]) -> None:
+    """Verifies the matches of pairs that are in the database already."""
+    listed = job.database.with_suffix(".txt")
+    listed.write_text("".join(
+        f"{name} {other}\n" for name, other in sorted(pairs)), encoding="utf-8")
+    pycolmap.verify_matches(job.database, listed, _verification_options(job))
+    listed.unlink()
+
+
+def _verification_options(job: MappingJob) -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job.seed
+    options.ransac.max_num_trials = MAX_TRIALS
+    return options
 
 
 def count_matches(job: MappingJob) -> Result:

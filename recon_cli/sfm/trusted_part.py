@@ -36,12 +36,11 @@ class TrustedPart:
 def keep_trusted_part(
     job: MappingJob, model: pycolmap.Reconstruction, verdict: ModelVerdict
 ) -> TrustedPart | None:
-    """Returns the part of a broken model to keep; None if it is not broken, or must stay whole.
+    """Returns the part of an untrusted model to keep; None if it is trusted or must stay whole.
 
     SfmError if no part that can be trusted has --min-registered of the frames.
     """
-    if not job.partial or job.accept_weak or not (
-            is_broken(verdict.weakest_cut) or is_aliased(verdict.aliasing)):
+    if not job.partial or job.accept_weak or verdict.trusted:
         return None
     part = find_trusted_part(job, model, verdict)
     kept = [] if part is None else mapper.list_registered(part.model)

@@ -5,11 +5,13 @@ import math
 import sqlite3
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pycolmap
 import pytest
 from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
+from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import fallbacks, mapper
 from recon_cli.sfm.fallbacks import (
     MapperAttempt,
@@ -47,6 +49,21 @@ def test_a_small_capture_begins_with_all_pairs_and_a_large_one_with_some(capture
         "exhaustive", "relaxed", "global"]
     assert [fallback.name for fallback in list_fallbacks(sized(job, 101))] == [
         "retrieval", "exhaustive", "relaxed", "global"]
+
+
+def test_a_video_begins_with_its_tracks_where_they_link_its_frames(capture):
+    job, _ = capture
+    count = len(job.names)
+    image = np.repeat(np.arange(count, dtype=np.int32), 30)
+    tracks = Tracks(job.names, image, np.tile(np.arange(30, dtype=np.int32), count),
+                    np.zeros((30 * count, 2), np.float32))
+    tracks.write(job.out / "tracks.safetensors")
+    video = replace(job, tracks=job.out / "tracks.safetensors")
+    assert [fallback.name for fallback in list_fallbacks(video)] == [
+        "tracks", "exhaustive", "relaxed", "global"]
+    # Each track ends before the next frame.
+    replace(tracks, track=np.arange(30 * count, dtype=np.int32)).write(video.tracks)
+    assert list_fallbacks(video)[0].name == "exhaustive"
 
 
 @pytest.mark.parametrize("pairs", ["exhaustive", "retrieval", "sequential"])

@@ -8,6 +8,7 @@ import summaries
 from facts import assert_facts
 from sfm_inputs import run, texture, turning, write_inputs
 
+from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, SfmError
 from recon_cli.io.records import Frame, FrameList, Group
@@ -33,6 +34,18 @@ def test_a_camera_that_turns_on_the_spot_is_not_taken_for_a_success(tmp_path, pa
         run(write_inputs(tmp_path, turning(12)), out, pairs=pairs, max_minutes=1.0)
     assert not (out / "sparse").exists()
     assert database.progress(out / "database.db", "matches") == count
+
+
+@pytest.mark.parametrize(("count", "given", "limit"), [
+    (75, None, 20), (100, None, 20), (292, None, 58.4), (292, 5.0, 5.0)])
+def test_the_time_limit_follows_the_frames_and_is_told_in_advance(count, given, limit):
+    notices = []
+    frames = FrameList("photos", (Group("a", 9, 9),), tuple(
+        Frame(f"{index:06d}.png", None, "a", None, held_out=False) for index in range(count)))
+    ctx = SimpleNamespace(notice=notices.append)
+    assert sfm._time_limit(SfmConfig(max_minutes=given), frames, ctx) == pytest.approx(limit)
+    assert len(notices) == (limit > 20)
+    assert all("up to 58 minutes" in notice for notice in notices)
 
 
 def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):

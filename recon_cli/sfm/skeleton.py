@@ -1,0 +1,436 @@
+"""Models that places which look alike cannot fold: first what is near in time, then what agrees.
+
+Two frames of a video that follow each other cannot be mistaken for others, so the cameras are found
+from tracks through every frame alone. With these cameras, the skeleton, each pair of frames that
+matches can be checked: most agree; some are off by what the cameras drift on a long way, and close
+a loop; the rest look alike but are two places, and are left out.
+
+The cameras of the skeleton are adjusted to the matches. Where that leaves a loop open they are
+found again from all matches that are left.
+"""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from recon_cli.io.tracks import Tracks
+from recon_cli.sfm import database, mapper, matching, merge_models
+from recon_cli.sfm.evidence import MAX_ERROR
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
+from recon_cli.sfm.matching import Pair, similar_pairs
+
+LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
+SKELETON = "skeleton"  # models in the folder of the attempts
+# Distances, in frames of a video, at which tracks are matches: enough for a path around a lost
+# frame. All up to 20 take twice as long; they are for videos that fall apart.
+STEPS, ALL_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
+ENOUGH = 0.9  # share of the frames that a skeleton must hold, else other mappers are tried
+# COLMAP uses a pair of images from 15 matches on (TwoViewGeometryOptions.min_num_inliers).
+MIN_MATCHES = 15
+# Tracks count beside features where a pair has fewer matches than this: they are less exact.
+FEW_MATCHES = 100
+# Share of the neighbours with MIN_MATCHES tracks above which a video hangs together by them.
+CONTINUOUS = 0.5
+# Pairs that the skeleton shows to overlap, per image. 30 lowered the error of a room's cameras from
+# .36 to .29 cm and took half as long again; all pairs gave .37 before the points were filtered.
+OVERLAPPING = 15
+SIMILAR = 10  # pairs per image that only look alike: they may close a loop
+ALWAYS = 3  # neighbours that are matched in any case
+# Two views overlap as far as a point of one lies in the other, at a like angle and distance.
+MAX_ANGLE_DEG, MAX_RATIO, MIN_OVERLAP = 30.0, 2.0, 0.2
+SAMPLED = 150  # points per image
+# Share of a pair's matches that the cameras of the skeleton must explain, within MAX_ERROR.
+MIN_AGREEING = 0.5
+# A pair whose own rotation is this close to the skeleton's may show its drift. Around a can whose
+# label repeats the pairs to leave out are off by 116 degrees in the median.
+MAX_DRIFT_DEG = 15.0
+MAX_DRIFT = 0.2  # displacement as a share of the way between the two frames
+NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
+NEAR = 3  # frames; a loop is closed by more than one pair of near frames
+
+
+@dataclass(frozen=True)
+class PairChecks:
+    """Verified pairs of images, by what a skeleton says of them."""
+
+    agreeing: frozenset[Pair]
+    drifted: frozenset[Pair]  # off by what the cameras may drift between the two
+    contradicting: frozenset[Pair]
+    unplaced: frozenset[Pair]  # not both images have a camera in one model
+
+
+def is_continuous(job: MappingJob) -> bool:
+    """Returns whether the frames of a video follow each other closely enough to be tracked."""
+    if job.tracks is None:
+        return False
+    tracks = _read_tracks(job)
+    shared = [len(tracks.matches(index, index + 1)[0]) for index in range(len(tracks.names) - 1)]
+    linked = sum(count >= MIN_MATCHES for count in shared)
+    return len(tracks.names) == len(job.names) and linked > CONTINUOUS * len(shared)
+
+
+def _read_tracks(job: MappingJob) -> Tracks:
+    assert job.tracks is not None
+    return Tracks.read(job.tracks)
+
+
+def near_pairs(job: MappingJob, reach: int) -> set[Pair]:
+    """Returns the pairs of frames of one camera that are up to `reach` apart by name."""
+    return {pair for group in job.groups for names in [sorted(group.names)]
+            for step in range(1, reach + 1) for pair in zip(names, names[step:], strict=False)}
+
+
+def choose_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
+    """Finds the skeleton of a job, keeps it, and returns the pairs of frames to match with it."""
+    models = build_skeleton(job, report)
+    folder = fresh_folder(job.attempts / SKELETON)
+    for index, model in enumerate(models):
+        (folder / str(index)).mkdir()
+        model.write(folder / str(index))
+    reach = ALWAYS if len(models) == 1 else matching.SEQUENTIAL_OVERLAP
+    pairs = near_pairs(job, reach).union(*(overlapping_pairs(model) for model in models))
+    return pairs | similar_pairs(
+        job.database, job.names, seed=job.seed, nearest=SIMILAR, besides=pairs)
+
+
+def build_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
+    """Returns the models that tracks alone give, the largest first."""
+    folder = fresh_folder(job.attempts / f"{SKELETON}.partial")
+    linked = replace(job, linked=folder / LINKED)
+    tracks = _read_tracks(job)
+    link(linked, job.database, {}, tracks)
+    models = mapper.map_incrementally(linked, report)
+    # The global mapper gets past a turn without parallax. As tracks cannot be mistaken, lower
+    # thresholds do no harm.
+    for find_models in (mapper.map_globally, mapper.map_relaxed):
+        if _most(models) >= ENOUGH * len(job.names):
+            break
+        link(linked, job.database, {}, tracks, steps=ALL_STEPS)
+        models = max(models, find_models(linked, report), key=_most)
+    shutil.rmtree(folder)
+    models.sort(key=mapper.model_size, reverse=True)
+    for model in models:
+        mapper.adjust(model)
+    return models
+
+
+def complete(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
+    """Returns the models that the skeleton and the matches that agree with it give.
+
+    `job.linked` names the database that is written and mapped from.
+    """
+    folder = job.attempts / SKELETON
+    models = [pycolmap.Reconstruction(path) for path in sorted(
+        folder.iterdir(), key=lambda path: int(path.name))] if folder.is_dir() else []
+    source = replace(job, linked=None).database
+    tracks = _read_tracks(job)
+    geometries = read_verified(source, None)
+    checked = check_pairs(source, models, geometries)
+    usable = {pair: geometry for pair, geometry in geometries.items()
+              if pair not in checked.contradicting}
+    if _most(models) < ENOUGH * len(job.names):
+        link(job, source, usable, tracks, steps=ALL_STEPS)
+        return mapper.map_relaxed(job, report)
+    link(job, source, usable, tracks)
+    fitted = _fit(job, models[0])
+    open_loops = check_pairs(source, [fitted], usable).drifted
+    if not open_loops:
+        return [fitted]
+    remapped = mapper.map_incrementally(job, report)
+    best = merge_models.best_model(job, remapped)
+    if best is not None and best.verdict.trusted:
+        return [best.model]
+    link(job, source, {pair: geometry for pair, geometry in usable.items()
+                       if pair not in open_loops}, tracks)
+    return [_fit(job, models[0])]
+
+
+def _most(models: Sequence[pycolmap.Reconstruction]) -> int:
+    """Returns the number of images in the largest model."""
+    return max((model.num_reg_images() for model in models), default=0)
+
+
+def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Returns the cameras of a skeleton with the points that the matches give, adjusted."""
+    poses = {image.name: image.cam_from_world() for image in _images(skeleton)}
+    model = mapper.triangulate(
+        job, merge_models.build_posed_model(job.database, skeleton, poses))
+    mapper.refine(job, model)
+    return mapper.extend_model(job, model) if len(poses) < len(job.names) else model
+
+
+def read_verified(
+    path: Path, pairs: Collection[Pair] | None
+) -> dict[Pair, pycolmap.TwoViewGeometry]:
+    """Returns the verified matches of some pairs, or of all; names in order."""
+    verified = {}
+    with pycolmap.Database.open(path) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            first, second = (names[i] for i in pycolmap.pair_id_to_image_pair(number))
+            if first > second:
+                first, second = second, first
+                geometry.invert()
+            wanted = pairs is None or (first, second) in pairs
+            if wanted and len(geometry.inlier_matches) >= MIN_MATCHES:
+                verified[first, second] = geometry
+    return verified
+
+
+def link(
+    job: MappingJob, source: Path, geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
+    tracks: Tracks, *, steps: Sequence[int] = STEPS,
+) -> None:
+    """Writes the database `job.linked`: images and keypoints of another one, and these matches.
+
+    Observations of tracks follow the keypoints of an image. They are matches where features gave
+    few.
+    """
+    database.remove(job.database)
+    shutil.copyfile(source, job.database)
+    matched = _match_tracks(tracks, geometries, steps)
+    with pycolmap.Database.open(job.database) as opened:
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+        opened.clear_descriptors()
+        images = {image.name: image for image in opened.read_all_images()}
+        counts = _append_tracks(opened, images, tracks)
+        for pair, geometry in geometries.items():
+            first, second = (images[name].image_id for name in pair)
+            if pair not in matched:
+                opened.write_matches(first, second, geometry.inlier_matches)
+                opened.write_two_view_geometry(first, second, geometry)
+        for pair, rows in matched.items():
+            first, second = (images[name].image_id for name in pair)
+            followed = rows + [counts[name] for name in pair]
+            features = [geometries[pair].inlier_matches] if pair in geometries else []
+            opened.write_matches(
+                first, second, np.concatenate([*features, followed]).astype(np.uint32))
+    if matched:
+        matching.verify_pairs(job, matched)
+
+
+def _match_tracks(
+    tracks: Tracks, geometries: Mapping[Pair, pycolmap.TwoViewGeometry], steps: Sequence[int]
+) -> dict[Pair, NDArray[np.int64]]:
+    """Returns which observations of two images show the same tracks, [M, 2] by row in each."""
+    start = np.searchsorted(tracks.image, np.arange(len(tracks.names)))
+    matched = {}
+    for step in steps:
+        for first in range(len(tracks.names) - step):
+            second = first + step
+            pair = tracks.names[first], tracks.names[second]
+            known = geometries.get(pair)
+            if known is not None and len(known.inlier_matches) >= FEW_MATCHES:
+                continue
+            rows = np.stack(tracks.matches(first, second), axis=1)
+            if len(rows) >= MIN_MATCHES:
+                matched[pair] = rows - start[[first, second]]
+    return matched
+
+
+def _append_tracks(
+    opened: pycolmap.Database, images: Mapping[str, pycolmap.Image], tracks: Tracks
+) -> dict[str, int]:
+    """Appends observations to the keypoints; returns how many keypoints each image had."""
+    counts = {}
+    bounds = np.searchsorted(tracks.image, np.arange(len(tracks.names) + 1))
+    for name, (first, last) in zip(tracks.names, itertools.pairwise(bounds), strict=True):
+        image = images[name]
+        camera = opened.read_camera(image.camera_id)
+        keypoints = opened.read_keypoints(image.image_id)
+        counts[name] = len(keypoints)
+        followed = np.zeros((last - first, database.KEYPOINT_COLUMNS), np.float32)
+        followed[:, :2] = tracks.xy[first:last] * [camera.width, camera.height]
+        followed[:, [2, 5]] = 1  # a shape of one pixel
+        opened.update_keypoints(image.image_id, np.concatenate([keypoints, followed]))
+    return counts
+
+
+def check_pairs(
+    path: Path, models: Sequence[pycolmap.Reconstruction],
+    geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
+) -> PairChecks:
+    """Returns which verified pairs of a database agree with the cameras of models."""
+    views: dict[str, _View] = {}
+    for model in reversed(models):
+        views |= _list_views(model)
+    agreeing, drifted, contradicting, unplaced = set(), set(), set(), set()
+    with pycolmap.Database.open(path) as opened:
+        keypoints = {
+            image.name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+            for image in opened.read_all_images()}
+    for pair, geometry in geometries.items():
+        first, second = (views.get(name) for name in pair)
+        if first is None or second is None or first.model is not second.model:
+            unplaced.add(pair)
+            continue
+        ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
+                        for side, name in enumerate(pair))
+        if _agreeing_share(first, ours, second, theirs) >= MIN_AGREEING:
+            agreeing.add(pair)
+        elif _is_drift(first, ours, second, theirs):
+            drifted.add(pair)
+        else:
+            contradicting.add(pair)
+    return PairChecks(
+        frozenset(agreeing), frozenset(_supported(drifted, agreeing)), frozenset(contradicting),
+        frozenset(unplaced))
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """An image of a skeleton."""
+
+    model: pycolmap.Reconstruction
+    image: pycolmap.Image
+    near: float  # depth of its nearest points, but for a twentieth
+    usual: float  # median depth of its points
+    travelled: float  # length of the path of the camera up to here, in order of names
+
+    @property
+    def camera(self) -> pycolmap.Camera:
+        """The camera of the image."""
+        return self.image.camera
+
+
+def _list_views(model: pycolmap.Reconstruction) -> dict[str, _View]:
+    views: dict[str, _View] = {}
+    places = {number: point.xyz for number, point in model.points3D.items()}
+    travelled, last = 0.0, None
+    for image in sorted(_images(model), key=lambda image: image.name):
+        center = image.projection_center()
+        travelled += 0.0 if last is None else float(np.linalg.norm(center - last))
+        last = center
+        seen = [places[point.point3D_id] for point in image.points2D if point.has_point3D()]
+        depths = np.asarray(image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2]
+        near, usual = np.percentile(depths, [5, 50]) if len(seen) else (0.0, 0.0)
+        views[image.name] = _View(model, image, float(near), float(usual), travelled)
+    return views
+
+
+def _agreeing_share(
+    first: _View, ours: NDArray[np.float64], second: _View, theirs: NDArray[np.float64]
+) -> float:
+    """Returns the share of matches, [M, 2] pixels each, that two cameras explain.
+
+    A match is explained if a point at some depth, not much nearer than what the first image shows,
+    is seen within MAX_ERROR of it. An epipolar line alone does not tell a pattern that repeats
+    along it.
+    """
+    motion = second.image.cam_from_world() * first.image.cam_from_world().inverse()
+    at_infinity = np.column_stack([
+        np.asarray(first.camera.cam_from_img(ours)), np.ones(len(ours))]
+    ) @ motion.rotation.matrix().T
+    target = np.asarray(second.camera.cam_from_img(theirs))
+    inverse = _inverse_depths(at_infinity, target, motion.translation)
+    most = 1 / (NEAREST * first.near) if first.near > 0 else np.inf
+    points = at_infinity + np.clip(inverse, 0, most)[:, None] * motion.translation
+    places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
+    errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
+    return float(np.mean(errors <= MAX_ERROR))  # NaN, behind the camera, is no agreement
+
+
+def _inverse_depths(
+    rays: NDArray[np.float64],  # [M, 3] of the first camera, turned into the second
+    target: NDArray[np.float64],  # [M, 2] in the second, at depth 1
+    translation: NDArray[np.float64],  # [3]
+) -> NDArray[np.float64]:  # [M]
+    """Returns 1 / depth in the first camera at which ray + translation / depth meets the target."""
+    offset = rays[:, :2] - target * rays[:, 2:]
+    slope = translation[:2] - target * translation[2]
+    return np.asarray(-(offset * slope).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-12))
+
+
+def _is_drift(
+    first: _View, ours: NDArray[np.float64], second: _View, theirs: NDArray[np.float64]
+) -> bool:
+    """Returns whether matches [M, 2] show a motion as near the skeleton's as drift leaves it.
+
+    The length of the translation follows from the usual depth of the first image.
+    """
+    rows = np.repeat(np.arange(len(ours), dtype=np.uint32)[:, None], 2, axis=1)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose = True
+    options.ransac.random_seed = 0
+    options.ransac.max_num_trials = matching.MAX_TRIALS
+    own = pycolmap.estimate_calibrated_two_view_geometry(
+        first.camera, ours, second.camera, theirs, rows, options).cam2_from_cam1
+    if own is None:
+        return False
+    motion = second.image.cam_from_world() * first.image.cam_from_world().inverse()
+    if np.degrees((own.rotation * motion.rotation.inverse()).angle()) > MAX_DRIFT_DEG:
+        return False
+    at_infinity = np.column_stack([
+        np.asarray(first.camera.cam_from_img(ours)), np.ones(len(ours))]) @ own.rotation.matrix().T
+    target = np.asarray(second.camera.cam_from_img(theirs))
+    inverse = _inverse_depths(at_infinity, target, own.translation)
+    length = first.usual * max(float(np.median(inverse)), 0.0)
+    off = np.linalg.norm(own.translation * length - motion.translation)
+    return bool(off <= MAX_DRIFT * abs(second.travelled - first.travelled))
+
+
+def _supported(drifted: Collection[Pair], agreeing: Collection[Pair]) -> set[Pair]:
+    """Returns the pairs beside which another pair of near frames shows drift as well."""
+    names = sorted({name for pair in (*drifted, *agreeing) for name in pair})
+    row = {name: index for index, name in enumerate(names)}
+    places = np.array([[row[name] for name in pair] for pair in drifted]).reshape(-1, 2)
+    return {
+        pair for pair, place in zip(drifted, places, strict=True)
+        if np.count_nonzero(np.abs(places - place).max(axis=1) <= NEAR) > 1}
+
+
+def overlapping_pairs(model: pycolmap.Reconstruction) -> set[Pair]:
+    """Returns each image of a model with the OVERLAPPING ones whose views have most in common."""
+    images = sorted(_images(model), key=lambda image: image.name)
+    share = _overlap(model, images)
+    mutual = np.minimum(share, share.T)
+    order = np.argsort(-mutual, axis=1, kind="stable")[:, :OVERLAPPING]
+    names = [image.name for image in images]
+    return {
+        (names[min(row, other)], names[max(row, other)])
+        for row, columns in enumerate(order.tolist()) for other in columns
+        if mutual[row, other] > MIN_OVERLAP}
+
+
+def _overlap(
+    model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]
+) -> NDArray[np.float64]:  # [N, N]
+    """Returns the share of the points of each image that another one should show, too."""
+    places = {number: point.xyz for number, point in model.points3D.items()}
+    seen = []
+    for image in images:
+        numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
+        step = max(1, len(numbers) // SAMPLED)
+        seen.append(np.array([places[number] for number in numbers[::step]]).reshape(-1, 3))
+    owner = np.repeat(np.arange(len(images)), [len(points) for points in seen])
+    points = np.concatenate([np.zeros((0, 3)), *seen])
+    centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
+    rays = points - centers[owner]
+    near = np.linalg.norm(rays, axis=1)
+    share = np.zeros((len(images), len(images)))
+    for column, image in enumerate(images):
+        camera = image.camera
+        local = np.asarray(image.cam_from_world() * points)
+        bounds = np.array([camera.width / camera.focal_length_x,
+                           camera.height / camera.focal_length_y]) / 2
+        inside = (local[:, 2] > 0) & (np.abs(local[:, :2]) < bounds * local[:, 2:]).all(axis=1)
+        others = points - centers[column]
+        far = np.linalg.norm(others, axis=1)
+        alike = ((rays * others).sum(axis=1) > np.cos(np.radians(MAX_ANGLE_DEG)) * near * far) & (
+            near < MAX_RATIO * far) & (far < MAX_RATIO * near)
+        share[:, column] = np.bincount(owner, inside & alike, len(images))
+    np.fill_diagonal(share, 0)
+    return np.asarray(share / np.maximum(np.bincount(owner, minlength=len(images)), 1)[:, None])
+
+
+def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [model.image(number) for number in model.reg_image_ids()]

@@ -1,0 +1,257 @@
+"""A skeleton from tracks, and which pairs of frames agree with it."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from made_model import HEIGHT, WIDTH, MadeModel, along, moved, wall
+
+from recon_cli.io.tracks import Tracks
+from recon_cli.sfm import skeleton
+from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.skeleton import (
+    build_skeleton,
+    check_pairs,
+    complete,
+    is_continuous,
+    link,
+    near_pairs,
+    overlapping_pairs,
+    read_verified,
+)
+
+SILENT = Reporter(io.BytesIO())
+
+
+def make_tracks(made, reach=6, breaks=()):
+    """What a tracker would see: each point for `reach` frames, and nothing across a break."""
+    image, track, xy, numbers = [], [], [], {}
+    for index in range(len(made.poses)):
+        points, places = made._seen(index)
+        stretch = sum(index >= start for start in breaks)
+        rows = []
+        for point, place in zip(points.tolist(), places, strict=True):
+            number = numbers.setdefault((point, stretch, index // reach), len(numbers))
+            rows.append((number, place))
+            if index % reach >= reach // 2:  # the next ones begin before these end
+                rows.append((numbers.setdefault(
+                    (point, stretch, index // reach + 1), len(numbers)), place))
+        for number, place in sorted(rows, key=lambda row: row[0]):
+            image.append(index)
+            track.append(number)
+            xy.append(place / [WIDTH, HEIGHT])
+    return Tracks(tuple(made.names), np.array(image, np.int32), np.array(track, np.int32),
+                  np.array(xy, np.float32))
+
+
+def make_job(folder, made, tracks=None):
+    """A job whose database holds the matches of a made model."""
+    if tracks is not None:
+        tracks.write(folder / "tracks.safetensors")
+    made.write_database(folder / "database.db")
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        for index in range(1, len(made.names) + 1):
+            places = opened.read_keypoints(index)
+            shaped = np.zeros((len(places), 6), np.float32)
+            shaped[:, :2], shaped[:, 2], shaped[:, 5] = places, 2, 2
+            opened.update_keypoints(index, shaped)
+    (folder / "rungs").mkdir()
+    return MappingJob(
+        frames=folder, denoised=folder, out=folder,
+        groups=(CameraGroup(tuple(made.names), WIDTH, HEIGHT),), masks=None, poses=None,
+        pose_use="keep", given_points=False,
+        tracks=None if tracks is None else folder / "tracks.safetensors", pairs="auto",
+        max_features=2000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
+        scale_between=None, max_minutes=5.0, seed=0, threads=1, sharpness={}, times={})
+
+
+def linked(job):
+    return replace(job, linked=job.out / skeleton.LINKED)
+
+
+def walk(count=16, step=0.5, **changes):
+    """Cameras along a wall with depth, so that parallax tells their places."""
+    points = wall(-4, 4 + count * step, count=150 * count)
+    points[:, 2] += np.random.default_rng(1).uniform(-1.5, 1.5, len(points))
+    return MadeModel(points, along(np.arange(count) * step), **changes)
+
+
+def errors(model, made):
+    """The worst error of a distance from each camera to another, at the best scale."""
+    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    found = np.array([images[name].projection_center() for name in sorted(images)])
+    rows = [made.names.index(name) for name in sorted(images)]
+    truth = np.array([made.poses[row].inverse().translation for row in rows])
+    # Cameras on a line fix no similarity: all distances between them are compared.
+    ours, true = (np.linalg.norm(places[:, None] - places, axis=2) for places in (found, truth))
+    return np.abs(ours * (true * ours).sum() / (ours**2).sum() - true).max(axis=0)
+
+
+def test_a_video_is_continuous_where_its_frames_share_tracks(tmp_path):
+    made = walk()
+    job = make_job(tmp_path, made, make_tracks(made))
+    assert is_continuous(job)
+    assert not is_continuous(replace(job, tracks=None))
+    make_tracks(made, breaks=range(1, 16, 2)).write(tmp_path / "tracks.safetensors")
+    assert not is_continuous(job)
+
+
+def test_near_frames_are_paired_within_a_camera_alone():
+    groups = (CameraGroup(("a", "b", "c"), 10, 10), CameraGroup(("d", "e"), 10, 10))
+    assert near_pairs(replace_groups(groups), 1) == {("a", "b"), ("b", "c"), ("d", "e")}
+    assert near_pairs(replace_groups(groups), 5) == {
+        ("a", "b"), ("b", "c"), ("a", "c"), ("d", "e")}
+
+
+def replace_groups(groups):
+    class Job:
+        pass
+
+    job = Job()
+    job.groups = groups
+    return job
+
+
+def test_views_of_one_surface_overlap_and_those_of_others_do_not():
+    made = walk(30)
+    pairs = overlapping_pairs(made.model())
+    gaps = [made.names.index(second) - made.names.index(first) for first, second in pairs]
+    assert {1, 2, 3, 4, 5} <= set(gaps)
+    # At a distance of 5 a view is 7.5 wide: those 6 apart have nothing in common.
+    assert max(gaps) < 15
+    backwards = MadeModel(made.points, [moved(0, 0, 0, 180) * pose for pose in made.poses])
+    assert overlapping_pairs(backwards.model()) == set()
+
+
+def test_pairs_are_read_in_order_of_their_names(tmp_path):
+    made = walk(6)
+    path = made.write_database(tmp_path / "database.db")
+    verified = read_verified(path, None)
+    assert len(verified) == 15
+    assert all(first < second for first, second in verified)
+    assert set(read_verified(path, {(made.names[1], made.names[3])})) == {
+        (made.names[1], made.names[3])}
+
+
+def test_observations_of_tracks_follow_the_features_of_an_image(tmp_path):
+    made = walk(6)
+    tracks = make_tracks(made)
+    job = make_job(tmp_path, made, tracks)
+    few = {pair: geometry for pair, geometry in read_verified(job.database, None).items()
+           if pair == (made.names[0], made.names[1])}
+    link(linked(job), job.database, few, tracks)
+    with pycolmap.Database.open(job.out / skeleton.LINKED) as opened:
+        features = len(made._seen(0)[0])
+        keypoints = opened.read_keypoints(1)
+        own = tracks.xy[tracks.image == 0] * [WIDTH, HEIGHT]
+        np.testing.assert_allclose(keypoints[features:, :2], own, atol=1e-3)
+        # Enough features match between 0 and 1: tracks, which are less exact, are left out.
+        assert opened.read_matches(1, 2)[:, 0].max() < features
+        rows = opened.read_matches(1, 3)
+        assert rows.min() >= min(features, len(made._seen(2)[0]))
+        first, _ = tracks.matches(0, 2)
+        assert len(rows) == len(first)
+        assert opened.read_two_view_geometry(1, 3).inlier_matches.shape[0] > 0.9 * len(first)
+
+
+def test_pairs_that_look_alike_contradict_the_cameras(tmp_path):
+    made = walk()
+    job = make_job(tmp_path, made)
+    model = made.model()
+    geometries = read_verified(job.database, None)
+    checked = check_pairs(job.database, [model], geometries)
+    assert checked.agreeing == set(geometries)
+    turned = walk(motions=dict.fromkeys(range(8, 16), moved(1, 0, 0, 40))).model()
+    checked = check_pairs(job.database, [turned], geometries)
+    across = {pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
+    assert len(across - checked.contradicting) <= 1  # a turn about the vertical may fit a pair
+    assert checked.contradicting <= across
+    assert set(geometries) - across <= checked.agreeing
+
+
+def test_pairs_that_a_drift_explains_are_kept_apart(tmp_path):
+    made = walk()
+    job = make_job(tmp_path, made)
+    geometries = read_verified(job.database, None)
+    bent = walk(motions=dict.fromkeys(range(8, 16), moved(0, 0.35, 0, 3))).model()
+    checked = check_pairs(job.database, [bent], geometries)
+    across = {pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
+    assert len(checked.drifted) > 0.6 * len(across)
+    assert checked.drifted <= across
+
+
+def test_a_single_pair_closes_no_loop(tmp_path):
+    made = walk()
+    job = make_job(tmp_path, made)
+    bent = walk(motions=dict.fromkeys(range(8, 16), moved(0, 0.35, 0, 3))).model()
+    pair = made.names[5], made.names[9]
+    lonely = read_verified(job.database, {pair})
+    checked = check_pairs(job.database, [bent], lonely)
+    assert checked.drifted == frozenset()
+    assert pair not in checked.agreeing
+
+
+def test_images_of_different_models_are_no_contradiction(tmp_path):
+    made = walk()
+    job = make_job(tmp_path, made)
+    halves = [walk(unregistered=frozenset(range(8))).model(),
+              walk(unregistered=frozenset(range(8, 16))).model()]
+    geometries = read_verified(job.database, None)
+    checked = check_pairs(job.database, halves, geometries)
+    assert checked.unplaced == {
+        pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
+
+
+@pytest.fixture
+def repeated(tmp_path):
+    """A walk along a wall whose end looks like its beginning, with tracks."""
+    made = walk(24)
+    looks = np.arange(len(made.points))
+    first = np.flatnonzero(made.points[:, 0] < 2)
+    # The points around x = 12 look like those around x = 0, in the same arrangement.
+    points = np.concatenate([made.points[made.points[:, 0] < 9],
+                             made.points[first] + [13.0, 0, 0]])
+    count = len(points) - len(first)
+    looks = np.concatenate([np.arange(count), np.zeros(len(first), int)])
+    place = np.full(len(made.points), -1)
+    place[made.points[:, 0] < 9] = np.arange(count)
+    looks[count:] = place[first]
+    alike = MadeModel(points, made.poses, looks=looks)
+    return alike, make_job(tmp_path, alike, make_tracks(alike))
+
+
+def test_tracks_place_what_looks_alike_where_it_is(repeated):
+    made, job = repeated
+    models = build_skeleton(job, SILENT)
+    assert [model.num_reg_images() for model in models] == [24]
+    assert errors(models[0], made).max() < 0.2
+    checked = check_pairs(job.database, models, read_verified(job.database, None))
+    alike = {pair for pair in read_verified(job.database, None)
+             if made.names.index(pair[1]) - made.names.index(pair[0]) > 17}
+    assert alike
+    assert not alike & checked.agreeing
+
+
+def test_a_model_is_completed_without_what_only_looks_alike(repeated):
+    made, job = repeated
+    (folder := job.attempts / skeleton.SKELETON / "0").mkdir(parents=True)
+    build_skeleton(job, SILENT)[0].write(folder)
+    models = complete(linked(job), SILENT)
+    assert [model.num_reg_images() for model in models] == [24]
+    assert errors(models[0], made).max() < 0.02
+
+
+def test_models_that_tracks_leave_apart_are_joined_by_matches(tmp_path):
+    made = walk()
+    tracks = make_tracks(made, breaks=[8])
+    job = make_job(tmp_path, made, tracks)
+    models = build_skeleton(job, SILENT)
+    assert sorted(model.num_reg_images() for model in models) == [8, 8]
+    for index, model in enumerate(models):
+        (job.attempts / skeleton.SKELETON / str(index)).mkdir(parents=True)
+        model.write(job.attempts / skeleton.SKELETON / str(index))
+    completed = complete(linked(job), SILENT)
+    assert [model.num_reg_images() for model in completed] == [16]
+    assert errors(completed[0], made).max() < 0.02
