@@ -45,8 +45,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         tracks=tracks if tracks.exists() else None, pairs=config.pairs,
         max_features=config.max_features, min_registered=config.min_registered,
         accept_weak=config.accept_weak, partial=config.partial, gravity=config.gravity == "auto",
-        scale_between=config.scale_between, max_minutes=_time_limit(config, frames, ctx), seed=config.seed,
-        threads=ctx.threads,
+        scale_between=config.scale_between, max_minutes=_time_limit(config, frames, ctx),
+        seed=config.seed, threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
         times=_times(frames))

@@ -1,13 +1,15 @@
 """Real captures through ingest, denoise and sfm: `python tests/bench/bench_captures.py DATA OUT`.
 
 DATA is the folder of test data. Each capture gets a workspace in OUT and a row of a table: what was
-chosen and registered, how far the cameras are from the reference where there is one, the verdict,
-seconds and peak memory of sfm. Name captures behind OUT to run only those.
+chosen and registered, which mapper gave the model (trusted, or a trusted part), how far the cameras
+are from the reference where there is one, seconds and peak memory of sfm. Name captures behind OUT
+to run only those, or files and folders that are not in DATA.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,7 +23,8 @@ import numpy as np
 from pose_errors import Poses, compare, model_poses, reference_poses
 
 HEADINGS = (
-    "capture", "chosen", "registered", "reprojection px", "centre RMSE", "centre median / max",
+    "capture", "chosen", "registered", "left out", "way", "reprojection px", "centre RMSE",
+    "centre median / max",
     "rotation median / max", "weak link", "fold", "sfm s", "MB", "ended with")
 
 
@@ -63,6 +66,16 @@ def room(name: str) -> Callable[[Path, Path], Poses]:
 def fox(data: Path, _out: Path) -> Poses:
     """Poses of fox that others found."""
     return reference_poses(data / "fox")
+
+
+def trident(data: Path, _out: Path) -> Poses:
+    """Poses that others found; frame k of the video is file k + 1, axes are OpenGL's."""
+    path = data / "walks" / "trident_desk" / "transforms_train.json"
+    frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+    return {
+        f"{int(''.join(filter(str.isdigit, Path(frame['file_path']).stem))) - 1:06d}.png":
+            np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        for frame in frames}
 
 
 def noisy_fox(data: Path, out: Path) -> Path:
@@ -123,6 +136,18 @@ CAPTURES = {
     "snowmiku": Capture(given("snowmiku_photos")),
     "snowmiku, DNG": Capture(dng),
     "large walk": Capture(large_walk),
+    "trident": Capture(given("walks/trident_desk/video.mp4"), trident),
+    "bonsai": Capture(given("walks/bonsai/images")),
+    "living room loop": Capture(given("walks/living_room_loop/video.mp4")),
+    "lockers": Capture(given("walks/club_room_lockers/images")),
+    "corridor with plants": Capture(given("walks/office_corridor_plants/images")),
+    "tello": Capture(given("walks/tello_lab/images")),
+    "redkitchen": Capture(given("walks/redkitchen/video.mp4")),
+    "fr1 rpy": Capture(given("walks/tum_fr1_rpy/video.mp4")),
+    **{f"walk {name}": Capture(given(f"walks/forward_walks/{name}.mp4"))
+       for name in (
+           "bedroom_walk", "classroom_walk", "dining_walk", "kitchen_walk", "lobby_walk",
+           "study_walk")},
 }
 
 
@@ -138,7 +163,8 @@ def ran(workspace: Path, verb: str, *arguments: str) -> tuple[int, str]:
 
 def measured(name: str, data: Path, out: Path) -> list[str]:
     """Returns the row of a capture."""
-    capture, workspace = CAPTURES[name], out / "ws"
+    capture = CAPTURES[name] if name in CAPTURES else Capture(lambda *_: Path(name).resolve())
+    workspace = out / "ws"
     out.mkdir(parents=True, exist_ok=True)
     sources: dict[str, tuple[str, ...]] = {"ingest": (str(capture.source(data, out)),)}
     for verb in ("ingest", "denoise", "sfm"):
@@ -151,7 +177,8 @@ def measured(name: str, data: Path, out: Path) -> list[str]:
     summary = manifest["summary"]
     verdict = json.loads((workspace / "sfm" / "verdict.json").read_text(encoding="utf-8"))
     return [
-        name, str(summary["frames"]), str(summary["registered"]),
+        name, str(summary["frames"]), str(summary["registered"]), str(len(summary["left_out"])),
+        next((rung["name"] for rung in summary["rungs"] if rung["kept"]), "given poses"),
         f"{summary['reprojection_error_px']:.2f}", *cells,
         share(verdict["weak_link"]), share(verdict["fold"]), f"{manifest['seconds']:.0f}",
         f"{manifest['peak_memory_bytes'] / 1e6:.0f}",
@@ -177,12 +204,14 @@ def accuracy(capture: Capture, data: Path, out: Path) -> tuple[str, str, str]:
 @click.command()
 @click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
-@click.argument("names", nargs=-1, type=click.Choice(list(CAPTURES)))
+@click.argument("names", nargs=-1)
 def main(data: Path, out: Path, names: tuple[str, ...]) -> None:
     """Prints a Markdown table, a row as soon as it is known."""
     click.echo(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}")
     for name in names or CAPTURES:
-        folder = out.resolve() / name.replace(", ", "_").replace(" ", "_")
+        if name not in CAPTURES and not Path(name).exists():
+            raise click.BadParameter(f"{name} is neither a file nor one of {', '.join(CAPTURES)}.")
+        folder = out.resolve() / re.sub(r"[^\w.]+", "_", name).strip("_")
         click.echo(f"| {' | '.join(measured(name, data.resolve(), folder))} |")
 
 

@@ -178,6 +178,7 @@ def nothing(*_, **__):
 def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    monkeypatch.setattr(mapper, "map_relaxed", nothing)
     result = build(job)
     assert [(item["name"], item["reason"], item["kept"]) for item in result["rungs"]] == [
         ("exhaustive", "20 frames are few enough to match all pairs", False),
@@ -188,6 +189,7 @@ def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
 def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    monkeypatch.setattr(mapper, "map_relaxed", nothing)
     monkeypatch.setattr(mapper, "map_globally", nothing)
     with pytest.raises(SfmError, match="Only 0 of 20 frames have a camera") as caught:
         build(job)
@@ -206,6 +208,7 @@ def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
 def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    monkeypatch.setattr(mapper, "map_relaxed", nothing)
     monkeypatch.setattr(mapper, "map_globally", interrupt)
     with pytest.raises(KeyboardInterrupt):
         build(job)
