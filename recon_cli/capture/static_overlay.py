@@ -34,15 +34,14 @@ MAX_PARTS = 8  # of the video in which the edges are added up, at 1 MB each
 # by 41 to 85, before a bare wall by 4.
 MIN_SPREAD = 8.0
 # From this `OverlayMeter.strength` on an edge is static; chance alone gives some / sqrt(views).
-# The 12th strongest pixel, times sqrt(views): chosen on 1.0 to 1.7 in two rooms, clean and noisy,
-# three walks and photos of a corridor, 3.8 at a strength of .24 for a drone's, and 4.8 to 8.1 with
-# text, a logo, blurred dirt of 40% and a bonnet over a room. Checked on 1.0 to 2.1 in nine other
-# walks, and 6.0 to 8.5 with the same four over one of them.
+# The 12th strongest pixel, times sqrt(views): 1.0 to 2.1 in 17 captures, 3.8 at a strength of .24
+# for a drone's; with text, a logo and a bonnet over two of them 7.2 to 8.5, with blurred dirt of
+# 40% 4.8 and 6.0. Checked over a third: 6.8 to 8.0, dirt 3.9 at a strength of .45.
 STATIC, PER_ROOT = 0.35, 3.0
 WEAKER = 0.7  # of that bound holds for pixels that adjoin
 # Static pixels of an overlay. What is straight ahead in a walk without any sway stays in place too:
-# up to 77 pixels in drawn corridors, none in the walks above, 650 to 2,400 in the overlays.
-MIN_PIXELS = 200
+# up to 77 pixels in drawn corridors; none in the captures above, 232 to 2,600 in the overlays.
+MIN_PIXELS = 120
 MIN_EDGE, CLOSE = 12, 5  # pixels of one static edge, and of a gap in it that is closed
 # A pixel whose gray values vary by a smaller share of what is usual in the frame is covered, and
 # an area inside static edges by the median of its pixels.
