@@ -88,3 +88,49 @@ def test_a_point_that_the_adjustment_lost_is_dropped(tmp_path, monkeypatch):
     mapper.adjust(model)
     assert model.num_points3D() == before - 1
     assert model.compute_mean_reprojection_error() < 1
+
+
+def disturb(model, pixels, *, share, seed=0):
+    """Moves a share of the observations of each image to the right, and adjusts the model."""
+    generator = np.random.default_rng(seed)
+    for number in model.reg_image_ids():
+        for point in model.image(number).points2D:
+            noise = generator.normal(0, 0.05, 2)
+            wrong = generator.uniform() < share
+            point.xy = point.xy + noise + (np.array([pixels, 0]) if wrong else 0)
+    mapper.adjust(model)
+
+
+def test_observations_that_are_off_no_longer_bend_a_model(tmp_path):
+    _, truth = make_capture(tmp_path)
+    model = pycolmap.Reconstruction(truth)
+    disturb(model, 3.0, share=0.05)
+    observations = model.compute_num_observations()
+    sharp = mapper.sharpen(model)
+    assert center_error(sharp, truth) < 0.5 * center_error(model, truth)
+    assert 0.93 * observations < sharp.compute_num_observations() < 0.97 * observations
+    assert sharp.num_reg_images() == 20
+    assert model.compute_num_observations() == observations
+
+
+def test_a_model_stays_as_it_is_where_an_image_would_lose_most_of_its_points(tmp_path):
+    _, truth = make_capture(tmp_path)
+    model = pycolmap.Reconstruction(truth)
+    number = min(model.reg_image_ids())
+    for index, point in enumerate(model.image(number).points2D):
+        if index % 3:
+            point.xy = point.xy + np.array([0, 3.0 if index % 2 else -3.0])
+    assert mapper.sharpen(model) is model
+
+
+def test_points_are_refined_until_the_cameras_settle(tmp_path):
+    job, truth = make_capture(tmp_path)
+    model = pycolmap.Reconstruction(truth)
+    generator = np.random.default_rng(0)
+    for point in model.points3D.values():
+        point.xyz = point.xyz + generator.normal(0, 0.02, 3)
+    shifted(model, 1)
+    mapper.refine(job, model)
+    assert center_error(model, truth) < 1e-3
+    assert model.camera(1).params[2] == pytest.approx(512, abs=0.1)
+    assert model.compute_mean_reprojection_error() < 0.01
