@@ -73,7 +73,7 @@ def linked(job):
 
 def walk(count=16, step=0.5, **changes):
     """Cameras along a wall with depth, so that parallax tells their places."""
-    points = wall(-4, 4 + count * step, count=150 * count)
+    points = wall(-4, 4 + count * step, count=60 * count)
     points[:, 2] += np.random.default_rng(1).uniform(-1.5, 1.5, len(points))
     return MadeModel(points, along(np.arange(count) * step), **changes)
 
