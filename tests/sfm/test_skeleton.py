@@ -234,6 +234,7 @@ def test_tracks_place_what_looks_alike_where_it_is(repeated):
     assert not alike & checked.agreeing
 
 
+@pytest.mark.integration
 def test_a_model_is_completed_without_what_only_looks_alike(repeated):
     made, job = repeated
     (folder := job.attempts / skeleton.SKELETON / "0").mkdir(parents=True)
@@ -243,6 +244,7 @@ def test_a_model_is_completed_without_what_only_looks_alike(repeated):
     assert errors(models[0], made).max() < 0.02
 
 
+@pytest.mark.integration
 def test_models_that_tracks_leave_apart_are_joined_by_matches(tmp_path):
     made = walk()
     tracks = make_tracks(made, breaks=[8])

@@ -64,6 +64,7 @@ def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notice
     assert notices() == []
 
 
+@pytest.mark.integration
 def test_the_bundled_video_gives_a_number_that_structure_from_motion_likes(sample_video, tmp_path):
     summary = take(sample_video, tmp_path / "out")
     assert 60 <= summary.frames <= 100
@@ -264,6 +265,7 @@ def marked(tmp_path):
     return write_video(tmp_path / "marked.mp4", marked_walk())
 
 
+@pytest.mark.integration
 def test_an_overlay_is_masked_in_every_frame_and_drawn_and_told(marked, tmp_path, notices):
     take(marked, tmp_path / "out")
     frames = listed(tmp_path / "out")["frames"]
@@ -285,6 +287,7 @@ def test_an_overlay_is_masked_in_every_frame_and_drawn_and_told(marked, tmp_path
                for notice in notices()) == 1
 
 
+@pytest.mark.integration
 def test_an_overlay_is_kept_on_request(marked, tmp_path, notices):
     take(marked, tmp_path / "out", config=IngestConfig(overlays="keep"))
     assert not any(frame["masked"] for frame in listed(tmp_path / "out")["frames"])
@@ -292,6 +295,7 @@ def test_an_overlay_is_kept_on_request(marked, tmp_path, notices):
     assert not any("fixed" in notice for notice in notices())
 
 
+@pytest.mark.integration
 def test_a_walk_without_an_overlay_gets_no_mask(tmp_path):
     video = write_video(tmp_path / "walk.mp4", walk(60, step=12, height=180, width=320))
     take(video, tmp_path / "out")
@@ -299,6 +303,7 @@ def test_a_walk_without_an_overlay_gets_no_mask(tmp_path):
     assert not (tmp_path / "out" / "overlay.png").exists()
 
 
+@pytest.mark.integration
 def test_a_second_try_finds_the_overlay_of_the_first_scan(marked, tmp_path, monkeypatch, notices):
     take(marked, tmp_path / "out")
     before = files(tmp_path / "out")
@@ -316,6 +321,7 @@ def listed_names(written):
     return sorted(name.removeprefix("masks/") for name in written if name.startswith("masks/"))
 
 
+@pytest.mark.integration
 def test_what_covers_too_much_of_the_picture_is_not_masked(marked, tmp_path, monkeypatch, notices):
     monkeypatch.setattr(from_video, "MOST", 0.01)
     take(marked, tmp_path / "out")
