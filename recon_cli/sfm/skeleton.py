@@ -133,7 +133,7 @@ def complete(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]
         folder.iterdir(), key=lambda path: int(path.name))] if folder.is_dir() else []
     source = replace(job, linked=None).database
     tracks = _read_tracks(job)
-    geometries = read_verified(source, None)
+    geometries = read_verified(source)
     checked = check_pairs(source, models, geometries)
     usable = {pair: geometry for pair, geometry in geometries.items()
               if pair not in checked.contradicting}
@@ -168,10 +168,8 @@ def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconst
     return mapper.extend_model(job, model) if len(poses) < len(job.names) else model
 
 
-def read_verified(
-    path: Path, pairs: Collection[Pair] | None
-) -> dict[Pair, pycolmap.TwoViewGeometry]:
-    """Returns the verified matches of some pairs, or of all; names in order."""
+def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
+    """Returns the verified matches of all pairs in a database; the names of a pair in order."""
     verified = {}
     with pycolmap.Database.open(path) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -180,8 +178,7 @@ def read_verified(
             if first > second:
                 first, second = second, first
                 geometry.invert()
-            wanted = pairs is None or (first, second) in pairs
-            if wanted and len(geometry.inlier_matches) >= MIN_MATCHES:
+            if len(geometry.inlier_matches) >= MIN_MATCHES:
                 verified[first, second] = geometry
     return verified
 
@@ -193,8 +190,10 @@ def link(
     """Writes the database `job.linked`: images and keypoints of another one, and these matches.
 
     Observations of tracks follow the keypoints of an image. They are matches where features gave
-    few.
+    few. Other pairs that were matched stay in it without matches: that they should show the same,
+    and do not, speaks against a model.
     """
+    tried = database.pair_names(source)
     database.remove(job.database)
     shutil.copyfile(source, job.database)
     matched = _match_tracks(tracks, geometries, steps)
@@ -215,6 +214,9 @@ def link(
             features = [geometries[pair].inlier_matches] if pair in geometries else []
             opened.write_matches(
                 first, second, np.concatenate([*features, followed]).astype(np.uint32))
+        for pair in sorted(tried - geometries.keys() - matched.keys()):
+            first, second = (images[name].image_id for name in pair)
+            opened.write_matches(first, second, np.zeros((0, 2), np.uint32))
     if matched:
         matching.verify_pairs(job, matched)
 
@@ -282,9 +284,10 @@ def check_pairs(
             drifted.add(pair)
         else:
             contradicting.add(pair)
+    supported = _supported(drifted, agreeing)
     return PairChecks(
-        frozenset(agreeing), frozenset(_supported(drifted, agreeing)), frozenset(contradicting),
-        frozenset(unplaced))
+        frozenset(agreeing), frozenset(supported),
+        frozenset(contradicting | (drifted - supported)), frozenset(unplaced))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from made_model import HEIGHT, WIDTH, MadeModel, along, moved, wall
 
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import skeleton
+from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
 from recon_cli.sfm.skeleton import (
     build_skeleton,
@@ -128,18 +129,16 @@ def test_views_of_one_surface_overlap_and_those_of_others_do_not():
 def test_pairs_are_read_in_order_of_their_names(tmp_path):
     made = walk(6)
     path = made.write_database(tmp_path / "database.db")
-    verified = read_verified(path, None)
+    verified = read_verified(path)
     assert len(verified) == 15
     assert all(first < second for first, second in verified)
-    assert set(read_verified(path, {(made.names[1], made.names[3])})) == {
-        (made.names[1], made.names[3])}
 
 
 def test_observations_of_tracks_follow_the_features_of_an_image(tmp_path):
     made = walk(6)
     tracks = make_tracks(made)
     job = make_job(tmp_path, made, tracks)
-    few = {pair: geometry for pair, geometry in read_verified(job.database, None).items()
+    few = {pair: geometry for pair, geometry in read_verified(job.database).items()
            if pair == (made.names[0], made.names[1])}
     link(linked(job), job.database, few, tracks)
     with pycolmap.Database.open(job.out / skeleton.LINKED) as opened:
@@ -156,11 +155,27 @@ def test_observations_of_tracks_follow_the_features_of_an_image(tmp_path):
         assert opened.read_two_view_geometry(1, 3).inlier_matches.shape[0] > 0.9 * len(first)
 
 
+def test_pairs_that_were_matched_in_vain_are_remembered(tmp_path):
+    made = walk(6)
+    tracks = make_tracks(made)
+    job = make_job(tmp_path, made, tracks)
+    geometries = read_verified(job.database)
+    dropped = made.names[0], made.names[4]  # tracks are matched 1, 2, 3, 5, ... apart
+    kept = {pair: geometry for pair, geometry in geometries.items() if pair != dropped}
+    link(linked(job), job.database, kept, tracks)
+    assert set(read_verified(linked(job).database)) == set(kept)
+    with pycolmap.Database.open(linked(job).database) as opened:
+        assert opened.exists_matches(1, 5)
+        assert len(opened.read_matches(1, 5)) == 0
+    evidence = gather_evidence(made.model(), linked(job).database, made.names)
+    assert evidence.tried[0, 4]
+
+
 def test_pairs_that_look_alike_contradict_the_cameras(tmp_path):
     made = walk()
     job = make_job(tmp_path, made)
     model = made.model()
-    geometries = read_verified(job.database, None)
+    geometries = read_verified(job.database)
     checked = check_pairs(job.database, [model], geometries)
     assert checked.agreeing == set(geometries)
     turned = walk(motions=dict.fromkeys(range(8, 16), moved(1, 0, 0, 40))).model()
@@ -174,7 +189,7 @@ def test_pairs_that_look_alike_contradict_the_cameras(tmp_path):
 def test_pairs_that_a_drift_explains_are_kept_apart(tmp_path):
     made = walk()
     job = make_job(tmp_path, made)
-    geometries = read_verified(job.database, None)
+    geometries = read_verified(job.database)
     bent = walk(motions=dict.fromkeys(range(8, 16), moved(0, 0.35, 0, 3))).model()
     checked = check_pairs(job.database, [bent], geometries)
     across = {pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
@@ -187,10 +202,10 @@ def test_a_single_pair_closes_no_loop(tmp_path):
     job = make_job(tmp_path, made)
     bent = walk(motions=dict.fromkeys(range(8, 16), moved(0, 0.35, 0, 3))).model()
     pair = made.names[5], made.names[9]
-    lonely = read_verified(job.database, {pair})
-    checked = check_pairs(job.database, [bent], lonely)
-    assert checked.drifted == frozenset()
-    assert pair not in checked.agreeing
+    geometries = read_verified(job.database)
+    assert pair in check_pairs(job.database, [bent], geometries).drifted
+    lonely = check_pairs(job.database, [bent], {pair: geometries[pair]})
+    assert lonely.contradicting == {pair}
 
 
 def test_images_of_different_models_are_no_contradiction(tmp_path):
@@ -198,7 +213,7 @@ def test_images_of_different_models_are_no_contradiction(tmp_path):
     job = make_job(tmp_path, made)
     halves = [walk(unregistered=frozenset(range(8))).model(),
               walk(unregistered=frozenset(range(8, 16))).model()]
-    geometries = read_verified(job.database, None)
+    geometries = read_verified(job.database)
     checked = check_pairs(job.database, halves, geometries)
     assert checked.unplaced == {
         pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
@@ -227,8 +242,8 @@ def test_tracks_place_what_looks_alike_where_it_is(repeated):
     models = build_skeleton(job, SILENT)
     assert [model.num_reg_images() for model in models] == [24]
     assert errors(models[0], made).max() < 0.2
-    checked = check_pairs(job.database, models, read_verified(job.database, None))
-    alike = {pair for pair in read_verified(job.database, None)
+    checked = check_pairs(job.database, models, read_verified(job.database))
+    alike = {pair for pair in read_verified(job.database)
              if made.names.index(pair[1]) - made.names.index(pair[0]) > 17}
     assert alike
     assert not alike & checked.agreeing
