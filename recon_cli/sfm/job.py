@@ -90,11 +90,6 @@ class MappingJob:
         return self.out / "rungs"
 
     @property
-    def undistorting(self) -> Path:
-        """Undistorted images until all of them are there."""
-        return self.out / "undistorted.partial"
-
-    @property
     def known_poses(self) -> bool:
         """Whether the cameras are given."""
         return self.poses is not None and self.pose_use != "ignore"
@@ -198,7 +193,7 @@ _ERRORS: dict[str, type[ReconError]] = {
 class Phase:
     """A phase of the work begins."""
 
-    name: str  # "features", "matches", "mapping" or "undistorted"
+    name: str  # "features", "skeleton", "matches", "mapping" or "undistorted"
     total: int  # units of work
     done: int  # those that an interrupted run had done
 

@@ -24,9 +24,11 @@ from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, pars
 _DOING = {
     "features": ("finding features", "frame"),
     "matches": ("matching frames", "pair"),
+    "skeleton": ("following frames", "frame"),
     "mapping": ("placing cameras", "frame"),
     "undistorted": ("undistorting frames", "frame")}
-_STEP = {"mapping": "model"}  # the step that a phase belongs to, where the names differ
+# The step that a phase belongs to, where the names differ.
+_STEP = {"skeleton": "features", "mapping": "model"}
 LOG = "log.txt"
 _LOG_TAIL = 64 * 1024  # bytes
 _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
@@ -61,8 +63,8 @@ class Monitor:
         text, unit = _DOING[self._phase.name]
         return f"{text} ({self._count} of {self._phase.total} {unit}s done)"
 
-    def show(self, event: Phase | int | None) -> None:
-        """Shows an event, or the progress on the disk when there is none."""
+    def show(self, event: Phase | int) -> None:
+        """Shows that a phase begins, or how many units of it are done."""
         if isinstance(event, Phase):
             self._open.close()
             text, unit = _DOING[event.name]
@@ -70,21 +72,10 @@ class Monitor:
             self._bar = self._open.enter_context(
                 self._progress.bar(text, event.total, unit=unit, done=event.done))
             self._record_durable(event)
-        elif self._phase is not None and self._bar is not None:
-            count = self._count_on_disk(self._phase) if event is None else event
-            if count > self._count:
-                self._bar.advance(count - self._count)
-                self._count = count
-                self._record_durable(self._phase)
-
-    def _count_on_disk(self, phase: Phase) -> int:
-        if phase.name == "undistorted":
-            # os.walk, not rglob: the process removes folders as it goes, and walk passes over them.
-            files = sum(
-                name.endswith(".png")
-                for _, _, files in os.walk(self._job.undistorting) for name in files)
-            return min(files, phase.total)  # masks lie there twice for a moment
-        return 0
+        elif self._phase is not None and self._bar is not None and event > self._count:
+            self._bar.advance(event - self._count)
+            self._count = event
+            self._record_durable(self._phase)
 
     def _record_durable(self, phase: Phase) -> None:
         """Records finished steps, and images or pairs in the database."""
@@ -115,7 +106,8 @@ def run_job(job: MappingJob, *, progress: Progress, record: Callable[[int, int],
                     raise event
                 if time.monotonic() > deadline:
                     raise _timeout_error(max_minutes, monitor)
-                monitor.show(event)
+                if event is not None:
+                    monitor.show(event)
             try:
                 code = child.wait(timeout=max(1.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired as error:  # native code may hang on its way out

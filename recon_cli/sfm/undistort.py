@@ -9,14 +9,16 @@ from __future__ import annotations
 import filecmp
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from recon_cli.io.colmap import Pinhole
+from recon_cli.io.images import read_png, write_png
 from recon_cli.io.records import read_poses
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.align_world import ScaleBetween, world_transform
@@ -66,15 +68,32 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
 
 def undistort(job: MappingJob, report: Reporter) -> Result:
     """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
-    model = pycolmap.Reconstruction(job.out / "sparse")
-    names = sorted(model.image(i).name for i in model.reg_image_ids())
-    masked = [name for name in names if job.masks and (job.masks / name).exists()]
-    report.phase("undistorted", 2 * len(names) + len(masked))
-    work = fresh_folder(job.undistorting)
-    _undistort(job, job.frames, names, work)
-    _write_twins(job, names, work)
-    _write_masks(job, masked, work)
-    flat = pycolmap.Reconstruction(work / SPARSE)
+    model = pycolmap.Reconstruction(job.out / SPARSE)
+    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    names = sorted(images)
+    report.phase("undistorted", len(names))
+    work = fresh_folder(job.out / "undistorted.partial")
+    flat = _write_model(job, names[0], work)
+    warps = {number: _warp(camera, flat.cameras[number])
+             for number, camera in model.cameras.items()}
+    masked = {name for name in names if job.masks and (job.masks / name).exists()}
+    for folder in (IMAGES, TWINS, *([MASKS] if masked else [])):
+        (work / folder).mkdir()
+
+    def write(name: str) -> None:
+        warp, target = warps[images[name].camera_id], work / IMAGES / name
+        write_png(target, _remap(read_png(job.frames / name), warp))
+        if filecmp.cmp(job.frames / name, job.denoised / name, shallow=False):
+            shutil.copyfile(target, work / TWINS / name)
+        else:
+            write_png(work / TWINS / name, _remap(read_png(job.denoised / name), warp))
+        if job.masks is not None and name in masked:  # 255 where most of a pixel counts
+            gray = _remap(read_png(job.masks / name)[:, :, 0], warp)
+            write_png(work / MASKS / name, np.where(gray < 128, 0, 255).astype(np.uint8))
+
+    with ThreadPoolExecutor(job.threads) as pool:
+        for count, _ in enumerate(pool.map(write, names), 1):
+            report.done(count)
     counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
     cameras = [
         {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
@@ -84,40 +103,27 @@ def undistort(job: MappingJob, report: Reporter) -> Result:
     return {"cameras": cameras}
 
 
-def _write_twins(job: MappingJob, names: Sequence[str], work: Path) -> None:
-    """Writes the denoised twins; those of unchanged frames are copies, byte by byte."""
-    changed = [
-        name for name in names
-        if not filecmp.cmp(job.frames / name, job.denoised / name, shallow=False)]
-    twins = work / TWINS
-    twins.mkdir()
-    if changed:  # an empty list would mean all
-        _undistort(job, job.denoised, changed, work / "twins")
-        for name in changed:
-            (work / "twins" / IMAGES / name).rename(twins / name)
-        shutil.rmtree(work / "twins")
-    for name in set(names).difference(changed):
-        shutil.copyfile(work / IMAGES / name, twins / name)
+def _write_model(job: MappingJob, name: str, work: Path) -> pycolmap.Reconstruction:
+    """Writes the undistorted model into work/sparse and returns it.
+
+    COLMAP undistorts images with it, at a fifth of OpenCV's speed; it is given a single one.
+    """
+    between = work / "between"
+    pycolmap.undistort_images(between, job.out / SPARSE, job.frames, [name], num_threads=1)
+    (between / SPARSE).rename(work / SPARSE)
+    shutil.rmtree(between)
+    return pycolmap.Reconstruction(work / SPARSE)
 
 
-def _write_masks(job: MappingJob, masked: Sequence[str], work: Path) -> None:
-    """Writes the undistorted masks of masked frames: 255 where most of a pixel counts."""
-    if job.masks is None or not masked:  # an empty list would mean all
-        return
-    (work / MASKS).mkdir()
-    _undistort(job, job.masks, masked, work / "between")
-    for name in masked:
-        data = np.frombuffer((work / "between" / IMAGES / name).read_bytes(), np.uint8)
-        gray = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))
-        _, packed = cv2.imencode(".png", np.where(gray < 128, 0, 255).astype(np.uint8))
-        (work / MASKS / name).write_bytes(packed.tobytes())
-    shutil.rmtree(work / "between")
+def _warp(camera: pycolmap.Camera, flat: pycolmap.Camera) -> NDArray[np.float32]:  # [H, W, 2]
+    """Returns where each pixel of the undistorted image lies in the frame (OpenCV: 0, 0 is the
+    middle of the first pixel)."""
+    x, y = np.meshgrid(np.arange(flat.width) + 0.5, np.arange(flat.height) + 0.5)
+    rays = np.asarray(flat.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1)))
+    places = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+    return (places - 0.5).reshape(flat.height, flat.width, 2).astype(np.float32)
 
 
-def _undistort(job: MappingJob, source: Path, names: Sequence[str], target: Path) -> None:
-    """Writes images/ and sparse/ into `target`, without COLMAP's stereo folder and scripts."""
-    pycolmap.undistort_images(
-        target, job.out / "sparse", source, list(names), num_threads=job.threads)
-    shutil.rmtree(target / "stereo")
-    for script in target.glob("run-colmap-*.sh"):
-        script.unlink()
+def _remap(image: NDArray[np.uint8], warp: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.remap(
+        image, warp, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)

@@ -1,0 +1,96 @@
+"""Undistortion of frames, their twins and masks."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from sfm_inputs import texture
+from synthetic import make_capture
+
+from recon_cli.io.images import read_png, write_png
+from recon_cli.sfm import undistort
+from recon_cli.sfm.job import Phase, Reporter, parse
+
+WIDTH, HEIGHT = 120, 90
+
+
+@pytest.fixture
+def mapped(tmp_path):
+    """A job with a model of six images, whose frames lie there; the second is denoised."""
+    job, model = make_capture(tmp_path, frames=6)
+    for camera in model.cameras.values():
+        camera.rescale(WIDTH, HEIGHT)
+    (tmp_path / "denoised").mkdir()
+    for seed, name in enumerate(job.names):
+        for folder in ("frames", "denoised"):
+            shown = texture(HEIGHT, WIDTH, seed)
+            write_png(tmp_path / folder / name, shown // 2 if (folder, seed) == (
+                "denoised", 1) else shown)
+    return replace(job, denoised=tmp_path / "denoised", threads=2), model
+
+
+def run(job, model, params=(), report=None):
+    """Undistorts with these distortion parameters; returns the folder."""
+    for camera in model.cameras.values():
+        camera.params = [*camera.params[:4], *(params or (0, 0, 0, 0))]
+    (job.out / "sparse").mkdir()
+    model.write(job.out / "sparse")
+    undistort.undistort(job, report or Reporter(io.BytesIO()))
+    return job.out / "undistorted"
+
+
+def test_frames_without_distortion_keep_their_pixels(mapped):
+    job, model = mapped
+    out = run(job, model)
+    for name in job.names:
+        np.testing.assert_array_equal(read_png(out / "images" / name), read_png(job.frames / name))
+
+
+def test_distorted_frames_become_what_colmap_makes_of_them(mapped):
+    job, model = mapped
+    out = run(job, model, (-0.15, 0.03, 0.002, -0.001))
+    pycolmap.undistort_images(job.out / "theirs", job.out / "sparse", job.frames)
+    for name in job.names:
+        ours, theirs = (read_png(path).astype(int) for path in (
+            out / "images" / name, job.out / "theirs" / "images" / name))
+        assert ours.shape == theirs.shape
+        # OpenCV takes places in steps of 1/32 of a pixel.
+        assert np.abs(ours - theirs)[1:-1, 1:-1].max() <= 8
+        assert np.abs(ours - theirs)[1:-1, 1:-1].mean() < 1
+    flat = pycolmap.Reconstruction(out / "sparse")
+    assert {camera.model.name for camera in flat.cameras.values()} == {"PINHOLE"}
+    assert flat.num_points3D() == model.num_points3D()
+
+
+def test_twins_are_copies_where_nothing_was_denoised(mapped):
+    job, model = mapped
+    out = run(job, model, (-0.1, 0, 0, 0))
+    for name in job.names:
+        image, twin = ((out / folder / name).read_bytes() for folder in ("images", "denoised"))
+        assert (image == twin) == (name != job.names[1])
+    halved = read_png(out / "denoised" / job.names[1]).astype(int)
+    assert np.abs(2 * halved - read_png(out / "images" / job.names[1])).max() <= 2
+
+
+def test_masks_stay_black_and_white(mapped, tmp_path):
+    job, model = mapped
+    (tmp_path / "masks").mkdir()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :WIDTH // 2] = 0
+    write_png(tmp_path / "masks" / job.names[2], mask)
+    out = run(replace(job, masks=tmp_path / "masks"), model, (-0.1, 0, 0, 0))
+    assert [path.name for path in (out / "masks").iterdir()] == [job.names[2]]
+    found = read_png(out / "masks" / job.names[2])[:, :, 0]
+    assert set(np.unique(found)) == {0, 255}
+    assert np.mean(found == 0) == pytest.approx(0.5, abs=0.02)
+
+
+def test_progress_ends_with_the_last_frame(mapped):
+    job, model = mapped
+    stream = io.BytesIO()
+    run(job, model, report=Reporter(stream))
+    phase, *counts = map(parse, stream.getvalue().splitlines())
+    assert phase == Phase("undistorted", 6, 0)
+    assert counts == [1, 2, 3, 4, 5, 6]
