@@ -20,7 +20,9 @@ from typing import Any
 import click
 import cv2
 import numpy as np
+import pycolmap
 from pose_errors import Poses, compare, model_poses, reference_poses
+from scipy.spatial.transform import Rotation
 
 HEADINGS = (
     "capture", "chosen", "registered", "left out", "way", "reprojection px", "centre RMSE",
@@ -76,6 +78,30 @@ def trident(data: Path, _out: Path) -> Poses:
         f"{int(''.join(filter(str.isdigit, Path(frame['file_path']).stem))) - 1:06d}.png":
             np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
         for frame in frames}
+
+
+def rpy(data: Path, _out: Path) -> Poses:
+    """Motion capture; frame k of the video is line k of rgb.txt."""
+    folder = data / "walks" / "tum_fr1_rpy"
+    path = np.loadtxt(folder / "groundtruth.txt")
+    times = np.array([float(line.split()[0]) for line in (folder / "rgb.txt").read_text(
+        encoding="utf-8").splitlines() if not line.startswith("#")])
+    rows = np.abs(path[:, :1] - times).argmin(axis=0)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(path[rows, 4:8]).as_matrix()
+    poses[:, :3, 3] = path[rows, 1:4]
+    return {f"{index:06d}.png": pose for index, pose in enumerate(poses)}
+
+
+def lockers(data: Path, out: Path) -> Poses:
+    """Poses that others found."""
+    model = pycolmap.Reconstruction(data / "walks" / "club_room_lockers" / "sparse" / "0")
+    images = (model.image(number) for number in model.reg_image_ids())
+    poses = {Path(image.name).name: np.vstack(
+        [image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]]) for image in images}
+    listed = json.loads((out / "ws" / "ingest" / "frames.json").read_text(encoding="utf-8"))
+    return {frame["name"]: poses[frame["source"]] for frame in listed["frames"]
+            if frame["source"] in poses}
 
 
 def noisy_fox(data: Path, out: Path) -> Path:
@@ -139,11 +165,11 @@ CAPTURES = {
     "trident": Capture(given("walks/trident_desk/video.mp4"), trident),
     "bonsai": Capture(given("walks/bonsai/images")),
     "living room loop": Capture(given("walks/living_room_loop/video.mp4")),
-    "lockers": Capture(given("walks/club_room_lockers/images")),
+    "lockers": Capture(given("walks/club_room_lockers/images"), lockers),
     "corridor with plants": Capture(given("walks/office_corridor_plants/images")),
     "tello": Capture(given("walks/tello_lab/images")),
     "redkitchen": Capture(given("walks/redkitchen/video.mp4")),
-    "fr1 rpy": Capture(given("walks/tum_fr1_rpy/video.mp4")),
+    "fr1 rpy": Capture(given("walks/tum_fr1_rpy/video.mp4"), rpy, metric=True),
     **{f"walk {name}": Capture(given(f"walks/forward_walks/{name}.mp4"))
        for name in (
            "bedroom_walk", "classroom_walk", "dining_walk", "kitchen_walk", "lobby_walk",
