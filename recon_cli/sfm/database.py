@@ -51,25 +51,6 @@ def keypoint_counts(path: Path) -> dict[str, int]:
             "SELECT name, rows FROM images JOIN keypoints USING (image_id)"))
 
 
-def keep_coarsest(path: Path, most: int) -> None:
-    """Removes the finest keypoints of images that have more than `most`, in one transaction.
-
-    The coarsest are seen from the most places; of equal ones the first stay, reproducibly.
-    """
-    with closing(_connect(path)) as connection, connection:
-        many = connection.execute(
-            "SELECT image_id, k.data, d.data FROM keypoints k JOIN descriptors d USING (image_id)"
-            " WHERE k.rows > ?", (most,)).fetchall()
-        for image, keypoints, descriptors in many:
-            shapes = np.frombuffer(keypoints, np.float32).reshape(-1, KEYPOINT_COLUMNS)
-            coarsest = np.sort(np.argsort(-scales(shapes), kind="stable")[:most])
-            rows = np.frombuffer(descriptors, np.uint8).reshape(len(shapes), -1)[coarsest]
-            for table, data in (("keypoints", shapes[coarsest]), ("descriptors", rows)):
-                connection.execute(
-                    f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?",
-                    (len(coarsest), data.tobytes(), image))
-
-
 def scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
     """Returns the size of keypoints [K, 6] (x, y and a 2x2 shape), in pixels, [K]."""
     _, _, a, b, c, d = keypoints.astype(np.float64).T

@@ -13,12 +13,13 @@ import dataclasses
 import shutil
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import pycolmap
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import checks, database, mapper, matching, merge_models, skeleton
+from recon_cli.sfm import checks, database, features, mapper, matching, merge_models, skeleton
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, StepLog, fresh_folder, publish
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.trusted_part import keep_trusted_part
@@ -27,6 +28,7 @@ from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
+TRACKS = "tracks"  # the fallback that has a database of its own
 # Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
 EXHAUSTIVE_MAX = 100
 # Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
@@ -85,12 +87,19 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     begin = (every,) if count <= EXHAUSTIVE_MAX else (
         _incremental("retrieval", f"{count} frames are too many to match all pairs at once"), every)
     if skeleton.is_continuous(job):
-        begin = (Fallback("tracks", "the frames of a video are tracked from one to the next",
+        begin = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                           skeleton.choose_pairs, skeleton.complete), *begin)
     return (
         *begin,
         Fallback("relaxed", "", lambda *_: set(), mapper.map_relaxed),
         Fallback("global", "", lambda *_: set(), mapper.map_globally))
+
+
+def find_features(job: MappingJob, report: Reporter) -> Result:
+    """Fills the database with the features of all frames; see `features.extract_features`."""
+    by_tracks = not job.known_poses and list_fallbacks(job)[0].name == TRACKS
+    with skeleton.build_beside(job, report) if by_tracks and job.threads > 1 else nullcontext():
+        return features.extract_features(job, report)
 
 
 def match_first(job: MappingJob, report: Reporter) -> Result:
@@ -214,7 +223,7 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
         raise SfmError(f"{error.message} Cameras by mapper: {counts}.", hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
     job = _linked_job(job, chosen.name)
-    model = mapper.sharpen(pycolmap.Reconstruction(job.attempts / chosen.name / "model"))
+    model = pycolmap.Reconstruction(job.attempts / chosen.name / "model")
     verdict = examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
     part = keep_trusted_part(job, model, verdict)
     if part is not None:
@@ -241,7 +250,7 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
 def _linked_job(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
     own = job.attempts / name / skeleton.LINKED
-    return dataclasses.replace(job, linked=own) if name == "tracks" else job
+    return dataclasses.replace(job, linked=own) if name == TRACKS else job
 
 
 def _incremental(pairs: str, reason: str) -> Fallback:

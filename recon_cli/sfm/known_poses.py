@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.errors import SfmError
 from recon_cli.io.records import KnownPoses, read_poses
-from recon_cli.sfm import checks, database, mapper, matching
+from recon_cli.sfm import checks, database, features, mapper, matching
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish
 from recon_cli.sfm.merge_models import build_posed_model
@@ -261,7 +261,7 @@ def spot_check(
     silent = Reporter(io.BytesIO())
     matching.create_database(sample)
     try:
-        matching.extract_features(sample, silent)
+        features.extract_features(sample, silent)
         matching.match_pairs(sample, wanted, silent)
         evidence = gather_evidence(
             build_posed_model(sample.database, None, _rigid(viewmats, sample.names)),

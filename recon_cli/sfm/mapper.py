@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import pycolmap
@@ -22,21 +22,24 @@ GLOBAL_RATIO = 1.2
 MIN_IMAGES_PRINCIPAL = 10
 # COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
 MAX_ERROR, MIN_ANGLE = 4.0, 1.5
-# Pixels, and then times the mean error: two rooms' cameras came out at .43 and .52 cm without,
-# at .15 and .25 with both.
-SHARP_ERROR, SHARP_RATIO = 2.0, 3.0
+# Times the mean error. Cameras of two rooms came out at .54 and .47 cm without, at .34 and .19 with
+# the first, at .16 and .09 with both; half and twice the scale change that by .02.
+SHARP_RATIO, LOSS_SCALE = 3.0, 0.5
+# Relative change of the cost that ends an adjustment; a hundredth takes three times as long and
+# moves those cameras by less than .001 cm.
+TOLERANCE = 1e-4
 KEPT_SHARE = 0.5  # of the points of every image
 # Where COLMAP writes models that are read from memory, and finds the one that it continues.
 MODELS, START = "found.partial", "begun.partial"
 
 
 def map_incrementally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
-    """Returns every model that the incremental mapper finds; they may share images."""
+    """Returns every model that the incremental mapper finds, adjusted; they may share images."""
     return _map(job, report, _options(job))
 
 
 def map_relaxed(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
-    """Returns the models with lower thresholds for the first pair and for further images."""
+    """Returns the models with lower thresholds for the first pair and each further image."""
     options = _options(job)
     _relax(options)
     return _map(job, report, options)
@@ -51,6 +54,12 @@ def _map(
         job.database, job.frames, fresh_folder(job.attempts / MODELS), options,
         next_image_callback=lambda: report.done(min(next(images), len(job.names))))
     shutil.rmtree(job.attempts / MODELS)
+    return _adjusted(models)
+
+
+def _adjusted(models: Mapping[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    for model in models.values():
+        adjust(model)
     return list(models.values())
 
 
@@ -67,7 +76,7 @@ def extend_model(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Re
 
 
 def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
-    """Returns the models of the global mapper, which places all images at once.
+    """Returns the models of the global mapper, which places all images at once, adjusted.
 
     Unknown focal lengths are estimated from the matches first, in a copy of the database.
     """
@@ -84,19 +93,26 @@ def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruct
         copy, job.frames, fresh_folder(job.attempts / MODELS), _global_options(job))
     shutil.rmtree(job.attempts / MODELS)
     database.remove(copy)
-    return list(models.values())
+    return _adjusted(models)
 
 
-def adjust(model: pycolmap.Reconstruction, *, constant: Collection[int] = ()) -> None:
+def adjust(
+    model: pycolmap.Reconstruction, *, constant: Collection[int] = (), loss_scale: float = 0.0
+) -> None:
     """Adjusts a model in place with the principal point free; drops points that got lost.
 
     All images together determine it: on the fox photos it comes out 2 px from the published value,
-    16 px off the middle. The intrinsics of the cameras `constant` stay as they are.
+    16 px off the middle. The intrinsics of the cameras `constant` stay as they are. Errors count
+    squared, or by Cauchy's loss from `loss_scale` pixels on.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
     options.ceres.solver_options.num_threads = THREADS
+    options.ceres.solver_options.function_tolerance = TOLERANCE
+    if loss_scale:
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = loss_scale
     # Taking images out of a model leaves points with a single ray, which COLMAP cannot adjust.
     for number in [number for number, point in model.points3D.items() if point.track.length() < 2]:
         model.delete_point3D(number)
@@ -126,21 +142,20 @@ def refine(job: MappingJob, model: pycolmap.Reconstruction) -> None:
 
 
 def sharpen(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Returns a model adjusted to its exact observations alone: SHARP_ERROR, then SHARP_RATIO.
+    """Returns an adjusted model, adjusted again to its exact observations.
 
-    COLMAP's 4 pixels keep wrong matches, and squared errors give those the most weight. Where an
-    image would lose most of its points, all stay as they are.
+    COLMAP's 4 pixels keep wrong matches, and squared errors give those the most weight. Errors
+    count by Cauchy's loss here, and those far above the mean not at all, but in an image that
+    would lose most of its points.
     """
-    points = {i: model.image(i).num_points3D for i in model.reg_image_ids()}
-    error = SHARP_ERROR
-    for _ in range(2):
+    error = model.compute_mean_reprojection_error()
+    sharp = pycolmap.Reconstruction(model)
+    pycolmap.ObservationManager(sharp).filter_all_points3D(SHARP_RATIO * error, MIN_ANGLE)
+    if any(sharp.image(i).num_points3D < KEPT_SHARE * model.image(i).num_points3D
+           for i in model.reg_image_ids()):
         sharp = pycolmap.Reconstruction(model)
-        pycolmap.ObservationManager(sharp).filter_all_points3D(error, MIN_ANGLE)
-        if any(sharp.image(i).num_points3D < KEPT_SHARE * count for i, count in points.items()):
-            break
-        adjust(sharp)
-        model, error = sharp, min(error, SHARP_RATIO * sharp.compute_mean_reprojection_error())
-    return model
+    adjust(sharp, loss_scale=LOSS_SCALE * error)
+    return sharp
 
 
 def triangulate(
@@ -193,15 +208,18 @@ def _options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job.seed
     options.min_model_size = checks.MIN_FRAMES  # COLMAP's 10 would drop small captures
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_RATIO
+    options.ba_global_function_tolerance = TOLERANCE
     return options
 
 
 def _relax(options: pycolmap.IncrementalPipelineOptions) -> None:
     """Halves COLMAP's thresholds for the first pair and each further image, and tries more often.
 
-    The angle falls to a quarter, which COLMAP itself tries last for a capture with short steps.
+    The angle of the first pair falls to a quarter, which COLMAP itself tries last for a capture
+    with short steps. A fast turn past a bare wall leaves points of small angles alone.
     """
     mapper = options.mapper
+    mapper.filter_min_tri_angle = options.triangulation.min_angle = MIN_ANGLE / 2
     mapper.init_min_num_inliers = 50  # of 100
     mapper.init_min_tri_angle = 4.0  # of 16 degrees
     mapper.abs_pose_min_num_inliers = 15  # of 30; a pair is verified from 15 on

@@ -39,36 +39,6 @@ CHUNK = 4096  # descriptors compared with the words at a time, to bound the memo
 Pair = tuple[str, str]  # file names in order
 
 
-def extract_features(job: MappingJob, report: Reporter) -> Result:
-    """Fills the database with the features of all frames and returns how many there are.
-
-    Images that an interrupted run has finished are kept. FormatError if a frame cannot be read,
-    SfmError if too few hold any texture.
-    """
-    report.phase("features", len(job.names), done=database.progress(job.database, "features"))
-    with _open_for_polling(job) as opened:
-        ids = [image.image_id for image in opened.read_all_images()]
-        with report.polling(lambda: sum(map(opened.exists_descriptors, ids))):
-            for group in job.groups:
-                _extract_group(job, group)
-    database.keep_coarsest(job.database, job.max_features)
-    counts = database.keypoint_counts(job.database)
-    _check_readable(job, counts)
-    checks.check_texture(counts)
-    return {"rows": len(counts), "keypoints": sum(counts.values())}
-
-
-def _extract_group(job: MappingJob, group: CameraGroup) -> None:
-    masked = [name for name in group.names if job.masks and (job.masks / name).exists()]
-    rest = sorted(set(group.names).difference(masked))
-    # COLMAP takes no image that has no mask where it is given a folder of masks.
-    for names, masks in ((masked, job.masks), (rest, None)):
-        if names:  # an empty list would mean all
-            pycolmap.extract_features(
-                job.database, job.frames, names, pycolmap.CameraMode.SINGLE,
-                _reader_options(group, masks), _extraction_options(job), pycolmap.Device.cpu)
-
-
 def _open_for_polling(job: MappingJob) -> pycolmap.Database:
     """Returns a connection that shows how far pycolmap is; to be open longer than its own.
 
@@ -117,15 +87,6 @@ def _reader_options(group: CameraGroup, masks: Path | None = None) -> pycolmap.I
     elif group.focal_px is not None:
         focal = group.focal_px
         options.camera_params = f"{focal},{focal},{group.width / 2},{group.height / 2},0,0,0,0"
-    return options
-
-
-def _extraction_options(job: MappingJob) -> pycolmap.FeatureExtractionOptions:
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = job.threads
-    # No hard cap, hence `keep_coarsest`: COLMAP stops after the scale at which the count is
-    # reached, and a keypoint with two orientations counts twice.
-    options.sift.max_num_features = job.max_features
     return options
 
 

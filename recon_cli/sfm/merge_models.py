@@ -44,18 +44,18 @@ class ModelCandidate:
 def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> ModelCandidate | None:
     """Returns the largest model, merged with others and without wrong images; None without models.
 
-    A part is merged only where the model is trusted no less with it than without it.
+    The models are adjusted; the result is sharp. A part is merged only where the model is trusted
+    no less with it than without it.
     """
     if not models:
         return None
     largest, *others = sorted(models, key=mapper.model_size, reverse=True)
-    mapper.adjust(largest)
-    best = drop_outliers(job, largest)
+    best = drop_outliers(job, mapper.sharpen(largest))
     for other in others:
         joined = merge(job, best.model, other)
         if joined is None:
             continue
-        merged = drop_outliers(job, joined)
+        merged = drop_outliers(job, mapper.sharpen(joined))
         larger = merged.model.num_reg_images() > best.model.num_reg_images()
         if larger and (merged.verdict.trusted or not best.verdict.trusted):
             best = merged
@@ -63,17 +63,21 @@ def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> Mo
 
 
 def drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandidate:
-    """Takes the images that the verdict suspects out of a model and adjusts the rest."""
-    first = _examine(job, model)
-    wrong = {
-        item.name: f"{item.share:.0%} of its {item.matches} matches agree with where it was placed"
-        for item in first.outliers}
-    if not wrong or len(wrong) > MAX_REJECTED * model.num_reg_images():
-        return ModelCandidate(model, first, (), {})
-    for name in wrong:
-        model.deregister_frame(model.find_image_with_name(name).frame_id)
-    mapper.adjust(model)
-    return ModelCandidate(model, _examine(job, model), (), wrong)
+    """Takes the images that the verdict suspects out of a model and adjusts the rest again.
+
+    Without them others may stand out, until none does or they are too many.
+    """
+    rejected: dict[str, str] = {}
+    cameras, verdict = model.num_reg_images(), _examine(job, model)
+    while verdict.outliers and len(
+            rejected) + len(verdict.outliers) <= MAX_REJECTED * cameras:
+        for item in verdict.outliers:
+            rejected[item.name] = (
+                f"{item.share:.0%} of its {item.matches} matches agree with where it was placed")
+            model.deregister_frame(model.find_image_with_name(item.name).frame_id)
+        model = mapper.sharpen(model)
+        verdict = _examine(job, model)
+    return ModelCandidate(model, verdict, (), rejected)
 
 
 def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> ModelVerdict:

@@ -11,9 +11,12 @@ found again from all matches that are left.
 
 from __future__ import annotations
 
+import io
 import itertools
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +27,7 @@ from numpy.typing import NDArray
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
 from recon_cli.sfm.evidence import MAX_ERROR
-from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.matching import Pair, similar_pairs
 
 LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
@@ -42,8 +45,8 @@ CONTINUOUS = 0.5
 # Pairs that the skeleton shows to overlap, per image, spread over the WIDEST from most to least
 # overlap: the closest tell little about depth. Errors of the cameras of two rooms, in cm: .21 and
 # .33; the 15 closest .28 and .47 with as many pairs; all pairs, four times as many, .24 and .35.
-OVERLAPPING, WIDEST = 10, 60
-SIMILAR = 10  # pairs per image that only look alike: they may close a loop
+OVERLAPPING, WIDEST = 8, 60
+SIMILAR = 5  # pairs per image that only look alike: they may close a loop
 ALWAYS = 3  # neighbours that are matched in any case
 # Two views overlap as far as a point of one lies in the other, at a like angle and distance.
 MAX_ANGLE_DEG, MAX_RATIO, MIN_OVERLAP = 30.0, 2.0, 0.2
@@ -89,37 +92,68 @@ def near_pairs(job: MappingJob, reach: int) -> set[Pair]:
             for step in range(1, reach + 1) for pair in zip(names, names[step:], strict=False)}
 
 
+@contextmanager
+def build_beside(job: MappingJob, report: Reporter) -> Iterator[None]:
+    """Builds the skeleton in a thread while something else is done, as it needs no features.
+
+    What is left of it when that is done is shown as a phase of its own.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        # The database is about to be filled.
+        images = fresh_folder(job.attempts / f"{SKELETON}.partial") / "images.db"
+        shutil.copyfile(job.database, images)
+        building = pool.submit(load_skeleton, job, Reporter(io.BytesIO()), images)
+        yield
+        if not building.done():
+            report.phase("skeleton", len(job.names))
+        building.result()
+
+
+def load_skeleton(
+    job: MappingJob, report: Reporter, images: Path | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Returns the models of the skeleton, the largest first, and keeps them in a folder.
+
+    `images` is the database with the images, if not that of the job.
+    """
+    folder = job.attempts / SKELETON
+    if not folder.is_dir():
+        report.phase("skeleton", len(job.names))
+        found = fresh_folder(job.attempts / f"{SKELETON}.found")
+        for index, model in enumerate(build_skeleton(job, images or job.database)):
+            (found / str(index)).mkdir()
+            model.write(found / str(index))
+        publish(found, folder)
+    return [pycolmap.Reconstruction(path) for path in sorted(
+        folder.iterdir(), key=lambda path: int(path.name))]
+
+
 def choose_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
-    """Finds the skeleton of a job, keeps it, and returns the pairs of frames to match with it."""
-    models = build_skeleton(job, report)
-    folder = fresh_folder(job.attempts / SKELETON)
-    for index, model in enumerate(models):
-        (folder / str(index)).mkdir()
-        model.write(folder / str(index))
+    """Returns the pairs of frames to match that the skeleton of a job shows to be worth it."""
+    models = load_skeleton(job, report)
     reach = ALWAYS if len(models) == 1 else matching.SEQUENTIAL_OVERLAP
     pairs = near_pairs(job, reach).union(*(overlapping_pairs(model) for model in models))
     return pairs | similar_pairs(
         job.database, job.names, seed=job.seed, nearest=SIMILAR, besides=pairs)
 
 
-def build_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
-    """Returns the models that tracks alone give, the largest first."""
-    folder = fresh_folder(job.attempts / f"{SKELETON}.partial")
+def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstruction]:
+    """Returns the models that tracks alone give, the largest first; a database has the images."""
+    silent = Reporter(io.BytesIO())
+    folder = fresh_folder(job.attempts / f"{SKELETON}.mapping")
     linked = replace(job, linked=folder / LINKED)
     tracks = _read_tracks(job)
-    link(linked, job.database, {}, tracks)
-    models = mapper.map_incrementally(linked, report)
-    # The global mapper gets past a turn without parallax. As tracks cannot be mistaken, lower
-    # thresholds do no harm.
-    for find_models in (mapper.map_globally, mapper.map_relaxed):
+    link(linked, images, {}, tracks)
+    models = mapper.map_incrementally(linked, silent)
+    # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
+    # without parallax.
+    for find_models in (mapper.map_relaxed, mapper.map_globally):
         if _most(models) >= ENOUGH * len(job.names):
             break
-        link(linked, job.database, {}, tracks, steps=ALL_STEPS)
-        models = max(models, find_models(linked, report), key=_most)
+        link(linked, images, {}, tracks, steps=ALL_STEPS)
+        models = max(models, find_models(linked, silent), key=_most)
     shutil.rmtree(folder)
     models.sort(key=mapper.model_size, reverse=True)
-    for model in models:
-        mapper.adjust(model)
     return models
 
 
@@ -128,9 +162,7 @@ def complete(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]
 
     `job.linked` names the database that is written and mapped from.
     """
-    folder = job.attempts / SKELETON
-    models = [pycolmap.Reconstruction(path) for path in sorted(
-        folder.iterdir(), key=lambda path: int(path.name))] if folder.is_dir() else []
+    models = load_skeleton(job, report)
     source = replace(job, linked=None).database
     tracks = _read_tracks(job)
     geometries = read_verified(source)
@@ -202,6 +234,8 @@ def link(
         opened.clear_two_view_geometries()
         opened.clear_descriptors()
         images = {image.name: image for image in opened.read_all_images()}
+        if not geometries:  # the features are of no use, and perhaps not found yet
+            opened.clear_keypoints()
         counts = _append_tracks(opened, images, tracks)
         for pair, geometry in geometries.items():
             first, second = (images[name].image_id for name in pair)
@@ -249,12 +283,15 @@ def _append_tracks(
     for name, (first, last) in zip(tracks.names, itertools.pairwise(bounds), strict=True):
         image = images[name]
         camera = opened.read_camera(image.camera_id)
-        keypoints = opened.read_keypoints(image.image_id)
+        there = opened.exists_keypoints(image.image_id)
+        keypoints = opened.read_keypoints(image.image_id) if there else np.zeros(
+            (0, database.KEYPOINT_COLUMNS), np.float32)
         counts[name] = len(keypoints)
         followed = np.zeros((last - first, database.KEYPOINT_COLUMNS), np.float32)
         followed[:, :2] = tracks.xy[first:last] * [camera.width, camera.height]
         followed[:, [2, 5]] = 1  # a shape of one pixel
-        opened.update_keypoints(image.image_id, np.concatenate([keypoints, followed]))
+        write = opened.update_keypoints if there else opened.write_keypoints
+        write(image.image_id, np.concatenate([keypoints, followed]))
     return counts
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import faulthandler
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -17,11 +16,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
+import cv2
 import filelock
 
 from recon_cli.errors import ReconError, WorkspaceError
 from recon_cli.sfm import database, fallbacks, known_poses, matching, undistort
-from recon_cli.sfm.job import LOCK, MappingJob, Reporter, Result, StepLog
+from recon_cli.sfm.job import LOCK, LOG_FILE, MappingJob, Reporter, Result, StepLog
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
@@ -32,7 +32,7 @@ def work(job: MappingJob, report: Reporter) -> None:
     """Runs unfinished steps; SfmError if no model can be trusted, FormatError for a bad frame."""
     deadline = time.monotonic() + 60 * job.max_minutes
     actions: dict[str, Callable[[], Result]] = {
-        "features": lambda: matching.extract_features(job, report),
+        "features": lambda: fallbacks.find_features(job, report),
         "matches": lambda: (
             known_poses.match_known if job.known_poses else fallbacks.match_first)(job, report),
         "model": lambda: (
@@ -48,7 +48,7 @@ def work(job: MappingJob, report: Reporter) -> None:
             continue
         log.forget_from(step)
         if step in ("features", "matches"):  # the models of finished attempts build on these
-            shutil.rmtree(job.attempts, ignore_errors=True)
+            (job.attempts / LOG_FILE).unlink(missing_ok=True)
         start = time.monotonic()
         result = actions[step]()
         result["seconds"] = round(time.monotonic() - start, 2)
@@ -92,6 +92,7 @@ def main() -> None:
     faulthandler.enable()
     _end_with_parent()
     job = MappingJob.read(Path(sys.argv[1]))
+    cv2.setNumThreads(1)  # images are shared out among the threads of the job
     try:
         with filelock.FileLock(job.out / LOCK, timeout=LOCK_SECONDS):
             work(job, report)

@@ -19,7 +19,7 @@ from recon_cli.config.stages import IngestConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io import records
 from recon_cli.progress import NullProgress
-from recon_cli.sfm import mapper, matching
+from recon_cli.sfm import features, mapper, matching
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, Reporter
 from recon_cli.stages import ingest
 
@@ -255,7 +255,7 @@ def prepare(capture: Capture, data: Path, out: Path) -> MappingJob:
     if not (folder / "matched").exists():
         job.database.unlink(missing_ok=True)
         matching.create_database(job)
-        matching.extract_features(job, quiet())
+        features.extract_features(job, quiet())
         pairs = matching.exhaustive_pairs(job.names)
         if not capture.exhaustive:
             pairs = matching.sequential_pairs(job.names)

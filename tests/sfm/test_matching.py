@@ -1,7 +1,6 @@
-"""Features, the choice of pairs, and their matching."""
+"""The database, the choice of pairs, and their matching."""
 
 import io
-import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +15,11 @@ from recon_cli.io.images import write_png
 from recon_cli.scene.camera import Lens
 from recon_cli.sfm import database
 from recon_cli.sfm import job as sfm_job
-from recon_cli.sfm.job import CameraGroup, MappingJob, Phase, Reporter, parse
+from recon_cli.sfm.features import extract_features
+from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, parse
 from recon_cli.sfm.matching import (
     create_database,
     exhaustive_pairs,
-    extract_features,
     match_pairs,
     sequential_pairs,
     similar_pairs,
@@ -143,95 +142,15 @@ def textured(job, **changes):
     return job
 
 
-def keypoints(job):
-    with pycolmap.Database.open(job.database) as opened:
-        return {image.name: opened.read_keypoints(image.image_id)
-                for image in opened.read_all_images()}
-
-
-def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
-    job = textured(job, max_features=100)
-    extract_features(job, Reporter(io.BytesIO()))
-    few = keypoints(job)
-    assert [len(found) for found in few.values()] == [100, 100, 100]
-    database.remove(job.database)
-    create_database(job)
-    extract_features(replace(job, max_features=5000), Reporter(io.BytesIO()))
-    for name, every in keypoints(job).items():
-        coarsest = np.sort(database.scales(every))[-100:]
-        np.testing.assert_array_equal(np.sort(database.scales(few[name])), coarsest)
-
-
-def counts_of(stream):
-    """Returns the counts that a reporter sent after it had begun a phase."""
-    phase, *counts = map(parse, stream.getvalue().splitlines())
-    assert isinstance(phase, Phase)
-    return phase, counts
-
-
-def test_progress_is_reported_up_to_the_last_image_and_pair(job, monkeypatch):
+def test_progress_is_reported_up_to_the_last_pair(job, monkeypatch):
     monkeypatch.setattr(sfm_job, "POLL_SECONDS", 0.001)
     job, stream = textured(job), io.BytesIO()
-    extract_features(job, Reporter(stream))
-    phase, counts = counts_of(stream)
-    assert (phase.done, phase.total) == (0, 3)
-    assert counts == sorted(counts)
-    assert counts[-1] == 3
-    stream = io.BytesIO()
+    extract_features(job, Reporter(io.BytesIO()))
     match_pairs(job, exhaustive_pairs(job.names), Reporter(stream))
-    phase, counts = counts_of(stream)
+    phase, *counts = map(parse, stream.getvalue().splitlines())
     assert (phase.done, phase.total) == (0, 3)
     assert counts == sorted(counts)
     assert counts[-1] == 3
-
-
-def test_descriptors_stay_with_their_keypoints(job):
-    job = textured(job, max_features=5000)
-    extract_features(job, Reporter(io.BytesIO()))
-    before, every = keypoints(job), descriptors(job)
-    database.keep_coarsest(job.database, 60)
-    for name, rows in descriptors(job).items():
-        places = [int(np.flatnonzero((before[name] == point).all(axis=1))[0])
-                  for point in keypoints(job)[name]]
-        np.testing.assert_array_equal(rows, every[name][places])
-
-
-def descriptors(job):
-    with pycolmap.Database.open(job.database) as opened:
-        return {image.name: np.asarray(opened.read_descriptors(image.image_id).data)
-                for image in opened.read_all_images()}
-
-
-def test_nothing_is_found_where_the_mask_is_black(job, tmp_path):
-    (tmp_path / "masks").mkdir()
-    mask = np.zeros((180, 240), np.uint8)
-    mask[:, 120:] = 255
-    Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
-    job = textured(job, masks=tmp_path / "masks")
-    extract_features(job, Reporter(io.BytesIO()))
-    found = keypoints(job)
-    assert len(found["b.png"]) > 20
-    assert found["b.png"][:, 0].min() >= 120
-    assert found["a.png"][:, 0].min() < 120
-
-
-def test_an_extraction_that_goes_on_keeps_the_cameras(job):
-    job = textured(job)
-    one, two = replace(job.groups[0], names=NAMES[:1]), replace(job.groups[0], names=NAMES[1:])
-    job = replace(job, groups=(one, two))
-    create_database(job)
-    extract_features(job, Reporter(io.BytesIO()))
-    whole = keypoints(job)
-    with sqlite3.connect(job.database) as connection:  # as a kill before the last image leaves it
-        for table in ("keypoints", "descriptors"):
-            connection.execute(f"DELETE FROM {table} WHERE image_id = 3")
-    connection.close()
-    extract_features(job, Reporter(io.BytesIO()))
-    assert database.is_sound(job.database, NAMES, 2)
-    with pycolmap.Database.open(job.database) as opened:
-        assert [image.camera_id for image in opened.read_all_images()] == [1, 2, 2]
-    for name, found in keypoints(job).items():
-        np.testing.assert_array_equal(found, whole[name])
 
 
 def names(count):

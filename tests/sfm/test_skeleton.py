@@ -239,7 +239,7 @@ def repeated(tmp_path):
 
 def test_tracks_place_what_looks_alike_where_it_is(repeated):
     made, job = repeated
-    models = build_skeleton(job, SILENT)
+    models = build_skeleton(job, job.database)
     assert [model.num_reg_images() for model in models] == [24]
     assert errors(models[0], made).max() < 0.2
     checked = check_pairs(job.database, models, read_verified(job.database))
@@ -253,7 +253,7 @@ def test_tracks_place_what_looks_alike_where_it_is(repeated):
 def test_a_model_is_completed_without_what_only_looks_alike(repeated):
     made, job = repeated
     (folder := job.attempts / skeleton.SKELETON / "0").mkdir(parents=True)
-    build_skeleton(job, SILENT)[0].write(folder)
+    build_skeleton(job, job.database)[0].write(folder)
     models = complete(linked(job), SILENT)
     assert [model.num_reg_images() for model in models] == [24]
     assert errors(models[0], made).max() < 0.02
@@ -264,7 +264,7 @@ def test_models_that_tracks_leave_apart_are_joined_by_matches(tmp_path):
     made = walk()
     tracks = make_tracks(made, breaks=[8])
     job = make_job(tmp_path, made, tracks)
-    models = build_skeleton(job, SILENT)
+    models = build_skeleton(job, job.database)
     assert sorted(model.num_reg_images() for model in models) == [8, 8]
     for index, model in enumerate(models):
         (job.attempts / skeleton.SKELETON / str(index)).mkdir(parents=True)
