@@ -21,6 +21,7 @@ import click
 import cv2
 import numpy as np
 import pycolmap
+from damaged_videos import CHANGES, bare, damaged, still, turning
 from pose_errors import Poses, compare, model_poses, reference_poses
 from scipy.spatial.transform import Rotation
 
@@ -61,7 +62,7 @@ def room(name: str) -> Callable[[Path, Path], Poses]:
         # a video that was cut together from the room
         places = np.loadtxt(out / "places.txt").astype(int)
         return {f"{index:06d}.png": poses[f"{place:06d}.png"]
-                for index, place in enumerate(places)}
+                for index, place in enumerate(places) if place >= 0}
     return read
 
 
@@ -174,6 +175,12 @@ CAPTURES = {
        for name in (
            "bedroom_walk", "classroom_walk", "dining_walk", "kitchen_walk", "lobby_walk",
            "study_walk")},
+    **{f"office, {what}": Capture(
+        damaged("rooms/office/video.mp4", change), room("office"), metric=True)
+       for what, change in CHANGES.items()},
+    **{f"bedroom, {what}": Capture(damaged("video_bedroom/room.mp4", change))
+       for what, change in CHANGES.items() if change not in (still, bare)},
+    "turning on the spot": Capture(turning),
 }
 
 
