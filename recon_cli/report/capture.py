@@ -52,6 +52,7 @@ class Capture:
 
     sheets: tuple[Markup, ...]  # contact sheets
     more_sheets: int  # contact sheets that are left out
+    overlays: tuple[Markup, ...]  # frames with what is fixed to the camera in red
     thumbs: tuple[tuple[str, Markup], ...]  # (name, picture) of frames if there is no sheet
     plan: Markup | None  # None without a mapping to draw
     notes: tuple[str, ...]  # on the plan
@@ -66,12 +67,14 @@ def read_capture(stages: StageReports) -> Capture:
     ingest = stages["ingest"]
     damaged: list[str] = []
     frames: tuple[Frame, ...] = ()
-    sheets, more, thumbs = [], 0, []
+    sheets, more, overlays, thumbs = [], 0, [], []
     try:
         frames = read_frame_list(ingest.folder).frames
         paths = sorted(ingest.folder.glob("*contact.png"))
         sheets = [encode_sheet(read_png(path)) for path in paths[:_SHEETS]]
         more = len(paths) - len(sheets)
+        overlays = [data_uri(fit_image(read_png(path), WIDTH), _THUMB_QUALITY)
+                    for path in sorted(ingest.folder.glob("*overlay.png"))[:_SHEETS]]
         some = () if sheets else frames[:: max(1, -(-len(frames) // _THUMBS))]
         thumbs = [(frame.name, data_uri(fit_image(
             read_png(ingest.folder / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY))
@@ -93,7 +96,7 @@ def read_capture(stages: StageReports) -> Capture:
     missing = dict.fromkeys(left_out, "left out")
     parts = [by_name.get(frame.name, missing.get(frame.name, "lost")) for frame in frames]
     return Capture(
-        tuple(sheets), more, tuple(thumbs), plan, notes,
+        tuple(sheets), more, tuple(overlays), tuple(thumbs), plan, notes,
         _draw_strip(frames, parts) if frames else None, _describe_left_out(frames, left_out),
         _draw_legend(parts) if frames else None, tuple(damaged))
 

@@ -25,7 +25,8 @@ SEQUENTIAL_OVERLAP = 10
 # Of COLMAP's 10000, mostly spent on pairs without anything in common. 2000 took a third off the
 # verification of five captures and lost 8 of 5700 verified pairs, but no image.
 MAX_TRIALS = 2000
-# Share of the verified matches above which pairs at some distance show whether there is depth.
+# Share of all verified matches that pairs at some distance must hold beside the flat ones to show
+# depth: pairs that hardly overlap look deep by chance.
 MIN_SHARE = 0.01
 # Similar images per image beside its neighbours. They hold 41% (10 hold 25%) of the other pairs
 # with 50 or more verified matches in a slow walk, 67% in a room, 80% in 50 photos.
@@ -230,7 +231,7 @@ def check_motion(job: MappingJob) -> None:
     all matches were flat, 0.22 of those 64 frames apart; in a turn on the spot all are.
     """
     groups = database.count_inliers(job.database)
-    total = sum(matches for _, matches, _ in groups)
-    large = [counts for counts in groups if counts[1] >= MIN_SHARE * total]
-    deepest = min(large, key=lambda counts: counts[2] / counts[1], default=(0, 0, 0))
+    everything = tuple(map(sum, zip(*groups, strict=True))) or (0, 0, 0)
+    deep = [counts for counts in groups if counts[1] - counts[2] >= MIN_SHARE * everything[1]]
+    deepest = min(deep, key=lambda counts: counts[2] / counts[1], default=everything)
     checks.check_motion(*deepest)

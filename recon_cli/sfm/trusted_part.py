@@ -7,7 +7,6 @@ cut again where it is broken too.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
@@ -16,12 +15,11 @@ import pycolmap
 from recon_cli.errors import SfmError
 from recon_cli.sfm import mapper
 from recon_cli.sfm.checks import MIN_FRAMES
-from recon_cli.sfm.job import CLIP_SECONDS, MappingJob
+from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import ModelCandidate, drop_outliers
 from recon_cli.sfm.verdict import MAX_LEAP, ModelVerdict, is_aliased, is_broken
 
 Names = tuple[str, ...]
-MOST_RUNS = 3  # stretches of frames that a sentence names
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +28,7 @@ class TrustedPart:
 
     candidate: ModelCandidate
     left_out: Names  # the frames that had a camera in the whole model
-    sentence: str  # what was broken, what is kept, and where in the capture the rest is
+    sentence: str  # what was broken, and what is kept
 
 
 def keep_trusted_part(
@@ -53,27 +51,9 @@ def keep_trusted_part(
             "them (--pairs exhaustive), accept the part with a lower --min-registered, or keep the "
             "whole as it is with --accept-weak.")
     left_out = tuple(sorted(set(mapper.list_registered(model)).difference(kept)))
-    runs = _describe_runs(job, left_out)
-    more = f" and {len(runs) - MOST_RUNS} more stretches" * (len(runs) > MOST_RUNS)
     return TrustedPart(part, left_out, (
         f"{verdict.problems[0]} The largest part that can be trusted on its own is kept, "
-        f"{len(kept)} of {len(job.names)} frames. Left out are {len(left_out)}: "
-        f"{'; '.join(runs[:MOST_RUNS])}{more}."))
-
-
-def _describe_runs(job: MappingJob, names: Collection[str]) -> list[str]:
-    """Returns the stretches of frames that follow each other, with their times in a video."""
-    stretches = []
-    for inside, run in itertools.groupby(job.names, key=lambda name: name in names):
-        if not inside:
-            continue
-        stretch = list(run)
-        first, last = stretch[0], stretch[-1]
-        text = first if first == last else f"{first} to {last}"
-        seconds = [job.times[name] % CLIP_SECONDS for name in (first, last) if name in job.times]
-        stretches.append(
-            f"{text} ({seconds[0]:.1f} to {seconds[1]:.1f} s)" if len(seconds) == 2 else text)
-    return stretches
+        f"{len(kept)} of {len(job.names)} frames."))
 
 
 def find_trusted_part(

@@ -5,7 +5,7 @@ The original frames are mapped, as filters move corners; denoised twins take the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, list_names
 from recon_cli.io import records as store
-from recon_cli.io.records import POSES, FrameList, read_poses
+from recon_cli.io.records import POSES, FrameList, describe_stretches, read_poses
 from recon_cli.io.tracks import TRACKS
 from recon_cli.sfm import process
 from recon_cli.sfm.align_world import parse_place
@@ -22,6 +22,7 @@ from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSumma
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.
 MAX_MINUTES, USUAL_FRAMES, MINUTES_PER_FRAME = 20.0, 100, 0.2
+STRETCHES = 8  # of frames without a camera, in a sentence
 
 
 def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> SfmSummary:
@@ -55,7 +56,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         parse_place(str(place), job.names)
     process.run_job(job, progress=ctx.progress, record=ctx.record)
     summary = _summary(frames, job)
-    _report(summary, ctx)
+    _report(summary, frames, ctx)
     return summary
 
 
@@ -110,10 +111,10 @@ def _summary(frames: FrameList, job: MappingJob) -> SfmSummary:
         "seconds": {step: result["seconds"] for step, result in results.items()}})
 
 
-def _report(summary: SfmSummary, ctx: StageContext) -> None:
+def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
     """Says what was tried, which frames have no camera and which models were left aside."""
     for sentence in (*_attempts(summary.rungs), *summary.lines, *_movement(summary.poses),
-                     *_describe_left_out(summary), *summary.world.sentences):
+                     *_describe_left_out(summary, frames), *summary.world.sentences):
         ctx.notice(sentence)
 
 
@@ -137,18 +138,24 @@ def _movement(poses: PosesSummary | None) -> Iterator[str]:
                f"{poses.turned_median_deg:.2f} degrees (at most {poses.turned_max_deg:.2f}).")
 
 
-def _describe_left_out(summary: SfmSummary) -> Iterator[str]:
+def _describe_left_out(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
     """Yields sentences on frames without a camera and on models that were left aside."""
+    def stretches(names: Collection[str]) -> str:
+        return list_names(describe_stretches(frames.frames, names), STRETCHES)
+
     missing, held_out = summary.unregistered, summary.unregistered_held_out
+    if summary.left_out:
+        yield (f"{len(summary.left_out)} frames are left out with the rest of the model: "
+               f"{stretches(summary.left_out)}.")
     for name, reason in summary.rejected.items():
         yield f"{name} was taken out of the model: {reason}."
     if missing and not summary.lines:  # the verdict names them, and why
         yield (f"{len(missing)} of {summary.frames} frames have no camera and are left out: "
-               f"{list_names(missing)}.")
+               f"{stretches(missing)}.")
     if held_out:
         yield (f"{len(held_out)} frames without a camera were held out and so cannot be scored: "
                f"{list_names(held_out)}.")
     if summary.apart:
-        parts = "; ".join(f"{len(part)} frames ({list_names(part, 3)})" for part in summary.apart)
+        parts = "; ".join(f"{len(part)} frames ({stretches(part)})" for part in summary.apart)
         yield (f"The capture fell apart: the largest model, of {summary.models[0]} frames, is "
                f"kept; left aside are {parts}.")

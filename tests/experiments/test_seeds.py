@@ -10,6 +10,8 @@ from posed_sets import make_replica
 from recon_cli.cli import main
 from recon_cli.evaluation.intervals import Spread
 
+pytestmark = pytest.mark.integration
+
 OPTIONS = ["--iterations", "30", "--max-gaussians", "200", "--validation", "0.2", "--seed", "4"]
 
 

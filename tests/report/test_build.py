@@ -106,6 +106,7 @@ def test_no_section_shows_figures_of_a_stale_stage_without_saying_so(workspace):
     assert "train.iterations changed: 60 -&gt; 7" in page
 
 
+@pytest.mark.integration
 def test_scores_that_were_changed_by_hand_are_stale_and_may_hold_anything(workspace):
     metrics = workspace / "evaluate" / "metrics.json"
     change(metrics, lambda value: value["models"]["base"].update(psnr_db=99.0))
@@ -177,6 +178,14 @@ def test_contact_sheets_take_the_place_of_thumbnails_and_many_are_counted(worksp
     assert capture.count('alt="Contact sheet of the capture"') == 4
     assert "2 more contact sheets are in ingest/" in capture
     assert "Some of the frames" not in capture
+
+
+def test_what_is_fixed_to_the_camera_is_shown(workspace):
+    assert "fixed to the camera" not in section(page_of(workspace), "capture")
+    write_png(workspace / "ingest" / "overlay.png", np.full((30, 40, 3), 9, np.uint8))
+    capture = section(page_of(workspace), "capture")
+    assert "fixed to the camera" in capture
+    assert capture.count('alt="A frame with the masked area in red"') == 1
 
 
 def test_frames_without_a_camera_are_lost_in_the_legend(workspace):
@@ -284,6 +293,7 @@ def test_a_place_that_cannot_be_is_an_error_that_says_so(workspace, tmp_path, ca
     assert "Give another file with -o" in capsys.readouterr().err
 
 
+@pytest.mark.integration
 def test_the_whole_file_stays_within_its_bounds(workspace, monkeypatch):
     rng = np.random.default_rng(0)
     for path in (workspace / "evaluate").rglob("*.png"):

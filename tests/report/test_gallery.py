@@ -86,6 +86,7 @@ def test_pictures_keep_their_size_where_there_is_room(noisy):
     assert (gallery.views[0].width, gallery.views[0].height) == gallery.full == (300, 220)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("share", [0.7, 0.4])
 def test_pictures_get_smaller_until_all_fit(noisy, share):
     whole = sum(view.size for view in build_gallery(noisy, read_metrics(noisy), 50_000_000).views)
@@ -95,6 +96,7 @@ def test_pictures_get_smaller_until_all_fit(noisy, share):
     assert gallery.encoding != ENCODINGS[0]
 
 
+@pytest.mark.integration
 def test_at_the_last_resort_the_worst_views_stay_and_the_rest_is_counted(noisy):
     least = build_gallery(noisy, read_metrics(noisy), 1)
     assert (least.views, least.left_out) == ((), 6)

@@ -7,7 +7,7 @@ import pytest
 from made_model import broken_walk, doubled_place, moved, walk
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob
+from recon_cli.sfm.job import CameraGroup, MappingJob
 from recon_cli.sfm.mapper import list_registered
 from recon_cli.sfm.trusted_part import find_trusted_part, keep_trusted_part
 from recon_cli.sfm.verdict import examine
@@ -33,7 +33,7 @@ def test_of_a_broken_walk_the_longer_side_is_kept(tmp_path):
     assert list_registered(part.candidate.model) == list(made.names[:10])
     assert part.candidate.verdict.trusted
     assert part.left_out == tuple(made.names[10:])
-    for fact in ("broken", "10 of 16 frames", "6", f"{made.names[10]} to {made.names[15]}"):
+    for fact in ("broken", "10 of 16 frames"):
         assert fact in part.sentence
     assert len(list_registered(model)) == 16  # the model itself is left alone
     # The cameras of the part stand as in truth, up to the scale.
@@ -51,15 +51,6 @@ def test_of_two_places_laid_over_each_other_one_is_kept(tmp_path):
     assert part is not None
     assert set(list_registered(part.candidate.model)) in (
         set(made.names[:6]), set(made.names[6:]))
-
-
-def test_the_stretches_that_are_left_out_are_told_with_their_times(tmp_path):
-    made = broken_walk(at=10)
-    job, model, verdict = prepare(made, tmp_path)
-    times = {name: CLIP_SECONDS + 0.5 * index for index, name in enumerate(made.names)}
-    part = keep_trusted_part(replace(job, times=times), model, verdict)
-    assert part is not None
-    assert "(5.0 to 7.5 s)" in part.sentence
 
 
 def test_a_part_that_is_too_small_is_refused_with_its_size(tmp_path):

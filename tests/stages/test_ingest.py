@@ -138,12 +138,14 @@ def test_long_frames_are_reduced_with_a_notice(video, tmp_path, notices):
     assert_facts(notice, "128x96", 64, "--max-size")
 
 
+@pytest.mark.integration
 def test_the_number_of_threads_changes_nothing(video, tmp_path):
     take(video, tmp_path / "one", threads=1)
     take(video, tmp_path / "four", threads=4)
     assert files(tmp_path / "one") == files(tmp_path / "four")
 
 
+@pytest.mark.integration
 def test_several_sources_are_kept_apart_and_share_the_budget(video, tmp_path):
     other = write_video(tmp_path / "slow.mp4", walk(40, step=2, height=64))
     folder = write_photos(tmp_path / "room", 4)

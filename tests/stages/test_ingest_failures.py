@@ -36,6 +36,7 @@ def test_a_video_cut_off_goes_on_with_what_is_left(video, tmp_path, notices):
     assert f"{summary.lost_frames} of 40 frames are lost" in notices()[0]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("filler", [b"\0", b"\xa5"])
 def test_a_video_corrupted_in_the_middle_goes_on_around_the_damage(
         tmp_path, notices, filler):
@@ -187,6 +188,7 @@ def test_too_few_photos_that_are_whole_are_refused(tmp_path):
         take(folder, tmp_path / "out")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["video", "photos"])
 def test_a_full_disk_leaves_no_half_written_frame(video, tmp_path, monkeypatch, kind):
     source = video if kind == "video" else write_photos(tmp_path / "room", 5)

@@ -235,6 +235,7 @@ def test_a_folder_of_all_frames_of_a_video_is_thinned_like_one(tmp_path, notices
     assert (sheet[-200:] != 255).any(axis=2).mean() > 0.3  # dropped photos have pictures, too
 
 
+@pytest.mark.integration
 def test_the_number_of_frames_of_a_sequence_can_be_set_up_to_all(tmp_path, notices):
     folder = write_sequence(tmp_path / "dump", 60)
     assert take(folder, tmp_path / "few", config=IngestConfig(frames=40)).frames == 40
@@ -257,6 +258,7 @@ def test_a_broken_photo_of_a_sequence_is_left_out_and_named(tmp_path, notices):
     assert (record["reason"], record["name"], record["sharpness"]) == ("damaged", None, None)
 
 
+@pytest.mark.integration
 def test_a_mask_that_does_not_fit_its_frame_of_a_sequence_costs_that_frame(tmp_path):
     folder = write_sequence(tmp_path / "dump", 60)
     for index in range(60):

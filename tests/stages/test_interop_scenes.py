@@ -6,6 +6,8 @@ from foreign import recon
 
 from recon_cli.io.splats.registry import read_splats
 
+pytestmark = pytest.mark.integration
+
 FOLDERS = {"metal": "metalsplatter/SplatIO/TestData",
            "transform": "splat-transform/test/fixtures/splat", "engine": "playcanvas-engine",
            "viewer": "splat-viewer"}

@@ -18,6 +18,8 @@ from recon_cli.stages import evaluate, prune, train
 from recon_cli.train import runner
 from recon_cli.train.state import save_state
 
+pytestmark = pytest.mark.integration
+
 CONFIG = TrainConfig(
     iterations=60, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
     checkpoint_every=7)

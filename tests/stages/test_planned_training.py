@@ -19,6 +19,8 @@ from recon_cli.train import plan as planning
 from recon_cli.train.state import save_state
 from recon_cli.train.train_data import estimate_memory
 
+pytestmark = pytest.mark.integration
+
 CONTEXT = StageContext(backend="numba")
 OPEN = TrainConfig(minutes=0.02, densify_every=10, checkpoint_every=30)
 
@@ -81,7 +83,6 @@ def test_the_numbers_of_a_plan_repeat_the_run_to_the_byte(inputs, done, tmp_path
     assert same_bytes(first, tmp_path / "again")
 
 
-@pytest.mark.integration
 def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monkeypatch):
     out = tmp_path / "out"
     with monkeypatch.context() as patch:

@@ -19,6 +19,8 @@ from recon_cli.train import prune_run, runner
 from recon_cli.train.state import save_state
 from recon_cli.workspace.atomic import write_bytes
 
+pytestmark = pytest.mark.integration
+
 CONFIG = TrainConfig(
     iterations=120, densify_every=10, max_gaussians=120, sh_rate=0.05, checkpoint_every=3,
     validation=0.2)
@@ -75,7 +77,6 @@ def test_nothing_is_left_that_only_a_resumed_run_would_need(whole):
             "log.jsonl", "rounds.json", "splats.ply"]
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("config", [THREE, SEARCH], ids=["ratio", "search"])
 def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     config, inputs, whole, tmp_path, monkeypatch

@@ -84,19 +84,28 @@ def told(caplog, **changes):
     summary = replace(
         summaries.SFM, frames=60, unregistered=tuple(f"{i}.png" for i in range(11)), models=(49,),
         rungs=(attempt("exhaustive", registered=40),))
-    sfm._report(replace(summary, **changes), StageContext())
+    names = sorted(f"{index}.png" for index in range(60))
+    frames = FrameList("video", (Group("a.mp4", 60, 40),), tuple(
+        Frame(name, index / 2, "a.mp4", None, held_out=False) for index, name in enumerate(names)))
+    sfm._report(replace(summary, **changes), frames, StageContext())
     return caplog.text
+
+
+def test_the_stretches_that_are_left_out_are_told_with_their_times(caplog):
+    text = told(caplog, left_out=("20.png", "21.png", "22.png", "30.png"))
+    assert ("4 frames are left out with the rest of the model: 20.png to 22.png "
+            "(6.5 to 7.5 s), 30.png (12.0 s).") in text
 
 
 def test_models_that_are_left_aside_are_told(caplog):
     text = told(caplog, models=(49, 3), apart=(("5.png", "6.png", "7.png"),))
-    assert_facts(text, 49, "kept", 3, "5.png", "6.png", "7.png")
+    assert_facts(text, 49, "kept", 3, "frames", "22.5", "6.png to 7.png")
 
 
 def test_frames_without_a_camera_are_told(caplog):
     text = told(caplog, unregistered_held_out=("3.png",))
     assert "11 of 60 frames have no camera" in text
-    assert "and 6 more" in text
+    assert "left out: 0.png to 10.png (0.0 to 1.0 s), 2.png (" in text
     assert_facts(text, 1, "held out", "3.png")
 
 

@@ -13,6 +13,8 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import estimate_gains
 
+pytestmark = pytest.mark.integration
+
 WIDTH, HEIGHT = 120, 90
 CAMERA = Camera(WIDTH, HEIGHT, 100.0, 100.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
 GAINS = np.array([[1.0, 1.1, 0.9], [1.2, 1.0, 1.0], [0.8, 0.9, 1.1], [1.0, 1.0, 1.0]])

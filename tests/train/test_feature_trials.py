@@ -7,6 +7,8 @@ from wall_scene import CONFIG, scene
 
 from recon_cli.train.feature_trials import examine
 
+pytestmark = pytest.mark.integration
+
 
 def reasons(needs):
     return {decision.name: decision.reason for decision in needs.decisions}

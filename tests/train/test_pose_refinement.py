@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from scenes import random_splats
 from scipy.spatial.transform import Rotation
@@ -15,6 +16,8 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.poses import Poses, move_camera
 from recon_cli.train.state import new_state
+
+pytestmark = pytest.mark.integration
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 8, 80, 60, 70.0
 TURN, MOVE = np.radians(1.0), 0.01  # of the disturbance, in rad and world units
