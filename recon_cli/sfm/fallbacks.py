@@ -85,7 +85,8 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         return (_incremental(job.pairs, "it was asked for"),)
     every = _incremental("exhaustive", f"{count} frames are few enough to match all pairs")
     begin = (every,) if count <= EXHAUSTIVE_MAX else (
-        _incremental("retrieval", f"{count} frames are too many to match all pairs at once"), every)
+        Fallback("retrieval", f"{count} frames are too many to match all pairs at once",
+                 _near_or_similar, skeleton.map_coarse_first), every)
     if skeleton.is_continuous(job):
         begin = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                           skeleton.choose_pairs, skeleton.complete), *begin)

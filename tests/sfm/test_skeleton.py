@@ -17,7 +17,9 @@ from recon_cli.sfm.skeleton import (
     check_pairs,
     complete,
     is_continuous,
+    keep_coarsest,
     link,
+    map_coarse_first,
     near_pairs,
     overlapping_pairs,
     read_verified,
@@ -272,3 +274,33 @@ def test_models_that_tracks_leave_apart_are_joined_by_matches(tmp_path):
     completed = complete(linked(job), SILENT)
     assert [model.num_reg_images() for model in completed] == [16]
     assert errors(completed[0], made).max() < 0.02
+
+
+def test_matches_of_the_coarsest_keypoints_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(skeleton, "COARSEST", 17)
+    made = walk(6)
+    job = make_job(tmp_path, made)
+    before = read_verified(job.database)
+    keep_coarsest(job.database, tmp_path / "coarse.db")
+    after = read_verified(tmp_path / "coarse.db")
+    assert after
+    assert after.keys() < before.keys()  # too few are left of some
+    for pair, geometry in after.items():
+        rows = before[pair].inlier_matches
+        np.testing.assert_array_equal(
+            geometry.inlier_matches, rows[(rows < 17).all(axis=1)])
+    np.testing.assert_equal(len(read_verified(job.database)), len(before))
+
+
+@pytest.mark.parametrize("coarsest", [120, 0])
+def test_cameras_of_coarse_features_get_the_points_of_all(tmp_path, monkeypatch, coarsest):
+    monkeypatch.setattr(skeleton, "COARSEST", coarsest)
+    made = walk()
+    job = make_job(tmp_path, made)
+    models = map_coarse_first(job, SILENT)
+    assert [model.num_reg_images() for model in models] == [16]
+    assert errors(models[0], made).max() < 0.01
+    seen = [point.point2D_idx for found in models[0].points3D.values()
+            for point in found.track.elements]
+    assert max(seen) > 150
+    assert not (job.attempts / "coarse.db").exists()
