@@ -16,10 +16,10 @@ from __future__ import annotations
 import io
 import itertools
 import shutil
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
-from recon_cli.sfm.evidence import MAX_ERROR
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.matching import Pair, similar_pairs
+from recon_cli.sfm.pair_checks import check_pairs
 
 LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
 SKELETON = "skeleton"  # models in the folder of the attempts
@@ -45,34 +45,16 @@ FEW_MATCHES = 100
 # Share of the neighbours with MIN_MATCHES tracks above which a video hangs together by them.
 CONTINUOUS = 0.5
 # Pairs that the skeleton shows to overlap, per image, spread over the WIDEST from most to least
-# overlap: the closest tell little about depth. Errors of the cameras of two rooms, in cm: .21 and
-# .33; the 15 closest .28 and .47 with as many pairs; all pairs, four times as many, .24 and .35.
+# overlap: the closest tell little about depth. Errors of the cameras of two rooms with 10, 8 and 6
+# of them, in cm: .17 and .09, .17 and .10, .20 and .10.
 OVERLAPPING, WIDEST = 8, 60
 SIMILAR = 5  # pairs per image that only look alike: they may close a loop
 ALWAYS = 3  # neighbours that are matched in any case
 # Two views overlap as far as a point of one lies in the other, at a like angle and distance.
 MAX_ANGLE_DEG, MAX_RATIO, MIN_OVERLAP = 30.0, 2.0, 0.2
 SAMPLED = 150  # points per image
-# Share of a pair's matches that the cameras of the skeleton must explain, within MAX_ERROR.
-MIN_AGREEING = 0.5
-# A pair whose own rotation is this close to the skeleton's may show its drift. Around a can whose
-# label repeats the pairs to leave out are off by 116 degrees in the median.
-MAX_DRIFT_DEG = 15.0
-MAX_DRIFT = 0.2  # displacement as a share of the way between the two frames
-NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
 # Keypoints of an image from which cameras are found first where images are many.
 COARSEST = 1000
-NEAR = 3  # frames; a loop is closed by more than one pair of near frames
-
-
-@dataclass(frozen=True)
-class PairChecks:
-    """Verified pairs of images, by what a skeleton says of them."""
-
-    agreeing: frozenset[Pair]
-    drifted: frozenset[Pair]  # off by what the cameras may drift between the two
-    contradicting: frozenset[Pair]
-    unplaced: frozenset[Pair]  # not both images have a camera in one model
 
 
 def is_continuous(job: MappingJob) -> bool:
@@ -332,140 +314,6 @@ def _append_tracks(
         write = opened.update_keypoints if there else opened.write_keypoints
         write(image.image_id, np.concatenate([keypoints, followed]))
     return counts
-
-
-def check_pairs(
-    path: Path, models: Sequence[pycolmap.Reconstruction],
-    geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
-) -> PairChecks:
-    """Returns which verified pairs of a database agree with the cameras of models."""
-    views: dict[str, _View] = {}
-    for model in reversed(models):
-        views |= _list_views(model)
-    agreeing, drifted, contradicting, unplaced = set(), set(), set(), set()
-    with pycolmap.Database.open(path) as opened:
-        keypoints = {
-            image.name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
-            for image in opened.read_all_images()}
-    for pair, geometry in geometries.items():
-        first, second = (views.get(name) for name in pair)
-        if first is None or second is None or first.model is not second.model:
-            unplaced.add(pair)
-            continue
-        ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
-                        for side, name in enumerate(pair))
-        if _agreeing_share(first, ours, second, theirs) >= MIN_AGREEING:
-            agreeing.add(pair)
-        elif _is_drift(first, ours, second, theirs):
-            drifted.add(pair)
-        else:
-            contradicting.add(pair)
-    supported = _supported(drifted, agreeing)
-    return PairChecks(
-        frozenset(agreeing), frozenset(supported),
-        frozenset(contradicting | (drifted - supported)), frozenset(unplaced))
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """An image of a skeleton."""
-
-    model: pycolmap.Reconstruction
-    image: pycolmap.Image
-    near: float  # depth of its nearest points, but for a twentieth
-    usual: float  # median depth of its points
-    travelled: float  # length of the path of the camera up to here, in order of names
-
-    @property
-    def camera(self) -> pycolmap.Camera:
-        """The camera of the image."""
-        return self.image.camera
-
-
-def _list_views(model: pycolmap.Reconstruction) -> dict[str, _View]:
-    views: dict[str, _View] = {}
-    places = {number: point.xyz for number, point in model.points3D.items()}
-    travelled, last = 0.0, None
-    for image in sorted(_images(model), key=lambda image: image.name):
-        center = image.projection_center()
-        travelled += 0.0 if last is None else float(np.linalg.norm(center - last))
-        last = center
-        seen = [places[point.point3D_id] for point in image.points2D if point.has_point3D()]
-        depths = np.asarray(image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2]
-        near, usual = np.percentile(depths, [5, 50]) if len(seen) else (0.0, 0.0)
-        views[image.name] = _View(model, image, float(near), float(usual), travelled)
-    return views
-
-
-def _agreeing_share(
-    first: _View, ours: NDArray[np.float64], second: _View, theirs: NDArray[np.float64]
-) -> float:
-    """Returns the share of matches, [M, 2] pixels each, that two cameras explain.
-
-    A match is explained if a point at some depth, not much nearer than what the first image shows,
-    is seen within MAX_ERROR of it. An epipolar line alone does not tell a pattern that repeats
-    along it.
-    """
-    motion = second.image.cam_from_world() * first.image.cam_from_world().inverse()
-    at_infinity = np.column_stack([
-        np.asarray(first.camera.cam_from_img(ours)), np.ones(len(ours))]
-    ) @ motion.rotation.matrix().T
-    target = np.asarray(second.camera.cam_from_img(theirs))
-    inverse = _inverse_depths(at_infinity, target, motion.translation)
-    most = 1 / (NEAREST * first.near) if first.near > 0 else np.inf
-    points = at_infinity + np.clip(inverse, 0, most)[:, None] * motion.translation
-    places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
-    errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
-    return float(np.mean(errors <= MAX_ERROR))  # NaN, behind the camera, is no agreement
-
-
-def _inverse_depths(
-    rays: NDArray[np.float64],  # [M, 3] of the first camera, turned into the second
-    target: NDArray[np.float64],  # [M, 2] in the second, at depth 1
-    translation: NDArray[np.float64],  # [3]
-) -> NDArray[np.float64]:  # [M]
-    """Returns 1 / depth in the first camera at which ray + translation / depth meets the target."""
-    offset = rays[:, :2] - target * rays[:, 2:]
-    slope = translation[:2] - target * translation[2]
-    return np.asarray(-(offset * slope).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-12))
-
-
-def _is_drift(
-    first: _View, ours: NDArray[np.float64], second: _View, theirs: NDArray[np.float64]
-) -> bool:
-    """Returns whether matches [M, 2] show a motion as near the skeleton's as drift leaves it.
-
-    The length of the translation follows from the usual depth of the first image.
-    """
-    rows = np.repeat(np.arange(len(ours), dtype=np.uint32)[:, None], 2, axis=1)
-    options = pycolmap.TwoViewGeometryOptions()
-    options.compute_relative_pose = True
-    options.ransac.random_seed = 0
-    options.ransac.max_num_trials = matching.MAX_TRIALS
-    own = pycolmap.estimate_calibrated_two_view_geometry(
-        first.camera, ours, second.camera, theirs, rows, options).cam2_from_cam1
-    if own is None:
-        return False
-    motion = second.image.cam_from_world() * first.image.cam_from_world().inverse()
-    if np.degrees((own.rotation * motion.rotation.inverse()).angle()) > MAX_DRIFT_DEG:
-        return False
-    at_infinity = np.column_stack([
-        np.asarray(first.camera.cam_from_img(ours)), np.ones(len(ours))]) @ own.rotation.matrix().T
-    target = np.asarray(second.camera.cam_from_img(theirs))
-    inverse = _inverse_depths(at_infinity, target, own.translation)
-    length = first.usual * max(float(np.median(inverse)), 0.0)
-    off = np.linalg.norm(own.translation * length - motion.translation)
-    return bool(off <= MAX_DRIFT * abs(second.travelled - first.travelled))
-
-
-def _supported(drifted: Collection[Pair], agreeing: Collection[Pair]) -> set[Pair]:
-    """Returns the pairs beside which another pair of near frames shows drift as well."""
-    names = sorted({name for pair in (*drifted, *agreeing) for name in pair})
-    row = {name: index for index, name in enumerate(names)}
-    places = np.array([[row[name] for name in pair] for pair in drifted]).reshape(-1, 2)
-    return {
-        pair for pair, place in zip(drifted, places, strict=True)
-        if np.count_nonzero(np.abs(places - place).max(axis=1) <= NEAR) > 1}
 
 
 def overlapping_pairs(model: pycolmap.Reconstruction) -> set[Pair]:

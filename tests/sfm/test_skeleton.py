@@ -12,9 +12,9 @@ from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import skeleton
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.pair_checks import check_pairs
 from recon_cli.sfm.skeleton import (
     build_skeleton,
-    check_pairs,
     complete,
     is_continuous,
     keep_coarsest,
