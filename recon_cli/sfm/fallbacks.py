@@ -83,17 +83,16 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     count = len(job.names)
     if job.pairs != "auto":
         return (_incremental(job.pairs, "it was asked for"),)
+    relaxed = Fallback("relaxed", "", lambda *_: set(), mapper.map_relaxed)
     every = _incremental("exhaustive", f"{count} frames are few enough to match all pairs")
-    begin = (every,) if count <= EXHAUSTIVE_MAX else (
+    ways: tuple[Fallback, ...] = (every, relaxed) if count <= EXHAUSTIVE_MAX else (
         Fallback("retrieval", f"{count} frames are too many to match all pairs at once",
-                 _near_or_similar, skeleton.map_coarse_first), every)
+                 _near_or_similar, skeleton.map_coarse_first),
+        relaxed, every)  # lower thresholds take less time than all pairs
     if skeleton.is_continuous(job):
-        begin = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
-                          skeleton.choose_pairs, skeleton.complete), *begin)
-    return (
-        *begin,
-        Fallback("relaxed", "", lambda *_: set(), mapper.map_relaxed),
-        Fallback("global", "", lambda *_: set(), mapper.map_globally))
+        ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
+                         skeleton.choose_pairs, skeleton.complete), *ways)
+    return (*ways, Fallback("global", "", lambda *_: set(), mapper.map_globally))
 
 
 def find_features(job: MappingJob, report: Reporter) -> Result:

@@ -48,7 +48,7 @@ def test_a_small_capture_begins_with_all_pairs_and_a_large_one_with_some(capture
     assert [fallback.name for fallback in list_fallbacks(sized(job, 100))] == [
         "exhaustive", "relaxed", "global"]
     assert [fallback.name for fallback in list_fallbacks(sized(job, 101))] == [
-        "retrieval", "exhaustive", "relaxed", "global"]
+        "retrieval", "relaxed", "exhaustive", "global"]
 
 
 def test_a_video_begins_with_its_tracks_where_they_link_its_frames(capture):
