@@ -88,7 +88,7 @@ def test_the_sample_video_becomes_a_scene_with_a_table(finished):
     metrics = json.loads((finished / "evaluate" / "metrics.json").read_text(encoding="utf-8"))
     base, pruned = metrics["models"]["base"], metrics["models"]["pruned"]
     assert pruned["gaussians"] < base["gaussians"]
-    assert base["psnr_db"] > 13  # forty steps at 96 pixels: a room, not yet a good one
+    assert base["psnr_db"] > 14  # forty steps at 96 pixels: a room, not yet a good one
     assert len(read_ply(finished / "export" / "splats.ply")) == pruned["gaussians"]
     frames = json.loads((finished / "ingest" / "frames.json").read_text(encoding="utf-8"))
     held_out = sorted(f["name"] for f in frames["frames"] if f["held_out"])
