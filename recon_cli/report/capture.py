@@ -67,20 +67,24 @@ def read_capture(stages: StageReports) -> Capture:
     ingest = stages["ingest"]
     damaged: list[str] = []
     frames: tuple[Frame, ...] = ()
-    sheets, more, overlays, thumbs = [], 0, [], []
+    sheets, more, thumbs = [], 0, []
+    overlays: list[Markup] = []
     try:
         frames = read_frame_list(ingest.folder).frames
         paths = sorted(ingest.folder.glob("*contact.png"))
         sheets = [encode_sheet(read_png(path)) for path in paths[:_SHEETS]]
         more = len(paths) - len(sheets)
-        overlays = [data_uri(fit_image(read_png(path), WIDTH), _THUMB_QUALITY)
-                    for path in sorted(ingest.folder.glob("*overlay.png"))[:_SHEETS]]
         some = () if sheets else frames[:: max(1, -(-len(frames) // _THUMBS))]
         thumbs = [(frame.name, data_uri(fit_image(
             read_png(ingest.folder / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY))
             for frame in some]
     except (FormatError, OSError) as error:
         damaged.append(f"The frames are not shown: {error}")
+    try:
+        overlays = [data_uri(fit_image(read_png(path), WIDTH), _THUMB_QUALITY)
+                    for path in sorted(ingest.folder.glob("*overlay.png"))[:_SHEETS]]
+    except (FormatError, OSError) as error:
+        damaged.append(f"What is masked is not shown: {error}")
     scene = None
     if stages["sfm"].there and frames:
         try:

@@ -186,6 +186,10 @@ def test_what_is_fixed_to_the_camera_is_shown(workspace):
     capture = section(page_of(workspace), "capture")
     assert "fixed to the camera" in capture
     assert capture.count('alt="A frame with the masked area in red"') == 1
+    (workspace / "ingest" / "overlay.png").write_bytes(b"short")
+    capture = section(page_of(workspace), "capture")
+    assert "What is masked is not shown: " in capture
+    assert "<figcaption>000000.png</figcaption>" in capture  # the frames still are
 
 
 def test_frames_without_a_camera_are_lost_in_the_legend(workspace):
