@@ -17,9 +17,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-# A match agrees below the Sampson error, in pixels, at which COLMAP accepted it
+# A match agrees where a point is seen within so many pixels of it, COLMAP's bound for a match
 # (TwoViewGeometryOptions.ransac.max_error).
 MAX_ERROR = 4.0
+NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class MatchEvidence:
     tried: NDArray[np.bool_]  # [N, N], symmetric: pairs that were matched, successfully or not
     pairs: NDArray[np.int64]  # [P, 2], verified pairs of images, first < second, sorted
     matches: NDArray[np.int64]  # [P], verified matches of each pair
-    # [P], those within MAX_ERROR of the epipolar lines of the poses; zero where a camera is missing
+    # [P], those that the poses explain within MAX_ERROR; zero where a camera is missing
     agreeing: NDArray[np.int64]
     traced: NDArray[np.int64]  # [P], matches of which both keypoints show a point of the model
     joined: NDArray[np.int64]  # [P], those of them that show one and the same point
@@ -94,7 +95,7 @@ def gather_evidence(
         keypoints=np.array([len(keypoints[index]) for index in range(len(names))], np.int64),
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
-        agreeing=_count_agreeing(placed, keypoints, pairs, matches), traced=traced, joined=joined)
+        agreeing=_count_agreeing(model, placed, keypoints, pairs, matches), traced=traced, joined=joined)
 
 
 def _read_matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
@@ -125,27 +126,73 @@ def _read_verified_pairs(
     return order, [inliers[pair] for pair in order]
 
 
+def explained_matches(
+    first: pycolmap.Image, ours: NDArray[np.float64],  # [M, 2] pixels
+    second: pycolmap.Image, theirs: NDArray[np.float64],  # [M, 2] pixels
+    least_depth: float,  # in the first camera; zero if any will do
+) -> NDArray[np.bool_]:  # [M]
+    """Returns which matches two cameras explain.
+
+    A match is explained if a point at some depth, not nearer than `least_depth`, is seen within
+    MAX_ERROR of it. An epipolar line alone does not tell a pattern that repeats along it, nor a
+    wrong distance between the cameras.
+    """
+    motion = second.cam_from_world() * first.cam_from_world().inverse()
+    at_infinity = lift_rays(first.camera, ours) @ motion.rotation.matrix().T
+    target = np.asarray(second.camera.cam_from_img(theirs))
+    inverse = inverse_depths(at_infinity, target, motion.translation)
+    most = 1 / least_depth if least_depth > 0 else np.inf
+    points = at_infinity + np.clip(inverse, 0, most)[:, None] * motion.translation
+    places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
+    errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
+    return np.asarray(errors <= MAX_ERROR)  # NaN, behind the camera, is no agreement
+
+
+def lift_rays(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the rays through pixels [M, 2] of a camera, [M, 3], of depth 1."""
+    return np.column_stack([np.asarray(camera.cam_from_img(pixels)), np.ones(len(pixels))])
+
+
+def inverse_depths(
+    rays: NDArray[np.float64],  # [M, 3] of the first camera, turned into the second
+    target: NDArray[np.float64],  # [M, 2] in the second, at depth 1
+    translation: NDArray[np.float64],  # [3]
+) -> NDArray[np.float64]:  # [M]
+    """Returns 1 / depth in the first camera at which ray + translation / depth meets the target."""
+    offset = rays[:, :2] - target * rays[:, 2:]
+    slope = translation[:2] - target * translation[2]
+    return np.asarray(-(offset * slope).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-12))
+
+
+def seen_depths(
+    image: pycolmap.Image, places: Mapping[int, NDArray[np.float64]]  # [3] by number of the point
+) -> NDArray[np.float64]:  # [M]
+    """Returns the depths of the points of the model that an image sees, in its camera."""
+    seen = [places[point.point3D_id] for point in image.points2D if point.has_point3D()]
+    return np.asarray(image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2]
+
+
+def nearest_depth(depths: NDArray[np.float64]) -> float:
+    """Returns a depth that no point is nearer than, from those of many points; 0 without any."""
+    return NEAREST * float(np.percentile(depths, 5)) if len(depths) else 0.0
+
+
 def _count_agreeing(
+    model: pycolmap.Reconstruction,
     placed: Mapping[int, pycolmap.Image],
     keypoints: Mapping[int, NDArray[np.float64]],
     pairs: Sequence[tuple[int, int]],
     matches: Sequence[NDArray[np.uint32]],
 ) -> NDArray[np.int64]:
-    """Returns how many matches of each pair agree with the poses, [P]."""
-    rays = {index: np.asarray(image.camera.cam_from_img(keypoints[index]))
-            for index, image in placed.items()}
+    """Returns how many matches of each pair the poses explain, [P]."""
+    places = {number: point.xyz for number, point in model.points3D.items()}
+    near = {index: nearest_depth(seen_depths(image, places)) for index, image in placed.items()}
     agreeing = np.zeros(len(pairs), np.int64)
     for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
-        if first not in placed or second not in placed:
-            continue
-        image, other = placed[first], placed[second]
-        essential = pycolmap.essential_matrix_from_pose(
-            other.cam_from_world() * image.cam_from_world().inverse())
-        squares = np.array(pycolmap.compute_squared_sampson_error(
-            rays[first][rows[:, 0]], rays[second][rows[:, 1]], essential))
-        focal = (image.camera.mean_focal_length() + other.camera.mean_focal_length()) / 2
-        # Not "<": two cameras in one place have no epipolar lines (NaN) and contradict nothing.
-        agreeing[pair] = len(rows) - np.count_nonzero(squares > (MAX_ERROR / focal) ** 2)
+        if first in placed and second in placed:
+            agreeing[pair] = np.count_nonzero(explained_matches(
+                placed[first], keypoints[first][rows[:, 0]],
+                placed[second], keypoints[second][rows[:, 1]], near[first]))
     return agreeing
 
 

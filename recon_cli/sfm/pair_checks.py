@@ -10,16 +10,21 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from recon_cli.sfm.evidence import MAX_ERROR
+from recon_cli.sfm.evidence import (
+    explained_matches,
+    inverse_depths,
+    lift_rays,
+    nearest_depth,
+    seen_depths,
+)
 from recon_cli.sfm.matching import MAX_TRIALS, Pair
 
-# Share of a pair's matches that the cameras of the skeleton must explain, within MAX_ERROR.
+# Share of a pair's matches that the cameras of the skeleton must explain.
 MIN_AGREEING = 0.5
 # A pair whose own rotation is this close to the skeleton's may show its drift. Around a can whose
 # label repeats the pairs to leave out are off by 116 degrees in the median.
 MAX_DRIFT_DEG = 15.0
 MAX_DRIFT = 0.2  # displacement as a share of the way between the two frames
-NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
 NEAR = 3  # frames; a loop is closed by more than one pair of near frames
 
 
@@ -53,7 +58,8 @@ def check_pairs(
             continue
         ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
                         for side, name in enumerate(pair))
-        if _agreeing_share(first, ours, second, theirs) >= MIN_AGREEING:
+        if explained_matches(
+                first.image, ours, second.image, theirs, first.near).mean() >= MIN_AGREEING:
             agreeing.add(pair)
         elif _is_drift(first, ours, second, theirs):
             drifted.add(pair)
@@ -71,7 +77,7 @@ class _View:
 
     model: pycolmap.Reconstruction
     image: pycolmap.Image
-    near: float  # depth of its nearest points, but for a twentieth
+    near: float  # depth that no point is nearer than
     usual: float  # median depth of its points
     travelled: float  # length of the path of the camera up to here, in order of names
 
@@ -91,44 +97,10 @@ def _list_views(model: pycolmap.Reconstruction) -> dict[str, _View]:
         center = image.projection_center()
         travelled += 0.0 if last is None else float(np.linalg.norm(center - last))
         last = center
-        seen = [places[point.point3D_id] for point in image.points2D if point.has_point3D()]
-        depths = np.asarray(image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2]
-        near, usual = np.percentile(depths, [5, 50]) if len(seen) else (0.0, 0.0)
-        views[image.name] = _View(model, image, float(near), float(usual), travelled)
+        depths = seen_depths(image, places)
+        usual = float(np.median(depths)) if len(depths) else 0.0
+        views[image.name] = _View(model, image, nearest_depth(depths), usual, travelled)
     return views
-
-
-def _agreeing_share(
-    first: _View, ours: NDArray[np.float64], second: _View, theirs: NDArray[np.float64]
-) -> float:
-    """Returns the share of matches, [M, 2] pixels each, that two cameras explain.
-
-    A match is explained if a point at some depth, not much nearer than what the first image shows,
-    is seen within MAX_ERROR of it. An epipolar line alone does not tell a pattern that repeats
-    along it.
-    """
-    motion = second.image.cam_from_world() * first.image.cam_from_world().inverse()
-    at_infinity = np.column_stack([
-        np.asarray(first.camera.cam_from_img(ours)), np.ones(len(ours))]
-    ) @ motion.rotation.matrix().T
-    target = np.asarray(second.camera.cam_from_img(theirs))
-    inverse = _inverse_depths(at_infinity, target, motion.translation)
-    most = 1 / (NEAREST * first.near) if first.near > 0 else np.inf
-    points = at_infinity + np.clip(inverse, 0, most)[:, None] * motion.translation
-    places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
-    errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
-    return float(np.mean(errors <= MAX_ERROR))  # NaN, behind the camera, is no agreement
-
-
-def _inverse_depths(
-    rays: NDArray[np.float64],  # [M, 3] of the first camera, turned into the second
-    target: NDArray[np.float64],  # [M, 2] in the second, at depth 1
-    translation: NDArray[np.float64],  # [3]
-) -> NDArray[np.float64]:  # [M]
-    """Returns 1 / depth in the first camera at which ray + translation / depth meets the target."""
-    offset = rays[:, :2] - target * rays[:, 2:]
-    slope = translation[:2] - target * translation[2]
-    return np.asarray(-(offset * slope).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-12))
 
 
 def _is_drift(
@@ -150,10 +122,9 @@ def _is_drift(
     motion = second.image.cam_from_world() * first.image.cam_from_world().inverse()
     if np.degrees((own.rotation * motion.rotation.inverse()).angle()) > MAX_DRIFT_DEG:
         return False
-    at_infinity = np.column_stack([
-        np.asarray(first.camera.cam_from_img(ours)), np.ones(len(ours))]) @ own.rotation.matrix().T
+    at_infinity = lift_rays(first.camera, ours) @ own.rotation.matrix().T
     target = np.asarray(second.camera.cam_from_img(theirs))
-    inverse = _inverse_depths(at_infinity, target, own.translation)
+    inverse = inverse_depths(at_infinity, target, own.translation)
     length = first.usual * max(float(np.median(inverse)), 0.0)
     off = np.linalg.norm(own.translation * length - motion.translation)
     return bool(off <= MAX_DRIFT * abs(second.travelled - first.travelled))

@@ -26,6 +26,7 @@ from recon_cli.sfm.still_points import MAX_STILL, find_still_share
 from recon_cli.sfm.visual_aliasing import VisualAliasing
 from recon_cli.sfm.weakest_cut import (
     MIN_AGREEING,
+    MIN_EXPLAINED,
     MIN_MATCHES,
     OutlierCamera,
     WeakestCut,
@@ -173,7 +174,11 @@ def examine(
 
 
 def is_broken(cut: WeakestCut) -> bool:
-    """Returns whether too few matches across a cut show the same points on both sides."""
+    """Returns whether too few matches across a cut show one point, or fit the cameras."""
+    return _is_torn(cut) or (cut.explained is not None and cut.explained < MIN_EXPLAINED)
+
+
+def _is_torn(cut: WeakestCut) -> bool:
     return cut.share is not None and cut.share < MIN_AGREEING
 
 
@@ -230,9 +235,13 @@ def _describe_still(share: float) -> list[str]:
 def _describe_break(cut: WeakestCut) -> list[str]:
     if not is_broken(cut):
         return []
+    if _is_torn(cut):
+        return [
+            f"The model is broken: of what the closest images of {_sides(cut.sides)} have in "
+            f"common, only {cut.share:.0%} is one point in both, but {MIN_AGREEING:.0%} is needed."]
     return [
-        f"The model is broken: of what the closest images of {_sides(cut.sides)} have in common, "
-        f"only {cut.share:.0%} is one point in both, but {MIN_AGREEING:.0%} is needed."]
+        f"The model is broken: of the matches between the closest images of {_sides(cut.sides)}, "
+        f"only {cut.explained:.0%} agree with the cameras, but {MIN_EXPLAINED:.0%} must."]
 
 
 def _describe_aliasing(aliasing: VisualAliasing) -> list[str]:

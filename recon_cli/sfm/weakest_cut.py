@@ -3,7 +3,9 @@
 A mapper that goes wrong at one frame builds two good halves and places them wrongly to each other,
 with a small reprojection error over what it kept. The matches across the break show it: each half
 has triangulated its own points, so the two keypoints of a match show two points in place of one.
-Unlike the distance from epipolar lines, that shows a half of wrong scale too.
+
+Where few matches tie two halves together, the mapper drops those that contradict it, and the rest
+show the same points even in a wrong model. So the cameras must also explain most of the matches.
 
 Places that look alike are matched as well, and rightly do not show the same points. So only the
 strongest ties count: of each image the few that it has most matches with, and, where the order of
@@ -23,8 +25,10 @@ from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
 from recon_cli.sfm.view_graph import Cut, Weights
 
-# Share of the matches of a pair that must show one point. See `tests/bench/bench_verdict.py`.
+# Share of the matches of a pair that must show one point, and that the cameras must explain. See
+# `tests/bench/bench_verdict.py`.
 MIN_AGREEING = 0.7
+MIN_EXPLAINED = 0.65
 # Images that each one has most matches with.
 STRONGEST = 5
 # Of the ties of a wrong camera so many at least contradict it; beside a break it is half of them.
@@ -46,6 +50,10 @@ class WeakestCut:
     # Of the matches of a pair of images across, those that show one point of the model, as far as
     # their keypoints show any: the median of the pairs that count; None if unknown.
     share: float | None
+    # Of the matches of those pairs, the share that the cameras explain: of all together or the
+    # median, whichever is more, since many weak pairs or a few strong ones may only look alike;
+    # None if they are few.
+    explained: float | None
     reason: str  # why it is unknown; empty otherwise
     sides: tuple[tuple[str, ...], tuple[str, ...]]  # names of the images, the smaller side first
     pairs: int  # verified, across
@@ -75,14 +83,33 @@ def find_weakest_cut(
     allowed = max(1, int(MAX_OUTLIERS * np.count_nonzero(evidence.registered)))
     inliers = _drop_wrong_cameras(links, evidence.registered, allowed)
     while (weakest := _weakest_side(links, inliers, order)) is not None:
-        side, share = weakest
+        side, strength = weakest
         count = np.count_nonzero(evidence.registered & ~inliers) + np.count_nonzero(side)
-        if share >= MIN_AGREEING or count > allowed:
-            return (_cut(evidence, links, side, inliers, share),
+        if strength.holds or count > allowed:
+            return (_cut(evidence, links, side, inliers, strength),
                     _outliers(evidence, links, inliers))
         inliers &= ~side
     reason = f"no two parts have a pair of images with {MIN_TRACED} matched points between them"
-    return WeakestCut(None, reason, ((), ()), 0, 0, 0, 0.0), _outliers(evidence, links, inliers)
+    return (WeakestCut(None, None, reason, ((), ()), 0, 0, 0, 0.0),
+            _outliers(evidence, links, inliers))
+
+
+@dataclass(frozen=True)
+class _Strength:
+    """How well matches across a cut agree with the model; infinite where too few tell."""
+
+    share: float  # of a pair's matches, those that show one point: the median
+    explained: float  # share of the matches that the cameras explain, as in WeakestCut
+
+    @property
+    def relative(self) -> float:
+        """The weaker of the two, over its bound."""
+        return min(self.share / MIN_AGREEING, self.explained / MIN_EXPLAINED)
+
+    @property
+    def holds(self) -> bool:
+        """Whether both reach their bounds."""
+        return self.relative >= 1
 
 
 @dataclass(frozen=True)
@@ -143,23 +170,35 @@ def _quantile(shares: NDArray[np.float64], quantile: float) -> float:
 
 def _weakest_side(
     links: _Links, inliers: Cut, order: NDArray[np.int64] | None
-) -> tuple[Cut, float] | None:
-    """Returns the smaller side, [N], of the cut with the least share; None where none is known."""
+) -> tuple[Cut, _Strength] | None:
+    """Returns the smaller side, [N], of the weakest cut; None where too few matches tell of any."""
     rows = np.flatnonzero(inliers)
     if len(rows) < 2:
         return None
     inner = np.ix_(rows, rows)
-    best, least = None, np.inf
-    for cut, pairs in _cuts(links.matches[inner], None if order is None else np.searchsorted(
+    matches, agreeing, shares = (
+        weights[inner] for weights in (links.matches, links.agreeing, links.shares))
+    best, least = None, _Strength(np.inf, np.inf)
+    for cut, pairs in _cuts(matches, None if order is None else np.searchsorted(
             rows, order[inliers[order]])):
-        share = _quantile(links.shares[inner][pairs], 0.5)
-        if share < least:
-            best, least = cut, share
+        strength = _Strength(
+            _quantile(shares[pairs], 0.5), _explained(matches[pairs], agreeing[pairs]))
+        if strength.relative < least.relative:
+            best, least = cut, strength
     if best is None:
         return None
     side = np.zeros_like(inliers)
     side[rows[best if 2 * np.count_nonzero(best) <= len(rows) else ~best]] = True
     return side, least
+
+
+def _explained(matches: NDArray[np.float64], agreeing: NDArray[np.float64]) -> float:  # [P], [P]
+    """Returns the share of the matches of pairs that agrees; infinity where they are too few."""
+    some = matches > 0
+    if np.count_nonzero(some) < 2 or matches.sum() < MIN_MATCHES:
+        return np.inf
+    return float(max(
+        agreeing.sum() / matches.sum(), np.median(agreeing[some] / matches[some])))
 
 
 def _cuts(
@@ -179,18 +218,22 @@ def _cuts(
 
 
 def _cut(
-    evidence: MatchEvidence, links: _Links, side: Cut, inliers: Cut, share: float
+    evidence: MatchEvidence, links: _Links, side: Cut, inliers: Cut, strength: _Strength
 ) -> WeakestCut:
     other = inliers & ~side
     across = np.ix_(side, other)
     rows = np.flatnonzero(inliers)
     names = np.array(evidence.names)
     return WeakestCut(
-        share=share, reason="",
+        share=_finite(strength.share), explained=_finite(strength.explained), reason="",
         sides=(tuple(names[side].tolist()), tuple(names[other].tolist())),
         pairs=int(np.count_nonzero(links.matches[across])),
         matches=int(links.matches[across].sum()), points=int(links.shared[across].sum()),
         normalised_cut=view_graph.conductance(links.shared[np.ix_(rows, rows)], side[rows]))
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def _outliers(evidence: MatchEvidence, links: _Links, inliers: Cut) -> tuple[OutlierCamera, ...]:

@@ -62,6 +62,26 @@ def test_a_half_of_wrong_scale_is_found_though_no_match_leaves_its_epipolar_line
     assert verdict.weakest_cut.sides == (tuple(made.names[:8]), tuple(made.names[8:]))
 
 
+def test_halves_that_few_points_tie_wrongly_are_found_by_the_other_matches(tmp_path):
+    """What would show the break is not in the model: the mapper has dropped it."""
+    made = broken_walk()
+    model = made.model()
+    first, second = (
+        {element.point3D_id for image in half for element in model.image(image).points2D
+         if element.has_point3D()} for half in (range(1, 9), range(9, 17)))
+    wanted = first & second
+    for number in list(model.points3D):
+        images = {element.image_id for element in model.point3D(number).track.elements}
+        if number not in wanted and images & {7, 8, 9, 10}:
+            model.delete_point3D(number)
+    verdict = examine(model, made.write_database(tmp_path / "database.db"), made.names)
+    assert verdict.weakest_cut.explained is not None
+    assert verdict.weakest_cut.explained < 0.5
+    assert sorted(verdict.weakest_cut.sides) == [tuple(made.names[:8]), tuple(made.names[8:])]
+    with pytest.raises(SfmError, match="agree with the cameras"):
+        check_weak_link(verdict, accept=False)
+
+
 def test_a_broken_model_is_refused_with_the_way_out_unless_it_is_accepted(tmp_path):
     verdict = verdict_on(broken_walk(), tmp_path)
     with pytest.raises(SfmError, match="The model is broken") as caught:
@@ -121,7 +141,7 @@ def test_a_camera_far_off_a_video_s_path_is_a_jump_there_and_back(tmp_path):
 
 
 def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
-    made = walk(motions={5: moved(0, 3000, 0)})
+    made = walk(motions={5: moved(0, 3000, 0)}, landmark=lambda image, point: (image == 5, point))
     verdict = verdict_on(made, tmp_path)
     assert not verdict.trusted
     assert any(f"leaps from {made.names[4]}" in problem for problem in verdict.problems)

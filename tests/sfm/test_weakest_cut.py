@@ -109,7 +109,38 @@ def test_an_image_that_shares_no_point_with_the_others_is_astray():
 
 
 def test_pairs_that_show_no_points_say_nothing():
-    made = evidence(halves(0.0), matches=lambda _a, _b: weakest_cut.MIN_TRACED - 1)
-    link, _ = weakest_cut.find_weakest_cut(made)
+    made = evidence(halves(0.0))
+    few = np.full_like(made.matches, weakest_cut.MIN_TRACED - 1)
+    link, _ = weakest_cut.find_weakest_cut(dataclasses.replace(
+        made, traced=few, joined=np.zeros_like(few), agreeing=made.matches))
     assert link.share is None
+    assert link.explained == 1
+
+
+def test_without_matches_nothing_is_known():
+    made = evidence(halves(0.0), matches=lambda _a, _b: 1)
+    link, _ = weakest_cut.find_weakest_cut(made)
+    assert (link.share, link.explained) == (None, None)
     assert "15 matched points" in link.reason
+
+
+@pytest.mark.parametrize("across", [0.0, 0.25, 0.5])
+def test_matches_that_the_cameras_do_not_explain_break_a_link_whose_points_agree(across):
+    made = evidence(lambda _a, _b: 1.0)
+    first, second = (made.pairs < 8).T
+    agreeing = np.where(first == second, made.matches, np.round(across * made.matches))
+    link, astray = weakest_cut.find_weakest_cut(
+        dataclasses.replace(made, agreeing=agreeing.astype(int)))
+    assert link.share == 1
+    assert link.explained == pytest.approx(across, abs=0.01)
+    assert link.sides == (tuple(NAMES[:8]), tuple(NAMES[8:]))
+    assert astray == ()
+
+
+def test_one_pair_that_the_cameras_do_not_explain_may_only_look_alike():
+    made = evidence(lambda _a, _b: 1.0)
+    alike = (made.pairs == [0, 19]).all(axis=1)
+    matches = np.where(alike, 5000, made.matches)
+    link, _ = weakest_cut.find_weakest_cut(dataclasses.replace(
+        made, matches=matches, agreeing=np.where(alike, 0, matches)))
+    assert link.explained == 1
