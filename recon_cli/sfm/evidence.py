@@ -17,9 +17,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-# A match agrees where a point is seen within so many pixels of it, COLMAP's bound for a match
+# A match agrees below the Sampson error, in pixels, at which COLMAP accepted it
 # (TwoViewGeometryOptions.ransac.max_error).
 MAX_ERROR = 4.0
+# It is explained by a point seen within this multiple of the model's mean error of it, within these
+# pixels: sharp videos come to .2 and shaken ones to 1. See `tests/bench/bench_verdict.py`.
+USUAL_OFFSET, OFFSETS = 4.0, (2.0, MAX_ERROR)
 NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
 
 
@@ -35,8 +38,9 @@ class MatchEvidence:
     tried: NDArray[np.bool_]  # [N, N], symmetric: pairs that were matched, successfully or not
     pairs: NDArray[np.int64]  # [P, 2], verified pairs of images, first < second, sorted
     matches: NDArray[np.int64]  # [P], verified matches of each pair
-    # [P], those that the poses explain within MAX_ERROR; zero where a camera is missing
+    # [P], those within MAX_ERROR of the epipolar lines of the poses; zero where a camera is missing
     agreeing: NDArray[np.int64]
+    explained: NDArray[np.int64]  # [P], those that the poses explain; likewise
     traced: NDArray[np.int64]  # [P], matches of which both keypoints show a point of the model
     joined: NDArray[np.int64]  # [P], those of them that show one and the same point
 
@@ -95,7 +99,9 @@ def gather_evidence(
         keypoints=np.array([len(keypoints[index]) for index in range(len(names))], np.int64),
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
-        agreeing=_count_agreeing(model, placed, keypoints, pairs, matches), traced=traced, joined=joined)
+        agreeing=_count_agreeing(placed, keypoints, pairs, matches),
+        explained=_count_explained(model, placed, keypoints, pairs, matches),
+        traced=traced, joined=joined)
 
 
 def _read_matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
@@ -130,12 +136,12 @@ def explained_matches(
     first: pycolmap.Image, ours: NDArray[np.float64],  # [M, 2] pixels
     second: pycolmap.Image, theirs: NDArray[np.float64],  # [M, 2] pixels
     least_depth: float,  # in the first camera; zero if any will do
+    offset: float,  # pixels
 ) -> NDArray[np.bool_]:  # [M]
     """Returns which matches two cameras explain.
 
     A match is explained if a point at some depth, not nearer than `least_depth`, is seen within
-    MAX_ERROR of it. An epipolar line alone does not tell a pattern that repeats along it, nor a
-    wrong distance between the cameras.
+    `offset` of it. An epipolar line alone does not tell a pattern that repeats along it.
     """
     motion = second.cam_from_world() * first.cam_from_world().inverse()
     at_infinity = lift_rays(first.camera, ours) @ motion.rotation.matrix().T
@@ -145,7 +151,7 @@ def explained_matches(
     points = at_infinity + np.clip(inverse, 0, most)[:, None] * motion.translation
     places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
     errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
-    return np.asarray(errors <= MAX_ERROR)  # NaN, behind the camera, is no agreement
+    return np.asarray(errors <= offset)  # NaN, behind the camera, is no agreement
 
 
 def lift_rays(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -178,6 +184,30 @@ def nearest_depth(depths: NDArray[np.float64]) -> float:
 
 
 def _count_agreeing(
+    placed: Mapping[int, pycolmap.Image],
+    keypoints: Mapping[int, NDArray[np.float64]],
+    pairs: Sequence[tuple[int, int]],
+    matches: Sequence[NDArray[np.uint32]],
+) -> NDArray[np.int64]:
+    """Returns how many matches of each pair agree with the poses, [P]."""
+    rays = {index: np.asarray(image.camera.cam_from_img(keypoints[index]))
+            for index, image in placed.items()}
+    agreeing = np.zeros(len(pairs), np.int64)
+    for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
+        if first not in placed or second not in placed:
+            continue
+        image, other = placed[first], placed[second]
+        essential = pycolmap.essential_matrix_from_pose(
+            other.cam_from_world() * image.cam_from_world().inverse())
+        squares = np.array(pycolmap.compute_squared_sampson_error(
+            rays[first][rows[:, 0]], rays[second][rows[:, 1]], essential))
+        focal = (image.camera.mean_focal_length() + other.camera.mean_focal_length()) / 2
+        # Not "<": two cameras in one place have no epipolar lines (NaN) and contradict nothing.
+        agreeing[pair] = len(rows) - np.count_nonzero(squares > (MAX_ERROR / focal) ** 2)
+    return agreeing
+
+
+def _count_explained(
     model: pycolmap.Reconstruction,
     placed: Mapping[int, pycolmap.Image],
     keypoints: Mapping[int, NDArray[np.float64]],
@@ -186,14 +216,15 @@ def _count_agreeing(
 ) -> NDArray[np.int64]:
     """Returns how many matches of each pair the poses explain, [P]."""
     places = {number: point.xyz for number, point in model.points3D.items()}
+    offset = float(np.clip(USUAL_OFFSET * model.compute_mean_reprojection_error(), *OFFSETS))
     near = {index: nearest_depth(seen_depths(image, places)) for index, image in placed.items()}
-    agreeing = np.zeros(len(pairs), np.int64)
+    explained = np.zeros(len(pairs), np.int64)
     for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
         if first in placed and second in placed:
-            agreeing[pair] = np.count_nonzero(explained_matches(
+            explained[pair] = np.count_nonzero(explained_matches(
                 placed[first], keypoints[first][rows[:, 0]],
-                placed[second], keypoints[second][rows[:, 1]], near[first]))
-    return agreeing
+                placed[second], keypoints[second][rows[:, 1]], near[first], offset))
+    return explained
 
 
 def _count_joined(

@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.sfm.evidence import (
+    MAX_ERROR,
     explained_matches,
     inverse_depths,
     lift_rays,
@@ -19,7 +20,7 @@ from recon_cli.sfm.evidence import (
 )
 from recon_cli.sfm.matching import MAX_TRIALS, Pair
 
-# Share of a pair's matches that the cameras of the skeleton must explain.
+# Share of a pair's matches that the cameras of the skeleton must explain, within MAX_ERROR.
 MIN_AGREEING = 0.5
 # A pair whose own rotation is this close to the skeleton's may show its drift. Around a can whose
 # label repeats the pairs to leave out are off by 116 degrees in the median.
@@ -58,8 +59,9 @@ def check_pairs(
             continue
         ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
                         for side, name in enumerate(pair))
-        if explained_matches(
-                first.image, ours, second.image, theirs, first.near).mean() >= MIN_AGREEING:
+        explained = explained_matches(
+            first.image, ours, second.image, theirs, first.near, MAX_ERROR)
+        if explained.mean() >= MIN_AGREEING:
             agreeing.add(pair)
         elif _is_drift(first, ours, second, theirs):
             drifted.add(pair)

@@ -190,9 +190,12 @@ def is_aliased(aliasing: VisualAliasing) -> bool:
 def check_weak_link(verdict: ModelVerdict, accept: bool, *, given: bool = False) -> None:
     """Raises SfmError for a model that cannot be trusted, unless `accept` (--accept-weak).
 
-    Cameras that were `given` may leap, and need no points in common: only matches refute them.
+    Cameras that were `given` may leap, need no points in common and may be off by some pixels:
+    only points that are two in place of one refute them.
     """
-    refuted = [*_describe_break(verdict.weakest_cut), *_describe_aliasing(verdict.aliasing)]
+    cut = verdict.weakest_cut
+    refuted = [*(_describe_break(cut) if _is_torn(cut) else ()),
+               *_describe_aliasing(verdict.aliasing)]
     problems = refuted if given else verdict.problems
     if accept or not problems:
         return

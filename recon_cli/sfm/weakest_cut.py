@@ -28,7 +28,7 @@ from recon_cli.sfm.view_graph import Cut, Weights
 # Share of the matches of a pair that must show one point, and that the cameras must explain. See
 # `tests/bench/bench_verdict.py`.
 MIN_AGREEING = 0.7
-MIN_EXPLAINED = 0.65
+MIN_EXPLAINED = 0.6
 # Images that each one has most matches with.
 STRONGEST = 5
 # Of the ties of a wrong camera so many at least contradict it; beside a break it is half of them.
@@ -118,6 +118,7 @@ class _Links:
 
     matches: Weights
     agreeing: Weights
+    explained: Weights
     shared: Weights
     shares: Weights  # of the matches, those that show one point; NaN where too few show any
 
@@ -126,15 +127,16 @@ class _Links:
         """Returns the matrices; matches of images without a camera are left out."""
         count, placed = len(evidence.names), evidence.placed
         pairs = evidence.pairs[placed]
-        matches, agreeing, traced, joined = (
+        matches, agreeing, explained, traced, joined = (
             view_graph.weights(count, pairs, values[placed]) for values in (
-                evidence.matches, evidence.agreeing, evidence.traced, evidence.joined))
+                evidence.matches, evidence.agreeing, evidence.explained, evidence.traced,
+                evidence.joined))
         shares = np.divide(
             joined, traced, out=np.full_like(traced, np.nan), where=traced >= MIN_TRACED)
         # A camera far from where it belongs sees no points at all; its matches speak all the same.
         blind = evidence.points < MIN_TRACED
         shares[(blind[:, None] | blind) & (matches >= MIN_MATCHES)] = 0.0
-        return cls(matches, agreeing, evidence.shared.astype(np.float64), shares)
+        return cls(matches, agreeing, explained, evidence.shared.astype(np.float64), shares)
 
 
 def _drop_wrong_cameras(links: _Links, registered: Cut, allowed: int) -> Cut:  # [N]
@@ -176,13 +178,13 @@ def _weakest_side(
     if len(rows) < 2:
         return None
     inner = np.ix_(rows, rows)
-    matches, agreeing, shares = (
-        weights[inner] for weights in (links.matches, links.agreeing, links.shares))
+    matches, explained, shares = (
+        weights[inner] for weights in (links.matches, links.explained, links.shares))
     best, least = None, _Strength(np.inf, np.inf)
     for cut, pairs in _cuts(matches, None if order is None else np.searchsorted(
             rows, order[inliers[order]])):
         strength = _Strength(
-            _quantile(shares[pairs], 0.5), _explained(matches[pairs], agreeing[pairs]))
+            _quantile(shares[pairs], 0.5), _explained_share(matches[pairs], explained[pairs]))
         if strength.relative < least.relative:
             best, least = cut, strength
     if best is None:
@@ -192,13 +194,15 @@ def _weakest_side(
     return side, least
 
 
-def _explained(matches: NDArray[np.float64], agreeing: NDArray[np.float64]) -> float:  # [P], [P]
-    """Returns the share of the matches of pairs that agrees; infinity where they are too few."""
+def _explained_share(
+    matches: NDArray[np.float64], explained: NDArray[np.float64]  # [P], [P]
+) -> float:
+    """Returns the share of matches of pairs that is explained; infinity where they are too few."""
     some = matches > 0
     if np.count_nonzero(some) < 2 or matches.sum() < MIN_MATCHES:
         return np.inf
     return float(max(
-        agreeing.sum() / matches.sum(), np.median(agreeing[some] / matches[some])))
+        explained.sum() / matches.sum(), np.median(explained[some] / matches[some])))
 
 
 def _cuts(

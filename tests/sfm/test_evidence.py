@@ -1,8 +1,9 @@
 import numpy as np
+import pycolmap
 import pytest
-from made_model import MadeModel, along, moved, wall
+from made_model import FOCAL, HEIGHT, WIDTH, MadeModel, along, wall
 
-from recon_cli.sfm.evidence import MAX_ERROR, gather_evidence
+from recon_cli.sfm.evidence import MAX_ERROR, OFFSETS, explained_matches, gather_evidence
 
 
 def made(**changes) -> MadeModel:
@@ -20,16 +21,46 @@ def test_exact_matches_all_agree_and_points_are_counted_once_per_image(tmp_path)
     assert not found.shared.diagonal().any()
 
 
-@pytest.mark.parametrize(("pixels", "agree"), [(MAX_ERROR - 1, True), (MAX_ERROR + 3, False)])
-def test_a_match_agrees_up_to_the_error_at_which_it_was_accepted(pixels, agree, tmp_path):
-    """A camera is turned up by an angle that shifts the middle of its image by so many pixels."""
+@pytest.mark.parametrize(("pixels", "whole"), [(OFFSETS[0] - 1, True), (OFFSETS[0] + 1, False)])
+def test_a_match_is_explained_up_to_an_offset_across_its_epipolar_line(pixels, whole, tmp_path):
     world = MadeModel(wall(-0.3, 0.8, count=300) * [1, 0.1, 1], along([0.0, 0.5]))
     model = world.model()
-    angle = pixels / 400
     image = model.image(2)
-    turned = moved(0, 0, 0)
-    turned.rotation = type(turned.rotation)(np.array([np.sin(angle / 2), 0, 0, np.cos(angle / 2)]))
-    image.frame.rig_from_world = turned * image.cam_from_world()
+    image.frame.rig_from_world = pitched(pixels / FOCAL) * image.cam_from_world()
+    found = gather_evidence(model, world.write_database(tmp_path / "db"), world.names)
+    assert found.explained[0] == (found.matches[0] if whole else 0)
+
+
+def pitched(angle: float) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(
+        np.array([np.sin(angle / 2), 0, 0, np.cos(angle / 2)])), np.zeros(3))
+
+
+def test_a_match_is_explained_at_no_depth_behind_the_cameras_or_too_near():
+    """Cameras a metre apart see a point at depth z moved by FOCAL / z pixels to the left."""
+    model = MadeModel(wall(-1, 1, count=300), along([0.0, 1.0])).model()
+    first, second = model.image(1), model.image(2)
+    depths = np.array([np.inf, 10.0, 5.0, 1.0, -5.0])
+    ours = np.tile([WIDTH / 2, HEIGHT / 2], (len(depths), 1))
+    rise = FOCAL / depths * (0.1 * np.cos(3) - 0.1)
+    theirs = ours + np.column_stack([-FOCAL / depths, rise])
+    explained = explained_matches(first, ours, second, theirs, 2.0, OFFSETS[0])
+    assert explained.tolist() == [True, True, True, False, False]
+    explained = explained_matches(first, ours, second, theirs, 0.0, OFFSETS[0])
+    assert explained.tolist() == [True, True, True, True, False]
+
+
+@pytest.mark.parametrize(("pixels", "agree"), [(MAX_ERROR - 1, True), (MAX_ERROR + 3, False)])
+def test_a_match_agrees_up_to_the_error_at_which_it_was_accepted(pixels, agree, tmp_path):
+    """A camera is turned up by an angle that shifts the middle of its image by so many pixels.
+
+    Sampson's error of one turned camera is the shift over the square root of two.
+    """
+    world = MadeModel(wall(-0.3, 0.8, count=300) * [1, 0.1, 1], along([0.0, 0.5]))
+    model = world.model()
+    angle = pixels * np.sqrt(2) / 400
+    image = model.image(2)
+    image.frame.rig_from_world = pitched(angle) * image.cam_from_world()
     found = gather_evidence(model, world.write_database(tmp_path / "db"), world.names)
     assert found.agreeing[0] == (found.matches[0] if agree else 0)
 

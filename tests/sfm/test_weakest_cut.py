@@ -24,7 +24,7 @@ def evidence(share, *, matches=lambda first, second: 300 // (second - first)) ->
         names=NAMES, registered=np.ones(COUNT, bool), centers=np.zeros((COUNT, 3)),
         keypoints=np.full(COUNT, 1000), visible=np.ones((COUNT, 50), bool),
         tried=np.ones((COUNT, COUNT), bool), pairs=np.array(pairs), matches=counts,
-        agreeing=joined, traced=counts, joined=joined)
+        agreeing=joined, explained=joined, traced=counts, joined=joined)
 
 
 def halves(across: float):
@@ -112,7 +112,7 @@ def test_pairs_that_show_no_points_say_nothing():
     made = evidence(halves(0.0))
     few = np.full_like(made.matches, weakest_cut.MIN_TRACED - 1)
     link, _ = weakest_cut.find_weakest_cut(dataclasses.replace(
-        made, traced=few, joined=np.zeros_like(few), agreeing=made.matches))
+        made, traced=few, joined=np.zeros_like(few), explained=made.matches))
     assert link.share is None
     assert link.explained == 1
 
@@ -128,9 +128,9 @@ def test_without_matches_nothing_is_known():
 def test_matches_that_the_cameras_do_not_explain_break_a_link_whose_points_agree(across):
     made = evidence(lambda _a, _b: 1.0)
     first, second = (made.pairs < 8).T
-    agreeing = np.where(first == second, made.matches, np.round(across * made.matches))
+    explained = np.where(first == second, made.matches, np.round(across * made.matches))
     link, astray = weakest_cut.find_weakest_cut(
-        dataclasses.replace(made, agreeing=agreeing.astype(int)))
+        dataclasses.replace(made, explained=explained.astype(int)))
     assert link.share == 1
     assert link.explained == pytest.approx(across, abs=0.01)
     assert link.sides == (tuple(NAMES[:8]), tuple(NAMES[8:]))
@@ -142,5 +142,5 @@ def test_one_pair_that_the_cameras_do_not_explain_may_only_look_alike():
     alike = (made.pairs == [0, 19]).all(axis=1)
     matches = np.where(alike, 5000, made.matches)
     link, _ = weakest_cut.find_weakest_cut(dataclasses.replace(
-        made, matches=matches, agreeing=np.where(alike, 0, matches)))
+        made, matches=matches, explained=np.where(alike, 0, matches)))
     assert link.explained == 1
