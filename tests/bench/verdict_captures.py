@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -81,8 +82,8 @@ def thinned(room: str, seed: int) -> Callable[[Path, Path], Path]:
     def write(data: Path, folder: Path) -> Path:
         photos = folder / "photos"
         photos.mkdir(exist_ok=True)
-        video = cv2.VideoCapture(str(data / "rooms" / room / "video.mp4"))
-        images = list(iter(lambda: video.read()[1], None))
+        video = av.open(str(data / "rooms" / room / "video.mp4"))
+        images = [frame.to_ndarray(format="bgr24") for frame in video.decode(video=0)]
         draws = np.random.default_rng(seed)
         step = int(draws.integers(3, 9))
         count = min(int(draws.integers(10, 22)), len(images) // step)
