@@ -126,9 +126,13 @@ class ModelVerdict:
 
     def _reassurances(self) -> Iterator[str]:
         cut, aliasing = self.weakest_cut, self.aliasing
-        if cut.share is not None:
-            yield (f"Weakest link: {cut.share:.0%} of what the closest images of "
-                   f"{_sides(cut.sides)} have in common is one point in both.")
+        shares = [
+            *([] if cut.share is None else [
+                f"{cut.share:.0%} of what their closest images have in common is one point in both"]),
+            *([] if cut.explained is None else [
+                f"the cameras explain {cut.explained:.0%} of the matches"])]
+        if shares:
+            yield f"Weakest link, between {_sides(cut.sides)}: {', and '.join(shares)}."
         if aliasing.share is not None:
             yield (f"Least overlap: two groups of cameras find {aliasing.share:.0%} as much of "
                    "what both should show as cameras of one group do.")
