@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 MAX_ERROR = 4.0
 # It is explained by a point seen within this multiple of the model's mean error of it, within these
 # pixels: sharp videos come to .2 and shaken ones to 1. See `tests/bench/bench_verdict.py`.
-USUAL_OFFSET, OFFSETS = 4.0, (2.0, MAX_ERROR)
+USUAL_OFFSET, OFFSETS = 6.0, (2.0, MAX_ERROR)
 NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
 
 

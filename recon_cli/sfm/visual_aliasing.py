@@ -36,7 +36,7 @@ MIN_SHARE = 0.25
 MIN_CELLS = 100  # between two groups of images: a handful of pairs
 # Of what pairs within two groups of images find of their cells, the pairs between them must find so
 # much. See `tests/bench/bench_verdict.py`.
-MIN_OVERLAP = 0.62
+MIN_OVERLAP = 0.56
 # Cells are told apart by the angle between the rays of the two images, in degrees.
 BANDS_DEG = (2.5, 5.0, 7.5)
 # A smaller share found within the groups is taken for this one: then they are wrong themselves.
