@@ -126,11 +126,12 @@ class ModelVerdict:
 
     def _reassurances(self) -> Iterator[str]:
         cut, aliasing = self.weakest_cut, self.aliasing
-        shares = [
-            *([] if cut.share is None else [
-                f"{cut.share:.0%} of what their closest images have in common is one point in both"]),
-            *([] if cut.explained is None else [
-                f"the cameras explain {cut.explained:.0%} of the matches"])]
+        shares = []
+        if cut.share is not None:
+            shares.append(
+                f"{cut.share:.0%} of what their closest images have in common is one point in both")
+        if cut.explained is not None:
+            shares.append(f"the cameras explain {cut.explained:.0%} of the matches")
         if shares:
             yield f"Weakest link, between {_sides(cut.sides)}: {', and '.join(shares)}."
         if aliasing.share is not None:
