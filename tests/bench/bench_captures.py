@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import click
 import cv2
@@ -28,7 +27,7 @@ from scipy.spatial.transform import Rotation
 HEADINGS = (
     "capture", "chosen", "registered", "left out", "way", "reprojection px", "centre RMSE",
     "centre median / max",
-    "rotation median / max", "weak link", "fold", "sfm s", "MB", "ended with")
+    "rotation median / max", "weak link", "explained", "fold", "sfm s", "MB", "ended with")
 
 
 @dataclass(frozen=True)
@@ -213,14 +212,15 @@ def measured(name: str, data: Path, out: Path) -> list[str]:
         name, str(summary["frames"]), str(summary["registered"]), str(len(summary["left_out"])),
         next((rung["name"] for rung in summary["rungs"] if rung["kept"]), "given poses"),
         f"{summary['reprojection_error_px']:.2f}", *cells,
-        share(verdict["weak_link"]), share(verdict["fold"]), f"{manifest['seconds']:.0f}",
+        share(verdict["weak_link"]["share"]), share(verdict["weak_link"]["explained"]),
+        share(verdict["fold"]["share"]), f"{manifest['seconds']:.0f}",
         f"{manifest['peak_memory_bytes'] / 1e6:.0f}",
         "trusted" if verdict["trusted"] else "; ".join(verdict["problems"])]
 
 
-def share(found: dict[str, Any]) -> str:
-    """The share of a test of the verdict."""
-    return "none" if found["share"] is None else f"{found['share']:.2f}"
+def share(found: float | None) -> str:
+    """A share that a test of the verdict found."""
+    return "none" if found is None else f"{found:.2f}"
 
 
 def accuracy(capture: Capture, data: Path, out: Path) -> tuple[str, str, str]:
