@@ -102,14 +102,15 @@ class _Strength:
     explained: float  # share of the matches that the cameras explain, as in WeakestCut
 
     @property
-    def relative(self) -> float:
-        """The weaker of the two, over its bound."""
-        return min(self.share / MIN_AGREEING, self.explained / MIN_EXPLAINED)
+    def order(self) -> tuple[bool, float]:
+        """Least for the weakest: one that is torn, then the lesser of the two over their bounds."""
+        share = self.share / MIN_AGREEING
+        return share >= 1, min(share, self.explained / MIN_EXPLAINED)
 
     @property
     def holds(self) -> bool:
         """Whether both reach their bounds."""
-        return self.relative >= 1
+        return self.order[1] >= 1
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ def _weakest_side(
             rows, order[inliers[order]])):
         strength = _Strength(
             _quantile(shares[pairs], 0.5), _explained_share(matches[pairs], explained[pairs]))
-        if strength.relative < least.relative:
+        if strength.order < least.order:
             best, least = cut, strength
     if best is None:
         return None

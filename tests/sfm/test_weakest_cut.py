@@ -137,6 +137,14 @@ def test_matches_that_the_cameras_do_not_explain_break_a_link_whose_points_agree
     assert astray == ()
 
 
+def test_a_link_whose_points_are_two_is_weaker_than_one_whose_matches_are_not_explained():
+    made = evidence(halves(0.5))
+    late = (made.pairs < 15).sum(axis=1) == 1
+    link, _ = weakest_cut.find_weakest_cut(
+        dataclasses.replace(made, explained=np.where(late, 0, made.matches)))
+    assert link.sides == (tuple(NAMES[:8]), tuple(NAMES[8:]))
+
+
 def test_one_pair_that_the_cameras_do_not_explain_may_only_look_alike():
     made = evidence(lambda _a, _b: 1.0)
     alike = (made.pairs == [0, 19]).all(axis=1)
