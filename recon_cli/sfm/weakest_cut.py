@@ -28,7 +28,7 @@ from recon_cli.sfm.view_graph import Cut, Weights
 # Share of the matches of a pair that must show one point, and that the cameras must explain. See
 # `tests/bench/bench_verdict.py`.
 MIN_AGREEING = 0.7
-MIN_EXPLAINED = 0.64
+MIN_EXPLAINED = 0.6
 # Images that each one has most matches with.
 STRONGEST = 5
 # Of the ties of a wrong camera so many at least contradict it; beside a break it is half of them.

@@ -221,13 +221,13 @@ def _made(
 def choose_bounds(rows: Sequence[Row]) -> dict[str, float]:
     """For each share, the middle between the lowest of a good model and the next broken one.
 
-    What one share shows, those after it need not show again.
+    What one share or another check shows, those after it need not show again.
     """
     bounds: dict[str, float] = {}
     for name in ("points", "explained", "overlap"):
         lowest = min(row.shares[name] for row in rows if row.label == "good")
         below = [row.shares[name] for row in rows
-                 if row.label == "broken" and row.shares[name] < lowest
+                 if row.label == "broken" and not row.otherwise and row.shares[name] < lowest
                  and not any(row.shares[other] < bound for other, bound in bounds.items())]
         bounds[name] = (lowest + max(below, default=0.0)) / 2
     return bounds
