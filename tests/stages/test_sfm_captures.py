@@ -56,7 +56,7 @@ def test_photos_of_other_things_are_named_and_not_in_the_model(sample_video, tmp
     summary = run(write_inputs(tmp_path / "in", images), tmp_path / "out")
     assert summary.registered == 12
     assert summary.unregistered == tuple(sorted(wrong))
-    assert [attempt.name for attempt in summary.rungs] == ["exhaustive"]
+    assert not any("got a camera" in attempt.reason for attempt in summary.rungs)
 
 
 @pytest.mark.integration
