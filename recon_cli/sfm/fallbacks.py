@@ -23,7 +23,7 @@ from recon_cli.sfm import checks, database, features, mapper, matching, merge_mo
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, StepLog, fresh_folder, publish
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.trusted_part import keep_trusted_part
-from recon_cli.sfm.verdict import check_weak_link, examine
+from recon_cli.sfm.verdict import ModelVerdict, check_weak_link, examine
 from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
@@ -118,20 +118,23 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
     """
     log = StepLog(job.attempts)
     attempts: list[MapperAttempt] = []
+    verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
     reason = list_fallbacks(job)[0].reason
     for fallback in list_fallbacks(job):
         recorded = log.result(fallback.name)
         if recorded:
             attempt = MapperAttempt.from_json(recorded)
         else:
-            attempt = _try_fallback(job, fallback, reason, attempts, report, deadline)
+            attempt, candidate = _try_fallback(job, fallback, reason, attempts, report, deadline)
+            if candidate is not None:
+                verdicts[fallback.name] = candidate.verdict
             log.finish(fallback.name, attempt.to_json(), job.attempts / fallback.name)
         attempts.append(attempt)
         if not attempt.skipped:
             reason = attempt.shortfall
             if not reason:
                 break
-    return _publish_best(job, attempts)
+    return _publish_best(job, attempts, verdicts)
 
 
 def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
@@ -181,7 +184,7 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
 def _try_fallback(
     job: MappingJob, fallback: Fallback, reason: str, before: Sequence[MapperAttempt],
     report: Reporter, deadline: float,
-) -> MapperAttempt:
+) -> tuple[MapperAttempt, ModelCandidate | None]:
     """Writes the model of a fallback into its folder and returns what became of it."""
     folder = fresh_folder(job.attempts / fallback.name)
     start = time.monotonic()
@@ -192,25 +195,28 @@ def _try_fallback(
     expected = (len(wanted - database.pair_names(job.database)) * per_pair
                 + SLOWER * max((attempt.seconds for attempt in before), default=0.0))
     if before and start + expected > deadline:
-        return MapperAttempt(
-            fallback.name, reason, skipped=f"it would take about {expected / 60:.0f} minutes")
+        skipped = f"it would take about {expected / 60:.0f} minutes"
+        return MapperAttempt(fallback.name, reason, skipped=skipped), None
     if wanted:
         matching.match_pairs(job, wanted, report)
     job = _linked_job(job, fallback.name)
     candidate = merge_models.best_model(job, fallback.find_models(job, report))
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
-        return MapperAttempt(fallback.name, reason, seconds)
+        return MapperAttempt(fallback.name, reason, seconds), None
     (folder / "model").mkdir()
     candidate.model.write(folder / "model")
-    return MapperAttempt(
+    attempt = MapperAttempt(
         fallback.name, reason, seconds, "", tuple(mapper.list_registered(candidate.model)),
         shortfall(candidate, reachable(job, candidate)), candidate.apart, candidate.rejected,
         candidate.verdict.trusted, candidate.verdict.weakest_cut.share,
         candidate.model.compute_mean_reprojection_error())
+    return attempt, candidate
 
 
-def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
+def _publish_best(
+    job: MappingJob, attempts: Sequence[MapperAttempt], verdicts: Mapping[str, ModelVerdict]
+) -> Result:
     """Publishes the best model, if it passes the checks, and returns the result of the step."""
     chosen = best_attempt(attempts)
     registered = chosen.registered if chosen else ()
@@ -224,7 +230,8 @@ def _publish_best(job: MappingJob, attempts: Sequence[MapperAttempt]) -> Result:
     assert chosen is not None  # three frames at least are registered
     job = _linked_job(job, chosen.name)
     model = pycolmap.Reconstruction(job.attempts / chosen.name / "model")
-    verdict = examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
+    verdict = verdicts.get(chosen.name) or examine(
+        model, job.database, job.names, sharpness=job.sharpness, times=job.times)
     part = keep_trusted_part(job, model, verdict)
     if part is not None:
         model, verdict = part.candidate.model, part.candidate.verdict
