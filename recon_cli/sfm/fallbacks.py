@@ -34,9 +34,6 @@ EXHAUSTIVE_MAX = 100
 # Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
 # held all of them; a slow walk that fell into four to seven models 76 to 82%.
 ENOUGH = 0.9
-# A smaller share of them in another model is no reason to go on: seven of 260 photos took another
-# seven minutes.
-FEW = 0.05
 # How much longer than the longest attempt so far a mapping may take. Relaxed thresholds took 0.8
 # and 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
@@ -159,8 +156,7 @@ def shortfall(candidate: ModelCandidate, reach: Collection[str]) -> str:
     held = candidate.model.num_reg_images()
     if held < ENOUGH * len(reach):
         return f"only {held} of {len(reach)} frames that can be placed got a camera"
-    parts = [part for part in candidate.apart
-             if len(set(part).intersection(reach)) > FEW * len(reach)]
+    parts = [part for part in candidate.apart if set(part).intersection(reach)]
     if parts:
         return f"the capture fell into {1 + len(parts)} models"
     if not candidate.verdict.trusted:
