@@ -3,8 +3,10 @@
 import logging
 import os
 import platform
+import threading
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -260,3 +262,33 @@ def test_a_warm_start_shows_no_bar(tmp_path, monkeypatch):
     monkeypatch.setattr(backend, "is_warm", lambda: False)
     assert registry.kernels_to_compile("numba") == backend.KERNELS
     assert registry.kernels_to_compile("torch") == 0
+
+
+# ---- two processes and one folder ----
+
+def test_while_another_process_compiles_its_progress_is_shown_and_nothing_runs(
+        fresh_folder, tmp_path, monkeypatch):
+    fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path))
+    folder = kernel.cache_folder()
+    monkeypatch.setattr(backend, "_WAIT_SECONDS", 0.01)
+    ran, counted = [], threading.Semaphore(0)
+    monkeypatch.setattr(backend, "_run_all", lambda: ran.append(folder))
+    with backend._writing(folder):
+        waiting = threading.Thread(target=backend.warm_up, args=(counted.release,))
+        waiting.start()
+        (folder / "composite.nbi").touch()
+        assert counted.acquire(timeout=20)
+        assert not ran
+        assert not counted.acquire(blocking=False)
+    waiting.join(20)
+    assert ran == [folder]
+    assert backend.is_warm()
+
+
+def test_an_installation_at_another_time_compiles_anew(monkeypatch):
+    # numba does so whatever the digest says, and it must not be taken for warm
+    here = kernel.fingerprint()
+    stat = Path.stat
+    monkeypatch.setattr(Path, "stat", lambda path, **options: SimpleNamespace(
+        st_mtime_ns=stat(path, **options).st_mtime_ns + 1))
+    assert kernel.fingerprint() != here

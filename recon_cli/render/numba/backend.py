@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from torch import Tensor
 
 from recon_cli.render.contract import (
@@ -32,6 +33,7 @@ from recon_cli.scene.splats import Splats
 
 KERNELS = 12  # that threads share; the progress counts these
 _SCIPY = "scipy.linalg"
+_WAIT_SECONDS = 0.25  # between looks at how far another process is
 _READY = "ready"  # file in the cache folder once every kernel is there
 _DAMAGE = (pickle.UnpicklingError, EOFError, ImportError, AttributeError, IndexError, KeyError,
            ValueError, TypeError, RuntimeError)
@@ -108,34 +110,82 @@ def is_warm() -> bool:
 def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
     """Loads or compiles every kernel by running a tiny scene, and returns the seconds it took.
 
-    `on_kernel` is called after each of the KERNELS kernels is ready.
+    `on_kernel` is called after each of the KERNELS kernels is ready. Where another process compiles
+    them, this one waits until it is done, or gone.
     """
     start = time.perf_counter()
     ready: set[str] = set()
+    counted = 0
 
-    def observe(name: str, _seconds: float) -> None:
-        if name not in ready:
-            ready.add(name)
+    def count(kernels: int) -> None:
+        nonlocal counted
+        for _ in range(counted, min(kernels, KERNELS)):
+            counted += 1
             on_kernel()
 
+    def observe(name: str, _seconds: float) -> None:
+        ready.add(name)
+        count(len(ready))
+
     folder = cache_folder()
-    # _READY may be missing although there are files: a crash can lose it and cut them short
-    has_files = folder is not None and any(folder.rglob("*.nbi"))
     before, pool.observer = pool.observer, observe
     try:
         with _without_scipy():
-            _run_all()
+            if folder is None:
+                _run_all()
+            elif not (is_warm() and _can_run_all()):
+                with _writing(folder, lambda: count(len(_finished(folder)))):
+                    _compile(folder)
+    finally:
+        pool.observer = before
+    return time.perf_counter() - start
+
+
+@contextmanager
+def _writing(folder: Path, on_wait: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Holds the lock of a folder: of two processes that write, numba may keep one's code for both.
+
+    Calls `on_wait` now and then while another process holds it.
+    """
+    lock = FileLock(folder.with_suffix(".lock"))
+    while True:
+        try:
+            lock.acquire(timeout=_WAIT_SECONDS)
+            break
+        except Timeout:
+            on_wait()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _finished(folder: Path) -> list[Path]:
+    """Returns the indices of the kernels that are there."""
+    return [*folder.rglob("*.nbi")]
+
+
+def _can_run_all() -> bool:
+    """Runs every kernel and tells whether that went well."""
+    try:
+        _run_all()
     except _DAMAGE:
-        if folder is None or not has_files:
+        return False
+    return True
+
+
+def _compile(folder: Path) -> None:
+    """Compiles what a folder lacks; all kernels, where what it holds cannot be read."""
+    has_files = bool(_finished(folder))  # a crash can lose _READY and cut files short
+    try:
+        _run_all()
+    except _DAMAGE:
+        if not has_files:
             raise
         logger.warning("the compiled kernels in %s cannot be read; compiling them again", folder)
         _clear(folder)
         _run_all()
-    finally:
-        pool.observer = before
-    if folder is not None:
-        (folder / _READY).touch()
-    return time.perf_counter() - start
+    (folder / _READY).touch()
 
 
 @contextmanager

@@ -3,7 +3,8 @@
 Compiling takes seconds, so the machine code is kept in the user's cache folder. numba stores it by
 pickle, which executes what the file says: the folder must belong to the user alone. Its name holds
 a digest of the CPU, the versions and all sources here (numba checks only the file that a kernel
-stands in, not what it inlines), so that other code is never loaded.
+stands in, not what it inlines), so that other code is never loaded. Where and when the sources were
+installed counts too: numba compiles again for another place or time.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def fingerprint() -> str:
         digest.update(text.encode() + b"\0")
     here = Path(__file__).parent
     for path in sorted([*here.glob("*.py"), here.parent / "contract.py"]):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+        digest.update(f"{path}\0{path.stat().st_mtime_ns}\0".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
