@@ -26,6 +26,7 @@ _PACKAGES = {
     "scikit-image": "scikit-image",
 }
 _CPUINFO = Path("/proc/cpuinfo")
+_LOW_PRIORITY = 10  # of POSIX: about a tenth of the share that others have of a core
 _SAMPLE_SECONDS = 0.5  # a sample of all children takes about 5 ms
 
 
@@ -86,6 +87,23 @@ def cache_root() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "recon" / "cache"
     return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "recon"
+
+
+def end_with_parent() -> None:
+    """Ends this process when its standard input does, which is when its parent is gone."""
+
+    def watch() -> None:
+        while os.read(0, 1):  # not sys.stdin, whose lock the interpreter wants at its own end
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def yield_to_others() -> None:
+    """Lowers the priority of this process: it takes what others leave of the cores."""
+    process = psutil.Process()
+    process.nice(psutil.BELOW_NORMAL_PRIORITY_CLASS if sys.platform == "win32" else _LOW_PRIORITY)
 
 
 class Meter:

@@ -17,6 +17,7 @@ from pathlib import Path
 from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
+from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
@@ -71,7 +72,8 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
 
 def job_at(root: Path, settings: Settings | None = None) -> Job:
     """Returns a job on the fake stages."""
-    return Job(Workspace(root), settings or {}, table=TABLE)
+    compute = ComputeConfig(backend="torch")  # which has nothing to compile
+    return Job(Workspace(root), settings or {}, compute, table=TABLE)
 
 
 def bring(

@@ -21,6 +21,7 @@ from typing import Any
 
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
 from recon_cli.errors import StageError
+from recon_cli.pipeline.compile_ahead import compile_ahead
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
 from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck, is_imported
 from recon_cli.stages import IMPORT, Stage
@@ -102,10 +103,11 @@ def run(
         refuse_missing_backend(job, stages)
         if not again:
             _refuse_to_replace(job, verb, stages)
-        for target in targets:
-            for outcome in _bring_up_to_date(job, target, again=again):
-                job.report(outcome)
-                outcomes.append(outcome)
+        with compile_ahead(job, stages, again=again):
+            for target in targets:
+                for outcome in _bring_up_to_date(job, target, again=again):
+                    job.report(outcome)
+                    outcomes.append(outcome)
     return tuple(outcomes)
 
 

@@ -114,6 +114,13 @@ def _fastest(backends: Iterable[BackendStatus], device: str) -> str:
     return status.name
 
 
+def renders_on_cpu(backend: str, device: str) -> bool:
+    """Returns whether these options, `auto` or a name, come to the numba backend."""
+    by_choice = backend == "numba" or (backend == "auto" and importlib.util.find_spec("numba"))
+    return bool(by_choice) and (device == "cpu" or (
+        device == "auto" and not torch.cuda.is_available()))
+
+
 def use_threads(backend: str, threads: int) -> None:
     """Lets a backend compute with `threads` CPU threads from now on."""
     if backend == "numba":

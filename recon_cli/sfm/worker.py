@@ -10,7 +10,6 @@ import faulthandler
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import BinaryIO
 import cv2
 import filelock
 
+from recon_cli import machine
 from recon_cli.errors import ReconError, WorkspaceError
 from recon_cli.sfm import database, fallbacks, known_poses, matching, undistort
 from recon_cli.sfm.job import LOCK, LOG_FILE, MappingJob, Reporter, Result, StepLog
@@ -67,17 +67,6 @@ def _prepare_database(job: MappingJob, log: StepLog) -> None:
             log.forget_from(step)
 
 
-def _end_with_parent() -> None:
-    """Ends this process when its standard input does, which is when its parent is gone."""
-
-    def watch() -> None:
-        while os.read(0, 1):  # not sys.stdin, whose lock the interpreter wants at its own end
-            pass
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def _take_stdout() -> BinaryIO:
     """Returns the pipe to the parent; what native code prints from now on goes to the log."""
     stream = os.fdopen(os.dup(1), "wb")
@@ -90,7 +79,7 @@ def main() -> None:
     report = Reporter(_take_stdout())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     faulthandler.enable()
-    _end_with_parent()
+    machine.end_with_parent()
     job = MappingJob.read(Path(sys.argv[1]))
     cv2.setNumThreads(1)  # images are shared out among the threads of the job
     try:

@@ -1,0 +1,32 @@
+"""The compiling process: `python -m recon_cli.render.compile_worker BACKEND DEVICE`.
+
+`pipeline.compile_ahead` starts it. It takes what other work leaves of the cores, writes on its
+standard error alone, and does not outlive its parent.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+from recon_cli import machine
+from recon_cli.render import registry
+
+
+def compile_kernels(backend: str, device: str) -> None:
+    """Compiles the kernels that these options, `auto` or a name, will take, if there are any."""
+    if registry.renders_on_cpu(backend, device) and registry.kernels_to_compile("numba"):
+        registry.use_threads("numba", 1)
+        registry.prepare("numba", lambda: None)
+
+
+def main() -> None:
+    """Compiles for the options on the command line."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    machine.end_with_parent()
+    machine.yield_to_others()
+    compile_kernels(*sys.argv[1:])
+
+
+if __name__ == "__main__":
+    main()

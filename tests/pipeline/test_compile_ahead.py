@@ -1,0 +1,143 @@
+"""Kernels are compiled in a process beside the stages that come before training."""
+
+import logging
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from fake_stages import TABLE
+
+from recon_cli.config.stages import ComputeConfig
+from recon_cli.pipeline import compile_ahead
+from recon_cli.pipeline.plan import Job
+from recon_cli.render import compile_worker, registry
+from recon_cli.workspace.layout import Workspace
+
+SECONDS = 20.0  # for a process to start or end on a busy machine
+
+
+def job_in(folder: Path, **compute: str) -> Job:
+    return Job(Workspace(folder), compute=ComputeConfig(**compute), table=TABLE)
+
+
+@pytest.fixture
+def worker(tmp_path, monkeypatch):
+    """Lets a script take the place of the interpreter that compiles; returns its writer."""
+    script = tmp_path / "python"
+
+    def write(text: str) -> None:
+        script.write_text(f"#!/bin/sh\n{text}\n")
+        script.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(script))
+
+    return write
+
+
+def children(*, alive: bool) -> list[psutil.Process]:
+    """Returns the child processes, once there are some that have ended or that are alive."""
+    deadline = time.monotonic() + SECONDS
+    while time.monotonic() < deadline:
+        found = psutil.Process().children()
+        if any((one.status() != psutil.STATUS_ZOMBIE) is alive for one in found):
+            return found
+        time.sleep(0.01)
+    return []
+
+
+needs_shell = pytest.mark.skipif(sys.platform == "win32", reason="the process is a shell script")
+
+
+@needs_shell
+def test_the_process_ends_with_the_stages_even_where_they_fail(tmp_path, worker):
+    worker("exec sleep 60")
+    started = []
+
+    def fail() -> None:
+        with compile_ahead.compile_ahead(job_in(tmp_path), ["ingest", "train"], again=False):
+            started.extend(children(alive=True))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert len(started) == 1
+    assert not started[0].is_running()
+
+
+@needs_shell
+def test_a_failure_goes_to_the_log_and_not_to_the_terminal(tmp_path, worker, caplog, capfd):
+    worker("echo out of memory >&2; exit 3")
+    with (caplog.at_level(logging.DEBUG, "recon"),
+          compile_ahead.compile_ahead(job_in(tmp_path), ["ingest", "train"], again=False)):
+        assert children(alive=False)
+    assert "ended with 3: out of memory" in caplog.text
+    assert all(record.levelno == logging.DEBUG for record in caplog.records)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("stages", "finished", "again", "compute", "beside"), [
+    (["ingest", "denoise", "sfm", "train"], [], False, {}, True),
+    (["train"], ["ingest", "denoise"], False, {}, True),  # sfm runs first
+    (["train"], ["ingest", "denoise", "sfm"], False, {}, False),
+    (["train"], ["ingest", "denoise", "sfm"], True, {}, False),
+    (["sfm", "train"], ["ingest", "denoise", "sfm"], True, {}, True),
+    (["ingest", "denoise", "sfm"], [], False, {}, False),
+    (["ingest", "train"], [], False, {"backend": "numba", "device": "cpu"}, True),
+    (["ingest", "train"], [], False, {"backend": "torch"}, False),
+    (["ingest", "train"], [], False, {"device": "cuda"}, False)])
+def test_a_process_starts_only_where_stages_that_render_wait_for_others(
+        tmp_path, monkeypatch, stages, finished, again, compute, beside):
+    for name in finished:
+        (tmp_path / name).mkdir()
+    commands = []
+
+    class Child:
+        def __init__(self, command, **_options):
+            commands.append(command[-3:])
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_exc):
+            pass
+
+        def poll(self):
+            return 0
+
+        kill = poll
+
+        def wait(self, _timeout):
+            pass
+
+    monkeypatch.setattr(compile_ahead.subprocess, "Popen", Child)
+    with compile_ahead.compile_ahead(job_in(tmp_path, **compute), stages, again=again):
+        pass
+    assert commands == [["recon_cli.render.compile_worker", compute.get("backend", "auto"),
+                         compute.get("device", "auto")]] * beside
+
+
+@pytest.mark.parametrize(("backend", "device", "cuda", "compiles"), [
+    ("auto", "auto", False, True), ("auto", "auto", True, False), ("auto", "cpu", True, True),
+    ("numba", "cpu", True, True), ("torch", "cpu", False, False),
+    ("triton", "auto", False, False), ("auto", "cuda", True, False)])
+def test_the_process_compiles_what_the_options_come_to(
+        monkeypatch, backend, device, cuda, compiles):
+    prepared = []
+    monkeypatch.setattr(registry.torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(registry, "kernels_to_compile", lambda name: 12 * (name == "numba"))
+    monkeypatch.setattr(registry, "use_threads", lambda *_: None)
+    monkeypatch.setattr(registry, "prepare", lambda name, _: prepared.append(name) or 0.0)
+    compile_worker.compile_kernels(backend, device)
+    assert prepared == ["numba"] * compiles
+
+
+@pytest.mark.compile
+def test_the_process_fills_the_cache_that_the_stages_read(tmp_path, monkeypatch):
+    monkeypatch.setenv("RECON_CACHE_DIR", str(tmp_path / "cache"))
+    with compile_ahead.compile_ahead(job_in(tmp_path), ["ingest", "train"], again=False):
+        (child,) = children(alive=True)
+        assert child.nice() > psutil.Process().nice()
+        child.wait(300)
+    (ready,) = (tmp_path / "cache").glob("kernels/*/ready")
+    assert list(ready.parent.rglob("*.nbc"))
