@@ -289,6 +289,10 @@ def test_an_installation_at_another_time_compiles_anew(monkeypatch):
     # numba does so whatever the digest says, and it must not be taken for warm
     here = kernel.fingerprint()
     stat = Path.stat
-    monkeypatch.setattr(Path, "stat", lambda path, **options: SimpleNamespace(
-        st_mtime_ns=stat(path, **options).st_mtime_ns + 1))
+
+    def stat_later(path, **options):
+        status = stat(path, **options)
+        return SimpleNamespace(st_mode=status.st_mode, st_mtime_ns=status.st_mtime_ns + 1)
+
+    monkeypatch.setattr(Path, "stat", stat_later)
     assert kernel.fingerprint() != here
