@@ -87,7 +87,7 @@ def test_code_for_another_cpu_is_kept_apart(avx2_run):
 
 
 def test_eight_lanes_compute_the_picture_of_sixteen(avx2_run):
-    assert (avx2_run.report["lanes"], avx2_run.report["tile"]) == (8, [8, 16])
+    assert (avx2_run.report["lanes"], avx2_run.report["tile"]) == (8, [16, 16])
     assert_same_picture(avx2_run.picture, picture("numba"))
 
 

@@ -44,11 +44,9 @@ HOT = [
     Hot("cull", "Gaussians against the image", 20, powers=True),
     Hot("project", "a block of Gaussians", 160, powers=True),
     Hot("project", "spherical harmonics", 8),
-    Hot("composite", "alpha along a row of pixels", 8, powers=True),
-    Hot("composite", "ranges of rows of a batch", 24),
-    Hot("composite", "colour along a row of pixels", 5),
-    Hot("composite_backward", "gradients along a row of pixels", 34, powers=True),
-    Hot("composite_backward", "ranges of rows of a batch", 24),
+    Hot("composite", "colour in a patch of pixels", 13, powers=True),
+    Hot("composite", "patches of a batch", 13),
+    Hot("composite_backward", "gradients in a patch of pixels", 34, powers=True),
     Hot("project_backward", "a block of Gaussians", 280, powers=True),
     Hot("project_backward", "gradients of spherical harmonics", 8),
     Hot("similarity", "blur along the row, and SSIM", 45),
@@ -135,9 +133,9 @@ def scalar_exponentials(values):
 def test_a_scalar_kernel_is_named_with_its_loop_and_its_calls(register):
     found = loops(assembler(scalar_exponentials, np.ones(64, np.float32)))
     with pytest.raises(pytest.fail.Exception) as failure:
-        check(Hot("composite", "alpha along a row of pixels", 8, powers=True), found, register)
+        check(Hot("composite", "colour in a patch of pixels", 8, powers=True), found, register)
     message = str(failure.value)
-    assert "composite: alpha along a row of pixels lost its vector instructions" in message
+    assert "composite: colour in a patch of pixels lost its vector instructions" in message
     assert "0 operations" in message
     assert "exp" in message.split("calls")[1]
 

@@ -9,7 +9,7 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
 s is zero where alpha was clamped. Gradients by mean and covariance are moments of s in the whitened
 coordinates (u, v), which are of order one even for needles.
 
-An instance is the outer loop: its sums stay in registers while its rows pass by, and go to a slot
+An instance is the outer loop: its sums stay in registers while its patches pass by, and go to a slot
 of its own at the end: no atomics and the same bits every time.
 """
 
@@ -18,27 +18,29 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.numba.compositing import (
-    BATCH_FLOATS, END_ROW, FIRST_ROW, L_BLUE, L_DEPTH, L_GREEN, L_RED, L_U_X, L_U_Y, L_V_Y, LOCAL,
-    load_batch, log2_alpha)
+    BATCH_FLOATS, LOCAL, load_instance, log2_alpha, patch_pixels, pixel)
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute, broadcast, exp2, fetch_add, fill, fma, lane_numbers, largest, load, minimum, select,
-    store, totals)
+    absolute, bits, broadcast, count_bits, exp2, fetch_add, fill, fma, largest, load, lowest_bit,
+    minimum, select, store, totals)
 from recon_cli.render.numba.soa import (
-    BATCH, LOG2_ALPHA_MAX, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH)
+    BATCH, BLUE, DEPTH, GREEN, LOG2_ALPHA_MAX, PATCHES, RED, SLOT, TILE_HEIGHT, TILE_PIXELS,
+    TILE_WIDTH, U_X, U_Y, V_Y)
 
 _T, _R, _LAST, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH = (i * TILE_PIXELS for i in range(7))
 _BEHIND_RED, _BEHIND_GREEN, _BEHIND_BLUE = (i * TILE_PIXELS for i in range(7, 10))
 _COUNTS = 10 * TILE_PIXELS  # 1 where a pixel counts in the scores, 0 elsewhere
-_BATCH = 11 * TILE_PIXELS
+_COLUMN, _ROW = 11 * TILE_PIXELS, 12 * TILE_PIXELS  # of each pixel in the tile
+_LIMITS = 13 * TILE_PIXELS  # number of the last instance that each patch needs
+_BATCH = _LIMITS + PATCHES
 BACKWARD_FLOATS = _BATCH + BATCH_FLOATS
 
 
 @kernel
 def composite_backward(counter, tile_start, members, slots, records, width, height, tiles_x,
-                       cutoff, background, final, last, grad_rgb, grad_alpha, grad_depth, details,
-                       scores, counting, sums, evaluated, scratch):
+                       cutoff, background, final, last, met, grad_rgb, grad_alpha, grad_depth,
+                       details, scores, counting, sums, evaluated, scratch):
     """Sums the gradients of every instance over the pixels of its tile.
 
     The arguments are those of `compositing.composite`, and `grad_*`, dL/d(rgb, alpha, depth), the
@@ -48,10 +50,12 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
     """
     has_alpha, has_depth = len(grad_alpha) > 0, len(grad_depth) > 0
     tiles = len(tile_start) - 1
-    column = lane_numbers()
     batch = scratch[_BATCH:]
-    limits = np.zeros(TILE_HEIGHT, np.float32)
     zero = fill(0.0)
+    for patch in range(PATCHES):
+        column, row = patch_pixels(patch)
+        store(scratch, _COLUMN + patch * LANES, column)
+        store(scratch, _ROW + patch * LANES, row)
     pairs = 0
     while True:
         tile = fetch_add(counter, 0, 1)
@@ -60,58 +64,63 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
         left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
         begin = tile_start[tile]
         deepest = np.float32(0)
-        for r in range(TILE_HEIGHT):
-            at = r * TILE_WIDTH
-            y = top + r
+        for patch in range(PATCHES):
+            at = patch * LANES
             latest = load(last, tile * TILE_PIXELS + at)
-            limits[r] = largest(latest)
-            deepest = max(deepest, limits[r])
+            scratch[_LIMITS + patch] = largest(latest)
+            deepest = max(deepest, scratch[_LIMITS + patch])
             store(scratch, _T + at, load(final, tile * TILE_PIXELS + at))
             store(scratch, _LAST + at, latest)
-            for i in range(TILE_WIDTH):
-                if y < height and left + i < width:
-                    p = y * width + left + i
-                    red, green, blue = grad_rgb[3 * p], grad_rgb[3 * p + 1], grad_rgb[3 * p + 2]
-                    scratch[_G_RED + at + i] = red
-                    scratch[_G_GREEN + at + i] = green
-                    scratch[_G_BLUE + at + i] = blue
-                    behind = red * background[0] + green * background[1] + blue * background[2]
-                    if has_alpha:  # coverage is 1 - T at the end: a colour of -1 behind all
-                        behind -= grad_alpha[p]
-                    scratch[_R + at + i] = behind
-                    if scores:
-                        counts = len(counting) == 0 or counting[p]
-                        scratch[_COUNTS + at + i] = np.float32(1 if counts else 0)
-                    if has_depth:
-                        scratch[_G_DEPTH + at + i] = grad_depth[p]
-                else:
-                    for plane in (_G_RED, _G_GREEN, _G_BLUE, _R, _G_DEPTH, _COUNTS):
-                        scratch[plane + at + i] = np.float32(0)
             if scores:
                 store(scratch, _BEHIND_RED + at, broadcast(background, 0))
                 store(scratch, _BEHIND_GREEN + at, broadcast(background, 1))
                 store(scratch, _BEHIND_BLUE + at, broadcast(background, 2))
+        for r in range(TILE_HEIGHT):
+            y = top + r
+            for i in range(TILE_WIDTH):
+                at = pixel(i, r)
+                if y < height and left + i < width:
+                    p = y * width + left + i
+                    red, green, blue = grad_rgb[3 * p], grad_rgb[3 * p + 1], grad_rgb[3 * p + 2]
+                    scratch[_G_RED + at] = red
+                    scratch[_G_GREEN + at] = green
+                    scratch[_G_BLUE + at] = blue
+                    behind = red * background[0] + green * background[1] + blue * background[2]
+                    if has_alpha:  # coverage is 1 - T at the end: a colour of -1 behind all
+                        behind -= grad_alpha[p]
+                    scratch[_R + at] = behind
+                    if scores:
+                        counts = len(counting) == 0 or counting[p]
+                        scratch[_COUNTS + at] = np.float32(1 if counts else 0)
+                    if has_depth:
+                        scratch[_G_DEPTH + at] = grad_depth[p]
+                else:
+                    for plane in (_G_RED, _G_GREEN, _G_BLUE, _R, _G_DEPTH, _COUNTS):
+                        scratch[plane + at] = np.float32(0)
         end = begin + np.int64(deepest)
         for e in range(end, tile_start[tile + 1]):
             for i in range(0, SLOT, LANES):
                 store(sums, np.int64(slots[e]) * SLOT + i, zero)
         while end > begin:
             first = max(begin, end - BATCH)
-            load_batch(batch, records, members, first, end - first, left, top)
+            for k in range(end - first):
+                load_instance(batch, records, k, members[first + k], left, top)
             for k in range(end - first - 1, -1, -1):
                 number = np.float32(first + k - begin + 1)
-                r0, r1 = np.int64(batch[FIRST_ROW + k]), np.int64(batch[END_ROW + k])
-                while r0 < r1 and limits[r0] < number:
-                    r0 += 1
-                while r1 > r0 and limits[r1 - 1] < number:
-                    r1 -= 1
+                needed = np.uint64(0)
+                for patch in range(0, PATCHES, LANES):
+                    needed |= bits(load(scratch, _LIMITS + patch) >= number) << np.uint64(patch)
+                needed &= np.uint64(met[first + k])
+                pairs += count_bits(needed) * LANES
                 g_red, g_green, g_blue, g_depth = zero, zero, zero, zero
                 s_0, s_u, s_v, s_uu, s_uv, s_vv = zero, zero, zero, zero, zero, zero
                 abs_x, abs_y, squared, hits, loo = zero, zero, zero, zero, zero
                 i = k * LOCAL
-                for r in range(r0, r1):
-                    at = r * TILE_WIDTH
-                    u, v, power = log2_alpha(batch, i, column, fill(np.float32(r)))
+                while needed != 0:
+                    at = lowest_bit(needed) * LANES
+                    needed &= needed - np.uint64(1)
+                    u, v, power = log2_alpha(
+                        batch, i, load(scratch, _COLUMN + at), load(scratch, _ROW + at))
                     a = exp2(minimum(power, LOG2_ALPHA_MAX))
                     part = (power >= cutoff) & (load(scratch, _LAST + at) >= number)
                     a = select(part, a, 0.0)
@@ -120,12 +129,12 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                     weight = a * T
                     red, green = load(scratch, _G_RED + at), load(scratch, _G_GREEN + at)
                     blue = load(scratch, _G_BLUE + at)
-                    shade = fma(red, broadcast(batch, i + L_RED),
-                                fma(green, broadcast(batch, i + L_GREEN),
-                                    blue * broadcast(batch, i + L_BLUE)))
+                    shade = fma(red, broadcast(batch, i + RED),
+                                fma(green, broadcast(batch, i + GREEN),
+                                    blue * broadcast(batch, i + BLUE)))
                     if has_depth:
                         z = load(scratch, _G_DEPTH + at)
-                        shade = fma(z, broadcast(batch, i + L_DEPTH), shade)
+                        shade = fma(z, broadcast(batch, i + DEPTH), shade)
                         g_depth = fma(weight, z, g_depth)
                     R = load(scratch, _R + at)
                     slope = shade - R
@@ -139,26 +148,25 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                     if details:
                         abs_x = abs_x + absolute(su)
                         abs_y = abs_y + absolute(fma(
-                            su, broadcast(batch, i + L_U_Y), sv * broadcast(batch, i + L_V_Y)))
+                            su, broadcast(batch, i + U_Y), sv * broadcast(batch, i + V_Y)))
                         squared = fma(s, s, squared)
                         hits = hits + select(part, 1.0, zero)
                     if scores:
                         behind = load(scratch, _BEHIND_RED + at)
-                        away = broadcast(batch, i + L_RED) - behind
+                        away = broadcast(batch, i + RED) - behind
                         store(scratch, _BEHIND_RED + at, fma(a, away, behind))
                         error = away * away
                         behind = load(scratch, _BEHIND_GREEN + at)
-                        away = broadcast(batch, i + L_GREEN) - behind
+                        away = broadcast(batch, i + GREEN) - behind
                         store(scratch, _BEHIND_GREEN + at, fma(a, away, behind))
                         error = fma(away, away, error)
                         behind = load(scratch, _BEHIND_BLUE + at)
-                        away = broadcast(batch, i + L_BLUE) - behind
+                        away = broadcast(batch, i + BLUE) - behind
                         store(scratch, _BEHIND_BLUE + at, fma(a, away, behind))
                         error = fma(away, away, error)
                         loo = fma(weight * weight * load(scratch, _COUNTS + at), error, loo)
-                pairs += (r1 - r0) * TILE_WIDTH
                 to = np.int64(slots[first + k]) * SLOT
-                abs_x = abs_x * broadcast(batch, i + L_U_X)
+                abs_x = abs_x * broadcast(batch, i + U_X)
                 if LANES == 16:
                     store(sums, to, totals((
                         g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu, s_uv, s_vv,

@@ -5,8 +5,8 @@ For each pixel, over the Gaussians of its tile in order of depth:
     alpha = min(.99, o exp(-q / 2)), a fragment where alpha >= 1/255
     C += alpha T c,  T <- T (1 - alpha), before the fragment that would leave T < 1e-4.
 
-A row of a tile is one vector. Instances are taken in batches, in the coordinates of their tile.
-Rows are the outer loop of a batch, so that colour and transmittance stay in registers.
+A patch of a tile is one vector. Instances are taken in batches, in the coordinates of their tile.
+Patches are the outer loop of a batch, so that colour and transmittance stay in registers.
 """
 
 from __future__ import annotations
@@ -20,105 +20,129 @@ from recon_cli.render.numba.simd_functions import (
     lowest_bit, maximum, minimum, select, square_root, store, total)
 from recon_cli.render.numba.soa import (
     BATCH, BLUE, DEPTH, EXTENT_X, EXTENT_Y, FAR, GREEN, HALF_Y, LOG2_ALPHA_MAX, LOG2_OPACITY,
-    MEAN_X, MEAN_X_LOW, MEAN_Y, MEAN_Y_LOW, RECORD, RED, SLOPE_Y, TILE_HEIGHT, TILE_PIXELS,
-    TILE_WIDTH, U_X, U_Y, V_Y)
+    MEAN_X, MEAN_X_LOW, MEAN_Y, MEAN_Y_LOW, PATCH_HEIGHT, PATCH_WIDTH, PATCHES, PATCHES_X,
+    PATCHES_Y, RECORD, RED, SLOPE_Y, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, U_X, U_Y, V_Y)
 
-# An instance of a batch: u = U_X i + U_Y r + U_0 and v = V_Y r + V_0 at column i and row r of the
-# tile; the rest is the record's own.
-LOCAL = 16
-L_U_0, L_U_X, L_U_Y, L_V_0, L_V_Y, L_POWER, L_RED, L_GREEN, L_BLUE, L_DEPTH = range(10)
-# What the range of rows is found from, one vector of instances each.
-RANGE = 8
-BATCH_FLOATS = LOCAL * BATCH + (RANGE + 2) * BATCH  # the last two: first row and end
-_RANGES = LOCAL * BATCH
-FIRST_ROW, END_ROW = _RANGES + RANGE * BATCH, _RANGES + (RANGE + 1) * BATCH
+# An instance of a batch: its record, where u = U_X i + U_Y r + U_0 and v = V_Y r + V_0 at column i
+# and row r of the tile take the places of what float32 drops of the mean.
+LOCAL = RECORD
+U_0, V_0 = MEAN_X_LOW, MEAN_Y_LOW
+# What the patches that an ellipse meets are found from, one plane of instances each.
+_PLANES = 9
+_DX, _DY, _EXTENT_X, _EXTENT_Y, _SLOPE_Y, _HALF_Y, _U_X, _U_Y, _V_Y = (
+    LOCAL * BATCH + i * BATCH for i in range(_PLANES))
+BATCH_FLOATS = LOCAL * BATCH
+# Which patches each instance meets, bits as whole numbers: those of some rows of patches in a plane,
+# as many as float32 holds exactly
+_MET = (LOCAL + _PLANES) * BATCH
+_MET_ROWS = 24 // PATCHES_X
+_MET_PLANES = -(-PATCHES_Y // _MET_ROWS)
 _MARGIN = np.float32(1e-3)  # pixels; more than the rounding of a pixel coordinate
 _T, _FINAL, _LAST, _RED, _GREEN, _BLUE, _DEPTH = (i * TILE_PIXELS for i in range(7))
 _COUNTS = 7 * TILE_PIXELS  # 1 where a pixel counts in the scores, 0 elsewhere
-_ALPHA = 8 * TILE_PIXELS  # alpha of a row for each instance of a batch
-# Scores of each instance of a batch, column by column: sums along each row take three times as long
-_HITS, _SUMS, _PEAKS = (_ALPHA + i * BATCH * LANES for i in range(1, 4))
-_BATCH = _ALPHA + 4 * BATCH * LANES
-FORWARD_FLOATS = _BATCH + BATCH_FLOATS
+# Scores of each instance of a batch, lane by lane: sums over each patch take three times as long
+_HITS, _SUMS, _PEAKS = (8 * TILE_PIXELS + i * BATCH * LANES for i in range(3))
+_BATCH = 8 * TILE_PIXELS + 3 * BATCH * LANES
+FORWARD_FLOATS = _BATCH + _MET + _MET_PLANES * BATCH
 _ONE = np.float32(1)
 
 
 @inlined
-def load_batch(batch, records, members, first, count, left, top):
-    """Fills `batch` with `count` instances of the tile whose first pixel is (left, top)."""
-    for k in range(count):
-        at, to = np.int64(members[first + k]) * RECORD, k * LOCAL
-        # in float64: far from the mean of a needle the two terms of u nearly cancel
-        dx = left + 0.5 - records[at + MEAN_X] - np.float64(records[at + MEAN_X_LOW])
-        dy = top + 0.5 - records[at + MEAN_Y] - np.float64(records[at + MEAN_Y_LOW])
-        u_x, u_y, v_y = records[at + U_X], records[at + U_Y], records[at + V_Y]
-        batch[to + L_U_0] = np.float32(u_x * dx + u_y * dy)
-        batch[to + L_U_X], batch[to + L_U_Y], batch[to + L_V_Y] = u_x, u_y, v_y
-        batch[to + L_V_0] = np.float32(v_y * dy)
-        batch[to + L_POWER] = records[at + LOG2_OPACITY]
-        batch[to + L_RED] = records[at + RED]
-        batch[to + L_GREEN] = records[at + GREEN]
-        batch[to + L_BLUE] = records[at + BLUE]
-        batch[to + L_DEPTH] = records[at + DEPTH]
-        ranges = _RANGES + k
-        batch[ranges] = np.float32(dx)
-        batch[ranges + BATCH] = np.float32(dy)
-        batch[ranges + 2 * BATCH] = records[at + EXTENT_X]
-        batch[ranges + 3 * BATCH] = records[at + EXTENT_Y]
-        batch[ranges + 4 * BATCH] = records[at + SLOPE_Y]
-        batch[ranges + 5 * BATCH] = records[at + HALF_Y]
-        batch[ranges + 6 * BATCH] = u_x
-        batch[ranges + 7 * BATCH] = u_y
-    for k in range(0, BATCH, LANES):
-        find_rows(batch, k, count)
+def load_instance(batch, records, k, member, left, top):
+    """Copies a Gaussian into place k of `batch`; returns the offset of the tile's first pixel.
+
+    That is (left, top), and the offset is from the Gaussian's mean.
+    """
+    at, to = np.int64(member) * RECORD, k * LOCAL
+    for i in range(0, RECORD, LANES):
+        store(batch, to + i, load(records, at + i))
+    # in float64: far from the mean of a needle the two terms of u nearly cancel
+    dx = left + 0.5 - records[at + MEAN_X] - np.float64(records[at + MEAN_X_LOW])
+    dy = top + 0.5 - records[at + MEAN_Y] - np.float64(records[at + MEAN_Y_LOW])
+    batch[to + U_0] = np.float32(records[at + U_X] * dx + records[at + U_Y] * dy)
+    batch[to + V_0] = np.float32(records[at + V_Y] * dy)
+    return dx, dy
 
 
 @inlined
-def find_rows(batch, k, count):
-    """Finds the rows where the ellipses of instances k to k + LANES meet the tile's columns."""
-    at = _RANGES + k
-    dx, dy = load(batch, at), load(batch, at + BATCH)
-    extent_x, extent_y = load(batch, at + 2 * BATCH), load(batch, at + 3 * BATCH)
-    slope_y, half = load(batch, at + 4 * BATCH), load(batch, at + 5 * BATCH)
-    slope_x = -load(batch, at + 7 * BATCH) / load(batch, at + 6 * BATCH)
-    slope_x = select(half < FAR, slope_x, 0.0)  # a box without an ellipse has no slope
-    low = maximum(dx, -extent_x)
-    high = minimum(dx + (TILE_WIDTH - 1), extent_x)
-    inside = (low <= high) & (lane_numbers() < count - k)
-    per_extent = 1.0 / extent_x
-    lowest = slope_x * extent_y  # offset of the ellipse's lowest point, where y is greatest
-    x = minimum(maximum(lowest, low), high)
-    across = x * per_extent
-    bottom = slope_y * x + half * square_root(maximum(1.0 - across * across, 0.0))
-    x = minimum(maximum(-lowest, low), high)
-    across = x * per_extent
-    above = slope_y * x - half * square_root(maximum(1.0 - across * across, 0.0))
-    above, bottom = maximum(above, -extent_y), minimum(bottom, extent_y)
-    first = -floor(dy - above + _MARGIN)  # the smallest row r with dy + r >= above
-    end = floor(bottom - dy + _MARGIN) + 1.0
-    first = maximum(first, 0.0)
-    end = minimum(end, TILE_HEIGHT)
-    store(batch, FIRST_ROW + k, select(inside, first, 0.0))
-    store(batch, END_ROW + k, select(inside, end, 0.0))
+def load_batch(batch, patches, records, members, first, count, left, top):
+    """Fills `batch` with `count` instances of the tile whose first pixel is (left, top).
+
+    Written are also `patches` [PATCHES] uint64, which instances meet each patch, instance 0 in the
+    lowest bit.
+    """
+    for k in range(count):
+        dx, dy = load_instance(batch, records, k, members[first + k], left, top)
+        to = k * LOCAL
+        batch[_DX + k], batch[_DY + k] = np.float32(dx), np.float32(dy)
+        batch[_EXTENT_X + k], batch[_EXTENT_Y + k] = batch[to + EXTENT_X], batch[to + EXTENT_Y]
+        batch[_SLOPE_Y + k], batch[_HALF_Y + k] = batch[to + SLOPE_Y], batch[to + HALF_Y]
+        batch[_U_X + k], batch[_U_Y + k] = batch[to + U_X], batch[to + U_Y]
+        batch[_V_Y + k] = batch[to + V_Y]
+    for patch in range(PATCHES):
+        patches[patch] = np.uint64(0)
+    for k in range(0, count, LANES):
+        find_patches(batch, patches, k, count)
+
+
+@inlined
+def find_patches(batch, patches, k, count):
+    """Adds which of the instances k to k + LANES meet each patch: exact up to rounding.
+
+    Over the rows of pixels of a row of patches an ellipse covers one interval of x.
+    """
+    dx, dy = load(batch, _DX + k), load(batch, _DY + k)
+    extent_x, extent_y = load(batch, _EXTENT_X + k), load(batch, _EXTENT_Y + k)
+    per_u = 1.0 / load(batch, _U_X + k)
+    slope, half = -load(batch, _U_Y + k) * per_u, extent_y * load(batch, _V_Y + k) * per_u
+    square = load(batch, _HALF_Y + k) >= FAR  # a box without an ellipse
+    slope, half = select(square, 0.0, slope), select(square, fill(FAR), half)
+    rightmost = load(batch, _SLOPE_Y + k) * extent_x  # y offset of the rightmost point
+    per_extent = 1.0 / extent_y
+    valid = lane_numbers() < count - k
+    met = fill(0.0)
+    for row in range(PATCHES_Y):
+        if row % _MET_ROWS == 0:
+            met = fill(0.0)
+        low = dy + np.float32(row * PATCH_HEIGHT)
+        high = minimum(low + np.float32(PATCH_HEIGHT - 1), extent_y)
+        low = maximum(low, -extent_y)
+        y = minimum(maximum(rightmost, low), high)
+        along = y * per_extent
+        right = slope * y + half * square_root(maximum(1.0 - along * along, 0.0))
+        y = minimum(maximum(-rightmost, low), high)
+        along = y * per_extent
+        left = slope * y - half * square_root(maximum(1.0 - along * along, 0.0))
+        # columns of pixels of the tile; the first one in is the next whole number
+        left = -floor(dx - maximum(left, -extent_x) + _MARGIN)
+        right = floor(minimum(right, extent_x) - dx + _MARGIN)
+        inside = (low <= high) & (left <= right) & valid
+        for column in range(PATCHES_X):
+            meets = (inside & (left <= np.float32((column + 1) * PATCH_WIDTH - 1))
+                     & (right >= np.float32(column * PATCH_WIDTH)))
+            patch = row * PATCHES_X + column
+            patches[patch] |= bits(meets) << np.uint64(k)
+            met = met + select(meets, fill(np.float32(1 << patch % (_MET_ROWS * PATCHES_X))), 0.0)
+        if (row + 1) % _MET_ROWS == 0 or row == PATCHES_Y - 1:
+            store(batch, _MET + row // _MET_ROWS * BATCH + k, met)
 
 
 @inlined
 def log2_alpha(batch, at, column, row):
-    """Returns u, v and log2 alpha along a row of pixels: the same bits in both passes."""
-    u = fma(broadcast(batch, at + L_U_X), column,
-            fma(broadcast(batch, at + L_U_Y), row, broadcast(batch, at + L_U_0)))
-    v = fma(broadcast(batch, at + L_V_Y), row, broadcast(batch, at + L_V_0))
-    return u, v, fma(-v, v, fma(-u, u, broadcast(batch, at + L_POWER)))
+    """Returns u, v and log2 alpha at pixels of a tile: the same bits in both passes."""
+    u = fma(broadcast(batch, at + U_X), column,
+            fma(broadcast(batch, at + U_Y), row, broadcast(batch, at + U_0)))
+    v = fma(broadcast(batch, at + V_Y), row, broadcast(batch, at + V_0))
+    return u, v, fma(-v, v, fma(-u, u, broadcast(batch, at + LOG2_OPACITY)))
 
 
 @inlined
-def row_bits(batch, row):
-    """Returns which instances of the batch meet a row, instance 0 in the lowest bit."""
-    mask = np.uint64(0)
-    for k in range(0, BATCH, LANES):
-        meets = (load(batch, FIRST_ROW + k) <= row) & (load(batch, END_ROW + k) > row)
-        mask |= bits(meets) << np.uint64(k)
-    return mask
+def patch_pixels(patch):
+    """Returns the columns and rows of a patch's pixels in their tile."""
+    column = np.float32(patch % PATCHES_X * PATCH_WIDTH)
+    row = np.float32(patch // PATCHES_X * PATCH_HEIGHT)
+    down = floor(lane_numbers() * np.float32(1 / PATCH_WIDTH))
+    return column + (lane_numbers() - PATCH_WIDTH * down), row + down
 
 
 @inlined
@@ -136,13 +160,20 @@ def load_counts(scratch, counting, width, height, left, top):
             ignored = False
             if len(counting) > 0 and top + r < height and left + i < width:
                 ignored = not counting[(top + r) * width + left + i]
-            scratch[_COUNTS + r * TILE_WIDTH + i] = np.float32(0) if ignored else _ONE
+            scratch[_COUNTS + pixel(i, r)] = np.float32(0) if ignored else _ONE
+
+
+@inlined
+def pixel(column, row):
+    """Returns where a pixel of a tile lies in its planes."""
+    patch = row // PATCH_HEIGHT * PATCHES_X + column // PATCH_WIDTH
+    return patch * LANES + row % PATCH_HEIGHT * PATCH_WIDTH + column % PATCH_WIDTH
 
 
 @kernel
 def composite(counter, tile_start, members, records, width, height, tiles_x, cutoff, t_min,
-              background, rgb, alpha, depth, final, last, scores, counting, slots, hits, weights,
-              peaks, evaluated, scratch):
+              background, rgb, alpha, depth, final, last, met, scores, counting, slots, hits,
+              weights, peaks, evaluated, scratch):
     """Composites tile by tile.
 
     Args:
@@ -153,8 +184,9 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
         cutoff: log2 of the least alpha of a fragment.
         t_min: transmittance before which a pixel stops.
         rgb: [H * W * 3] out; [H * W] out are alpha, and depth, the sum of alpha T z.
-        final: [tiles * TILE_PIXELS] out, T at the end.
+        final: [tiles * TILE_PIXELS] out, T at the end, patch by patch.
         last: [tiles * TILE_PIXELS] out, number of the last instance that contributed, from 1.
+        met: [E] uint32 out, which patches each instance meets, as far as any were looked at.
         scores: write hits, weights and peaks.
         counting: [H * W] which pixels count in the scores, or empty for all.
         slots: [E] slot of each instance.
@@ -163,8 +195,8 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
         evaluated: [1] pairs of an instance and a pixel are added.
     """
     tiles = len(tile_start) - 1
-    column = lane_numbers()
     batch = scratch[_BATCH:]
+    patches = np.zeros(PATCHES, np.uint64)
     pairs = 0
     while True:
         tile = fetch_add(counter, 0, 1)
@@ -172,14 +204,13 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
             break
         left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
         alive = np.uint64(0)
-        for r in range(TILE_HEIGHT):
-            at = r * TILE_WIDTH
-            inside = select(column < width - left, fill(1.0), fill(0.0))
-            if top + r >= height:
-                inside = fill(0.0)
-            else:
-                alive |= np.uint64(1) << np.uint64(r)
-            store(scratch, _T + at, inside)
+        for patch in range(PATCHES):
+            at = patch * LANES
+            column, row = patch_pixels(patch)
+            inside = (column < width - left) & (row < height - top)
+            if bits(inside) != 0:
+                alive |= np.uint64(1) << np.uint64(patch)
+            store(scratch, _T + at, select(inside, fill(1.0), 0.0))
             store(scratch, _FINAL + at, fill(1.0))
             for plane in range(2, 7):
                 store(scratch, plane * TILE_PIXELS + at, fill(0.0))
@@ -188,43 +219,43 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
             load_counts(scratch, counting, width, height, left, top)
         begin, end = tile_start[tile], tile_start[tile + 1]
         for first in range(begin, end, BATCH):
-            load_batch(batch, records, members, first, min(BATCH, end - first), left, top)
-            for r in range(TILE_HEIGHT):
-                if not (alive >> np.uint64(r)) & np.uint64(1):
-                    continue
-                row = fill(np.float32(r))
-                meets = row_bits(batch, row)
+            count = min(BATCH, end - first)
+            load_batch(batch, patches, records, members, first, count, left, top)
+            for k in range(count):
+                mask = np.uint64(0)
+                for plane in range(_MET_PLANES):
+                    mask |= np.uint64(np.int64(batch[_MET + plane * BATCH + k])) << np.uint64(
+                        plane * _MET_ROWS * PATCHES_X)
+                met[first + k] = mask
+            remaining = alive
+            while remaining != 0:
+                patch = lowest_bit(remaining)
+                remaining &= remaining - np.uint64(1)
+                meets = patches[patch]
                 if meets == 0:
                     continue
+                column, row = patch_pixels(patch)
                 pairs += count_bits(meets) * LANES
-                at = r * TILE_WIDTH
+                at = patch * LANES
                 T, final_T = load(scratch, _T + at), load(scratch, _FINAL + at)
                 latest, z = load(scratch, _LAST + at), load(scratch, _DEPTH + at)
                 red, green = load(scratch, _RED + at), load(scratch, _GREEN + at)
                 blue = load(scratch, _BLUE + at)
-                # two short chains of operations overlap better than one long one
-                left_over, to = meets, _ALPHA
-                while left_over != 0:
-                    k = lowest_bit(left_over)
-                    left_over &= left_over - np.uint64(1)
-                    _, _, power = log2_alpha(batch, k * LOCAL, column, row)
+                while meets != 0:
+                    k = lowest_bit(meets)
+                    meets &= meets - np.uint64(1)
+                    i = k * LOCAL
+                    _, _, power = log2_alpha(batch, i, column, row)
                     a = exp2(minimum(power, LOG2_ALPHA_MAX))
-                    store(scratch, to, select(power >= cutoff, a, 0.0))
-                    to += LANES
-                left_over, to = meets, _ALPHA
-                while left_over != 0:
-                    k = lowest_bit(left_over)
-                    left_over &= left_over - np.uint64(1)
-                    i, a = k * LOCAL, load(scratch, to)
-                    to += LANES
+                    a = select(power >= cutoff, a, 0.0)
                     weight = T * a
                     T = T * (1.0 - a)
                     live = t_min <= T
                     weight = select(live, weight, 0.0)
-                    red = fma(weight, broadcast(batch, i + L_RED), red)
-                    green = fma(weight, broadcast(batch, i + L_GREEN), green)
-                    blue = fma(weight, broadcast(batch, i + L_BLUE), blue)
-                    z = fma(weight, broadcast(batch, i + L_DEPTH), z)
+                    red = fma(weight, broadcast(batch, i + RED), red)
+                    green = fma(weight, broadcast(batch, i + GREEN), green)
+                    blue = fma(weight, broadcast(batch, i + BLUE), blue)
+                    z = fma(weight, broadcast(batch, i + DEPTH), z)
                     final_T = select(live, T, final_T)
                     hit = weight > 0.0
                     latest = select(hit, fill(np.float32(first - begin + k + 1)), latest)
@@ -243,9 +274,9 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                 store(scratch, _BLUE + at, blue)
                 store(scratch, _DEPTH + at, z)
                 if bits(t_min <= T) == 0:
-                    alive &= ~(np.uint64(1) << np.uint64(r))
+                    alive &= ~(np.uint64(1) << np.uint64(patch))
             if scores:
-                for k in range(min(BATCH, end - first)):
+                for k in range(count):
                     slot = slots[first + k]
                     hits[slot] = np.int32(total(load(scratch, _HITS + k * LANES)))
                     weights[slot] = total(load(scratch, _SUMS + k * LANES))
@@ -253,20 +284,18 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                 clear_scores(scratch)
             if alive == 0:
                 break
-        for r in range(TILE_HEIGHT):
-            at = r * TILE_WIDTH
-            y = top + r
+        for at in range(0, TILE_PIXELS, LANES):
             store(final, tile * TILE_PIXELS + at, load(scratch, _FINAL + at))
             store(last, tile * TILE_PIXELS + at, load(scratch, _LAST + at))
-            if y < height:
-                for i in range(min(TILE_WIDTH, width - left)):
-                    p = y * width + left + i
-                    t = scratch[_FINAL + at + i]
-                    rgb[3 * p] = scratch[_RED + at + i] + t * background[0]
-                    rgb[3 * p + 1] = scratch[_GREEN + at + i] + t * background[1]
-                    rgb[3 * p + 2] = scratch[_BLUE + at + i] + t * background[2]
-                    alpha[p] = _ONE - t
-                    depth[p] = scratch[_DEPTH + at + i]
+        for r in range(min(TILE_HEIGHT, height - top)):
+            for i in range(min(TILE_WIDTH, width - left)):
+                p, at = (top + r) * width + left + i, pixel(i, r)
+                t = scratch[_FINAL + at]
+                rgb[3 * p] = scratch[_RED + at] + t * background[0]
+                rgb[3 * p + 1] = scratch[_GREEN + at] + t * background[1]
+                rgb[3 * p + 2] = scratch[_BLUE + at] + t * background[2]
+                alpha[p] = _ONE - t
+                depth[p] = scratch[_DEPTH + at]
     fetch_add(evaluated, 0, pairs)
 
 

@@ -18,9 +18,13 @@ from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     absolute, fill, load, maximum, minimum, select, square_root, store, transpose)
 
-TILE_WIDTH = LANES  # one vector is one row of pixels of a tile
-TILE_HEIGHT = 16
+TILE_WIDTH, TILE_HEIGHT = 2 * LANES, 16
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+# One vector is a patch of pixels: an ellipse of 8 x 8 pixels meets 8 patches of 4 x 4, but 12 rows
+# of 16. Pixels of a tile lie patch by patch, along rows of patches.
+PATCH_WIDTH, PATCH_HEIGHT = 4, LANES // 4
+PATCHES_X, PATCHES_Y = TILE_WIDTH // PATCH_WIDTH, TILE_HEIGHT // PATCH_HEIGHT
+PATCHES = PATCHES_X * PATCHES_Y  # 32 whatever LANES is: a bit each
 
 RECORD = 16  # floats a Gaussian
 MEAN_X, MEAN_Y = 0, 1  # pixels
@@ -36,7 +40,7 @@ SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
 MEAN_X_LOW, MEAN_Y_LOW = 14, 15
 
 FAR = 1e9  # pixels; the half of an ellipse that only its box cuts
-BATCH = 32  # instances of a tile that are prepared at a time
+BATCH = 64  # instances of a tile that are prepared at a time, a bit each
 
 # What the backward pass sums over the pixels of an instance, in its slot; s = alpha dL/dalpha.
 SLOT = 16

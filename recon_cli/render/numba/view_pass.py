@@ -187,6 +187,7 @@ class ViewPass:
         tiles = len(self.tile_start) - 1
         self.final = self.take("final", tiles * TILE_PIXELS)
         self.last = self.take("last", tiles * TILE_PIXELS)
+        self.met = self.take("met", len(self.members), np.uint32)
         evaluated = np.zeros(1, np.int64)
         scored = len(self.members) if settings.scores else 0
         self.hits = self.take("hits", scored, np.int32)
@@ -200,8 +201,8 @@ class ViewPass:
             composite, self.tile_start, self.members, self.records, self.view.width,
             self.view.height, self.tiles_x, self.cutoff,
             np.float32(settings.approximation.transmittance_min), self.background, image.rgb,
-            image.alpha, image.depth, self.final, self.last, settings.scores, self.counting,
-            self.slots, self.hits, self.weights, self.peaks, evaluated)
+            image.alpha, image.depth, self.final, self.last, self.met, settings.scores,
+            self.counting, self.slots, self.hits, self.weights, self.peaks, evaluated)
         self.pairs_forward = int(evaluated[0])
 
     def backward(
@@ -219,7 +220,7 @@ class ViewPass:
         pool.run(
             composite_backward, self.tile_start, self.members, self.slots, self.records,
             self.view.width, self.view.height, self.tiles_x, self.cutoff, self.background,
-            self.final, self.last, image.rgb, image.alpha, image.depth, details, loo,
+            self.final, self.last, self.met, image.rgb, image.alpha, image.depth, details, loo,
             self.counting, sums, evaluated)
         self.pairs_backward = int(evaluated[0])
         pool.run(
