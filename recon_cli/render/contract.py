@@ -106,6 +106,7 @@ class StepOptions:
     details: bool = False  # absolute_grad and variance too
     scores: bool = False  # hits and blend weights too, over the mask; else they mean nothing
     loo: bool = False  # likewise
+    harmonics: bool = True  # without, the gradient of sh_rest may be left as it is
 
 
 class Renderer(Protocol):

@@ -112,7 +112,8 @@ class Stepper:
             degree, schedule.config.ssim_weight,
             details=schedule.gathers(iteration) and self._strategy.variance,
             scores=importance is not None and importance.weighs,
-            loo=importance is not None and importance.leaves_out)
+            loo=importance is not None and importance.leaves_out,
+            harmonics=schedule.moves_sh(iteration) or state.poses is not None)
         result.loss[place], statistics = self._compute(
             state.optimizer, view, options,
             None if state.exposure is None else state.exposure.gain(index))

@@ -92,6 +92,21 @@ def test_the_fused_step_gives_the_scores_of_the_renderer():
                 getattr(step.statistics, name), getattr(output.statistics, name)), name
 
 
+def test_without_harmonics_their_gradient_is_left_alone_and_the_others_are_the_same():
+    camera = camera_at(60, 41)
+    truth = np.random.default_rng(0).integers(0, 256, (41, 60, 3), np.uint8)
+    splats = random_splats(200, seed=13, dtype=torch.float32)
+    whole, part = (splats.map(lambda tensor: torch.full_like(tensor, 7.0)) for _ in range(2))
+    step = PhotometricStep()
+    for gradients, harmonics in ((whole, True), (part, False)):
+        step(splats, gradients, camera, TargetImage(truth),
+             StepOptions(3, 0.2, harmonics=harmonics))
+    assert (part.sh_rest == 7).all()
+    assert not (whole.sh_rest == 7).any()
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh_dc"):
+        assert torch.equal(getattr(whole, name), getattr(part, name)), name
+
+
 def test_asking_for_scores_changes_no_gradient():
     camera = camera_at(60, 41)
     truth = np.random.default_rng(0).integers(0, 256, (41, 60, 3), np.uint8)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from recon_cli.render.numba.kernel import kernel
+from recon_cli.render.numba.kernel import inlined, kernel
 from recon_cli.render.numba.simd_functions import fetch_add
 from recon_cli.render.numba.soa import (
     BLOCK, EXTENT_X, EXTENT_Y, FAR, MEAN_X, MEAN_Y, RECORD, SLOPE_Y, TILE_HEIGHT, TILE_WIDTH, U_X,
@@ -38,18 +38,57 @@ def row_starts(rows, starts):
     starts[len(starts) - 1] = total
 
 
+@inlined
+def order_by_depth(keys, rows, order, spare):
+    """Writes the Gaussians that have rows of tiles in order of depth; returns how many.
+
+    Ties are ordered by index. Radix sort, four passes of 11 bits. `keys` are the bits of positive
+    float64 depths, which are ordered as the numbers are. float32 depths would tie where exact ones
+    do not, and draw overlapping Gaussians in the wrong order.
+    """
+    n = 0
+    for j in range(len(keys)):
+        if rows[2 * j + 1] > 0:
+            order[n] = j
+            n += 1
+    histogram = np.zeros((_PASSES, _DIGITS), np.int64)
+    for i in range(n):
+        key = keys[order[i]] >> _DROPPED
+        for digit in range(_PASSES):
+            histogram[digit, (key >> np.uint64(_DIGIT * digit)) & _DIGIT_MASK] += 1
+    for digit in range(_PASSES):
+        total = 0
+        for b in range(_DIGITS):
+            count = histogram[digit, b]
+            histogram[digit, b] = total
+            total += count
+        for i in range(n):
+            j = order[i]
+            b = (keys[j] >> (_DROPPED + np.uint64(_DIGIT * digit))) & _DIGIT_MASK
+            spare[histogram[digit, b]] = j
+            histogram[digit, b] += 1
+        order, spare = spare, order
+    return n  # after an even number of passes the result lies in `order`
+
+
 @kernel
-def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
-    """Writes for each row of tiles of each Gaussian the first tile and the end.
+def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles, keys, order, spare,
+               visible):
+    """Writes for each row of tiles of each Gaussian the first tile and the end, and sorts by depth.
 
     `rows` [M * 2] are first row and number of rows, `starts` [M + 1] where the spans of each begin.
     With `square` the whole box counts, not the ellipse in it. Written are `spans` [S * 2] and
-    `tiles` [M], the number of tiles of each Gaussian.
+    `tiles` [M], the number of tiles of each Gaussian. Meanwhile one thread sorts: see
+    `order_by_depth`, whose result is `visible` [1].
     """
     n = len(tiles)
     blocks = (n + BLOCK - 1) // BLOCK
     while True:
         block = fetch_add(counter, 0, 1)
+        if block == 0:
+            visible[0] = order_by_depth(keys, rows, order, spare)
+            continue
+        block -= 1
         if block >= blocks:
             break
         for j in range(block * BLOCK, min((block + 1) * BLOCK, n)):
@@ -89,39 +128,6 @@ def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles):
                 spans[2 * (starts[j] + k) + 1] = end
                 count += end - first
             tiles[j] = count
-
-
-@kernel
-def order_by_depth(keys, tiles, order, spare):
-    """Writes the Gaussians that have tiles in order of depth, ties by index; returns how many.
-
-    Radix sort, four passes of 11 bits. `keys` are the bits of positive float64 depths, which are
-    ordered as the numbers are. float32 depths would tie where exact ones do not, and draw
-    overlapping Gaussians in the wrong order.
-    """
-    n = 0
-    for j in range(len(tiles)):
-        if tiles[j] > 0:
-            order[n] = j
-            n += 1
-    histogram = np.zeros((_PASSES, _DIGITS), np.int64)
-    for i in range(n):
-        key = keys[order[i]] >> _DROPPED
-        for digit in range(_PASSES):
-            histogram[digit, (key >> np.uint64(_DIGIT * digit)) & _DIGIT_MASK] += 1
-    for digit in range(_PASSES):
-        total = 0
-        for b in range(_DIGITS):
-            count = histogram[digit, b]
-            histogram[digit, b] = total
-            total += count
-        for i in range(n):
-            j = order[i]
-            b = (keys[j] >> (_DROPPED + np.uint64(_DIGIT * digit))) & _DIGIT_MASK
-            spare[histogram[digit, b]] = j
-            histogram[digit, b] += 1
-        order, spare = spare, order
-    return n  # after an even number of passes the result lies in `order`
 
 
 @kernel

@@ -9,8 +9,8 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
 s is zero where alpha was clamped. Gradients by mean and covariance are moments of s in the whitened
 coordinates (u, v), which are of order one even for needles.
 
-An instance is the outer loop: its sums stay in registers while its patches pass by, and go to a slot
-of its own at the end: no atomics and the same bits every time.
+An instance is the outer loop: its sums stay in registers while its patches pass by, and go to a
+slot of its own at the end: no atomics and the same bits every time.
 """
 
 from __future__ import annotations

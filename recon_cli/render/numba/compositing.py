@@ -32,8 +32,8 @@ _PLANES = 9
 _DX, _DY, _EXTENT_X, _EXTENT_Y, _SLOPE_Y, _HALF_Y, _U_X, _U_Y, _V_Y = (
     LOCAL * BATCH + i * BATCH for i in range(_PLANES))
 BATCH_FLOATS = LOCAL * BATCH
-# Which patches each instance meets, bits as whole numbers: those of some rows of patches in a plane,
-# as many as float32 holds exactly
+# Which patches each instance meets, bits as whole numbers: a plane for as many rows of patches as
+# float32 holds exactly
 _MET = (LOCAL + _PLANES) * BATCH
 _MET_ROWS = 24 // PATCHES_X
 _MET_PLANES = -(-PATCHES_Y // _MET_ROWS)

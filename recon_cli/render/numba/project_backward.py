@@ -35,10 +35,13 @@ GRADIENT_FLOATS = (_PULL + 15) * LANES
 
 @kernel
 def project_backward(counter, ids, block_starts, slot_start, sums, depths, means, quats, log_scales,
-                     logits, sh_dc, sh_rest, stride, terms, view, records, g_means, g_quats,
-                     g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad, absolute_grad,
-                     variance, loo, scratch):
-    """Writes the gradients of all Gaussians, zero for those that were not seen."""
+                     logits, sh_dc, sh_rest, stride, terms, harmonics, view, records, g_means,
+                     g_quats, g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad,
+                     absolute_grad, variance, loo, scratch):
+    """Writes the gradients of all Gaussians, zero for those that were not seen.
+
+    Without `harmonics`, g_sh_rest is left alone.
+    """
     n = len(logits)
     blocks = len(block_starts) - 1
     while True:
@@ -51,7 +54,7 @@ def project_backward(counter, ids, block_starts, slot_start, sums, depths, means
         clear(g_log_scales, 3 * low, 3 * high)
         clear(g_logits, low, high)
         clear(g_sh_dc, 3 * low, 3 * high)
-        if terms > 0:
+        if harmonics and terms > 0:
             clear(g_sh_rest, min(stride * low, len(sh_rest)), min(stride * high, len(sh_rest)))
         clear(means2d_grad, 2 * low, 2 * high)
         clear(absolute_grad, 2 * low, 2 * high)
@@ -77,7 +80,7 @@ def project_backward(counter, ids, block_starts, slot_start, sums, depths, means
                     j = first + min(k, count - 1)
                     store(scratch, (SQUARE + k) * LANES, load(records, j * RECORD + plane))
                 transpose(scratch, SQUARE * LANES, scratch, (_RECORD + plane) * LANES)
-            colour_gradient(scratch, used)
+            colour_gradient(scratch, used, harmonics)
             shape_gradient(scratch, view)
             for k in range(count):
                 j = first + k
@@ -96,7 +99,7 @@ def project_backward(counter, ids, block_starts, slot_start, sums, depths, means
                     absolute_grad[2 * i + c] = scratch[(G_ABSOLUTE + c) * LANES + k]
                 variance[i] = scratch[G_VARIANCE * LANES + k]
                 loo[i] = scratch[(_SUMS + LEAVE_ONE_OUT) * LANES + k]
-            if used > 0:
+            if harmonics and used > 0:
                 planes_to_rows(scratch, G_REST, SQUARE, used, ids, first, count, slot_start,
                                g_sh_rest, stride)
 
@@ -120,7 +123,7 @@ def plane(scratch, number):
 
 
 @inlined
-def colour_gradient(scratch, terms):
+def colour_gradient(scratch, terms, harmonics):
     """Writes the gradients of the coefficients, and into G_MEAN what the direction pulls."""
     red = select(plane(scratch, _RECORD + RED) > 0.0, plane(scratch, _SUMS + GRAD_RED), 0.0)
     green = select(plane(scratch, _RECORD + GREEN) > 0.0, plane(scratch, _SUMS + GRAD_GREEN), 0.0)
@@ -132,17 +135,18 @@ def colour_gradient(scratch, terms):
         for c in range(3):
             store(scratch, (G_MEAN + c) * LANES, 0.0 * red)
         return
-    for k in range(3 * terms, 45):  # degrees that are not in use
+    for k in range(3 * terms, 45 if harmonics else 0):  # degrees that are not in use
         store(scratch, (G_REST + k) * LANES, fill(0.0))
     dx, dy, dz = plane(scratch, P_DX), plane(scratch, P_DY), plane(scratch, P_DZ)
     per_length = 1.0 / square_root(maximum(dx * dx + dy * dy + dz * dz, 1e-37))
     x, y, z = dx * per_length, dy * per_length, dz * per_length
     write_basis(scratch, P_BASIS * LANES, x, y, z, terms)
     for k in range(terms):
-        basis, at = plane(scratch, P_BASIS + k), G_REST + 3 * k
-        store(scratch, at * LANES, basis * red)
-        store(scratch, (at + 1) * LANES, basis * green)
-        store(scratch, (at + 2) * LANES, basis * blue)
+        if harmonics:
+            basis, at = plane(scratch, P_BASIS + k), G_REST + 3 * k
+            store(scratch, at * LANES, basis * red)
+            store(scratch, (at + 1) * LANES, basis * green)
+            store(scratch, (at + 2) * LANES, basis * blue)
         at = P_REST + 3 * k
         store(scratch, (_PULL + k) * LANES, fma(red, plane(scratch, at), fma(
             green, plane(scratch, at + 1), blue * plane(scratch, at + 2))))

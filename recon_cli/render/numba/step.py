@@ -51,7 +51,8 @@ class PhotometricStep:
         """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
 
         Splats are float32 on the CPU, the photograph's pixels contiguous; sh_rest of `gradients` is
-        left alone at degree 0. A masked pixel counts as one without error, and gets no gradient.
+        left alone at degree 0 and without `options.harmonics`. A masked pixel counts as one without
+        error, and gets no gradient.
         """
         height, width, truth = camera.height, camera.width, target.pixels
         if truth.shape != (height, width, CHANNELS) or not truth.flags.c_contiguous:
@@ -88,7 +89,7 @@ class PhotometricStep:
         view.backward(
             packed, PackedSplats.of(gradients.parameters().values()),
             ImageBuffers(grad_rgb, nothing, nothing), self.statistics, details=options.details,
-            loo=options.loo)
+            loo=options.loo, harmonics=options.harmonics)
         return loss
 
     def _gain_backward(

@@ -163,16 +163,15 @@ class ViewPass:
         binning.row_starts(self.rows, span_starts)
         spans = self.take("spans", 2 * int(span_starts[-1]), np.int32)
         per_gaussian = self.take("tiles", m, np.int32)
+        order, visible = self.take("order", m, np.int32), np.zeros(1, np.int64)
         pool.run(binning.find_spans, self.records, self.rows, span_starts, self.tiles_x,
-                 square, spans, per_gaussian, scratch=False)
-        order = self.take("order", m, np.int32)
-        visible = binning.order_by_depth(
-            self.depths.view(np.uint64), per_gaussian, order, self.take("spare", m, np.int32))
+                 square, spans, per_gaussian, self.depths.view(np.uint64), order,
+                 self.take("spare", m, np.int32), visible, scratch=False)
         self.slot_start = self.take("slot_start", m + 1, np.int64)
         binning.slot_starts(per_gaussian, self.slot_start)
         instances = int(self.slot_start[-1])
-        parts = min(pool.size, 1 + visible // 1000)
-        cuts = np.linspace(0, visible, parts + 1).astype(np.int64)
+        parts = min(pool.size, 1 + int(visible[0]) // 1000)
+        cuts = np.linspace(0, visible[0], parts + 1).astype(np.int64)
         places = np.zeros((parts, tiles), np.int64)
         pool.run(binning.count_tiles, cuts, order, self.rows, span_starts, spans, self.tiles_x,
                  places, scratch=False)
@@ -207,13 +206,13 @@ class ViewPass:
 
     def backward(
         self, splats: PackedSplats, gradients: PackedSplats, image: ImageBuffers,
-        statistics: Statistics, *, details: bool, loo: bool,
+        statistics: Statistics, *, details: bool, loo: bool, harmonics: bool = True,
     ) -> None:
         """Writes gradients and statistics of all N Gaussians for the last forward pass.
 
-        `image` holds the gradients of the loss; sh_rest of `gradients` is left alone at degree 0.
-        With `details` absolute_grad and variance are written too, with `loo` that, over the pixels
-        that counted in the forward pass.
+        `image` holds the gradients of the loss; sh_rest of `gradients` is left alone at degree 0
+        and without `harmonics`. With `details` absolute_grad and variance are written too, with
+        `loo` that, over the pixels that counted in the forward pass.
         """
         sums = self.take("sums", len(self.members) * SLOT)
         evaluated = np.zeros(1, np.int64)
@@ -226,10 +225,10 @@ class ViewPass:
         pool.run(
             project_backward, self.ids, self.block_starts, self.slot_start, sums, self.depths,
             splats.means, splats.quats, splats.log_scales, splats.logit_opacities, splats.sh_dc,
-            splats.sh_rest, splats.stride, self.terms, self.view, self.records, gradients.means,
-            gradients.quats, gradients.log_scales, gradients.logit_opacities, gradients.sh_dc,
-            gradients.sh_rest, flat(statistics.means2d_grad), flat(statistics.absolute_grad),
-            flat(statistics.variance), flat(statistics.loo))
+            splats.sh_rest, splats.stride, self.terms, harmonics, self.view, self.records,
+            gradients.means, gradients.quats, gradients.log_scales, gradients.logit_opacities,
+            gradients.sh_dc, gradients.sh_rest, flat(statistics.means2d_grad),
+            flat(statistics.absolute_grad), flat(statistics.variance), flat(statistics.loo))
 
 
 _MOST_FREE = 2  # passes that are kept for their next use
