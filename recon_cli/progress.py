@@ -53,7 +53,8 @@ class _TqdmBar:
         self._bar = bar
 
     def advance(self, steps: int = 1) -> None:
-        self._bar.update(steps)
+        with tqdm.get_lock():  # threads may report at once
+            self._bar.update(steps)
 
     def note(self, text: str) -> None:
         self._bar.set_postfix_str(text, refresh=False)

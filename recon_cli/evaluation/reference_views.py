@@ -6,6 +6,7 @@ import hashlib
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,7 +38,9 @@ from recon_cli.scene.train_view import TrainView
 
 LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}  # of the models of a workspace
 MASK_HINT = "Run `recon ingest` with masks that hide less."
+_AT_ONCE = 4  # views a thread: renders that are in memory together
 _Item = TypeVar("_Item")
+_View = TypeVar("_View", bound=TrainView)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +78,7 @@ def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:
 
 
 def load_reference_views(
-    views: Sequence[View], max_size: int, ctx: StageContext | None = None
+    views: Sequence[View], max_size: int, ctx: StageContext | None = None, *, threads: int = 1
 ) -> list[ReferenceView]:
     """Returns views with their original pixels, without those whose mask leaves too little.
 
@@ -87,23 +90,24 @@ def load_reference_views(
             raise ConfigError(
                 f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
                 f"needs {MIN_SIDE} pixels a side.", hint="Use a larger --max-size.")
-    return load_views(views, max_size, "not scored", ctx)
+    return load_views(views, max_size, "not scored", ctx, threads=threads)
 
 
 def load_views(
     views: Sequence[View], max_size: int, consequence: str, ctx: StageContext | None = None, *,
-    denoised: bool = False,
+    denoised: bool = False, threads: int = 1,
 ) -> list[ReferenceView]:
     """Returns views without those whose mask leaves too little; a notice gives the consequence."""
-    loaded, hidden = [], []
-    for view in views:
+    def read(view: View) -> ReferenceView:
         camera = fit_camera(view.camera, max_size)
         path = view.denoised if denoised else view.original
         image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
-        if leaves_enough(mask):
-            loaded.append(ReferenceView(camera, image, mask, name=view.name))
-        else:
-            hidden.append(view.name)
+        return ReferenceView(camera, image, mask, name=view.name)
+
+    with ThreadPoolExecutor(threads) as pool:
+        every = list(pool.map(read, views))
+    loaded = [view for view in every if leaves_enough(view.mask)]
+    hidden = [view.name for view in every if not leaves_enough(view.mask)]
     if hidden and ctx is not None:
         ctx.notice(f"{len(hidden)} views are {consequence}: their masks leave fewer than "
                    f"{MIN_PIXELS} pixels: {', '.join(hidden)}")
@@ -120,7 +124,7 @@ def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[
         raise ReconstructionError(
             f"No held-out view has a camera ({len(scene.unregistered_test)} were held out).",
             hint="Run `recon ingest` with another --holdout, such as every:8.")
-    views = load_reference_views(scene.test, max_size, ctx)
+    views = load_reference_views(scene.test, max_size, ctx, threads=ctx.threads)
     if not views:
         raise ReconstructionError(
             f"The masks leave nothing to score of {len(scene.test)} held-out views.",
@@ -137,52 +141,77 @@ def render_on_black(splats: Splats, camera: Camera, sh_degree: int, backend: str
 
 def score_views(
     splats: Splats, views: Sequence[ReferenceView], sh_degree: int, backend: str,
-    *, perceptual: Perceptual | None = None,
+    *, perceptual: Perceptual | None = None, threads: int = 1,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _image: None,
 ) -> RenderScores:
     """Renders every view, at least one, of a model and returns its scores.
 
-    `perceptual` is LPIPS; `on_view` gets each view and its render [H, W, 3], not clamped.
+    `perceptual` is LPIPS; `on_view` gets each view and its render [H, W, 3], not clamped, in one of
+    `threads`.
     """
-    scores, milliseconds, corrected = [], [], []
-    for view in views:
-        start = time.perf_counter()
-        image = _pixels(splats, view, sh_degree, backend)
-        milliseconds.append(1e3 * (time.perf_counter() - start))
+    def score(view: ReferenceView, image: NDArray[np.float32]) -> tuple[ViewScore, float]:
         photo, mask = view.image, view.mask
-        scores.append(ViewScore(
+        scores = ViewScore(
             view.name, psnr(image, photo, mask), psnr(to_uint8(image), photo, mask),
             ssim(image, photo, mask), ssim(image, photo, mask, padded=True),
             perceptual(image, photo) if perceptual is not None and mask is None else None,
-            None if mask is None else float(mask.mean())))
-        corrected.append(corrected_psnr(image, photo, mask))
+            None if mask is None else float(mask.mean()))
         on_view(view, image)
-    return RenderScores(tuple(scores), statistics.fmean(corrected), statistics.median(milliseconds))
+        return scores, corrected_psnr(image, photo, mask)
+
+    milliseconds: list[float] = []
+    scores, corrected = zip(*_measure(
+        splats, views, sh_degree, backend, score, threads=threads, milliseconds=milliseconds),
+        strict=True)
+    return RenderScores(scores, statistics.fmean(corrected), statistics.median(milliseconds))
 
 
 def mean_psnr(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str,
-    *, corrected: bool = False, on_view: Callable[[], None] = lambda: None,
+    *, corrected: bool = False, threads: int = 1, on_view: Callable[[], None] = lambda: None,
 ) -> float:
-    """Returns the mean PSNR in dB over views, at least one."""
+    """Returns the mean PSNR in dB over views, at least one; `on_view` is called in `threads`."""
     metric = corrected_psnr if corrected else psnr
-    values = []
-    for view in views:
-        values.append(metric(_pixels(splats, view, sh_degree, backend), view.image, view.mask))
+
+    def score(view: TrainView, image: NDArray[np.float32]) -> float:
+        value = metric(image, view.image, view.mask)
         on_view()
-    return statistics.fmean(values)
+        return value
+
+    return statistics.fmean(_measure(splats, views, sh_degree, backend, score, threads=threads))
 
 
 def mean_score(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str
 ) -> MeanScore:
     """Returns the mean PSNR and SSIM over views, at least one."""
-    pairs = []
-    for view in views:
-        image = _pixels(splats, view, sh_degree, backend)
-        pairs.append((psnr(image, view.image, view.mask), ssim(image, view.image, view.mask)))
-    mean = np.mean(pairs, axis=0)
+    mean = np.mean(_measure(splats, views, sh_degree, backend, lambda view, image: (
+        psnr(image, view.image, view.mask), ssim(image, view.image, view.mask))), axis=0)
     return MeanScore(float(mean[0]), float(mean[1]))
+
+
+def _measure(
+    splats: Splats, views: Sequence[_View], sh_degree: int, backend: str,
+    score: Callable[[_View, NDArray[np.float32]], _Item], *, threads: int = 1,
+    milliseconds: list[float] | None = None,
+) -> list[_Item]:
+    """Returns the `score` of each view and its render [H, W, 3].
+
+    Scores of some views are taken at once, as most of them keep to one core; meanwhile nothing is
+    rendered, so that `milliseconds`, to which the times of the renders are added, mean something.
+    """
+    results: list[_Item] = []
+    with ThreadPoolExecutor(threads) as pool:
+        for begin in range(0, len(views), _AT_ONCE * threads):
+            group, images = views[begin:begin + _AT_ONCE * threads], []
+            for view in group:
+                start = time.perf_counter()
+                output = render_on_black(splats, view.camera, sh_degree, backend)
+                images.append(np.asarray(output.rgb.cpu().numpy(), np.float32))  # waits for it
+                if milliseconds is not None:
+                    milliseconds.append(1e3 * (time.perf_counter() - start))
+            results += pool.map(score, group, images)
+    return results
 
 
 def mean_psnr_on_device(
@@ -199,12 +228,6 @@ def mean_psnr_on_device(
             error = (errors if counting is None else errors[counting]).mean().item()
             values.append(-10 * np.log10(max(error, 1e-10)))
     return float(np.mean(values))
-
-
-def _pixels(splats: Splats, view: TrainView, sh_degree: int, backend: str) -> NDArray[np.float32]:
-    """Returns the render [H, W, 3] of a view; waits for the device."""
-    output = render_on_black(splats, view.camera, sh_degree, backend)
-    return np.asarray(output.rgb.cpu().numpy(), np.float32)
 
 
 def reference_digest(views: Sequence[ReferenceView]) -> str:

@@ -89,6 +89,7 @@ class _Evaluation:
     ) -> ModelMetrics:
         """Renders and scores one model, and saves its pictures."""
         path, backend = self.folders[model] / "splats.ply", self.ctx.backend
+        threads = self.ctx.threads
         splats = read_ply(path).map(lambda tensor: tensor.to(self.ctx.device))
         degree = self.config.sh_degree
 
@@ -97,9 +98,11 @@ class _Evaluation:
             on_view()
 
         scores = score_views(
-            splats, self.held_out, degree, backend, perceptual=perceptual, on_view=save)
+            splats, self.held_out, degree, backend, perceptual=perceptual, threads=threads,
+            on_view=save)
         seen_db = {
-            name: mean_psnr(splats, views, degree, backend, corrected=self.gains, on_view=on_view)
+            name: mean_psnr(splats, views, degree, backend, corrected=self.gains, threads=threads,
+                            on_view=on_view)
             for name, views in self.training_views.items()}
         log = self.folders[model] / LOG
         seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
@@ -177,7 +180,8 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
     splits = {"training": scene.train if train_config.poses != "on" else (),
               "validation": scene.validation}
     training_views = {name: views for name, split in splits.items() if (
-        views := load_reference_views(evenly_spread(split, _SEEN_VIEWS), size))}
+        views := load_reference_views(
+            evenly_spread(split, _SEEN_VIEWS), size, threads=ctx.threads))}
     folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
     return _Evaluation(

@@ -73,7 +73,8 @@ def _refuse_tiny_units(scene: Scene) -> None:
 def load_views(views: Sequence[View], config: RunConfig, ctx: StageContext) -> list[TrainView]:
     """Returns the views at the training size, without those whose mask leaves next to nothing."""
     return [*reference_views.load_views(
-        views, config.max_size, "not trained on", ctx, denoised=config.images == "denoised")]
+        views, config.max_size, "not trained on", ctx, denoised=config.images == "denoised",
+        threads=ctx.threads)]
 
 
 def write_config(folder: Path, config: RunConfig) -> None:

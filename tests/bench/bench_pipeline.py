@@ -3,7 +3,8 @@
 Runs `recon run VIDEO` with the options after `--` in the workspace OUT, and prints a row for each
 stage and progress bar, and a chart with a line a core. Ten times a second the CPU seconds of all
 processes are sampled, and on Linux also how long their threads waited for a core: what others on
-the machine take is then not counted as idle. `--cold` has the kernels compiled anew.
+the machine take is then not counted as idle, and "alone" is how long all would take without them.
+`--cold` has the kernels compiled anew.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ class Sample:
     def wanted(self) -> float:
         """How many cores were in use, or would have been on an idle machine."""
         return (self.busy + self.waiting) / self.seconds
+
+    def alone(self, cores: int) -> float:
+        """How long its work would have taken where nothing else runs, in seconds."""
+        return self.busy / min(cores, self.wanted) if self.busy else self.seconds
 
 
 class Usage:
@@ -163,8 +168,8 @@ def _stage(workspace: Path) -> str:
 
 def table(samples: Sequence[Sample]) -> str:
     """Returns a row a stage, below it one for each of its phases, in the order of their begin."""
-    rows = ["| stage | wall s | core s | cores, mean | s with one core or none |",
-            "|---|---:|---:|---:|---:|", _row("**all**", samples)]
+    rows = ["| stage | wall s | alone, s | core s | cores, mean | s with one core or none |",
+            "|---|---:|---:|---:|---:|---:|", _row("**all**", samples)]
     for stage in dict.fromkeys(sample.stage for sample in samples):
         own = [sample for sample in samples if sample.stage == stage]
         rows.append(_row(f"**{stage}**", own))
@@ -187,8 +192,10 @@ def _name_phases(samples: Sequence[Sample]) -> dict[str, list[Sample]]:
 def _row(name: str, samples: Sequence[Sample]) -> str:
     wall, busy = sum(one.seconds for one in samples), sum(one.busy for one in samples)
     wanted = sum(one.busy + one.waiting for one in samples)
-    idle = sum(one.seconds for one in samples if one.wanted <= ONE_CORE)
-    return f"| {name} | {wall:.1f} | {busy:.1f} | {wanted / wall:.2f} | {idle:.1f} |"
+    alone = [one.alone(usable_threads()) for one in samples]
+    idle = sum(time for one, time in zip(samples, alone, strict=True) if one.wanted <= ONE_CORE)
+    return (f"| {name} | {wall:.1f} | {sum(alone):.1f} | {busy:.1f} | {wanted / wall:.2f} | "
+            f"{idle:.1f} |")
 
 
 def chart(samples: Sequence[Sample], cores: int) -> str:
