@@ -111,6 +111,10 @@ def _ignore(done: int, total: int) -> None:
     """Keeps no record of progress."""
 
 
+def _leave_idle() -> None:
+    """Does nothing with an idle core."""
+
+
 @dataclass(frozen=True)
 class StageInputs:
     """What a stage may read."""
@@ -130,6 +134,8 @@ class StageContext:
     threads: int = 1  # CPU threads to use
     # called with (done, total) whenever that would survive a crash; shown by `recon status`
     record: Callable[[int, int], None] = _ignore
+    # called where the stage keeps to one core, of another process, from now on
+    on_idle: Callable[[], None] = _leave_idle
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
     ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
 

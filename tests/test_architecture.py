@@ -29,7 +29,7 @@ ALLOWED: dict[str, set[str]] = {
     "config": {"errors", "workspace"},
     "context": {"progress", "scene"},
     "render": {"errors", "machine", "scene"},
-    "io": {"errors", "workspace", "scene"},
+    "io": {"errors", "lazy", "workspace", "scene"},
     "capture": READ,
     "sfm": READ,
     "evaluation": READ | {"context", "render"},

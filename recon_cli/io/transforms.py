@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import make_lens, pose_from_viewmat, viewmat_from_pose
-from recon_cli.io.ply import read_ply_points
 from recon_cli.io.posed import (
     SUFFIXES,
     DepthFile,
@@ -34,6 +33,7 @@ from recon_cli.io.posed import (
     is_file,
     resolve_inside,
 )
+from recon_cli.lazy import load
 from recon_cli.scene.camera import Camera, Lens
 from recon_cli.workspace.atomic import read_json, write_json
 
@@ -394,7 +394,8 @@ def _read_points(
     path = resolve_inside(file.parent, name, f"{file}, ply_file_path,")
     if not is_file(path):
         return None, None, (f"its points {name} are missing",)
-    points, colors = read_ply_points(path)
+    # Late, for it imports torch, which nothing else here needs.
+    points, colors = load("recon_cli.io.ply.read_ply_points")(path)
     if colors is None:
         return points, np.full(points.shape, 128, np.uint8), (f"its points {name} have no colours",)
     return points, colors, ()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 
 from recon_cli import machine
@@ -53,6 +55,7 @@ class Job:
     # called while Gaussians are trained; they do not affect the result
     callbacks: tuple[TrainCallback, ...] = ()
     ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
+    asked: tuple[str, ...] = ()  # the stages that run, where that is known
 
     def inspect(self) -> WorkspaceCheck:
         """Returns the checks of the workspace as it is now."""
@@ -80,7 +83,10 @@ def run_stage(
     out, earlier = workspace.begin(key)
     with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
-        summary: JsonRecord = load(f"{row.module}.run")(config, inputs, out, ctx)
+        run_it = load(f"{row.module}.run")
+        with importing_ahead(job) as on_idle:
+            summary: JsonRecord = run_it(
+                config, inputs, out, dataclasses.replace(ctx, on_idle=on_idle))
     outputs = workspace.seal(row.name)
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
@@ -92,6 +98,36 @@ def run_stage(
     workspace.commit(manifest)
     logger.debug("%s: finished in %.1f s", row.name, run.seconds)
     return manifest
+
+
+@contextmanager
+def importing_ahead(job: Job) -> Iterator[Callable[[], None]]:
+    """Yields a function that imports, in a thread, what the stages need that render: seconds.
+
+    Only for a block whose own thread imports nothing from then on: two threads that import modules
+    which need each other may get one of them half made.
+    """
+    rows = [row for row in job.table if row.renders and row.name in job.asked]
+    threads: list[threading.Thread] = []
+
+    def start() -> None:
+        if rows:
+            import_module("multiprocessing.synchronize")  # which tqdm imports for its first bar
+            threads.append(threading.Thread(target=_import_quietly, args=(rows[0], job.compute)))
+            threads[-1].start()
+
+    try:
+        yield start
+    finally:
+        for thread in threads:
+            thread.join()
+
+
+def _import_quietly(row: Stage, compute: ComputeConfig) -> None:
+    with suppress(Exception):  # of any package; whoever needs it imports it again, and fails then
+        load(f"{row.module}.run")
+        if load("recon_cli.render.registry.renders_on_cpu")(compute.backend, compute.device):
+            load("recon_cli.render.numba.backend.render")
 
 
 @contextmanager

@@ -104,6 +104,7 @@ def run(
         if not again:
             _refuse_to_replace(job, verb, stages)
         with compile_ahead(job, stages, again=again):
+            job = dataclasses.replace(job, asked=tuple(stages))
             for target in targets:
                 for outcome in _bring_up_to_date(job, target, again=again):
                     job.report(outcome)

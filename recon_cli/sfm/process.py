@@ -37,13 +37,16 @@ _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, threa
 class Monitor:
     """Shows one bar a phase, and calls `record` with (done, total) of what would survive a crash.
 
-    Each step counts as many units as there are frames.
+    Each step counts as many units as there are frames. `on_idle` is called once, when what follows
+    keeps one core busy: the mapper, which must give the same bytes for any number of threads.
     """
 
     def __init__(
-        self, job: MappingJob, progress: Progress, record: Callable[[int, int], None]
+        self, job: MappingJob, progress: Progress, record: Callable[[int, int], None],
+        on_idle: Callable[[], None],
     ) -> None:
         self._job, self._progress, self._record = job, progress, record
+        self._on_idle: Callable[[], None] | None = on_idle
         self._phase: Phase | None = None
         self._bar: Bar | None = None
         self._count = self._durable = 0
@@ -76,6 +79,15 @@ class Monitor:
             self._bar.advance(event - self._count)
             self._count = event
             self._record_durable(self._phase)
+        self._note_idle()
+
+    def _note_idle(self) -> None:
+        phase, on_idle = self._phase, self._on_idle
+        if on_idle is None or phase is None:
+            return
+        if phase.name == "mapping" or (phase.name == "matches" and self._count >= phase.total):
+            self._on_idle = None
+            on_idle()
 
     def _record_durable(self, phase: Phase) -> None:
         """Records finished steps, and images or pairs in the database."""
@@ -88,7 +100,10 @@ class Monitor:
         self._record(self._durable, len(steps) * frames)
 
 
-def run_job(job: MappingJob, *, progress: Progress, record: Callable[[int, int], None]) -> None:
+def run_job(
+    job: MappingJob, *, progress: Progress, record: Callable[[int, int], None],
+    on_idle: Callable[[], None],
+) -> None:
     """Runs a job in a process of its own; its results are in the step log. See also `Monitor`.
 
     SfmError if there is no model to trust, the time is up, or the process died; FormatError if a
@@ -100,7 +115,8 @@ def run_job(job: MappingJob, *, progress: Progress, record: Callable[[int, int],
     file = job.out / "job.json"
     job.write(file)
     try:
-        with _start(job, file) as child, Monitor(job, progress, record) as monitor:
+        with _start(job, file) as child, Monitor(
+                job, progress, record, on_idle) as monitor:
             for event in _events(child):
                 if isinstance(event, (ReconError, OSError)):
                     raise event

@@ -54,7 +54,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
-    process.run_job(job, progress=ctx.progress, record=ctx.record)
+    process.run_job(
+        job, progress=ctx.progress, record=ctx.record, on_idle=ctx.on_idle)
     summary = _summary(frames, job)
     _report(summary, frames, ctx)
     return summary

@@ -1,6 +1,12 @@
-"""The mapping process: its failures and its log."""
+"""The mapping process: its failures, its log, and what its events say."""
 
-from recon_cli.sfm.process import last_error
+from types import SimpleNamespace
+
+import pytest
+
+from recon_cli.progress import NullProgress
+from recon_cli.sfm.job import STEPS, Phase
+from recon_cli.sfm.process import Monitor, last_error
 
 GLOG = "I20260101 10:00:00.000001 139 timer.cc:90] Elapsed time: 0.1 [minutes]\n"
 
@@ -40,3 +46,16 @@ def test_an_empty_log_says_nothing(tmp_path):
 def test_only_the_end_of_a_long_log_is_read(tmp_path):
     assert last_error(written(tmp_path, "Error: long ago\n" + GLOG * 2000)) == (
         "Elapsed time: 0.1 [minutes]")
+
+
+@pytest.mark.parametrize(("events", "idle"), [
+    ([Phase("features", 4, 0), 4, Phase("matches", 6, 0), 5], 0),
+    ([Phase("matches", 6, 0), 5, 6, Phase("undistorted", 4, 0), 4], 1),
+    ([Phase("matches", 6, 6)], 1),  # kept from an interrupted run
+    ([Phase("mapping", 4, 0), 2, Phase("matches", 6, 6), Phase("mapping", 4, 0)], 1)])
+def test_a_core_is_reported_idle_once_when_all_pairs_are_matched(events, idle):
+    job, calls = SimpleNamespace(names=("a.png",) * 4, steps=STEPS), []
+    with Monitor(job, NullProgress(), lambda *_: None, lambda: calls.append(1)) as monitor:
+        for event in events:
+            monitor.show(event)
+    assert len(calls) == idle

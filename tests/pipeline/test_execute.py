@@ -1,0 +1,45 @@
+"""What later stages need is imported while a stage leaves a core idle."""
+
+import dataclasses
+import sys
+import threading
+
+import pytest
+from fake_stages import TABLE, job_at
+
+from recon_cli.pipeline.execute import importing_ahead
+
+
+@pytest.fixture
+def rows(tmp_path, monkeypatch):
+    """Returns a table whose training stage stands in a module of the test."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "late_stage.py").write_text(
+        "import threading\nTHREAD = threading.get_ident()\nrun = 1")
+    yield tuple(dataclasses.replace(row, module="late_stage") if row.name == "train" else row
+                for row in TABLE)
+    sys.modules.pop("late_stage", None)
+
+
+def test_the_next_stage_that_renders_is_imported_in_a_thread(tmp_path, rows):
+    job = dataclasses.replace(job_at(tmp_path), table=rows, asked=("sfm", "train", "prune"))
+    with importing_ahead(job) as on_idle:
+        assert "late_stage" not in sys.modules
+        on_idle()
+    assert threading.get_ident() != sys.modules["late_stage"].THREAD
+
+
+@pytest.mark.parametrize("asked", [(), ("ingest", "sfm")])
+def test_nothing_is_imported_for_stages_that_do_not_render(tmp_path, rows, asked):
+    job = dataclasses.replace(job_at(tmp_path), table=rows, asked=asked)
+    with importing_ahead(job) as on_idle:
+        on_idle()
+    assert "late_stage" not in sys.modules
+
+
+def test_what_cannot_be_imported_fails_where_it_is_needed(tmp_path, rows):
+    (tmp_path / "late_stage.py").write_text("raise RuntimeError('half installed')")
+    job = dataclasses.replace(job_at(tmp_path), table=rows, asked=("train",))
+    with importing_ahead(job) as on_idle:
+        on_idle()
+    assert "late_stage" not in sys.modules
