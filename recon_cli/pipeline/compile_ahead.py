@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
+from recon_cli import machine
 from recon_cli.pipeline.execute import Job
 
+_SOURCES = Path(__file__).parents[1] / "render" / "numba"
 _KILL_SECONDS = 10.0
 _LOG_TAIL = 2000  # characters
 
@@ -45,9 +49,24 @@ def compile_ahead(job: Job, stages: Sequence[str], *, again: bool) -> Iterator[N
                              log.read().decode(errors="replace")[-_LOG_TAIL:])
 
 
+def _compiled_since_installed() -> bool:
+    """Returns whether kernels were compiled after their sources and numba were installed.
+
+    A hint, for numba alone, whose import takes a second, knows what it is going to compile: where
+    it misleads, kernels are compiled when they are needed.
+    """
+    numba = importlib.util.find_spec("numba")
+    sources = [*_SOURCES.glob("*.py"), *([Path(numba.origin)] if numba and numba.origin else [])]
+    installed = max(path.stat().st_ctime for path in sources)
+    return any(mark.stat().st_mtime > installed
+               for mark in (machine.cache_root() / "kernels").glob("*/ready"))
+
+
 def _waits(job: Job, stages: Sequence[str], *, again: bool) -> bool:
     """Returns whether the first stage that renders must wait for others."""
     if job.compute.backend not in ("auto", "numba") or job.compute.device == "cuda":
+        return False
+    if _compiled_since_installed():
         return False
     first = next((row for row in job.table if row.renders and row.name in stages), None)
     if first is None:

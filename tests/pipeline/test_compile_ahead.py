@@ -1,6 +1,7 @@
 """Kernels are compiled in a process beside the stages that come before training."""
 
 import logging
+import os
 import sys
 import time
 from pathlib import Path
@@ -20,6 +21,11 @@ SECONDS = 20.0  # for a process to start or end on a busy machine
 
 def job_in(folder: Path, **compute: str) -> Job:
     return Job(Workspace(folder), compute=ComputeConfig(**compute), table=TABLE)
+
+
+@pytest.fixture(autouse=True)
+def _cold(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("RECON_CACHE_DIR", str(tmp_path / "cache"))
 
 
 @pytest.fixture
@@ -87,9 +93,31 @@ def test_a_failure_goes_to_the_log_and_not_to_the_terminal(tmp_path, worker, cap
     (["ingest", "train"], [], False, {"backend": "torch"}, False),
     (["ingest", "train"], [], False, {"device": "cuda"}, False)])
 def test_a_process_starts_only_where_stages_that_render_wait_for_others(
-        tmp_path, monkeypatch, stages, finished, again, compute, beside):
+        tmp_path, stages, finished, again, compute, beside):
     for name in finished:
         (tmp_path / name).mkdir()
+    commands = starts(tmp_path, stages, again=again, **compute)
+    assert commands == [["recon_cli.render.compile_worker", compute.get("backend", "auto"),
+                         compute.get("device", "auto")]] * beside
+
+
+@pytest.mark.parametrize(("age", "beside"), [(-100, False), (100, True)])
+def test_kernels_of_an_earlier_installation_do_not_count(tmp_path, monkeypatch, age, beside):
+    sources = tmp_path / "sources"
+    sources.mkdir()
+    (sources / "kernel.py").touch()
+    monkeypatch.setattr(compile_ahead, "_SOURCES", sources)
+    monkeypatch.setattr(compile_ahead.importlib.util, "find_spec", lambda _: None)
+    mark = tmp_path / "cache" / "kernels" / "0123" / "ready"
+    mark.parent.mkdir(parents=True)
+    mark.touch()
+    installed = (sources / "kernel.py").stat().st_ctime
+    os.utime(mark, (installed - age, installed - age))
+    assert bool(starts(tmp_path, ["ingest", "train"])) is beside
+
+
+def starts(folder, stages, *, again=False, **compute):
+    """Returns the commands of the processes that would be started for stages, run by nobody."""
     commands = []
 
     class Child:
@@ -110,11 +138,11 @@ def test_a_process_starts_only_where_stages_that_render_wait_for_others(
         def wait(self, _timeout):
             pass
 
-    monkeypatch.setattr(compile_ahead.subprocess, "Popen", Child)
-    with compile_ahead.compile_ahead(job_in(tmp_path, **compute), stages, again=again):
-        pass
-    assert commands == [["recon_cli.render.compile_worker", compute.get("backend", "auto"),
-                         compute.get("device", "auto")]] * beside
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compile_ahead.subprocess, "Popen", Child)
+        with compile_ahead.compile_ahead(job_in(folder, **compute), stages, again=again):
+            pass
+    return commands
 
 
 @pytest.mark.parametrize(("backend", "device", "cuda", "compiles"), [
@@ -133,8 +161,7 @@ def test_the_process_compiles_what_the_options_come_to(
 
 
 @pytest.mark.compile
-def test_the_process_fills_the_cache_that_the_stages_read(tmp_path, monkeypatch):
-    monkeypatch.setenv("RECON_CACHE_DIR", str(tmp_path / "cache"))
+def test_the_process_fills_the_cache_that_the_stages_read(tmp_path):
     with compile_ahead.compile_ahead(job_in(tmp_path), ["ingest", "train"], again=False):
         (child,) = children(alive=True)
         deadline = time.monotonic() + SECONDS
@@ -144,3 +171,4 @@ def test_the_process_fills_the_cache_that_the_stages_read(tmp_path, monkeypatch)
         child.wait(300)
     (ready,) = (tmp_path / "cache").glob("kernels/*/ready")
     assert list(ready.parent.rglob("*.nbc"))
+    assert not starts(tmp_path, ["ingest", "train"])
