@@ -68,7 +68,7 @@ class CostModel:
     seconds: float  # that the calibration took
 
     def run_seconds(self, schedule: Schedule, first: int) -> float:
-        """Returns the seconds of a whole run that begins with `first` Gaussians."""
+        """Returns the seconds of all steps of a schedule that begins with `first` Gaussians."""
         costs = {cost.level: cost for cost in self.levels}
         config, total = schedule.config, 0.0
         every, saves = report_every(schedule), config.checkpoint_every
@@ -85,8 +85,8 @@ class CostModel:
 def counts(schedule: Schedule, first: int) -> list[tuple[int, int, int]]:
     """Returns the run cut into (begin, end, Gaussians), the count as the schedule lets it grow."""
     config = schedule.config
-    stride = math.ceil(config.iterations / _SEGMENTS)
-    result, count, begin = [], min(first, config.max_gaussians), 0
+    stride = math.ceil(schedule.steps / _SEGMENTS)
+    result, count, begin = [], min(first, config.max_gaussians), schedule.first
     while begin < config.iterations:
         end = min(begin + stride, config.iterations)
         result.append((begin, end, count))

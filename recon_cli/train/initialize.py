@@ -75,7 +75,7 @@ def first_state(
         far = far_content(task.train, points, task.extent)
     gains = estimate_gains(task.train, points).log_gains if config.exposure == "on" else None
     splats = first_splats(config, points, colors, far, most=most)
-    exposure, poses = _parts(task, gains)
+    exposure, poses = new_parts(task, gains)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
         backend=task.backend, exposure=exposure, poses=poses)
@@ -88,7 +88,7 @@ def restore_state(path: Path, task: Task) -> TrainState:
         FormatError: the file is truncated or of another version.
         TrainingError: it holds values that are not finite.
     """
-    exposure, poses = _parts(task, None)
+    exposure, poses = new_parts(task)
     return load_state(
         path, task.schedule.config, task.extent, task.device, backend=task.backend,
         exposure=exposure, poses=poses)
@@ -104,8 +104,8 @@ def make_finished_state(splats: Splats, task: Task) -> TrainState:
     return state
 
 
-def _parts(
-    task: Task, log_gains: NDArray[np.float64] | None
+def new_parts(
+    task: Task, log_gains: NDArray[np.float64] | None = None
 ) -> tuple[Exposure | None, Poses | None]:
     """Returns the optional parts that the options switch on, before any step."""
     config, images = task.schedule.config, len(task.train)

@@ -24,9 +24,9 @@ def next_iteration(
     the best one before, once densification has ended and the state for pruning is kept. `looks` are
     (iteration, validation PSNR in dB) so far, ascending.
     """
-    steps, recipe = schedule.config.iterations, schedule.recipe
-    final = round(min(recipe.final_from, _LAST_FIFTH) * steps)
-    settled = max(recipe.densify_until * steps, schedule.mid)
+    first, steps, recipe = schedule.first, schedule.steps, schedule.recipe
+    final = first + round(min(recipe.final_from, _LAST_FIFTH) * steps)
+    settled = max(first + recipe.densify_until * steps, schedule.mid)
     if not settled < iteration < final:
         return None
     since = iteration - _WINDOW * steps
@@ -85,14 +85,20 @@ class Schedule:
 
     config: RunConfig  # the run's options
     recipe: Recipe = None  # type: ignore[assignment]  # that of the strategy, filled in below
+    first: int = 0  # step after which it begins; shares are of the steps from there
 
     def __post_init__(self) -> None:
         if self.recipe is None:
             object.__setattr__(self, "recipe", RECIPES[self.config.densify])
 
+    @property
+    def steps(self) -> int:
+        """Steps from the first to the last."""
+        return self.config.iterations - self.first
+
     def share(self, iteration: int) -> float:
         """Returns how much of the run is done after a step, 0 to 1."""
-        return min(1.0, iteration / self.config.iterations)
+        return min(1.0, (iteration - self.first) / max(1, self.steps))
 
     def epoch(self, views: int) -> int:
         """Returns the steps in which no view need come twice; at least one."""
@@ -106,7 +112,7 @@ class Schedule:
     @property
     def mid(self) -> int:
         """The iteration whose state is kept for pruning."""
-        return max(1, round(self.config.mid * self.config.iterations))
+        return self.first + max(1, round(self.config.mid * self.steps))
 
     def level(self, iteration: int) -> int:
         """Returns the factor by which images are reduced in this step."""
@@ -142,13 +148,13 @@ class Schedule:
     def densifies(self, iteration: int) -> bool:
         """Tells whether Gaussians are added and deleted after this step."""
         start = max(self.config.densify_every,
-                    round(self.recipe.densify_from * self.config.iterations))
-        return (self.gathers(iteration) and iteration >= start
+                    round(self.recipe.densify_from * self.steps))
+        return (self.gathers(iteration) and iteration - self.first >= start
                 and iteration % self.config.densify_every == 0)
 
     def gathers(self, iteration: int) -> bool:
         """Tells whether densification still needs this step's gradients."""
-        return iteration < self.recipe.densify_until * self.config.iterations
+        return iteration - self.first < self.recipe.densify_until * self.steps
 
     def target(self, iteration: int, first: int) -> int:
         """Returns the count that a budget allows after this step, from `first` up to the cap."""
@@ -167,16 +173,15 @@ class Schedule:
         return self.recipe.resets and iteration > self.reset_every
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecoverySchedule(Schedule):
-    """A recovery after pruning: images in full size, and learning rates that start anew."""
+@dataclass(frozen=True)
+class ContinuedSchedule(Schedule):
+    """The plan of steps after the end of another run: one of their own, from a finished model.
 
-    first: int  # step at which the recovery begins
-    until: int  # step at which it ends
-
-    def share(self, iteration: int) -> float:
-        """Returns how much of the recovery is done after a step, 0 to 1."""
-        return min(1.0, (iteration - self.first) / max(1, self.until - self.first))
+    Learning rates start anew, and the count grows to the cap of the whole run; images are in full
+    size and colours of full degree from the first step. The longer run's plan, taken up where the
+    shorter one ended, gives less: on office, 1,000 steps carried on to 2,000 end at 31.1 dB by it,
+    at 31.5 dB by this one, and 2,000 in one go at 31.7 dB.
+    """
 
     def level(self, iteration: int) -> int:  # noqa: ARG002
         """Returns 1: images are never reduced."""
@@ -185,6 +190,25 @@ class RecoverySchedule(Schedule):
     def sh_degree(self, iteration: int) -> int:  # noqa: ARG002
         """Returns the degree in use, which is the highest."""
         return self.config.sh_degree
+
+
+def make_schedule(config: RunConfig, continues_at: int | None) -> Schedule:
+    """Returns the schedule of a run; `continues_at` as in plan.json, None for one that begins."""
+    if continues_at is None:
+        return Schedule(config)
+    return ContinuedSchedule(config, first=continues_at)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecoverySchedule(ContinuedSchedule):
+    """A recovery after pruning: steps after the end of another run in which nothing grows back."""
+
+    until: int  # step at which it ends
+
+    @property
+    def steps(self) -> int:
+        """Steps from the first to the last."""
+        return self.until - self.first
 
     def gathers(self, iteration: int) -> bool:  # noqa: ARG002
         """Returns False: nothing grows back."""

@@ -9,8 +9,8 @@ from tiny_task import CONFIG, first_state, same, tiny_task
 from recon_cli.context import ProcessGroup
 from recon_cli.train.distributed.data_parallel import Fit, pack_fit, unpack_fit
 from recon_cli.train.importance import Importance
-from recon_cli.train.initialize import _parts
-from recon_cli.train.schedule import RecoverySchedule
+from recon_cli.train.initialize import new_parts
+from recon_cli.train.schedule import ContinuedSchedule, RecoverySchedule
 
 
 def test_a_fit_is_the_same_after_it_was_handed_over():
@@ -19,7 +19,7 @@ def test_a_fit_is_the_same_after_it_was_handed_over():
     task = dataclasses.replace(tiny_task(config), schedule=plan, camera_error=0.25)
     task.train[2] = dataclasses.replace(task.train[2], mask=np.eye(30, 40) > 0)
     state = first_state(config)
-    state.exposure, state.poses = _parts(task, None)
+    state.exposure, state.poses = new_parts(task, None)
     found = Importance.of_score("paper", 40, torch.device("cpu"))
     ranks = ProcessGroup(1, 2)
     first = unpack_fit(pack_fit(Fit(state, task, found, 3)), ranks)
@@ -37,3 +37,10 @@ def test_a_fit_is_the_same_after_it_was_handed_over():
             assert (mine.mask is None) == (theirs.mask is None)
         assert np.array_equal(one.task.train[2].mask, task.train[2].mask)
     assert (first.importance.weighs, first.importance.leaves_out) == (True, False)
+
+
+def test_a_run_that_goes_on_does_so_in_every_process():
+    plan = ContinuedSchedule(CONFIG, first=3)
+    task = dataclasses.replace(tiny_task(CONFIG), schedule=plan)
+    sent = unpack_fit(pack_fit(Fit(first_state(CONFIG), task, None, 1)), ProcessGroup(1, 2))
+    assert sent.task.schedule == plan

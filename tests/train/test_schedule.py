@@ -4,7 +4,7 @@ import pytest
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.errors import ConfigError
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.schedule import ContinuedSchedule, Schedule, next_iteration
 
 
 def test_a_run_of_30000_follows_the_reference():
@@ -72,3 +72,33 @@ def test_nothing_is_added_after_the_state_that_pruning_branches_off(iterations):
 def test_the_target_never_falls_below_what_the_run_began_with():
     plan = Schedule(RunConfig(iterations=1000, max_gaussians=5000))
     assert plan.target(900, 5000) == 5000
+
+
+def test_a_run_that_goes_on_is_one_of_its_own_in_full_size_and_degree():
+    config = RunConfig(iterations=3000, max_gaussians=5000)
+    plan, alone = ContinuedSchedule(config, first=2000), Schedule(RunConfig(iterations=1000))
+    for i in range(1, 1001):
+        assert plan.means_rate(2000 + i) == alone.means_rate(i)
+        assert plan.rate_factor(2000 + i) == alone.rate_factor(i)
+        assert plan.densifies(2000 + i) == alone.densifies(i)
+        assert (plan.level(2000 + i), plan.sh_degree(2000 + i)) == (1, 3)
+    assert plan.mid == 2000 + alone.mid
+    counts = [plan.target(i, 4000) for i in range(2001, 3001)]
+    assert counts == sorted(counts)
+    assert (counts[0], counts[599]) == (4000, 5000)
+
+
+@pytest.mark.parametrize("steps", [1, 7, 90, 1000])
+def test_nothing_is_added_after_the_middle_of_a_run_that_goes_on(steps):
+    plan = ContinuedSchedule(RunConfig(iterations=2000 + steps, densify_every=1), first=2000)
+    added = [i for i in range(2001, 2001 + steps) if plan.densifies(i)]
+    assert max(added, default=0) <= plan.mid <= 2000 + steps
+
+
+def test_a_run_that_goes_on_stops_early_by_shares_of_its_own_steps():
+    plan = ContinuedSchedule(RunConfig(iterations=3000), first=2000)
+    looks = [(2000 + 50 * (i + 1), 20.0) for i in range(20)]
+    jumps = [next_iteration(plan, at, looks[:i + 1]) for i, (at, _) in enumerate(looks)]
+    assert [at for (at, _), to in zip(looks, jumps, strict=True) if to == 2800] == [
+        2650, 2700, 2750]
+    assert set(jumps) == {None, 2800}

@@ -34,7 +34,12 @@ from recon_cli.train.cost import EXCHANGE, join_exchange
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import restore_state
-from recon_cli.train.schedule import RecoverySchedule, Schedule
+from recon_cli.train.schedule import (
+    ContinuedSchedule,
+    RecoverySchedule,
+    Schedule,
+    make_schedule,
+)
 from recon_cli.train.state import TrainState, save_state, tensors_of
 from recon_cli.train.stepper import Stepper
 from recon_cli.train.task import Task
@@ -204,8 +209,10 @@ def pack_fit(fit: Fit) -> dict[str, NDArray[Any]]:
     assert schedule.recipe == Schedule(schedule.config).recipe, "only trials have one of their own"
     views = () if task.ranks.views is task.train else task.train
     recovery = [schedule.first, schedule.until] if isinstance(schedule, RecoverySchedule) else None
+    continues_at = schedule.first if isinstance(schedule, ContinuedSchedule) else None
     said = {
         "config": dataclasses.asdict(schedule.config), "recovery": recovery,
+        "continues_at": continues_at,
         "extent": task.extent, "backend": task.backend, "device": task.device.type,
         "camera_error": task.camera_error, "threads": fit.threads,
         "scores": importance and [importance.weighs, importance.leaves_out],
@@ -232,7 +239,7 @@ def unpack_fit(arrays: dict[str, NDArray[Any]], ranks: ProcessGroup) -> Fit:
                       arrays.get(f"mask.{i}"))
             for i, lens in enumerate(said["cameras"])]
     config = RunConfig(**said["config"])
-    schedule = Schedule(config)
+    schedule = make_schedule(config, said["continues_at"])
     if said["recovery"]:
         first, until = said["recovery"]
         schedule = RecoverySchedule(config, first=first, until=until)
