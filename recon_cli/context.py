@@ -122,6 +122,7 @@ class StageInputs:
     # finished folder by stage name: of all in `needs`, and of those in `uses` that are fresh
     folders: Mapping[str, Path] = field(default_factory=dict)
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
+    continues: Path | None = None  # finished result of the stage itself that the run goes on from
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,14 @@ class FakeSummary(JsonRecord):
     steps: int
     length: float
     names: tuple[str, ...]
+    planned_iterations: int | None = None  # of train
 
 
 TABLE = tuple(
     dataclasses.replace(row, module="fake_stages", summary=FakeSummary) for row in STAGES)
 NAMES = [row.name for row in TABLE]
 STEPS = 6
+DEFAULT_LENGTH = 3000  # iterations of train where none are asked for
 
 ran: list[str] = []  # stages that have been run, in order
 actions: dict[str, Callable[[], None]] = {}  # done by a stage before it writes anything
@@ -60,6 +62,7 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     options = {key: value for key, value in config.hashed_fields().items() if key != "seed"}
     read = [(path / "result.txt").read_text() for path in inputs.folders.values()]
     read += [path.read_text() for path in inputs.sources if path.is_file()]
+    read += [(inputs.continues / "result.txt").read_text()] if inputs.continues else []
     result = hashlib.sha256(json.dumps([name, options, read]).encode()).hexdigest()
     (out / "result.txt").write_text(result)
     for volatile in next(row.volatile for row in TABLE if row.name == name):
@@ -67,7 +70,8 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
         path.parent.mkdir(exist_ok=True)
         path.write_text(str(time.time_ns()))
     (out / "table.txt").write_text(f"the table of {name}\n")
-    return FakeSummary(STEPS, 1.5, ("a", "b"))
+    planned = (getattr(config, "iterations", None) or DEFAULT_LENGTH) if name == "train" else None
+    return FakeSummary(STEPS, 1.5, ("a", "b"), planned)
 
 
 def job_at(root: Path, settings: Settings | None = None) -> Job:

@@ -14,9 +14,10 @@ from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import TrainCallback
 from recon_cli.pipeline import plan
+from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.plan import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress, format_duration
-from recon_cli.stages import STAGES, Stage
+from recon_cli.stages import IMPORT, STAGES, Stage
 from recon_cli.workspace.layout import Workspace
 
 
@@ -44,8 +45,10 @@ def run_stages(
     job = Job(
         Workspace(call.workspace), file_settings, compute, TqdmProgress(), report_outcome, table,
         callbacks, call.ranks)
+    start = Start.IMPORTED if call.from_import else Start.AUTO
     targets = [
-        Target(row.name, config, () if row.needs else sources)
+        Target(row.name, config, () if row.needs else sources,
+               start if row.name == IMPORT.name else Start.AUTO)
         for row, config in zip(rows, configs.values(), strict=True)]
     plan.run(job, verb, targets, again=call.again)
     if "evaluate" in stages:

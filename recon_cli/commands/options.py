@@ -46,6 +46,7 @@ class Call:
     config_file: Path | None = None
     verbose: bool = False
     again: bool = False
+    from_import: bool = False
     print_config: bool = False
     settings: Settings = field(default_factory=dict)  # given as options of their own
     assigned: Settings = field(default_factory=dict)  # given by --set
@@ -153,6 +154,7 @@ def _switch(flag: str, help: str, *short: str) -> Decorator:
 
 verbosity = _switch("--verbose", "Show details and tracebacks.", "-v")
 again = _switch("--again", "Run even if up to date.")
+from_import = _switch("--from-import", "Train the imported scene further.")
 print_config = _switch("--print-config", "Print options as TOML and exit.")
 
 

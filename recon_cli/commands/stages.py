@@ -80,6 +80,7 @@ def sfm(call: Call) -> None:
     expert=("max_mb", "rounds", "score", "recovery"), lead="With --prune: ")
 @click.option(
     "--view", "with_view", is_flag=True, help="Show the training in the browser.  [default: off]")
+@options.from_import
 @options.stage(TrainConfig, renders=True)
 @pass_call
 def train(call: Call, with_prune: bool, with_view: bool) -> None:

@@ -26,8 +26,8 @@ from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.progress import Progress
 from recon_cli.scene.scene import Scene
-from recon_cli.train.feature_trials import PARTS
-from recon_cli.train.plan import choose_parts, model_parts
+from recon_cli.train.feature_trials import PARTS, model_parts
+from recon_cli.train.plan import choose_parts
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task

@@ -13,18 +13,21 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.stages import EvaluateConfig, TrainConfig
-from recon_cli.errors import WorkspaceError
+from recon_cli.errors import StageError, WorkspaceError
 from recon_cli.evaluation.comparison import ScoredModel, read_workspace_scores
 from recon_cli.evaluation.intervals import Spread
 from recon_cli.evaluation.reference_views import LABELS
 from recon_cli.evaluation.scores import Table
 from recon_cli.pipeline import plan
+from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.execute import Job
+from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.pipeline.plan import Target
 from recon_cli.stages import stage
 from recon_cli.workspace import atomic
@@ -89,7 +92,7 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
     """Trains a workspace's models with the next seeds, writes seeds.json and returns the scores.
 
     Raises:
-        StageError: there is no fresh model.
+        StageError: there is no fresh model, or it was imported.
         WorkspaceError: the workspace is in use, full, or was changed meanwhile.
     """
     plan.run(job, "eval", [Target("evaluate", config)])
@@ -100,6 +103,7 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
         check = inspection.check(name)
         if check.fresh and check.manifest:
             configs[name] = inspection.config(check.row, check.manifest.key)
+    _refuse_import(inspection, root)
     train = configs.pop("train")
     assert isinstance(train, TrainConfig)
     seeds = tuple(range(train.seed, train.seed + count))
@@ -115,6 +119,16 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
     return result
 
 
+def _refuse_import(inspection: WorkspaceCheck, root: Path) -> None:
+    """Raises StageError where the scene was imported: no seed of this program made it."""
+    manifest = inspection.check("train").manifest
+    source = manifest.run.summary.get("imported_from") if manifest else None
+    if source:
+        raise StageError(
+            f"{root} holds a scene that was imported from {source}: with another seed, all of it "
+            "would be trained here.", hint="Give a workspace without an imported scene with -w.")
+
+
 def _score_seed(job: Job, configs: Mapping[str, StageConfig], seed: int) -> list[ScoredModel]:
     """Runs stages, in their order, with another seed and returns the scores of its models."""
     workspace = Workspace(job.workspace.root / SEEDS / str(seed))
@@ -127,7 +141,8 @@ def _score_seed(job: Job, configs: Mapping[str, StageConfig], seed: int) -> list
     seeded = dataclasses.replace(
         job, workspace=workspace,
         settings=layers.merge([job.settings, {"train": {"seed": seed}}]))
-    plan.run(seeded, "eval --seeds", [Target(name, value) for name, value in configs.items()])
+    plan.run(seeded, "eval --seeds", [
+        Target(name, value, start=Start.ANEW) for name, value in configs.items()])
     return read_workspace_scores(f"seed {seed}", workspace.folder("evaluate"))
 
 

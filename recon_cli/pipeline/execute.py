@@ -20,6 +20,7 @@ from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup, StageContext, StageInputs, TrainCallback
 from recon_cli.errors import BackendError, ConfigError, ManifestError, ReconError
 from recon_cli.lazy import load
+from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.stages import STAGES, Stage
@@ -64,7 +65,7 @@ class Job:
 
 def run_stage(
     job: Job, checks: WorkspaceCheck, row: Stage, config: StageConfig,
-    sources: tuple[Source, ...] | None = None,
+    sources: tuple[Source, ...] | None = None, *, start: Start = Start.AUTO,
 ) -> Manifest:
     """Runs a stage whose needs are fresh and returns its manifest; no `sources` are the last ones.
 
@@ -76,9 +77,11 @@ def run_stage(
         sources = () if row.needs else _read_last_sources(job, row)
     key = ResultKey(row.name, row.version, config.hashed_fields(), sources, checks.upstream(row))
     _warn_of_stale_uses(checks, row)
+    key = dataclasses.replace(key, continues=find_start(workspace, row, key, start))
     inputs = StageInputs(
         {name: workspace.folder(name) for name, digest in key.upstream.items() if digest},
-        tuple(Path(source.path) for source in sources))
+        tuple(Path(source.path) for source in sources),
+        workspace.folder(row.name) if key.continues else None)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key)
     with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):

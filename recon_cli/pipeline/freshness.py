@@ -18,6 +18,7 @@ from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.errors import ConfigError, ManifestError
+from recon_cli.pipeline.continuation import is_imported, may_resume
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, read_source
 from recon_cli.workspace.layout import Workspace
@@ -61,11 +62,6 @@ class StageCheck:
         if partial and not self.fresh:
             return f"unfinished ({describe_progress(partial.done, partial.total)})"
         return f"{self.state}: {'; '.join(self.reasons)}" if self.reasons else self.state
-
-
-def is_imported(key: ResultKey) -> bool:
-    """Returns whether a result is an imported scene: training itself reads no file of the user."""
-    return key.stage == IMPORT.name and bool(key.sources)
 
 
 class WorkspaceCheck:
@@ -168,7 +164,8 @@ class WorkspaceCheck:
         upstream = self.upstream(row)
         for need in row.needs:  # what is missing now may well come out as it was
             upstream[need] = upstream[need] or stored.upstream.get(need)
-        return ResultKey(row.name, row.version, config.hashed_fields(), sources, upstream)
+        return ResultKey(
+            row.name, row.version, config.hashed_fields(), sources, upstream, stored.continues)
 
     def _read_again(self, stored: tuple[Source, ...]) -> tuple[tuple[str, ...], tuple[Source, ...]]:
         """Returns the paths of sources that cannot be read any more, and all as they are now."""
@@ -181,7 +178,7 @@ class WorkspaceCheck:
     def _resumable(self, row: Stage) -> PartialRun | None:
         """Returns the interrupted run of a stage if the next run would resume it."""
         partial = self._workspace.partial_run(row.name)
-        if partial is None:
+        if partial is None or not may_resume(self._workspace, partial):
             return None
         _, sources = self._read_again(partial.key.sources)
         expected = self._current_key(row, self.config(row, partial.key), partial.key, sources)

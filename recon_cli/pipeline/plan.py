@@ -22,8 +22,9 @@ from typing import Any
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
 from recon_cli.errors import StageError
 from recon_cli.pipeline.compile_ahead import compile_ahead
+from recon_cli.pipeline.continuation import Start, is_imported, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
-from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck, is_imported
+from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, matches, read_source
 from recon_cli.workspace.layout import LOG, disk_errors, remove, size_of
@@ -44,6 +45,7 @@ class Target:
     stage: str
     config: StageConfig
     sources: tuple[Path, ...] = ()
+    start: Start = Start.AUTO
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def run(
     with disk_errors(root, f"running {verb}"), job.workspace.writing(verb), _log_to(root / LOG):
         refuse_missing_backend(job, stages)
         if not again:
-            _refuse_to_replace(job, verb, stages)
+            _refuse_to_replace(job, verb, targets)
         with compile_ahead(job, stages, again=again):
             job = dataclasses.replace(job, asked=tuple(stages))
             for target in targets:
@@ -112,12 +114,15 @@ def run(
     return tuple(outcomes)
 
 
-def _refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
+def _refuse_to_replace(job: Job, verb: str, targets: Sequence[Target]) -> None:
     """Raises StageError where training or import would replace the scene of the other."""
+    stages = [target.stage for target in targets if target.start is not Start.IMPORTED]
     for row in [row for row in job.table if row.name == IMPORT.name and row.name in stages]:
         finished, partial = job.workspace.manifest(row.name), job.workspace.partial_run(row.name)
         importing = row.verb == IMPORT.verb
         if finished and is_imported(finished.key) is not importing:
+            if partial and partial.key.continues and may_resume(job.workspace, partial):
+                continue  # it is trained further already
             sources = finished.key.sources
             scene = (f"the scene imported from {Path(sources[0].path).name}" if sources
                      else "a scene that was trained")
@@ -125,9 +130,11 @@ def _refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
             scene = f"a training that was interrupted at {partial.done} of {partial.total}"
         else:
             continue
+        further = "" if importing else "Train it further by `recon train --from-import`, or "
+        hint = f"give another workspace with -w, or replace it by `recon {verb} --again`."
         raise StageError(
             f"{job.workspace.root} holds {scene}, which `recon {verb}` would replace.",
-            hint=f"Give another workspace with -w, or replace it by `recon {verb} --again`.")
+            hint=f"{further or 'Give'}{hint if further else hint.removeprefix('give')}")
 
 
 def plan(checks: WorkspaceCheck, stage: str) -> tuple[Stage, ...]:
@@ -203,7 +210,9 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         plan(checks, row.name)  # what was fresh may have become stale by what has just run
         fresh = None if again else _find_fresh(job, checks, target, sources)
     if fresh is None:
-        yield Outcome(row.name, run_stage(job, checks, row, target.config, sources), ran=True)
+        start = Start.ANEW if again and target.start is Start.AUTO else target.start
+        manifest = run_stage(job, checks, row, target.config, sources, start=start)
+        yield Outcome(row.name, manifest, ran=True)
     else:
         yield Outcome(row.name, fresh, ran=False)
 
@@ -235,7 +244,8 @@ def _find_fresh(
     check = checks.check_against(target.stage, target.config, sources)
     manifest = check.manifest
     if manifest is None or not check.fresh:
-        if manifest:
+        # a trained scene in the place of an imported one differs in everything
+        if manifest and bool(manifest.key.sources) is bool(checks.row(target.stage).takes):
             logger.info("%s is stale: %s", target.stage, "; ".join(check.reasons))
         return None
     if sources and sources != manifest.key.sources:

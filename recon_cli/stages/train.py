@@ -1,7 +1,8 @@
 """train: Gaussians from cameras and points, by a plan that is made first.
 
 Leaves splats.ply, the states at the middle (where pruning branches off) and the end of the run,
-plan.json, config.json, and log.jsonl with loss, validation PSNR, count and seconds.
+plan.json, config.json, and log.jsonl with loss, validation PSNR, count and seconds. It begins with
+the points of sfm, or goes on from a finished model: of a shorter run, or imported.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_scene, size_summary
 from recon_cli.io.ply import write_ply
-from recon_cli.train.plan import first_or_saved, model_parts, plan_task
+from recon_cli.io.records import ImportRecord
+from recon_cli.train.feature_trials import model_parts
+from recon_cli.train.finished_model import FinishedModel
+from recon_cli.train.plan import first_or_saved, plan_task
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
@@ -24,12 +28,16 @@ from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs, validation=config.validation)
-    task = plan_task(config, scene, out, ctx)
+    model = None if inputs.continues is None else FinishedModel.read(inputs.continues)
+    task = plan_task(config, scene, out, ctx, model)
     ctx.notice_idle(task.schedule.config.batch_views)
-    state = first_or_saved(task, scene, out / CHECKPOINT)
+    if model is not None and not (out / CHECKPOINT).exists():
+        model.hand_on(task.schedule, out, ctx)
+    state = first_or_saved(task, scene, out / CHECKPOINT, model)
     until = task.schedule.config.iterations
     run_fit(state, task, until, Segment(
-        out, "train", until, keep={task.schedule.mid: "mid.safetensors"}), ctx)
+        out, "train", until, first=task.schedule.first,
+        keep={task.schedule.mid: "mid.safetensors"}), ctx)
     save_state(out / "final.safetensors", state)
     write_ply(out / "splats.ply", state.splats)
     (out / CHECKPOINT).unlink(missing_ok=True)
@@ -38,7 +46,10 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
 
 def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> TrainSummary:
     config, plan, last = task.schedule.config, TrainPlan.read(out), LogRow.read_all(out / LOG)[-1]
+    import_record = ImportRecord.read(out)
     return TrainSummary(
+        imported_from=import_record.file if import_record else None,
+        continued_from_step=plan.continues_at or None,
         iterations=state.steps, gaussians=len(state.splats),
         initial_gaussians=state.first_count, max_gaussians=config.max_gaussians,
         max_size=config.max_size, planned_iterations=config.iterations,

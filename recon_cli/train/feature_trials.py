@@ -108,6 +108,11 @@ _POINTS = 5000
 _CAP = 10_000
 _FAR_SHARE = 0.003  # of the directions; the window of one room is .012, that of another .045
 PARTS = ("far", "exposure", "poses", "images")
+
+
+def model_parts(config: RunConfig) -> dict[str, Any]:
+    """Returns the parts of the model that trials decide on, by the names of their options."""
+    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
 # Gain from which higher harmonics are worth 45 of 59 parameters: trials gave .24 dB on photos of a
 # glossy thing, and .08 to .12 dB in two rooms, where a tenth more Gaussians give as much for less.
 _HARMONICS_DB = 0.15

@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,9 +22,10 @@ from recon_cli.context import StageContext
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate, with_exchange
-from recon_cli.train.feature_trials import PARTS, Candidate, Needs, examine
+from recon_cli.train.feature_trials import Candidate, Needs, examine, model_parts
+from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.initialize import first_state, restore_state
-from recon_cli.train.schedule import RECIPES, Schedule
+from recon_cli.train.schedule import RECIPES, Schedule, make_schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import (
@@ -99,18 +99,27 @@ def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
 
 
 def make_plan(
-    asked: TrainConfig, facts: Facts, cost: CostModel, *, spent: float = 0.0
+    asked: TrainConfig, facts: Facts, cost: CostModel, *, spent: float = 0.0,
+    model: FinishedModel | None = None,
 ) -> TrainPlan:
-    """Returns the plan; --minutes include the calibration and the seconds `spent` on trials."""
+    """Returns the plan; --minutes include the calibration and the seconds `spent` on trials.
+
+    `model` is what the run goes on from.
+    """
+    continues_at = None if model is None else model.steps
+
     def at(iterations: int) -> TrainPlan:
         most = cap(asked, facts, iterations)
+        if model is not None:
+            most = max(most, model.gaussians)
         config = _fill_in(asked, iterations, most, first_config(asked).max_size)
-        first = first_count(config, facts.points)
+        first = first_count(config, facts.points) if model is None else model.gaussians
+        schedule = make_schedule(config, continues_at)
         return TrainPlan(
             iterations=iterations, max_gaussians=most, max_size=config.max_size,
             first_gaussians=first, detail=facts.detail,
-            seconds=round(_LONGER * cost.run_seconds(Schedule(config), first), 2),
-            cost=dataclasses.asdict(cost))
+            seconds=round(_LONGER * cost.run_seconds(schedule, first), 2),
+            cost=dataclasses.asdict(cost), continues_at=continues_at)
 
     if asked.minutes is None:
         return at(first_config(asked).iterations)
@@ -177,31 +186,40 @@ def _largest(fits: Callable[[int], bool], low: int, high: int) -> int:
     return low
 
 
-def plan_task(config: TrainConfig, scene: Scene, out: Path, ctx: StageContext) -> Task:
-    """Returns the task of a run by its plan: a recorded one, or one that is made and recorded."""
+def plan_task(
+    config: TrainConfig, scene: Scene, out: Path, ctx: StageContext,
+    model: FinishedModel | None = None,
+) -> Task:
+    """Returns the task of a run by its plan: a recorded one, or one that is made and recorded.
+
+    `model` is what the run goes on from: it keeps the parts of that.
+    """
     if (out / TrainPlan.FILE).exists():
         recorded = dataclasses.replace(read_config(out), checkpoint_every=config.checkpoint_every)
-        return load_task(scene, recorded, ctx)
+        schedule = make_schedule(recorded, TrainPlan.read(out).continues_at)
+        return dataclasses.replace(load_task(scene, recorded, ctx), schedule=schedule)
+    if model is not None:
+        config = dataclasses.replace(config, **model.choose_parts(config))
     first = first_config(config)
+    if model is not None:  # all of it must fit
+        first = dataclasses.replace(
+            first, max_gaussians=max(first.max_gaussians, model.gaussians))
     fit_memory = gaussians_that_fit(scene, first, ctx)
     task = load_task(scene, first, ctx)
-    needs = choose_parts(task, scene, ctx, harmonics=config.sh_degree is None)
+    needs = Needs(first, model.decisions) if model is not None else choose_parts(
+        task, scene, ctx, harmonics=config.sh_degree is None)
     if needs.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = Facts(count_detail(task.train), len(task.train), len(scene.points), fit_memory)
     cost = _measure_cost(asked, facts, task, scene, out, ctx)
-    plan = make_plan(asked, facts, cost, spent=needs.seconds)
+    plan = make_plan(
+        asked, facts, cost, spent=0.0 if model is not None else needs.seconds, model=model)
     _report_plan(plan, asked, facts, ctx)
     config = run_config(asked, plan)
     write_config(out, config)
     write_json(out / TrainPlan.FILE, dataclasses.replace(plan, needs=needs.decisions).to_json())
-    return dataclasses.replace(task, schedule=Schedule(config))
-
-
-def model_parts(config: RunConfig) -> dict[str, Any]:
-    """Returns the parts of the model that trials decide on, by the names of their options."""
-    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
+    return dataclasses.replace(task, schedule=make_schedule(config, plan.continues_at))
 
 
 def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False) -> Needs:
@@ -239,7 +257,8 @@ def _measure_cost(
 def _report_plan(plan: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageContext) -> None:
     logger.info(
         "training takes about %.0f s: %s steps, up to %s Gaussians, images of up to %d pixels",
-        plan.seconds, f"{plan.iterations:,}", f"{plan.max_gaussians:,}", plan.max_size)
+        plan.seconds, f"{plan.iterations - (plan.continues_at or 0):,}",
+        f"{plan.max_gaussians:,}", plan.max_size)
     useful = useful_cap(facts, plan.iterations)
     if config.max_gaussians is None and plan.max_gaussians < useful:
         ctx.notice(f"memory has room for {plan.max_gaussians:,} Gaussians; {useful:,} would suit "
@@ -249,9 +268,13 @@ def _report_plan(plan: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageC
                    f"{plan.iterations} steps takes about {plan.seconds:.1f} s")
 
 
-def first_or_saved(task: Task, scene: Scene, checkpoint: Path) -> TrainState:
-    """Returns the state that a checkpoint holds, or the first one."""
+def first_or_saved(
+    task: Task, scene: Scene, checkpoint: Path, model: FinishedModel | None = None
+) -> TrainState:
+    """Returns the state that a checkpoint holds, or the first one: that of `model` if given."""
     if checkpoint.exists():
         return restore_state(checkpoint, task)
+    if model is not None:
+        return model.first_state(task)
     most = first_count(task.schedule.config, len(scene.points))
     return first_state(task, scene.points, scene.colors, most=most)

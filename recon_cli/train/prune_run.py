@@ -86,7 +86,8 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
         ConfigError: the middle of a run is asked for that took place elsewhere.
     """
     train = inputs.folders["train"]
-    import_record = ImportRecord.read(train)
+    final = train / "final.safetensors"
+    import_record = None if final.exists() else ImportRecord.read(train)
     if import_record and config.at == "mid":
         raise ConfigError(
             f"at is mid, but the scene was imported from {import_record.file}: the middle of its "
@@ -97,7 +98,6 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
     ctx.notice_idle(train_config.batch_views)
-    final = train / "final.safetensors"
     path = train / "mid.safetensors" if config.at == "mid" else final
 
     def begin() -> TrainState:

@@ -175,11 +175,31 @@ def load_state(
                 part.restore(tensors)
         state.exposure, state.poses = exposure, poses
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise FormatError(
-            f"The checkpoint {path} cannot be read: {error}.",
-            hint="Run the stage again with --again; it starts from the beginning.") from error
+        raise _unreadable(path, error) from error
     check_finite(tensors, f"The checkpoint {path} is damaged")
     return state
+
+
+def read_progress(path: Path) -> tuple[int, int]:
+    """Returns the steps taken and the count of Gaussians in a checkpoint, without loading it.
+
+    Raises:
+        FormatError: the file is truncated or of another version.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            scalars = json.loads((file.metadata() or {})["state"])
+            begin, end = scalars["jump"] or (0, 0)
+            return (int(scalars["iteration"]) - (end - begin),
+                    file.get_slice("splats.means").get_shape()[0])
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> FormatError:
+    return FormatError(
+        f"The checkpoint {path} cannot be read: {error}.",
+        hint="Run the stage again with --again; it starts from the beginning.")
 
 
 def check_finite(tensors: dict[str, Tensor], what: str) -> None:

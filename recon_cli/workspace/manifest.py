@@ -27,13 +27,20 @@ class ResultKey:
     sources: tuple[Source, ...]  # the user's own files; only ingest has any
     # digest of what each earlier stage wrote; None where a stage is left out
     upstream: Mapping[str, str | None]
+    # digest of the finished result of this stage that the run goes on from; None where it begins
+    # anew
+    continues: str | None = None
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 over all of it; of the sources only the contents count."""
         return sha256_json({
             "stage": self.stage, "version": self.version, "config": self.config,
-            "sources": [source.contents() for source in self.sources], "upstream": self.upstream})
+            "sources": [source.contents() for source in self.sources], "upstream": self.upstream,
+            **self._continues_json()})
+
+    def _continues_json(self) -> dict[str, str]:
+        return {"continues": self.continues} if self.continues else {}
 
     def to_json(self) -> dict[str, Any]:
         """Returns plain values that `from_json` takes."""
@@ -42,13 +49,16 @@ class ResultKey:
             "version": self.version,
             "config": dict(self.config),
             "inputs": [dataclasses.asdict(source) for source in self.sources],
-            "upstream": dict(self.upstream)}
+            "upstream": dict(self.upstream),
+            **self._continues_json()}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ResultKey:
         """Returns the key that `to_json` described."""
         sources = tuple(Source(item["path"], _digests(item["files"])) for item in value["inputs"])
-        return cls(value["stage"], value["version"], value["config"], sources, value["upstream"])
+        return cls(
+            value["stage"], value["version"], value["config"], sources, value["upstream"],
+            value.get("continues"))
 
 
 @dataclass(frozen=True)

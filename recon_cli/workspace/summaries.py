@@ -255,6 +255,9 @@ class TrainPlan(JsonRecord):
     seconds: float  # expected for the training, with reports and checkpoints
     cost: Mapping[str, Any]  # what the parts of a run take: `train.cost.CostModel`
     needs: tuple[TrialDecision, ...] = ()
+    # steps of the finished run that this one goes on from, 0 for an imported scene; None where it
+    # begins anew
+    continues_at: int | None = None
 
     @classmethod
     def read(cls, train: Path) -> TrainPlan:
@@ -295,6 +298,8 @@ class LogRow(JsonRecord):
 class TrainSummary(JsonRecord):
     """How a training ended."""
 
+    imported_from: str | None = None  # name of the file that it started from
+    continued_from_step: int | None = None  # of the finished run that it went on from
     iterations: int  # steps taken
     gaussians: int
     initial_gaussians: int

@@ -42,7 +42,7 @@ def test_each_verb_runs_its_stage_and_says_what_came_of_it(capsys: Said) -> None
         assert main(words) == 0
     assert fake_stages.ran == NAMES
     out = capsys.readouterr().out
-    assert "train: steps 6, length 1.5 (" in out
+    assert "train: steps 6, length 1.5, planned iterations 3,000 (" in out
     assert "the table of evaluate" in out
     assert main(["train"]) == 0
     assert capsys.readouterr().out == "train is up to date\n"

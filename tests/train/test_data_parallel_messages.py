@@ -19,7 +19,7 @@ def test_a_fit_is_the_same_after_it_was_handed_over():
     task = dataclasses.replace(tiny_task(config), schedule=plan, camera_error=0.25)
     task.train[2] = dataclasses.replace(task.train[2], mask=np.eye(30, 40) > 0)
     state = first_state(config)
-    state.exposure, state.poses = new_parts(task, None)
+    state.exposure, state.poses = new_parts(task)
     found = Importance.of_score("paper", 40, torch.device("cpu"))
     ranks = ProcessGroup(1, 2)
     first = unpack_fit(pack_fit(Fit(state, task, found, 3)), ranks)

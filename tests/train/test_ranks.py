@@ -11,7 +11,7 @@ from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, t
 from recon_cli.errors import TrainingError
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
-from recon_cli.train.initialize import _parts
+from recon_cli.train.initialize import new_parts
 from recon_cli.train.schedule import RecoverySchedule
 
 pytestmark = pytest.mark.integration
@@ -101,7 +101,7 @@ def test_cameras_gains_and_masks_are_those_of_one_process(others):
     for i, view in enumerate(task.train):
         view.camera.viewmat[0, 3] += 0.01 * i  # cameras in one place have no path
     for state in states:
-        state.exposure, state.poses = _parts(task, None)
+        state.exposure, state.poses = new_parts(task)
     mine, single = states
     others.fit(mine, task, 24)
     alone(single, task, 24)

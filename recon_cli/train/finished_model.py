@@ -1,0 +1,141 @@
+"""The finished model that a training goes on from: of a shorter run, or an imported scene.
+
+A run that goes on takes steps of their own after the end of that model (`ContinuedSchedule`), and
+keeps the parts of it: no trial is repeated. What is known of an imported scene stays with the
+result, since whoever trained it may have seen the held-out views.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recon_cli.config.stages import RunConfig, TrainConfig
+from recon_cli.context import StageContext
+from recon_cli.errors import ConfigError
+from recon_cli.io.ply import read_ply
+from recon_cli.io.records import ImportRecord
+from recon_cli.scene.splats import with_rows
+from recon_cli.train.feature_trials import PARTS, model_parts
+from recon_cli.train.initialize import new_parts, restore_state
+from recon_cli.train.runner import LOG
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.state import DensificationStats, TrainState, new_state, read_progress
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import read_config
+from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.summaries import LogRow, TrainPlan, TrialDecision
+
+FINAL = "final.safetensors"
+_FEW = 0.1  # of the steps before; fewer do not make good what the rates lose that start anew
+
+
+logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True)
+class FinishedModel:
+    """A finished model in its folder."""
+
+    folder: Path
+    config: RunConfig  # options of its run
+    import_record: ImportRecord | None  # of the scene that the first run began with, if any
+    steps: int  # taken so far, not counting those of another program
+    gaussians: int  # count
+    decisions: tuple[TrialDecision, ...]  # of its trials
+
+    @staticmethod
+    def read(folder: Path) -> FinishedModel:
+        """Returns the model in a finished folder of train or import.
+
+        Raises:
+            FormatError: a file in it is damaged or of another version.
+        """
+        final = folder / FINAL
+        steps, gaussians = read_progress(final) if final.exists() else (
+            0, len(read_ply(folder / "splats.ply")))
+        return FinishedModel(
+            folder, read_config(folder), ImportRecord.read(folder), steps, gaussians,
+            TrainPlan.read(folder).needs if (folder / TrainPlan.FILE).exists() else ())
+
+    @property
+    def trained(self) -> bool:
+        """Whether it was trained here, at least at last."""
+        return self.steps > 0
+
+    def choose_parts(self, asked: TrainConfig) -> dict[str, Any]:
+        """Returns the parts of the model that goes on, by the names of their options.
+
+        A trained one keeps its own. To an imported scene those are added that were asked for.
+
+        Raises:
+            ConfigError: the options contradict the imported scene.
+        """
+        if self.trained:
+            return model_parts(self.config)
+        if asked.far == "on":
+            raise ConfigError(
+                "far is on, but an imported scene has what background it has: distant Gaussians "
+                "are added to the points of sfm only.", hint="Leave out --far.")
+        if asked.max_gaussians is not None and asked.max_gaussians < self.gaussians:
+            raise ConfigError(
+                f"max_gaussians is {asked.max_gaussians:,}, but the imported scene has "
+                f"{self.gaussians:,} Gaussians.",
+                hint="Leave out --max-gaussians, and let `recon prune` lower the count.")
+        own = model_parts(self.config)
+        given = {name: getattr(asked, name) for name in (*PARTS, "sh_degree")}
+        return {name: own[name] if value in (None, "auto") else value
+                for name, value in given.items()}
+
+    def hand_on(self, schedule: Schedule, out: Path, ctx: StageContext) -> None:
+        """Writes what the result takes over into its folder, and tells the user of the start."""
+        if self.trained:
+            logger.info("training goes on from step %s of the finished run", f"{self.steps:,}")
+            if schedule.steps < _FEW * self.steps:
+                ctx.notice(f"{schedule.steps:,} more steps than {self.steps:,} are too few to gain "
+                           "anything: learning rates start anew")
+            write_bytes(out / LOG, _renumbered(LogRow.read_all(self.folder / LOG)))
+        record = self.import_record
+        if record is None:
+            return
+        if not self.trained:
+            logger.info("training starts from the scene imported from %s", record.file)
+            if record.doubt:
+                ctx.notice(record.doubt)
+        dataclasses.replace(record, doubt="").write(out)  # it has been fitted to the views
+
+    def first_state(self, task: Task) -> TrainState:
+        """Returns the state before the first further step.
+
+        Raises:
+            FormatError: the checkpoint is truncated or of another version.
+        """
+        config = task.schedule.config
+        if not self.trained:
+            splats = read_ply(self.folder / "splats.ply").with_degree(config.sh_degree)
+            splats.sh_rest = with_rows(splats.sh_rest, len(splats))  # each may get harmonics
+            exposure, poses = new_parts(task)
+            return new_state(
+                splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
+                backend=task.backend, exposure=exposure, poses=poses)
+        state = restore_state(self.folder / FINAL, task)
+        state.iteration = state.steps
+        state.jump, state.looks = None, []  # it may stop early again, by looks of its own
+        state.gathered = DensificationStats.zeros(len(state.splats), task.device)
+        state.first_count = len(state.splats)
+        return state
+
+
+def _renumbered(rows: tuple[LogRow, ...]) -> bytes:
+    """Returns the lines of a log that counts the steps taken, also after an early stop."""
+    lines, skipped = [], 0
+    for row in rows:
+        own = dataclasses.replace(row, iteration=row.iteration - skipped, goes_on_at=None)
+        lines.append(json.dumps(own.to_json()) + "\n")
+        if row.goes_on_at is not None:
+            skipped += row.goes_on_at - row.iteration
+    return "".join(lines).encode()
