@@ -58,7 +58,8 @@ class AsyncTrainer:
         self._compute = cast(DeferredStep, gradient_step(task.backend, task.device))
         self._strategy = STRATEGIES[task.schedule.config.densify]
         self._trail: list[_Before] = []
-        self._batch = _Batch(self._compute, task.schedule.config.batch_views)
+        self._batch = _Batch(
+            self._compute, task.schedule.config.batch_views, variance=self._strategy.variance)
 
     def advance(self) -> float:
         """Takes steps up to the next at which the host is needed, and returns its loss.
@@ -117,8 +118,8 @@ class AsyncTrainer:
 class _Batch:
     """The views of one step taken together on the device, as `Stepper` does on the host."""
 
-    def __init__(self, compute: DeferredStep, views: int) -> None:
-        self._compute, self._views = compute, views
+    def __init__(self, compute: DeferredStep, views: int, *, variance: bool) -> None:
+        self._compute, self._views, self._variance = compute, views, variance
         like = compute.status.numbers
         # of several views: losses of this step, and steps that came to nothing
         self._loss, self._skipped = like.new_zeros(()), like.new_zeros(())
@@ -139,7 +140,7 @@ class _Batch:
         several = self._views > 1
         if statistics is not None:
             gathered = self._gathered if several else state.gathered
-            gathered.add(statistics, camera.width, camera.height)
+            gathered.add(statistics, camera.width, camera.height, variance=self._variance)
         if several:
             state.optimizer.accumulate(1 / self._views, sh_rest=moves_sh)
             self._seen |= self._compute.counted

@@ -43,14 +43,20 @@ class DensificationStats:
         """Returns the statistics of n Gaussians before any step."""
         return DensificationStats(*(torch.zeros(n, device=device) for _ in range(4)))
 
-    def add(self, statistics: Statistics, width: int, height: int) -> None:
-        """Adds the statistics of a backward pass over an image of width x height."""
+    def add(self, statistics: Statistics, width: int, height: int, *, variance: bool) -> None:
+        """Adds the statistics of a backward pass over an image of width x height.
+
+        With `variance` that alone, else all others: no strategy needs both, and over all Gaussians
+        they would take a tenth of a step.
+        """
+        if variance:
+            self.variance += statistics.variance
+            return
         # numbers and not a tensor of them: a copy to a GPU would wait for it
         across, down = statistics.means2d_grad.unbind(-1)
         self.pull += torch.stack((across * (width / 2), down * (height / 2)), -1).norm(dim=-1)
         self.count += statistics.radii > 0
         self.radius = torch.maximum(self.radius, statistics.radii)
-        self.variance += statistics.variance
 
     def over(self, ranks: ProcessGroup) -> None:
         """Reduces the statistics over the processes that train together."""

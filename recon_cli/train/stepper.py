@@ -82,7 +82,9 @@ class Stepper:
             if statistics is None:
                 continue
             if gathers:
-                gathered.add(statistics, view.camera.width, view.camera.height)
+                gathered.add(
+                    statistics, view.camera.width, view.camera.height,
+                    variance=self._strategy.variance)
             if several:
                 state.optimizer.accumulate(1 / len(batch), sh_rest=moves_sh)
         if several:

@@ -74,10 +74,20 @@ def test_the_pull_is_measured_in_normalised_device_coordinates_over_seen_steps()
     statistics.means2d_grad[0] = torch.tensor([0.3, 0.4])
     statistics.radii[0] = 5.0
     gathered = DensificationStats.zeros(2, torch.device("cpu"))
-    gathered.add(statistics, 20, 20)
-    gathered.add(statistics, 20, 20)
+    gathered.add(statistics, 20, 20, variance=False)
+    gathered.add(statistics, 20, 20, variance=False)
     assert gathered.mean_grad2d.tolist() == pytest.approx([0.5 * 10, 0.0])
     assert gathered.radius.tolist() == [5.0, 0.0]
+
+
+def test_the_variance_is_added_alone():
+    statistics = Statistics.zeros(torch.zeros(2, 3))
+    statistics.variance[0], statistics.radii[0] = 3.0, 5.0
+    gathered = DensificationStats.zeros(2, torch.device("cpu"))
+    gathered.add(statistics, 20, 20, variance=True)
+    assert gathered.variance.tolist() == [3.0, 0.0]
+    assert not gathered.count.any()
+    assert not gathered.radius.any()
 
 
 def test_a_reset_lowers_high_opacities_and_leaves_low_ones():
