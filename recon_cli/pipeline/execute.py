@@ -107,6 +107,8 @@ def run_stage(
 def importing_ahead(job: Job) -> Iterator[Callable[[], None]]:
     """Yields a function that imports, in a thread, what the stages need that render: seconds.
 
+    Kernels that are compiled are loaded, too.
+
     Only for a block whose own thread imports nothing from then on: two threads that import modules
     which need each other may get one of them half made.
     """
@@ -116,7 +118,7 @@ def importing_ahead(job: Job) -> Iterator[Callable[[], None]]:
     def start() -> None:
         if rows:
             import_module("multiprocessing.synchronize")  # which tqdm imports for its first bar
-            threads.append(threading.Thread(target=_import_quietly, args=(rows[0], job.compute)))
+            threads.append(threading.Thread(target=_load_quietly, args=(rows[0], job.compute)))
             threads[-1].start()
 
     try:
@@ -126,11 +128,12 @@ def importing_ahead(job: Job) -> Iterator[Callable[[], None]]:
             thread.join()
 
 
-def _import_quietly(row: Stage, compute: ComputeConfig) -> None:
+def _load_quietly(row: Stage, compute: ComputeConfig) -> None:
     with suppress(Exception):  # of any package; whoever needs it imports it again, and fails then
         load(f"{row.module}.run")
-        if load("recon_cli.render.registry.renders_on_cpu")(compute.backend, compute.device):
-            load("recon_cli.render.numba.backend.render")
+        if (load("recon_cli.render.registry.renders_on_cpu")(compute.backend, compute.device)
+                and not load("recon_cli.render.registry.kernels_to_compile")("numba")):
+            load("recon_cli.render.registry.prepare")("numba", lambda: None)
 
 
 @contextmanager

@@ -7,7 +7,9 @@ import threading
 import pytest
 from fake_stages import TABLE, job_at
 
+from recon_cli.config.stages import ComputeConfig
 from recon_cli.pipeline.execute import importing_ahead
+from recon_cli.render import registry
 
 
 @pytest.fixture
@@ -27,6 +29,18 @@ def test_the_next_stage_that_renders_is_imported_in_a_thread(tmp_path, rows):
         assert "late_stage" not in sys.modules
         on_idle()
     assert threading.get_ident() != sys.modules["late_stage"].THREAD
+
+
+def test_kernels_are_loaded_where_they_are_compiled(tmp_path, rows, monkeypatch):
+    job = dataclasses.replace(
+        job_at(tmp_path), table=rows, asked=("train",), compute=ComputeConfig(device="cpu"))
+    prepared = []
+    monkeypatch.setattr(registry, "prepare", lambda name, _: prepared.append(name) or 0.0)
+    for to_compile in (12, 0):
+        monkeypatch.setattr(registry, "kernels_to_compile", lambda _, left=to_compile: left)
+        with importing_ahead(job) as on_idle:
+            on_idle()
+        assert prepared == ["numba"] * (to_compile == 0)
 
 
 @pytest.mark.parametrize("asked", [(), ("ingest", "sfm")])
