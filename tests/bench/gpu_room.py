@@ -75,7 +75,8 @@ class Room:
     def trained(self, steps: int) -> Run:
         """Trains and scores."""
         device = ["--device", self._figures.device]
-        self._recon("train", "--iterations", str(steps), "--no-early-stop", *self._size, *device)
+        self._recon("train", "--again", "--iterations", str(steps), "--no-early-stop", *self._size,
+                    *device)
         self._recon("eval", *device)
         manifest = self._manifest("train")
         scores = json.loads((self._workspace / "evaluate" / "metrics.json").read_text())
