@@ -33,7 +33,7 @@ from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task, read_config
 from recon_cli.workspace.atomic import read_json, write_bytes
-from recon_cli.workspace.summaries import JsonRecord
+from recon_cli.workspace.summaries import JsonRecord, TrainPlan
 
 logger = logging.getLogger("recon")
 
@@ -108,12 +108,21 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     start, epoch = begin(), task.schedule.epoch(len(task.train))
     steps = config.recovery
     if steps is None:
-        # from the middle as many as the unpruned run took, which may have stopped early
-        steps = (restore_state(final, task).steps - start.steps if config.at == "mid"
-                 else max(train_config.iterations // _END_RECOVERY, _END_EPOCHS * epoch))
+        steps = max(train_config.iterations // _END_RECOVERY, _END_EPOCHS * epoch)
+        if config.at == "mid":
+            # as many as the unpruned run took, which may have stopped early; where that went on for
+            # a few steps only, too few to recover
+            rest = restore_state(final, task).steps - start.steps
+            steps = max(rest, steps) if _went_on(train) else rest
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
         config.rounds or rounds_within(steps, epoch), seconds_at(train / LOG, start.iteration))
+
+
+def _went_on(train: Path) -> bool:
+    """Returns whether a training went on from a finished model."""
+    plan = TrainPlan.read(train) if (train / TrainPlan.FILE).exists() else None
+    return plan is not None and plan.continues_at is not None
 
 
 class StoredPruneRun(PruneRun):
