@@ -175,9 +175,9 @@ def warm_start(rounds: int) -> Timing:
 
 # Operations of an evaluated pair, forward and backward, counted in the inner loops of the
 # compositing kernels: a multiply-add is two, a division one; comparisons, selections, integer
-# operations, loads, and what is the same for all pixels of a row are none. As in docs/bench.md.
+# operations and loads are none. As in docs/bench.md.
 OPERATIONS_PER_PAIR = {
-    "u along the row, log2 alpha = log2 o - u^2 - v^2": (6, 6),
+    "u, v, log2 alpha = log2 o - u^2 - v^2": (10, 10),
     "2^x: reduction 3, polynomial of degree 5 by Estrin 11": (14, 14),
     "weight alpha T; T (1 - alpha), T / (1 - alpha)": (3, 3),
     "red, green, blue, depth composited, or their gradients summed": (8, 8),
