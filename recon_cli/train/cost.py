@@ -34,7 +34,7 @@ from recon_cli.train.task import Task
 # Of Gaussians that stand for trained ones: with .3 a step takes what a real one does within 10%,
 # with the .1 that training begins with up to 25% less (room `living`, one thread).
 _OPACITY = 0.3
-_STEPS = 6  # timed at each level and count; views differ by a third in what they take
+_STEPS = 8  # timed at each level and count: harmonics, moved in every fourth, cost some more
 _WARM = 1  # steps before them: the first one makes buffers
 _FEW = 3  # the smaller of the two counts is the larger one by this
 _MOST = 100_000  # Gaussians that are timed; to make more takes as long as some hundred steps
@@ -198,7 +198,7 @@ class _Probe:
         return new_state(splats, task.schedule.config, task.extent, backend=task.backend)
 
     def _step_ms(self, splats: Splats, level: int) -> float:
-        """Returns the median of a few steps in the middle of a level; at least of one."""
+        """Returns the mean of a few steps in the middle of a level; at least of one."""
         state = self._state(splats)
         state.iteration = _middle(self._task.schedule, level)
         state.queue = list(self._views)
@@ -206,7 +206,7 @@ class _Probe:
         with suppress(_Enough):
             fit(state, self._task, state.iteration + len(self._views), (timer,))
         times = [1e3 * (end - begin) for begin, end in pairwise(timer.marks)]
-        return statistics.median(times[_WARM:])
+        return statistics.fmean(times[_WARM:])
 
     def report(self) -> LevelCost:
         """Returns the cost of a look at all validation views, from one at the first of them."""
