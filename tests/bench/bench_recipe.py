@@ -16,6 +16,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import click
 
@@ -62,11 +63,7 @@ def planned(task: Task, changes: dict[str, Any], seed: int) -> Task:
         changes["levels"] = ((changes.pop("half"), 2),)
     config = dataclasses.replace(task.schedule.config, seed=seed, **{
         name: value for name, value in changes.items() if name not in FIELDS})
-    own = RECIPES[config.densify]
-    config = dataclasses.replace(config, **{  # the optimizer multiplies them by the recipe's own
-        name: getattr(config, name) * changes.pop(name) / getattr(own, name)
-        for name in ("scales_rate", "sh_rate") if name in changes})
-    recipe = dataclasses.replace(own, **{
+    recipe = dataclasses.replace(RECIPES[config.densify], **{
         name: value for name, value in changes.items() if name in FIELDS})
     return dataclasses.replace(task, schedule=Schedule(config, recipe))
 
@@ -74,9 +71,10 @@ def planned(task: Task, changes: dict[str, Any], seed: int) -> Task:
 def trained(task: Task, scene: Scene) -> TrainState:
     """Returns the state at the end of a run."""
     config = task.schedule.config
-    state = first_state(
-        task, scene.points, scene.colors, most=first_count(config, len(scene.points)))
-    fit(state, task, config.iterations)
+    with patch.dict(RECIPES, {config.densify: task.schedule.recipe}):  # the optimizer looks there
+        state = first_state(
+            task, scene.points, scene.colors, most=first_count(config, len(scene.points)))
+        fit(state, task, config.iterations)
     return state
 
 
