@@ -181,8 +181,7 @@ class TrainConfig(StageConfig):
         "decays to a hundredth.", minimum=0.0, expert=True)
     quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)
     scales_rate: float = option(
-        5e-3, "Learning rate of the log-scales; 4 times as high with budget.", minimum=0.0,
-        expert=True)
+        5e-3, "Learning rate of the log-scales; doubled with budget.", minimum=0.0, expert=True)
     opacities_rate: float = option(
         5e-2, "Learning rate of the opacity logits.", minimum=0.0, expert=True)
     sh_rate: float = option(

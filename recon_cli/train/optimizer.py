@@ -37,7 +37,6 @@ class SplatOptimizer:
     ) -> None:
         self._extent, self._backend = extent, backend
         recipe = RECIPES[config.densify]
-        self._betas = recipe.momentum, _BETAS[1]
         self._rates = {
             "means": config.means_rate * extent, "quats": config.quats_rate,
             "log_scales": recipe.scales_rate * config.scales_rate,
@@ -151,13 +150,13 @@ class SplatOptimizer:
         names = self._names(sh_rest=sh_rest)
         if self._backend == "triton":
             load("recon_cli.render.triton.optimizer.step")(
-                *self._groups(names), taken=self._taken, counted=counted, betas=self._betas,
+                *self._groups(names), taken=self._taken, counted=counted, betas=_BETAS,
                 epsilon=_EPSILON)
             return
         self._taken += 1
         if self.fused:
             load("recon_cli.render.numba.optimizer.step")(
-                *self._groups(names), count=self.count, betas=self._betas, epsilon=_EPSILON)
+                *self._groups(names), count=self.count, betas=_BETAS, epsilon=_EPSILON)
         else:
             self._step_torch(names)
 
@@ -179,7 +178,7 @@ class SplatOptimizer:
             count = torch.full((), self.count - 1.0, device=value.device)
             adam([value], [value.grad], [self._view(name, "exp_avg")],
                  [self._view(name, "exp_avg_sq")], [], [count], fused=True, amsgrad=False,
-                 beta1=self._betas[0], beta2=self._betas[1], lr=self._factor * self._rates[name],
+                 beta1=_BETAS[0], beta2=_BETAS[1], lr=self._factor * self._rates[name],
                  weight_decay=0.0, eps=_EPSILON, maximize=False)
             value.grad = None
 

@@ -33,7 +33,7 @@ def stepped(splats, times=3, densify="reference"):
     return optimizer
 
 
-@pytest.mark.parametrize(("densify", "scales", "colors"), [("reference", 1, 1), ("budget", 4, 2)])
+@pytest.mark.parametrize(("densify", "scales", "colors"), [("reference", 1, 1), ("budget", 2, 2)])
 def test_the_first_step_moves_each_parameter_by_its_learning_rate(densify, scales, colors):
     splats = random_splats(4).map(lambda tensor: tensor.float())
     before = splats.map(lambda tensor: tensor.clone())
@@ -44,14 +44,6 @@ def test_the_first_step_moves_each_parameter_by_its_learning_rate(densify, scale
              "sh_dc": colors * 2.5e-3, "sh_rest": colors * 1.25e-4}
     for name, rate in rates.items():
         assert abs(moved[name] - rate) < 0.02 * rate, name
-
-
-@pytest.mark.parametrize(("densify", "share"), [("reference", 0.1), ("budget", 0.2)])
-def test_a_recipe_has_a_momentum_of_its_own(densify, share):
-    splats = random_splats(4).map(lambda tensor: tensor.float())
-    moments = stepped(splats, times=1, densify=densify).tensors()
-    gradient = 2 * splats.quats  # of the sum of squares
-    assert torch.allclose(moments["adam.quats.exp_avg"], share * gradient, rtol=1e-5)
 
 
 def test_kept_rows_go_on_as_if_nothing_had_happened():
