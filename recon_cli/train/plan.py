@@ -49,9 +49,8 @@ _FULL_AT = 3000  # steps after which there may be a Gaussian for each pixel with
 _VIEWS_EACH = 8  # views that must show a Gaussian, about, to tell where it is
 _FIRST = 0.5  # of the cap, at the start
 _FEWEST = 5000
-# Real Gaussians cover more tiles than timed ones: seven runs of 25 to 60 s took 12 to 37% longer,
-# 22% on the mean (living, office, fox, bedroom, trident, house entry, redkitchen)
-_LONGER = 1.2
+# Real Gaussians cover more tiles than timed ones: ten runs took -1 to 17% longer, 9% on the mean
+_LONGER = 1.09
 _ROUND = 100  # counts are multiples of this
 
 logger = logging.getLogger("recon")
