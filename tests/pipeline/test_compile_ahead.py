@@ -23,9 +23,14 @@ def job_in(folder: Path, **compute: str) -> Job:
     return Job(Workspace(folder), compute=ComputeConfig(**compute), table=TABLE)
 
 
+EARLIER: set[int] = set()  # children of this process before the test, left by others
+
+
 @pytest.fixture(autouse=True)
 def _cold(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("RECON_CACHE_DIR", str(tmp_path / "cache"))
+    EARLIER.clear()
+    EARLIER.update(child.pid for child in psutil.Process().children())
 
 
 @pytest.fixture
@@ -45,7 +50,7 @@ def children(*, alive: bool) -> list[psutil.Process]:
     """Returns the child processes, once there are some that have ended or that are alive."""
     deadline = time.monotonic() + SECONDS
     while time.monotonic() < deadline:
-        found = psutil.Process().children()
+        found = [one for one in psutil.Process().children() if one.pid not in EARLIER]
         if any((one.status() != psutil.STATUS_ZOMBIE) is alive for one in found):
             return found
         time.sleep(0.01)
