@@ -55,6 +55,8 @@ def status_table(stages: Sequence[StageStatus]) -> str:
         state = stage.state
         if state == "partial":
             state = f"partial ({describe_progress(stage.done, stage.total)})"
+        elif state == "fresh" and stage.total:  # a training that goes on from it
+            state = f"fresh, going on ({describe_progress(stage.done, stage.total)})"
         time = "" if stage.seconds is None else format_duration(stage.seconds)
         rows.append((
             stage.name, state, time, "; ".join(stage.reasons) or summary_text(stage.summary)))

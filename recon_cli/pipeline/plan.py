@@ -130,11 +130,11 @@ def _refuse_to_replace(job: Job, verb: str, targets: Sequence[Target]) -> None:
             scene = f"a training that was interrupted at {partial.done} of {partial.total}"
         else:
             continue
-        further = "" if importing else "Train it further by `recon train --from-import`, or "
-        hint = f"give another workspace with -w, or replace it by `recon {verb} --again`."
+        further = "" if importing else ", train it further by `recon train --from-import`"
         raise StageError(
             f"{job.workspace.root} holds {scene}, which `recon {verb}` would replace.",
-            hint=f"{further or 'Give'}{hint if further else hint.removeprefix('give')}")
+            hint=f"Give another workspace with -w{further}, or replace it by `recon {verb} "
+            "--again`.")
 
 
 def plan(checks: WorkspaceCheck, stage: str) -> tuple[Stage, ...]:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from killed import Killed, kill_after
 from tiny_scene import make_inputs
 
 from recon_cli.config.stages import PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io.ply import read_ply
 from recon_cli.stages import prune, train
-from recon_cli.train import fit, runner
+from recon_cli.train import fit
 from recon_cli.train import plan as planning
-from recon_cli.train.state import save_state
 from recon_cli.workspace.summaries import LogRow, TrainPlan
 
 pytestmark = pytest.mark.integration
@@ -52,19 +52,6 @@ def go_on(config, inputs, finished, out, ctx=CONTEXT):
 def same_bytes(one, other):
     return all((one / name).read_bytes() == (other / name).read_bytes()
                for name in ("splats.ply", "mid.safetensors", "final.safetensors", "config.json"))
-
-
-class Killed(Exception):  # noqa: N818 - an event, not an error
-    """Stands for a kill."""
-
-
-def kill_after(steps, monkeypatch):
-    def save_then_die(path, state):
-        save_state(path, state)
-        if state.iteration >= steps:
-            raise Killed
-
-    monkeypatch.setattr(runner, "save_state", save_then_die)
 
 
 def test_the_result_says_where_it_went_on_and_is_better(finished, continued):

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from killed import Killed, kill_after
 from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, run, without
 
 from recon_cli.config.stages import ExportConfig, PruneConfig, RunConfig
@@ -17,7 +18,6 @@ from recon_cli.errors import FormatError, StageError, TrainingError
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.stages import export, prune, train
 from recon_cli.train import prune_run, runner
-from recon_cli.train.state import save_state
 
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
 
@@ -26,20 +26,6 @@ RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
 def inputs(tiny_pruned):
     """ingest, sfm, and a finished train and prune."""
     return tiny_pruned
-
-
-class Killed(Exception):  # noqa: N818 - an event, not an error
-    """Stands for a kill: nothing gets the chance to clean up."""
-
-
-def stopping_after(steps, monkeypatch):
-    """Makes the training loop die right after a step, as kill -9 would."""
-    def save_then_die(path, state):
-        save_state(path, state)
-        if state.iteration >= steps:
-            raise Killed
-
-    monkeypatch.setattr(runner, "save_state", save_then_die)
 
 
 def test_training_leaves_a_scene_its_states_and_a_log(inputs):
@@ -65,7 +51,7 @@ def test_a_killed_training_ends_with_the_bytes_of_an_uninterrupted_one(
     inputs, tmp_path, monkeypatch, steps
 ):
     with monkeypatch.context() as patch:
-        stopping_after(steps, patch)
+        kill_after(steps, patch)
         with pytest.raises(Killed):
             run(train, CONFIG, inputs, tmp_path / "out")
     run(train, CONFIG, inputs, tmp_path / "out")
@@ -114,7 +100,7 @@ def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(input
 
 def test_a_killed_recovery_ends_with_the_same_bytes(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        stopping_after(119, patch)
+        kill_after(119, patch)
         patch.setattr(prune_run, "read_config", lambda _: RUN)  # checkpoints every 7 steps
         with pytest.raises(Killed):
             run(prune, PRUNE, inputs, tmp_path / "out")
@@ -176,7 +162,7 @@ def test_an_export_that_reads_back_differently_fails(inputs, tmp_path, monkeypat
 
 def test_a_checkpoint_cut_short_is_refused_with_what_to_type(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        stopping_after(7, patch)
+        kill_after(7, patch)
         with pytest.raises(Killed):
             run(train, CONFIG, inputs, tmp_path / "out")
     path = tmp_path / "out" / "checkpoint.safetensors"

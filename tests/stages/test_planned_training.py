@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from killed import Killed, kill_after
 from tiny_scene import Shape, make_inputs
 
 from recon_cli.config.stages import PruneConfig, TrainConfig
@@ -14,9 +15,8 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.io.ply import read_ply
 from recon_cli.stages import prune, train
-from recon_cli.train import fit, runner, train_data
+from recon_cli.train import fit, train_data
 from recon_cli.train import plan as planning
-from recon_cli.train.state import save_state
 from recon_cli.train.train_data import estimate_memory
 
 pytestmark = pytest.mark.integration
@@ -40,19 +40,6 @@ def done(inputs, tmp_path_factory):
 def run(config, inputs, out, ctx=CONTEXT):
     out.mkdir(exist_ok=True)
     return train.run(config, inputs, out, ctx)
-
-
-class Killed(Exception):  # noqa: N818 - an event, not an error
-    """Stands for a kill."""
-
-
-def killed_after(steps, monkeypatch):
-    def save_then_die(path, state):
-        save_state(path, state)
-        if state.iteration >= steps:
-            raise Killed
-
-    monkeypatch.setattr(runner, "save_state", save_then_die)
 
 
 def same_bytes(one, other):
@@ -86,7 +73,7 @@ def test_the_numbers_of_a_plan_repeat_the_run_to_the_byte(inputs, done, tmp_path
 def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monkeypatch):
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
-        killed_after(60, patch)
+        kill_after(60, patch)
         with pytest.raises(Killed):
             run(OPEN, inputs, out)
     recorded = (out / "plan.json").read_bytes()
@@ -183,7 +170,7 @@ def test_a_killed_run_that_stops_early_ends_with_the_same_bytes(
 ):
     run(STOPPING, inputs, tmp_path / "whole")
     with monkeypatch.context() as patch:
-        killed_after(steps, patch)
+        kill_after(steps, patch)
         with pytest.raises(Killed):
             run(STOPPING, inputs, tmp_path / "out")
     run(STOPPING, inputs, tmp_path / "out")
