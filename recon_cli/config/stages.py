@@ -146,7 +146,8 @@ class TrainConfig(StageConfig):
         "budget", "Add Gaussians where the error is (budget) or as 3DGS does (reference).",
         choices=("budget", "reference"))
     iterations: int | None = option(
-        None, "Optimization steps.", minimum=1, automatic="by --quality")
+        None, "Optimization steps; more than those of a finished run go on from its end.", minimum=1,
+        automatic="by --quality")
     batch_views: int = option(
         1, "Views per step and process; their mean gradient is used.", unit="views", minimum=1,
         expert=True)
@@ -154,8 +155,7 @@ class TrainConfig(StageConfig):
         None, "Longest side of a training image.", unit="pixels", minimum=16,
         automatic="by --quality")
     sh_degree: int | None = option(
-        None, "Degree of the spherical harmonics.", minimum=0, maximum=3,
-        automatic="auto, chosen by a short trial")
+        None, "Spherical harmonics degree.", minimum=0, maximum=3, automatic="by a trial")
     max_gaussians: int | None = option(
         None, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS,
         automatic="auto, by image detail, steps and memory")
