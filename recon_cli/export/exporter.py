@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -16,18 +17,21 @@ from torch import Tensor
 from recon_cli.config.stages import ExportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.evaluation.reference_views import evenly_spread, load_scene
 from recon_cli.export.cleanup import drop_floaters, drop_islands
 from recon_cli.export.coordinate_frame import ExportFrame
-from recon_cli.export.reduce import crop, fit_to_size, measure_change
+from recon_cli.export.reduce import LowerDegrees, crop, fit_to_size, measure_change
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.colmap import write_colmap
+from recon_cli.io.images import fit_camera
 from recon_cli.io.ply import write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
 from recon_cli.io.splats.glb import nearest_axes, write_glb
 from recon_cli.io.splats.html import write_html
 from recon_cli.io.splats.registry import FORMATS
+from recon_cli.io.splats.sog import SHARING, write_sog
+from recon_cli.io.splats.splat import write_splat
 from recon_cli.io.splats.spz import write_spz
 from recon_cli.io.transforms import write_transforms
 from recon_cli.scene.camera import Camera
@@ -42,6 +46,7 @@ from recon_cli.workspace.summaries import ExportChange, ExportedFile
 MAX_LOSS_DB = {"splat": 3.0}
 _MAX_LOSS_DB = 0.3
 _IMAGES = "images"
+_COLOR_SIZE, _COLOR_VIEWS = 400, 100  # pixels and views, at most, that colours are fitted to
 _SCORE = "loo"  # which Gaussians --max-mb keeps; docs/pruning.md
 
 logger = logging.getLogger("recon")
@@ -58,6 +63,7 @@ class Exporter:
         self._similarity, self._up = frame.similarity, frame.up
         self._last: tuple[Splats, float] | None = None
         self._whole: Splats | None = None
+        self._lower: tuple[Splats, LowerDegrees] | None = None
 
     def reduce(self, splats: Splats) -> tuple[Splats, list[ExportChange]]:
         """Returns the scene after the options that remove something, in order, and the changes.
@@ -82,11 +88,12 @@ class Exporter:
         if config.crop is not None:
             splats = step("crop", crop(splats, config.crop))
         if config.sh_degree is not None and config.sh_degree < splats.sh_degree:
-            splats = step("sh_degree", splats.with_degree(config.sh_degree))
+            splats = step("sh_degree", self._at_degree(splats, config.sh_degree))
         if config.max_mb is not None:
             splats = step("max_mb", fit_to_size(
                 splats, int(1e6 * config.max_mb), size_of=self._size_of(config.formats[0]),
-                score_of=self._score, psnr_db=self._psnr.psnr_db))
+                score_of=self._score, at_degree=partial(self._at_degree, splats),
+                psnr_db=self._psnr.psnr_db))
         return splats, changes
 
     def write(self, name: str, splats: Splats) -> ExportedFile:
@@ -100,17 +107,12 @@ class Exporter:
         if name in others:
             return ExportedFile(file=others[name](splats).name)
         path = self._out / f"splats.{name}"
-        self._write_format(name, path, splats)
-        return self._check(name, path, splats)
-
-    def _check(self, name: str, path: Path, splats: Splats) -> ExportedFile:
-        """Reads a file back and logs its size and its loss."""
-        gain = self._psnr.psnr_db(FORMATS[name].read(path)) - self._psnr_db_before(splats)
-        size, whole = path.stat().st_size, (self._out / "splats.ply").stat().st_size
-        text = f"{name}: {whole / size:.1f}x smaller, {gain:+.2f} dB"
         max_loss = self._config.max_loss
         if max_loss is None:
             max_loss = MAX_LOSS_DB.get(name, _MAX_LOSS_DB)
+        gain = self._write_format(name, path, splats, max_loss)
+        size, whole = path.stat().st_size, (self._out / "splats.ply").stat().st_size
+        text = f"{name}: {whole / size:.1f}x smaller, {gain:+.2f} dB"
         if not gain >= -max_loss:  # a NaN fails too
             raise ReconstructionError(
                 f"{text} on {self._psnr.describe()}, but it may lose {max_loss:g} dB at most.",
@@ -119,7 +121,28 @@ class Exporter:
         return ExportedFile(file=path.name, bytes=size, smaller=round(whole / size, 3),
                             psnr_change_db=round(gain, 4))
 
-    def _write_format(self, name: str, path: Path, splats: Splats) -> None:
+    def _write_format(
+        self, name: str, path: Path, splats: Splats, max_loss: float
+    ) -> float:
+        """Writes a file, reads it back, and returns its gain in dB over the scene."""
+        def gain() -> float:
+            return self._psnr.psnr_db(FORMATS[name].read(path)) - self._psnr_db_before(splats)
+
+        if name != "sog":
+            self._write_file(name, path, splats)
+            return gain()
+        limited = self._config.max_mb is not None and name == self._config.formats[0]
+        found = -math.inf
+        for sharing in SHARING:
+            write_sog(path, splats, sharing=sharing)
+            if limited and path.stat().st_size > 1e6 * (self._config.max_mb or 0):
+                break
+            found = gain()
+            if found >= -max_loss:
+                break
+        return found
+
+    def _write_file(self, name: str, path: Path, splats: Splats) -> None:
         if name == "glb":
             write_glb(path, splats, axes=nearest_axes(self._up))
         elif name == "spz":
@@ -127,6 +150,8 @@ class Exporter:
         elif name == "html":
             write_html(path, splats, title=self._title, up=self._up,
                        views=self._place(self._scene.train))
+        elif name == "splat":
+            write_splat(path, self._at_degree(splats, 0))
         else:
             FORMATS[name].write(path, splats)
 
@@ -140,10 +165,21 @@ class Exporter:
         def size_of(splats: Splats) -> int:
             with tempfile.TemporaryDirectory(prefix="recon-size-") as folder:
                 path = Path(folder) / f"splats.{name}"
-                self._write_format(name, path, splats)
+                self._write_file(name, path, splats)
                 return path.stat().st_size
 
         return size_of
+
+    def _at_degree(self, splats: Splats, degree: int) -> Splats:
+        """Returns the scene in a degree, at most its own, as the training views see it."""
+        if degree >= splats.sh_degree:
+            return splats
+        if self._lower is None or self._lower[0] is not splats:
+            cameras = [fit_camera(self._similarity.camera(view.camera), _COLOR_SIZE)
+                       for view in evenly_spread(self._scene.train, _COLOR_VIEWS)]
+            on_device = splats.map(lambda tensor: tensor.to(self._ctx.device))
+            self._lower = splats, LowerDegrees(on_device, cameras, backend=self._ctx.backend)
+        return self._lower[1].at(degree).map(lambda tensor: tensor.to(splats.means.device))
 
     def _psnr_db_before(self, splats: Splats) -> float:
         """Returns the PSNR of the scene that all files are made of, rendered once."""

@@ -6,13 +6,17 @@ import logging
 
 import pytest
 import torch
-from tiny_stages import CONTEXT
+from tiny_stages import CONTEXT, LEARNT
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
+from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.export.reduce import fit_to_size
+from recon_cli.export.verify import load_reference_psnr
 from recon_cli.io.ply import read_ply
 from recon_cli.io.splats.registry import FORMATS
+from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.splats import SH_C0
 from recon_cli.stages import export
 
 
@@ -62,13 +66,34 @@ def test_a_box_without_gaussians_is_refused_with_where_they_are(inputs, tmp_path
         ExportConfig(crop=(1.0, 0.0, 0.0, 0.0, 1.0, 1.0))
 
 
-def test_a_lower_degree_cuts_the_harmonics_off(inputs, whole, tmp_path):
+def test_a_lower_degree_keeps_the_colours_that_the_views_see(inputs, whole, tmp_path):
     summary = exported(inputs, tmp_path, sh_degree=1)
     back = read_ply(tmp_path / "splats.ply")
     assert back.sh_degree == 1
-    assert torch.equal(back.sh_rest, whole.sh_rest[:len(back.sh_rest), :3])
     (change,) = summary.changes
     assert (change.degree, change.degree_before) == (1, 3)
+    scene = load_scene(inputs, validation=LEARNT.validation)
+    psnr = load_reference_psnr(scene, Similarity(), LEARNT.max_size, CONTEXT)
+    cut = psnr.psnr_db(whole.with_degree(1)) - psnr.psnr_db(whole)
+    assert cut < change.psnr_change_db - 0.1
+
+
+def test_a_file_without_harmonics_has_the_colours_that_the_views_see(inputs, whole, tmp_path):
+    exported(inputs, tmp_path, format="splat")
+    exported(inputs, tmp_path, format="ply", sh_degree=0)
+    back = FORMATS["splat"].read(tmp_path / "splats.splat")
+    fitted = read_ply(tmp_path / "splats.ply")
+    assert not torch.equal(fitted.sh_dc, whole.sh_dc)
+    assert torch.allclose(  # .splat has another order
+        back.sh_dc.sort(0).values, fitted.sh_dc.sort(0).values.clamp(-0.5 / SH_C0, 0.5 / SH_C0),
+        atol=0.5 / 255 / SH_C0 + 1e-3)
+
+
+def test_a_palette_that_loses_too_much_gets_more_entries(inputs, tmp_path):
+    small = exported(inputs, tmp_path, format="sog", max_loss=9.0).files["sog"]
+    large = exported(inputs, tmp_path, format="sog").files["sog"]
+    assert small.psnr_change_db < -0.3 <= large.psnr_change_db
+    assert large.bytes > small.bytes
 
 
 @pytest.mark.parametrize("name", ["ply", "spz", "sog"])
@@ -94,7 +119,8 @@ def test_the_size_is_met_by_what_looks_best(whole):
     best = fit_to_size(
         whole, 68 * 40 + 2000, size_of=lambda splats: len(splats) * (
             68 + 12 * (0, 3, 8, 15)[splats.sh_degree]) + 1500,
-        score_of=lambda splats: torch.arange(len(splats)).double(), psnr_db=psnr_db)
+        score_of=lambda splats: torch.arange(len(splats)).double(),
+        at_degree=whole.with_degree, psnr_db=psnr_db)
     assert best.sh_degree == 1
     assert [degree for degree, _ in asked] == [3, 2, 1, 0]
     counts = [count for _, count in asked]

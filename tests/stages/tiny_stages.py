@@ -18,7 +18,7 @@ CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
     checkpoint_every=7)
 PRUNE = PruneConfig(ratio=0.5, at="mid")
-LEARNT = RunConfig(iterations=120, max_gaussians=120, sh_rate=0.05)  # harmonics that show
+LEARNT = RunConfig(iterations=120, max_gaussians=120, sh_rate=0.01)  # harmonics that show
 CONTEXT = StageContext()
 
 

@@ -52,9 +52,7 @@ _TAG = 252  # of a quaternion whose greatest component is w
 _ROOT2 = math.sqrt(2)  # only the greatest component of a unit quaternion exceeds 1 / sqrt(2)
 _MAX_ENTRIES = 65535  # of a palette, besides one of zeros: labels are 16 bits
 _MAX_COUNT = 16383 * 16383  # pixels of the largest WebP
-# Gaussians per entry. A scene of photos with 60,000 (fox, degree 3) loses .15, .19, .25 and .33 dB
-# with 4, 8, 16 and 32, and takes 23.7, 18.7, 16.1 and 14.7 bytes each.
-_SHARE = 16
+SHARING = (16, 8, 4, 2, 1)  # Gaussians per entry of the palette, on the mean: smallest file first
 META = "meta.json"
 _META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
 _SMALL = 1 << 20  # Gaussians or pixels that are always accepted: a few hundred MB
@@ -66,12 +64,15 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others cannot be stoppe
 Doubles = NDArray[np.float64]
 
 
-def write_sog(path: Path, splats: Splats, *, seed: int = 0) -> None:
+def write_sog(
+    path: Path, splats: Splats, *, seed: int = 0, sharing: int = SHARING[0]
+) -> None:
     """Writes `splats` to `path`, whole or not at all; the same seed gives the same bytes.
 
     Gaussians are sorted in Morton order, those that have coefficients first. Quaternions are
     normalized, and opacities are rounded to 255ths. `seed` is of the k-means that finds codebooks
-    and palette. FormatError if there are no Gaussians, or a value is not finite.
+    and palette, in which an entry stands for the harmonics of `sharing` Gaussians. FormatError if
+    there are no Gaussians, or a value is not finite.
     """
     rng = np.random.default_rng(seed)
     table = to_arrays(splats, ".sog")
@@ -98,7 +99,8 @@ def write_sog(path: Path, splats: Splats, *, seed: int = 0) -> None:
     }
     images = {name: _image(row) for name, row in rows.items()}
     if table["sh_rest"].size:
-        meta["shN"], palette = pack_harmonics(table["sh_rest"], len(splats.sh_rest), rng)
+        meta["shN"], palette = pack_harmonics(
+            table["sh_rest"], len(splats.sh_rest), rng, sharing)
         images |= palette
     write_bytes(path, pack_archive(meta, images))
 
@@ -193,14 +195,14 @@ def pack_quats(quats: Floats) -> Bytes:
 
 
 def pack_harmonics(
-    sh_rest: Floats, colored: int, rng: np.random.Generator
+    sh_rest: Floats, colored: int, rng: np.random.Generator, sharing: int
 ) -> tuple[dict[str, Any], dict[str, Bytes]]:
     """Returns the entry of meta.json and the images of coefficients [N, T, 3].
 
     The first `colored` Gaussians have any; the others share an entry of zeros.
     """
     n, terms = sh_rest.shape[:2]
-    size = min(_MAX_ENTRIES, -(-colored // _SHARE))
+    size = min(_MAX_ENTRIES, -(-colored // sharing))
     entries, labels = fit_palette(sh_rest[:colored].reshape(colored, -1), size, rng)
     # Neighbours in space get neighbouring numbers, so that both images compress.
     order = np.argsort(np.bincount(labels, np.arange(colored)) / np.bincount(labels))
