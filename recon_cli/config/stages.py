@@ -146,8 +146,8 @@ class TrainConfig(StageConfig):
         "budget", "Add Gaussians where the error is (budget) or as 3DGS does (reference).",
         choices=("budget", "reference"))
     iterations: int | None = option(
-        None, "Optimization steps; more than those of a finished run go on from its end.", minimum=1,
-        automatic="by --quality")
+        None, "Optimization steps; more than those of a finished run go on from its end.",
+        minimum=1, automatic="by --quality")
     batch_views: int = option(
         1, "Views per step and process; their mean gradient is used.", unit="views", minimum=1,
         expert=True)
@@ -181,12 +181,13 @@ class TrainConfig(StageConfig):
         "decays to a hundredth.", minimum=0.0, expert=True)
     quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)
     scales_rate: float = option(
-        5e-3, "Learning rate of the log-scales; doubled with budget.", minimum=0.0, expert=True)
+        5e-3, "Learning rate of the log-scales; 4 times as high with budget.", minimum=0.0,
+        expert=True)
     opacities_rate: float = option(
         5e-2, "Learning rate of the opacity logits.", minimum=0.0, expert=True)
     sh_rate: float = option(
         2.5e-3, "Learning rate of the base colours; doubled with budget. Higher degrees use a "
-        "twentieth.", minimum=0.0, expert=True)
+        "twentieth, with budget a fifth in every fourth step.", minimum=0.0, expert=True)
     densify_every: int = option(
         100, "Interval between densification steps.", unit="steps", minimum=1, expert=True)
     densify_gradient: float = option(

@@ -37,11 +37,12 @@ class SplatOptimizer:
     ) -> None:
         self._extent, self._backend = extent, backend
         recipe = RECIPES[config.densify]
+        self._betas = recipe.momentum, _BETAS[1]
         self._rates = {
             "means": config.means_rate * extent, "quats": config.quats_rate,
             "log_scales": recipe.scales_rate * config.scales_rate,
             "logit_opacities": config.opacities_rate, "sh_dc": recipe.sh_rate * config.sh_rate,
-            "sh_rest": recipe.sh_rate * config.sh_rate * _REST_FACTOR}
+            "sh_rest": recipe.sh_rest_rate * config.sh_rate * _REST_FACTOR}
         # on the device where a step may come to nothing there without the host's knowledge
         self._taken = torch.zeros(1, dtype=torch.int64)
         if backend == "triton":
@@ -150,13 +151,13 @@ class SplatOptimizer:
         names = self._names(sh_rest=sh_rest)
         if self._backend == "triton":
             load("recon_cli.render.triton.optimizer.step")(
-                *self._groups(names), taken=self._taken, counted=counted, betas=_BETAS,
+                *self._groups(names), taken=self._taken, counted=counted, betas=self._betas,
                 epsilon=_EPSILON)
             return
         self._taken += 1
         if self.fused:
             load("recon_cli.render.numba.optimizer.step")(
-                *self._groups(names), count=self.count, betas=_BETAS, epsilon=_EPSILON)
+                *self._groups(names), count=self.count, betas=self._betas, epsilon=_EPSILON)
         else:
             self._step_torch(names)
 
@@ -178,7 +179,7 @@ class SplatOptimizer:
             count = torch.full((), self.count - 1.0, device=value.device)
             adam([value], [value.grad], [self._view(name, "exp_avg")],
                  [self._view(name, "exp_avg_sq")], [], [count], fused=True, amsgrad=False,
-                 beta1=_BETAS[0], beta2=_BETAS[1], lr=self._factor * self._rates[name],
+                 beta1=self._betas[0], beta2=self._betas[1], lr=self._factor * self._rates[name],
                  weight_decay=0.0, eps=_EPSILON, maximize=False)
             value.grad = None
 

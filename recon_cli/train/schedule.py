@@ -53,6 +53,8 @@ class Recipe:
     means_rate: float = 1.0
     scales_rate: float = 1.0
     sh_rate: float = 1.0
+    sh_rest_rate: float = 1.0  # of the higher degrees, each time that they are moved
+    momentum: float = 0.9  # of the Gaussians' Adam: beta 1
     means_final: float = 0.01  # last rate of the means over the first; exponential between
     final_from: float = 1.0  # share from which all other rates fall
     final_rate: float = 1.0  # to which they fall at the end, of their own; exponential
@@ -66,7 +68,8 @@ REFERENCE = Recipe(
 BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
     sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False, means_rate=6.0,
-    scales_rate=2.0, sh_rate=2.0, final_from=0.8, final_rate=0.1)
+    scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8, final_from=0.8,
+    final_rate=0.1)
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 

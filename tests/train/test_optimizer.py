@@ -33,17 +33,26 @@ def stepped(splats, times=3, densify="reference"):
     return optimizer
 
 
-@pytest.mark.parametrize(("densify", "scales", "colors"), [("reference", 1, 1), ("budget", 2, 2)])
-def test_the_first_step_moves_each_parameter_by_its_learning_rate(densify, scales, colors):
+@pytest.mark.parametrize(("densify", "scales", "colors", "rest"), [
+    ("reference", 1, 1, 1), ("budget", 4, 2, 4)])
+def test_the_first_step_moves_each_parameter_by_its_learning_rate(densify, scales, colors, rest):
     splats = random_splats(4).map(lambda tensor: tensor.float())
     before = splats.map(lambda tensor: tensor.clone())
     optimizer = stepped(splats, times=1, densify=densify)
     moved = {name: (getattr(before, name) - value).abs().median().item()
              for name, value in optimizer.splats.parameters().items()}
     rates = {"means": 2e-4, "quats": 1e-3, "log_scales": scales * 5e-3, "logit_opacities": 5e-2,
-             "sh_dc": colors * 2.5e-3, "sh_rest": colors * 1.25e-4}
+             "sh_dc": colors * 2.5e-3, "sh_rest": rest * 1.25e-4}
     for name, rate in rates.items():
         assert abs(moved[name] - rate) < 0.02 * rate, name
+
+
+@pytest.mark.parametrize(("densify", "share"), [("reference", 0.1), ("budget", 0.2)])
+def test_a_recipe_has_a_momentum_of_its_own(densify, share):
+    splats = random_splats(4).map(lambda tensor: tensor.float())
+    moments = stepped(splats, times=1, densify=densify).tensors()
+    gradient = 2 * splats.quats  # of the sum of squares
+    assert torch.allclose(moments["adam.quats.exp_avg"], share * gradient, rtol=1e-5)
 
 
 def test_kept_rows_go_on_as_if_nothing_had_happened():
