@@ -164,7 +164,7 @@ class TrainConfig(StageConfig):
         "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
         choices=("auto", "denoised", "original"))
     far: str = option(
-        "auto", "Add distant background Gaussians; auto: if a trial improves validation PSNR.",
+        "auto", "Add distant background Gaussians; auto: unless a trial lowers validation PSNR.",
         choices=("auto", "on", "off"))
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",

@@ -46,6 +46,14 @@ def test_a_loss_keeps_the_part_off():
     assert not decided([-0.5] * 8).on
 
 
+@pytest.mark.parametrize(("gains", "on"), [
+    ([2.0, -1.5, 0, 0.1, -1, 0.3, -0.2, 0.1], True),  # nothing is sure
+    ([-0.5, -0.4, -0.6, -0.3, -0.5, -0.4, -0.6, -0.5], False),
+    ([-0.04] * 8, True), ([0.3, math.nan, 0.3, 0.3], False)])
+def test_a_part_that_is_on_anyway_goes_off_by_a_sure_loss(gains, on):
+    assert decided(gains, unless_worse=True).on is on
+
+
 def test_an_arm_that_broke_down_keeps_the_part_off():
     assert not decided([0.3, math.nan, 0.3, 0.3]).on
 

@@ -1,4 +1,4 @@
-"""Parts of the model are off unless a sign speaks for them and a trial shows that they pay."""
+"""Parts of the model are on where a sign speaks for them and a trial does."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ def test_a_plain_scene_needs_nothing_and_pays_nothing():
     needs = examine(scene())
     assert (needs.config.far, needs.config.exposure, needs.config.poses) == ("off",) * 3
     assert needs.seconds == 0
-    assert "cover 100.0%" in reasons(needs)["far"]
+    assert "cover all" in reasons(needs)["far"]
     assert "differs by" in reasons(needs)["exposure"]
 
 

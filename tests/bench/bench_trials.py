@@ -1,0 +1,139 @@
+"""Holds what trials choose against full runs: `python tests/bench/bench_trials.py --help`.
+
+WORKSPACES have their sfm done and are only read. For each, the trials of `recon train` choose the
+optional parts of the model; then runs of full length differ from the chosen one in one part each.
+Both are scored on the validation views, a fifth of the training views, each after its best gain.
+`gain` is what a part is worth in the full run, `lost` what the choice gives away: never more than
+.1 dB is the aim.
+
+    python tests/bench/bench_trials.py living fox --iterations 3000 --iterations 10000
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.config.stages import RunConfig, TrainConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_scene, mean_psnr
+from recon_cli.render.registry import use_threads
+from recon_cli.scene.scene import Scene
+from recon_cli.train.feature_trials import PARTS
+from recon_cli.train.fit import fit
+from recon_cli.train.initialize import first_state
+from recon_cli.train.plan import Facts, cap, choose_parts, count_detail, first_config, first_count
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.task import Task
+from recon_cli.train.train_data import load_task, load_views
+
+VALIDATION = 0.2  # share of the training views: as many views as trials hold out by themselves
+DEGREE = "sh-degree"
+ALL = (*PARTS, DEGREE)
+SWITCHED = {  # the other value of a part
+    "far": ("off", "on"), "exposure": ("off", "on"), "poses": ("off", "on"),
+    "images": ("original", "denoised")}
+
+
+class Capture:
+    """A workspace whose cameras are known, and the runs made of it."""
+
+    def __init__(self, workspace: Path, asked: TrainConfig, ctx: StageContext) -> None:
+        self.name, self.asked, self.ctx = workspace.name, asked, ctx
+        inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
+        self.scene: Scene = load_scene(inputs, validation=VALIDATION)
+        self.task: Task = load_task(self.scene, first_config(asked), ctx)
+        self.needs = choose_parts(self.task, self.scene, ctx, harmonics=True)
+        self._scores: dict[RunConfig, NDArray[np.float64]] = {}
+
+    def config(self, iterations: int) -> RunConfig:
+        """Returns the options of a run with the chosen parts."""
+        facts = Facts(count_detail(self.task.train), len(self.task.train),
+                      len(self.scene.points), 10**9)
+        return dataclasses.replace(
+            self.needs.config, iterations=iterations, early_stop=False,
+            max_gaussians=cap(self.asked, facts, iterations))
+
+    def changed(self, config: RunConfig, part: str) -> RunConfig | None:
+        """Returns the options with the other choice of a part; None where there is none."""
+        if part == DEGREE:
+            return dataclasses.replace(config, sh_degree=0 if config.sh_degree else 3)
+        if part == "images" and not any(d.name == "images" for d in self.needs.decisions):
+            return None  # nothing was denoised
+        values = SWITCHED[part]
+        value = values[1 - values.index(getattr(config, part))]
+        return dataclasses.replace(config, **{part: value})  # type: ignore[arg-type]
+
+    def scores(self, config: RunConfig) -> NDArray[np.float64]:
+        """Returns the PSNR in dB of each validation view after a run."""
+        if config not in self._scores:
+            train = self.task.train
+            if config.images == "denoised":
+                train = load_views(self.scene.train, config, self.ctx)
+            task = dataclasses.replace(
+                self.task, train=train, validation=[], schedule=Schedule(config))
+            state = first_state(task, self.scene.points, self.scene.colors,
+                                most=first_count(config, len(self.scene.points)))
+            fit(state, task, config.iterations)
+            self._scores[config] = np.array([
+                mean_psnr(state.splats, [view], config.sh_degree, task.backend, corrected=True)
+                for view in self.task.validation])
+        return self._scores[config]
+
+    def row(self, part: str, iterations: int) -> str | None:
+        """Returns the line of one part at one length; None where there is no choice."""
+        config = self.config(iterations)
+        other = self.changed(config, part)
+        if other is None:
+            return None
+        start = time.process_time()
+        chosen, changed = self.scores(config), self.scores(other)
+        seconds = time.process_time() - start
+        on = (config.sh_degree > 0 if part == DEGREE
+              else getattr(config, part) == SWITCHED[part][1])
+        gains = (chosen - changed) * (1 if on else -1)
+        mean, error = gains.mean(), gains.std(ddof=1) / math.sqrt(len(gains))
+        trial = next((d for d in self.needs.decisions if d.name.startswith(
+            "harmonics above degree 0" if part == DEGREE else part)), None)
+        tried = ("no sign" if trial is None or trial.mean_db is None
+                 else f"{trial.mean_db:+.2f} ± {trial.standard_error_db:.2f}")
+        choice = str(config.sh_degree) if part == DEGREE else ("on" if on else "off")
+        lost = max(0.0, -mean if on else mean)
+        return (f"| {self.name} | {part} | {tried} | {choice} | {iterations:,} "
+                f"| {chosen.mean():.2f} | {mean:+.2f} ± {error:.2f} | {lost:.2f} | {seconds:.0f} |")
+
+
+@click.command()
+@click.argument("workspaces", nargs=-1, required=True,
+                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--iterations", "lengths", multiple=True, type=int, default=(3000, 10_000),
+              show_default=True)
+@click.option("--part", "parts", multiple=True, type=click.Choice(ALL), default=ALL,
+              show_default=True)
+@click.option("--max-size", default=400, show_default=True)
+@click.option("--threads", default=1, show_default=True)
+def main(workspaces: tuple[Path, ...], lengths: tuple[int, ...], parts: tuple[str, ...],
+         max_size: int, threads: int) -> None:
+    """Print what each part is worth in the trial and in runs of full length, in dB."""
+    use_threads("numba", threads)
+    ctx = StageContext(backend="numba")
+    click.echo("| capture | part | trial | chosen | steps | PSNR | gain in full | lost | CPU s |\n"
+               "|---|---|---:|---|---:|---:|---:|---:|---:|")
+    for workspace in workspaces:
+        capture = Capture(workspace, TrainConfig(
+            max_size=max_size, validation=VALIDATION), ctx)
+        for iterations in lengths:
+            for part in parts:
+                line = capture.row(part, iterations)
+                if line is not None:
+                    click.echo(line)
+
+
+if __name__ == "__main__":
+    main()
