@@ -225,9 +225,16 @@ def test_it_fits_a_phone(page, tmp_path):
 
 
 def test_while_it_loads_the_page_says_so(page, tmp_path):
-    path = made(tmp_path / "a.html", 0, 50)
-    page.page.goto(path.as_uri(), wait_until="commit")
-    assert page.page.locator("#message").inner_text().startswith("Loading room")
+    page.page.add_init_script("""
+        window.said = [];
+        new MutationObserver(() => {
+            const message = document.getElementById("message");
+            if (message) said.push(message.textContent);
+        }).observe(document, {childList: true, subtree: true, characterData: true});""")
+    opened(page, made(tmp_path / "a.html", 0, 50))
+    said = page.page.evaluate("said")
+    assert said[0].startswith("Loading room")
+    assert said[-1] == ""
 
 
 def test_without_webgl_2_the_page_says_what_to_do(page, tmp_path):
