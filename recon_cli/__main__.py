@@ -1,5 +1,11 @@
 """Runs the command line as `python -m recon_cli`."""
 
-from recon_cli.cli import main
+import os
 
+from recon_cli.cli import main
+from recon_cli.machine import end_with_parent
+from recon_cli.pipeline.executor import CHILD
+
+if os.environ.pop(CHILD, ""):
+    end_with_parent()
 raise SystemExit(main())

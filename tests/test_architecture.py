@@ -43,7 +43,7 @@ ALLOWED: dict[str, set[str]] = {
     "viewer": RUN | {"flythrough"},
     "commands": RUN | {"experiments", "flythrough", "report", "viewer"},
     "cli": RUN | {"commands"},
-    "__main__": {"cli"},
+    "__main__": {"cli", "machine", "pipeline"},
 }
 # Packages that only some parts may import.
 HOMES = {
@@ -57,6 +57,7 @@ HOMES = {
     "llvmlite": {"render"},
     "tqdm": {"progress"},
     "triton": {"render"},
+    "ray": {"pipeline"},
     "pycolmap": {"sfm", "io"},
 }
 

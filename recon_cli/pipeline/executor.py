@@ -1,0 +1,153 @@
+"""Runs recon commands for other programs: in processes of this machine, or see `ray_executor`.
+
+A command is what one would type. What it makes lies in a workspace whose stages commit atomically
+and resume: a retry is the same command, and nothing but an exit code has to come back. How far it
+is can be read in the workspace.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from filelock import FileLock, Timeout
+
+from recon_cli.workspace.layout import LOCK
+
+PROGRAM = (sys.executable, "-m", "recon_cli")
+CHILD = "RECON_JOB"  # environment variable of a process that ends with the one that started it
+CORES = 4  # of a command where nothing is said; more shorten it by little
+TRIES = 3  # of a command whose process is killed, by the system for want of memory or by somebody
+INTERRUPTED = 130
+KILLED = 128  # exit code of a shell for a process that a signal ended, plus that signal
+_LOCK_SECONDS = 60.0  # within which a process that lost its parent is gone
+_STOP_SECONDS = 60.0  # for saving a checkpoint
+
+
+@dataclass(frozen=True)
+class Command:
+    """One `recon` command on one workspace; paths are absolute."""
+
+    words: tuple[str, ...]  # after `recon`
+    workspace: Path
+    log: Path  # gets what it prints; replaced by each call
+
+
+class Executor(Protocol):
+    """Runs commands somewhere; `run` may be called by `slots` threads at once."""
+
+    slots: int
+
+    def run(self, command: Command) -> int:
+        """Runs a command until it ends and returns its exit code; 128 + n for a signal n.
+
+        Raises:
+            BackendError: the machines cannot be reached any more.
+        """
+
+    def stop(self) -> None:
+        """Interrupts what runs: it saves its checkpoint, and `run` returns 130."""
+
+    def close(self) -> None:
+        """Lets the machines go."""
+
+
+class LocalExecutor:
+    """Runs up to `slots` commands at once in processes of this machine."""
+
+    def __init__(self, slots: int) -> None:
+        self.slots = slots
+        self._running: set[RunningCommand] = set()
+        self._lock = threading.Lock()
+        self._stopped = False
+
+    def run(self, command: Command) -> int:
+        """Runs a command until it ends and returns its exit code; see `Executor`."""
+        running = RunningCommand(command)
+        with self._lock:
+            if self._stopped:
+                return INTERRUPTED
+            self._running.add(running)
+        try:
+            return running.wait()
+        finally:
+            with self._lock:
+                self._running.discard(running)
+
+    def stop(self) -> None:
+        """Interrupts what runs; see `Executor`."""
+        with self._lock:
+            self._stopped = True
+            for running in self._running:
+                running.interrupt()
+
+    def close(self) -> None:
+        """Does nothing: no process outlives `run`."""
+
+
+class RunningCommand:
+    """A command in a process of this machine, which ends when this process does."""
+
+    def __init__(self, command: Command) -> None:
+        self._command = command
+        self._stopped = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def wait(self) -> int:
+        """Runs the command until it ends by itself, three times at most; returns its exit code."""
+        code = 0
+        for _ in range(TRIES):
+            code = INTERRUPTED if self._stopped.is_set() else self._run_once()
+            if code >= 0:
+                return code
+        return KILLED - code
+
+    def interrupt(self) -> None:
+        """Has the command save what it has and end; `wait` returns 130."""
+        self._stopped.set()
+        process = self._process
+        if process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGINT)
+            timer = threading.Timer(_STOP_SECONDS, process.kill)
+            timer.daemon = True
+            timer.start()
+
+    def _run_once(self) -> int:
+        """Returns the exit code, negative for a signal."""
+        command = self._command
+        command.workspace.mkdir(parents=True, exist_ok=True)
+        _wait_until_free(command.workspace)
+        # In the workspace: `python -m` looks for modules in the current folder first. A session of
+        # its own: Ctrl-C is passed on by `interrupt`, once.
+        with command.log.open("wb") as log, subprocess.Popen(
+            [*PROGRAM, *command.words], cwd=command.workspace,
+            stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+            env={**os.environ, CHILD: "1"},
+        ) as process:
+            self._process = process
+            if self._stopped.is_set():
+                self.interrupt()
+            try:
+                return process.wait()
+            finally:
+                self._process = None
+                process.kill()  # where this thread is interrupted itself
+
+
+def _wait_until_free(workspace: Path) -> None:
+    """Waits for a process whose parent was killed: it ends, but not at once.
+
+    A process that holds the workspace for longer is somebody else's; the command says so.
+    """
+    lock = FileLock(workspace / LOCK)
+    with contextlib.suppress(Timeout):
+        lock.acquire(timeout=_LOCK_SECONDS)
+        lock.release()
