@@ -33,6 +33,7 @@ VERBS = {
     "view": ("view.view", "View the trained scene in the browser."),
     "report": ("workspace.report", "Write an HTML report: capture, scores, views, settings."),
     "run": ("stages.run", "Run every stage from INPUT to the exported .ply."),
+    "batch": ("batch.batch", "Reconstruct many captures, each in a workspace of its own."),
     "demo": ("stages.demo", "Run every stage on the bundled room video."),
     "status": ("workspace.status", "Show which stages are fresh, stale and why, or missing."),
     "clean": ("workspace.clean", "Free disk space."),

@@ -1,0 +1,120 @@
+"""`recon batch`: many captures, each as `recon run` does it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from recon_cli import machine
+from recon_cli.commands import options
+from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.config import settings
+from recon_cli.config.stages import ComputeConfig
+from recon_cli.errors import ReconstructionError, WorkspaceError
+from recon_cli.lazy import load
+from recon_cli.pipeline.batch import CaptureResult, name_captures, run_batch
+from recon_cli.pipeline.executor import CORES, Executor, LocalExecutor
+from recon_cli.progress import TqdmProgress, format_duration, hide_bars
+from recon_cli.workspace.layout import disk_errors, hold_lock
+
+
+def _check_assignments(
+    _ctx: click.Context, _parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[str, ...]:
+    settings.check(settings.merge(map(settings.parse_assignment, values)))
+    return values
+
+
+@verb("batch")
+@click.argument(
+    "inputs", metavar="INPUT...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+    help="Folder of the workspaces, of batch.json and batch.html.")
+@click.option(
+    "--on", "place", type=click.Choice(["local", "ray"]), default="local",
+    help="Run in processes of this machine, or on the Ray cluster at RAY_ADDRESS.  "
+         "[default: local]")
+@click.option(
+    "--jobs", cls=options.Option, type=click.IntRange(min=1), metavar="N",
+    help=f"Captures at once.  [default: one for each {CORES} cores]")
+@click.option(
+    "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
+    help="Also prune in mid-training.  [default: on]")
+@click.option(
+    "--set", "assignments", multiple=True, metavar="SECTION.FIELD=VALUE",
+    callback=_check_assignments,
+    help="Set an option of any stage, such as train.minutes=2; may be repeated.  [default: none]")
+@click.option(
+    "--config", "config_file", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="TOML file with options.  [default: none]")
+@options.of(ComputeConfig)
+@options.again
+@options.verbosity
+@pass_call
+def batch(
+    call: Call, inputs: tuple[Path, ...], out: Path, place: str, jobs: int | None,
+    with_prune: bool, assignments: tuple[str, ...], config_file: Path | None,
+) -> None:
+    """Reconstruct many captures, each in a workspace of its own.
+
+    Each INPUT (a video, a folder of photos, a data set with poses) is a capture, reconstructed as
+    by `recon run` in DIR/<name of INPUT>. Failures stop no other capture. The same command goes on
+    with what is unfinished. The exit code is 0 only if every capture has a scene.
+    """
+    compute = settings.build(ComputeConfig, call.settings)
+    words = [word for text in assignments for word in ("--set", text)]
+    words += ["--config", str(config_file.absolute())] if config_file else []
+    words += [] if with_prune else ["--no-prune"]
+    words += ["--device", compute.device, "--backend", compute.backend]
+    words += ["--again"] * call.again + ["-v"] * call.verbose
+    captures = name_captures(inputs, out)
+    try:
+        with disk_errors(out, "making it"):
+            out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WorkspaceError(f"{out} cannot be made: {error.strerror}.",
+                             hint="Give another folder with --out.") from error
+    with hold_lock(out, "batch", other="another folder with --out"):
+        executor, threads = _start(place, jobs, compute, out, inputs)
+        try:
+            results = run_batch(
+                captures, out, [*words, "--threads", str(threads)], executor, TqdmProgress(),
+                _report)
+        finally:
+            executor.close()
+    page = load("recon_cli.report.batch_page.write_batch_page")(results, out)
+    click.echo(load("recon_cli.report.batch_page.batch_text")(results))
+    click.echo(f"The page of this table is {page}")
+    failed = [result.capture for result in results if not result.succeeded]
+    if failed:
+        raise ReconstructionError(
+            f"{len(failed)} of {len(results)} captures have no scene.",
+            hint=f"The reasons are above and in {page}; the same command tries them again.")
+
+
+def _start(
+    place: str, jobs: int | None, compute: ComputeConfig, out: Path, inputs: tuple[Path, ...]
+) -> tuple[Executor, int]:
+    """Returns what runs the commands, and how many threads each of them has."""
+    if place == "ray":
+        gpu = {"auto": None, "cpu": False, "cuda": True}[compute.device]
+        executor = load("recon_cli.pipeline.ray_executor.RayExecutor").connect(
+            cores=compute.threads, gpu=gpu, slots=jobs, folder=out.absolute(),
+            inputs=[path.absolute() for path in inputs])
+        return executor, executor.cores
+    cores = machine.usable_threads()
+    slots = jobs or max(1, cores // (compute.threads or CORES))
+    return LocalExecutor(slots), compute.threads or max(1, cores // slots)
+
+
+def _report(result: CaptureResult) -> None:
+    """Prints one line about a capture that has ended."""
+    with hide_bars():
+        if result.succeeded:
+            score = "" if result.psnr_db is None else f"{result.psnr_db:.2f} dB, "
+            click.echo(f"{result.capture}: {score}{result.gaussians or 0:,} Gaussians "
+                       f"({format_duration(result.seconds or 0.0)})")
+        else:
+            click.echo(f"{result.capture}: exit code {result.exit_code}: {result.reason}")

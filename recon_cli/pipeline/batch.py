@@ -1,0 +1,228 @@
+"""Reconstructs many captures, each in a workspace of its own, and goes on after failures."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon_cli.errors import ConfigError, ReconError, WorkspaceError
+from recon_cli.pipeline import plan
+from recon_cli.pipeline.execute import Job, last_sources
+from recon_cli.pipeline.executor import INTERRUPTED, KILLED, TRIES, Command, Executor
+from recon_cli.progress import Bar, Progress
+from recon_cli.stages import STAGES
+from recon_cli.workspace.atomic import write_json
+from recon_cli.workspace.layout import Workspace, disk_errors
+from recon_cli.workspace.manifest import describe_progress
+from recon_cli.workspace.summaries import JsonRecord
+
+FILE = "batch.json"
+_VERSION = 1
+_LOOK_SECONDS = 1.0  # between two looks at how far the captures are
+# Percent of a run by its end, on the demo's room
+_DONE_AFTER = {"ingest": 4, "denoise": 6, "sfm": 32, "train": 76, "prune": 96, "evaluate": 99,
+               "export": 100}
+
+
+@dataclass(frozen=True)
+class Capture:
+    """An input, and where its scene goes."""
+
+    name: str
+    source: Path  # absolute
+    workspace: Path
+
+    @property
+    def log(self) -> Path:
+        """What its command prints."""
+        return self.workspace.with_suffix(f"{self.workspace.suffix}.log")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureResult(JsonRecord):
+    """How a capture ended; None for what it did not come to."""
+
+    capture: str
+    source: str
+    exit_code: int | None  # None while it has not ended
+    reason: str = ""  # why it failed
+    frames: int | None = None
+    registered: int | None = None  # frames with a camera
+    psnr_db: float | None = None  # of the exported model on the held-out views
+    ssim: float | None = None
+    gaussians: int | None = None
+    bytes: int | None = None  # of the .ply
+    seconds: float | None = None  # of all stages, in this call or before
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there is a scene."""
+        return self.exit_code == 0
+
+
+def name_captures(inputs: Sequence[Path], out: Path) -> tuple[Capture, ...]:
+    """Returns the captures in the order of their inputs, each with a folder below `out`.
+
+    They are named after the files; where two have the same name, with their folder before it.
+
+    Raises:
+        ConfigError: an input is given twice, or two have the same name still.
+    """
+    paths = [path.absolute() for path in inputs]
+    twice = [str(path) for path, count in Counter(paths).items() if count > 1]
+    if twice:
+        raise ConfigError(f"{twice[0]} is given more than once.", hint="Give every input once.")
+    stems = Counter(_stem(path) for path in paths)
+    names = [_stem(path) if stems[_stem(path)] == 1 else f"{path.parent.name}-{_stem(path)}"
+             for path in paths]
+    for name, count in Counter(names).items():
+        if count > 1:
+            same = [str(path) for path, other in zip(paths, names, strict=True) if other == name]
+            raise ConfigError(
+                f"{' and '.join(same)} would both be reconstructed in {out / name}.",
+                hint="Rename one of them, or give them to batches with different --out.")
+    return tuple(
+        Capture(name, path, out.absolute() / name)
+        for name, path in zip(names, paths, strict=True))
+
+
+def _stem(path: Path) -> str:
+    return path.name if path.is_dir() else path.stem
+
+
+def run_batch(
+    captures: Sequence[Capture], out: Path, words: Sequence[str], executor: Executor,
+    progress: Progress, report: Callable[[CaptureResult], None],
+) -> tuple[CaptureResult, ...]:
+    """Runs `recon run` on every capture and returns how they ended, in their order.
+
+    `words` are options of `recon run`; `report` gets each result when it is there. Results so far
+    are in batch.json at any time.
+
+    Raises:
+        ConfigError: a workspace holds another capture.
+        BackendError: the machines cannot be reached any more.
+        KeyboardInterrupt: after the commands have saved what they have.
+    """
+    for capture in captures:
+        _refuse_other_capture(capture)
+    results = {capture: _read_result(capture, None, "") for capture in captures}
+
+    def run(capture: Capture) -> CaptureResult:
+        command = Command(
+            ("run", str(capture.source), "-w", str(capture.workspace), *words), capture.workspace,
+            capture.log)
+        try:
+            with progress.bar(capture.name, 100, unit="%") as bar, _watching(capture, bar):
+                code = executor.run(command)
+        except OSError as error:  # of a full disk, say
+            return _read_result(capture, WorkspaceError.exit_code, str(error))
+        return _read_result(capture, code, _find_reason(capture.log, code))
+
+    _write(out, results.values())
+    with ThreadPoolExecutor(executor.slots) as threads:
+        futures = {threads.submit(run, capture): capture for capture in captures}
+        try:
+            for future in as_completed(futures):
+                results[futures[future]] = result = future.result()
+                _write(out, results.values())
+                report(result)
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            executor.stop()
+            raise
+    return tuple(results.values())
+
+
+def _refuse_other_capture(capture: Capture) -> None:
+    """Raises ConfigError where the workspace holds a scene of something else."""
+    before = last_sources(Job(Workspace(capture.workspace)), STAGES[0].name)
+    if before and [source.path for source in before] != [str(capture.source)]:
+        raise ConfigError(
+            f"{capture.workspace} holds a scene of {before[0].path}, not of {capture.source}.",
+            hint="Give another folder with --out, or move that one.")
+
+
+@contextmanager
+def _watching(capture: Capture, bar: Bar) -> Iterator[None]:
+    """Shows on a bar how far a command is, by what it leaves in its workspace."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        shown = 0
+        while not ended.wait(_LOOK_SECONDS):
+            percent, text = _look(Workspace(capture.workspace))
+            bar.note(text)
+            bar.advance(max(0, percent - shown))
+            shown = max(percent, shown)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _look(workspace: Workspace) -> tuple[int, str]:
+    """Returns how much of a run is done, in percent, and what it is at."""
+    before = 0
+    for row in STAGES:
+        after = _DONE_AFTER[row.name]
+        partial = workspace.partial_run(row.name)
+        if partial:
+            share = partial.done / partial.total if partial.total else 0.0
+            progress = describe_progress(partial.done, partial.total) if partial.total else ""
+            return before + int(share * (after - before)), f"{row.name} {progress}".rstrip()
+        if workspace.folder(row.name).exists():
+            before = after
+    return before, ""
+
+
+def _read_result(capture: Capture, code: int | None, reason: str) -> CaptureResult:
+    """Returns how a capture stands, with the figures of its fresh stages."""
+    result = CaptureResult(
+        capture=capture.name, source=str(capture.source), exit_code=code, reason=reason)
+    try:
+        stages = plan.status(Job(Workspace(capture.workspace)))
+    except ReconError:  # a damaged manifest, of which the command has told
+        return result
+    fresh = {stage.name: stage.summary for stage in stages if stage.state == "fresh"}
+    export = fresh.get("export", {})
+    scores = {key.removeprefix(f"{export.get('model')}_"): value
+              for key, value in fresh.get("evaluate", {}).items()}
+    return dataclasses.replace(
+        result, frames=fresh.get("ingest", {}).get("frames"),
+        registered=fresh.get("sfm", {}).get("registered"), psnr_db=scores.get("psnr_db"),
+        ssim=scores.get("ssim"), gaussians=export.get("gaussians"), bytes=export.get("bytes"),
+        seconds=round(sum(stage.seconds or 0.0 for stage in stages if stage.name in fresh), 1))
+
+
+def _find_reason(log: Path, code: int) -> str:
+    """Returns why a command failed, by its last error message; empty where it did not."""
+    if code == 0:
+        return ""
+    if code == INTERRUPTED:
+        return "interrupted"
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    _, found, message = text.rpartition("\nerror: " if "\nerror: " in text else "error: ")
+    if found:
+        return message.partition("\nhint: ")[0].strip()
+    if code > KILLED:
+        return f"its process was killed by signal {code - KILLED}, {TRIES} times"
+    return text.strip().splitlines()[-1] if text.strip() else "it left no message"
+
+
+def _write(out: Path, results: Iterable[CaptureResult]) -> None:
+    """Writes batch.json, whole or not at all."""
+    with disk_errors(out, "writing the results"):
+        write_json(out / FILE, {
+            "version": _VERSION, "captures": [result.to_json() for result in results]})
