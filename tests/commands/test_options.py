@@ -50,7 +50,7 @@ def test_every_option_has_help_and_shows_its_default(parameter: click.Option) ->
     ctx.meta[options.HELP_ALL] = True
     record = parameter.get_help_record(ctx)
     assert record
-    assert "default: " in record[1]
+    assert ("required" if parameter.required else "default: ") in record[1]
     assert parameter.help
     assert not parameter.help.startswith("[")
 
