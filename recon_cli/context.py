@@ -139,6 +139,8 @@ class StageContext:
     on_idle: Callable[[], None] = _leave_idle
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
     ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
+    max_memory_bytes: int | None = None  # that a stage may take; None: what is free
+    scratch: Path | None = None  # folder for files without a name; None: the system's
 
     def notice(self, text: str) -> None:
         """Tells the user one line that must not be missed; unprintable characters are escaped."""

@@ -49,7 +49,7 @@ def _check_assignments(
 @click.option(
     "--config", "config_file", type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="TOML file with options.  [default: none]")
-@options.of(ComputeConfig)
+@options.compute(trains=True)
 @options.again
 @options.verbosity
 @pass_call
@@ -68,6 +68,7 @@ def batch(
     words += ["--config", str(config_file.absolute())] if config_file else []
     words += [] if with_prune else ["--no-prune"]
     words += ["--device", compute.device, "--backend", compute.backend]
+    words += [] if compute.max_memory is None else ["--max-memory", str(compute.max_memory)]
     words += ["--again"] * call.again + ["-v"] * call.verbose
     captures = name_captures(inputs, out)
     try:

@@ -65,7 +65,7 @@ def _scene_options(function: Command) -> Command:
 
 
 _compute_options = options.stack([
-    options.assignments("ingest.frames=200"), options.of(ComputeConfig), options.verbosity])
+    options.assignments("ingest.frames=200"), options.compute(), options.verbosity])
 
 
 def _output_options(plot: str) -> Decorator:
@@ -106,7 +106,7 @@ def _output_options(plot: str) -> Decorator:
 @click.option(
     "--backend", "backends", multiple=True, metavar="NAME",
     help="Rasterizer to measure; may be repeated.  [default: all that run on the device]")
-@options.of(ComputeConfig, without=("backend",))
+@options.compute(without=("backend",))
 @click.option(
     "--rounds", type=click.IntRange(min=1), metavar="N",
     help="Runs behind each median.  [default: 7, with --quick 2]")

@@ -25,7 +25,7 @@ from recon_cli.config.settings import (
     read_settings,
     section_of,
 )
-from recon_cli.config.stages import ComputeConfig
+from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 
 if TYPE_CHECKING:
@@ -186,8 +186,14 @@ def assignments(example: str = "train.iterations=1000") -> Decorator:
 
 def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
     """Returns a decorator that adds a stage's options; device and backend where it `renders`."""
-    compute: Decorator = of(ComputeConfig, only=() if renders else ("threads",))
-    return stack([of(config), compute, again, print_config, common()])
+    where = compute(trains=config in (TrainConfig, PruneConfig)) if renders else of(
+        ComputeConfig, only=("threads",))
+    return stack([of(config), where, again, print_config, common()])
+
+
+def compute(*, trains: bool = False, without: Sequence[str] = ()) -> Decorator:
+    """Returns a decorator that adds where a verb computes, and the memory for one that trains."""
+    return of(ComputeConfig, without=(*without, *(() if trains else ("max_memory",))))
 
 
 def of(

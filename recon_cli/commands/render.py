@@ -10,7 +10,6 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
-from recon_cli.config.stages import ComputeConfig
 from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TRAINING, RenderRequest
 from recon_cli.lazy import load
 
@@ -73,7 +72,7 @@ def _color(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
     "--out", type=click.Path(path_type=Path), metavar="FOLDER|FILE",
     help="Folder of the frames, where finished ones are kept; or a file for a single video (.mp4) "
          "or image (.png).  [default: a folder in render/ of the workspace]")
-@options.of(ComputeConfig)
+@options.compute()
 @options.common()
 @pass_call
 def render(call: Call, /, path: str | None, views: tuple[str, ...], **request: Any) -> None:

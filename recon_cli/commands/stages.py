@@ -14,7 +14,6 @@ from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.view import show_training
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import (
-    ComputeConfig,
     DenoiseConfig,
     EvaluateConfig,
     ExportConfig,
@@ -188,7 +187,7 @@ def export(call: Call) -> None:
     "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
     help="Also prune in mid-training.  [default: on]")
 @options.assignments()
-@options.of(ComputeConfig)
+@options.compute(trains=True)
 @options.again
 @options.print_config
 @options.common()
@@ -204,7 +203,7 @@ def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
 
 @verb("demo")
 @options.assignments()
-@options.of(ComputeConfig)
+@options.compute(trains=True)
 @options.again
 @options.common(workspace="demo", envvar=None)
 @pass_call

@@ -15,7 +15,6 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
-from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import TrainCallback
 from recon_cli.errors import InputError
 from recon_cli.lazy import load
@@ -36,7 +35,7 @@ from recon_cli.workspace.layout import Workspace
 @click.option(
     "--open/--no-open", "opening", cls=options.Option, default=None,
     help="Open the page in the browser.  [default: on in a terminal with a desktop]")
-@options.of(ComputeConfig)
+@options.compute()
 @options.common()
 @pass_call
 def view(

@@ -390,3 +390,6 @@ class ComputeConfig(StageConfig):
         choices=("auto", "triton", "numba", "torch"), hashed=False)
     threads: int | None = option(
         None, "CPU threads.", minimum=1, hashed=False, automatic="all cores")
+    max_memory: float | None = option(
+        None, "Memory that training may take; images that do not fit are read from the disk.",
+        unit="GB", minimum=0.1, hashed=False, automatic="what is free")

@@ -32,6 +32,7 @@ from recon_cli.io.images import fit_camera, read_masked_image, to_uint8
 from recon_cli.io.records import read_frame_list
 from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -95,14 +96,19 @@ def load_reference_views(
 
 def load_views(
     views: Sequence[View], max_size: int, consequence: str, ctx: StageContext | None = None, *,
-    denoised: bool = False, threads: int = 1,
+    denoised: bool = False, threads: int = 1, file: ImageFile | None = None,
 ) -> list[ReferenceView]:
-    """Returns views without those whose mask leaves too little; a notice gives the consequence."""
+    """Returns views without those whose mask leaves too little; a notice gives the consequence.
+
+    Their images are put into `file`, if any.
+    """
     def read(view: View) -> ReferenceView:
         camera = fit_camera(view.camera, max_size)
         path = view.denoised if denoised else view.original
         image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
-        return ReferenceView(camera, image, mask, name=view.name)
+        if file is not None:
+            image = file.put(image)
+        return ReferenceView(camera, image, mask, name=view.name, file=file)
 
     with ThreadPoolExecutor(threads) as pool:
         every = list(pool.map(read, views))

@@ -198,7 +198,8 @@ def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> S
     """Returns the context of a stage, with device and threads set up."""
     if row.renders:
         context = render_context(job.compute, job.progress, job.ranks)
-        return dataclasses.replace(context, record=record, callbacks=job.callbacks)
+        return dataclasses.replace(
+            context, record=record, callbacks=job.callbacks, scratch=job.workspace.partial(""))
     threads = job.compute.threads or machine.usable_threads()
     return StageContext(progress=job.progress, threads=threads, record=record)
 
@@ -215,7 +216,8 @@ def render_context(
     backend, device = _resolve_backend(compute, ranks)
     load("recon_cli.render.registry.use_threads")(backend, threads)
     _prepare_kernels(progress, backend)
-    return StageContext(progress, device, backend, threads, ranks=ranks)
+    most = None if compute.max_memory is None else int(compute.max_memory * 1e9)
+    return StageContext(progress, device, backend, threads, ranks=ranks, max_memory_bytes=most)
 
 
 def _resolve_backend(compute: ComputeConfig, ranks: ProcessGroup) -> tuple[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.image_file import ImageFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,15 +18,28 @@ class TrainView:
     """One view in the form that training reads."""
 
     camera: Camera  # at the size of the image
-    image: NDArray[np.uint8]  # [H, W, 3]; one colour under the mask (`io.images.fill_masked`)
+    stored: NDArray[np.uint8]  # the image, [H, W, 3]; one colour under the mask (`fill_masked`)
     mask: NDArray[np.bool_] | None = None  # [H, W], True where a pixel counts; None where all do
+    file: ImageFile | None = field(default=None, kw_only=True)  # in which the image lies, if in any
 
     def __post_init__(self) -> None:
-        if self.mask is not None and self.mask.shape != self.image.shape[:2]:
-            raise ValueError(f"a mask of {self.mask.shape} for an image of {self.image.shape}")
+        if self.mask is not None and self.mask.shape != self.stored.shape[:2]:
+            raise ValueError(f"a mask of {self.mask.shape} for an image of {self.stored.shape}")
+
+    @property
+    def image(self) -> NDArray[np.uint8]:
+        """The image, to be read now: others in its file may be let out of memory."""
+        if self.file is not None:
+            self.file.look(self.stored.nbytes)
+        return self.stored
 
     def page_locked(self) -> TrainView:
-        """Returns the view in memory that a GPU reads by itself while the host goes on."""
+        """Returns the view in memory that a GPU reads by itself while the host goes on.
+
+        One that lies in a file stays there.
+        """
+        if self.file is not None:
+            return self
         mask = None if self.mask is None else torch.from_numpy(self.mask).pin_memory().numpy()
         return TrainView(self.camera, torch.from_numpy(self.image).pin_memory().numpy(), mask)
 

@@ -30,6 +30,7 @@ from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import (
     gaussians_that_fit,
+    image_file,
     load_task,
     load_views,
     read_config,
@@ -228,7 +229,9 @@ def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool
 
     def twins() -> tuple[list[TrainView], list[TrainView]]:
         denoised = dataclasses.replace(config, images="denoised")
-        return load_views(scene.train, denoised, ctx), load_views(scene.validation, denoised, ctx)
+        file = None if task.train[0].file is None else image_file(ctx)
+        return (load_views(scene.train, denoised, ctx, file),
+                load_views(scene.validation, denoised, ctx, file))
 
     changed = config.images == "auto" and any(
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)

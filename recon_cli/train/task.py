@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
+from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
 
@@ -53,6 +54,10 @@ def reduce_view(view: TrainView, factor: int) -> TrainView:
     return TrainView(camera.resized(width, height), np.ascontiguousarray(image), mask)
 
 
+def _in_file(view: TrainView, file: ImageFile | None) -> TrainView:
+    return view if file is None else replace(view, stored=file.put(view.stored), file=file)
+
+
 class Pyramid:
     """The training views at every size that a run asks for, made when it does."""
 
@@ -61,7 +66,8 @@ class Pyramid:
         self._at = cache(self._reduced)
 
     def _reduced(self, index: int, factor: int) -> TrainView:
-        view = reduce_view(self._views[index], factor)
+        full = self._views[index]
+        view = _in_file(reduce_view(full, factor), full.file)
         return view.page_locked() if self._page_locked else view
 
     def view(self, index: int, factor: int) -> TrainView:

@@ -18,6 +18,7 @@ from recon_cli.evaluation import reference_views
 from recon_cli.io.images import fit_camera
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
+from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
@@ -35,19 +36,22 @@ _COPIES = 4 + 1
 _BUFFERS_PER_GAUSSIAN = 128 + 6 * 72  # a record, indices and the gradient sums of about six tiles
 _BUFFERS_PER_PIXEL = 96  # image, its gradient, three maps of the loss, transmittance
 _PROGRAM = 350 << 20  # Python, torch and the kernels
+_REDUCED = 1.25  # of the images: full ones and those of half the size
+_IN_MEMORY = 0.5  # of the memory; images that take more lie in a file
+_WINDOW = 256 << 20  # bytes of that file that are in memory at once
 _TORCH_FACTOR = 4  # autograd keeps what the fused kernels compute again
 
 
 def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
-    """Returns the training task at the training size, images in memory as uint8.
+    """Returns the training task at the training size, images as uint8 in memory or in a file.
 
     Raises:
         TrainingError: fewer than two views are left to train on, or memory is short.
     """
     refuse_few_views(scene)
     _refuse_tiny_units(scene)
-    check_memory(scene, config, ctx)
-    train = load_views(scene.train, config, ctx)
+    file = image_file(ctx) if check_memory(scene, config, ctx).in_file else None
+    train = load_views(scene.train, config, ctx, file)
     if len(train) < 2:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
@@ -56,7 +60,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         train = [view.page_locked() for view in train]
     error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
     return Task(
-        train, load_views(scene.validation, config, ctx), Schedule(config), scene.extent,
+        train, load_views(scene.validation, config, ctx, file), Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), camera_error=error)
 
 
@@ -70,11 +74,20 @@ def _refuse_tiny_units(scene: Scene) -> None:
             "of the data set.")
 
 
-def load_views(views: Sequence[View], config: RunConfig, ctx: StageContext) -> list[TrainView]:
+def load_views(
+    views: Sequence[View], config: RunConfig, ctx: StageContext, file: ImageFile | None = None
+) -> list[TrainView]:
     """Returns the views at the training size, without those whose mask leaves next to nothing."""
     return [*reference_views.load_views(
         views, config.max_size, "not trained on", ctx, denoised=config.images == "denoised",
-        threads=ctx.threads)]
+        threads=ctx.threads, file=file)]
+
+
+def image_file(ctx: StageContext) -> ImageFile:
+    """Returns a file for images that would take too much memory."""
+    if ctx.scratch is not None:
+        ctx.scratch.mkdir(parents=True, exist_ok=True)
+    return ImageFile(ctx.scratch, _WINDOW)
 
 
 def write_config(folder: Path, config: RunConfig) -> None:
@@ -108,6 +121,7 @@ class MemoryEstimate:
     gaussians: int  # parameters, gradients, moments at the largest count
     gaussian_buffers: int  # of one step, for each Gaussian
     program: int  # everything else
+    in_file: bool  # whether the images lie in a file, and few of them in memory
 
     @property
     def total(self) -> int:
@@ -118,24 +132,33 @@ class MemoryEstimate:
     def describe(self) -> str:
         """Returns the estimate in words."""
         buffers = self.pixel_buffers + self.gaussian_buffers
-        return (f"about {_megabytes(self.total)} (images {_megabytes(self.images)}, Gaussians "
+        images = f"images {_megabytes(self.images)}{' at a time' if self.in_file else ''}"
+        return (f"about {_megabytes(self.total)} ({images}, Gaussians "
                 f"{_megabytes(self.gaussians)}, buffers {_megabytes(buffers)})")
 
 
 def estimate_memory(
     *, views: int, width: int, height: int, gaussians: int, fused: bool, sh_degree: int = 3,
-    masks: int = 0,
+    masks: int = 0, free: int | None = None,
 ) -> MemoryEstimate:
-    """Returns the memory for views of at most width x height; `fused` means without autograd."""
+    """Returns the memory for views of at most width x height; `fused` means without autograd.
+
+    Images that take too much of `free` bytes lie in a file.
+    """
     pixels = width * height
+    images = int(_REDUCED * pixels * (3 * views + masks))
+    in_file = free is not None and images > _IN_MEMORY * free
+    if in_file:
+        images = min(images, _WINDOW + int(_REDUCED * pixels * masks))
     rest = 3 * TERMS[sh_degree]
     # and of one moment of one parameter at a time
     per_gaussian = 4 * (_COPIES * (_FLOATS + rest) + max(_LARGEST, rest))
     factor = 1 if fused else _TORCH_FACTOR
     return MemoryEstimate(
-        images=pixels * (3 * views + masks), pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
+        images=images, pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
         gaussians=gaussians * per_gaussian,
-        gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM)
+        gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM,
+        in_file=in_file)
 
 
 def gaussians_within(one: MemoryEstimate, free: int) -> int:
@@ -187,17 +210,23 @@ def _memory(
     return estimate_memory(
         views=len(views), width=width, height=height, gaussians=gaussians,
         fused=ctx.backend == "numba", sh_degree=config.sh_degree,
-        masks=sum(view.mask is not None for view in views))
+        masks=sum(view.mask is not None for view in views), free=_host_bytes(ctx))
 
 
 def _free_bytes(ctx: StageContext) -> int:
-    return (torch.cuda.mem_get_info()[0] if ctx.device == "cuda"
-            else free_memory_bytes() // ctx.ranks.local)
+    return torch.cuda.mem_get_info()[0] if ctx.device == "cuda" else _host_bytes(ctx)
 
 
-def check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> None:
-    """Logs the memory that the run will take; raises TrainingError where that is not free."""
+def _host_bytes(ctx: StageContext) -> int:
+    """Returns the memory beside the CPU that this process may take."""
+    free = free_memory_bytes() // ctx.ranks.local
+    return free if ctx.max_memory_bytes is None else min(free, ctx.max_memory_bytes)
+
+
+def check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> MemoryEstimate:
+    """Returns and logs the memory that the run will take; TrainingError where that is not free."""
     needed = _memory(scene, config, ctx, gaussians=config.max_gaussians)
     free = _free_bytes(ctx)
     logger.info("training takes %s at most; %.0f MB are free", needed.describe(), free / 1e6)
     refuse_what_does_not_fit(needed, free)
+    return needed

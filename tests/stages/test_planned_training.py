@@ -97,6 +97,34 @@ def test_memory_that_is_short_lowers_the_cap_and_says_so(inputs, tmp_path, monke
     assert "9,000 would suit" in caplog.text
 
 
+def test_images_in_a_file_change_no_byte(inputs, done, tmp_path, monkeypatch):
+    first, summary = done
+    monkeypatch.setattr(train_data, "_IN_MEMORY", 0.0)
+    monkeypatch.setattr(train_data, "_WINDOW", 3 * 48 * 36)
+    opened = []
+
+    def opening(ctx):
+        opened.append(image_file(ctx))
+        return opened[-1]
+
+    image_file = train_data.image_file
+    monkeypatch.setattr(train_data, "image_file", opening)
+    again = replace(
+        OPEN, minutes=None, iterations=summary.planned_iterations,
+        max_gaussians=summary.max_gaussians, max_size=summary.max_size)
+    run(again, inputs, tmp_path / "again", replace(CONTEXT, scratch=tmp_path / "scratch"))
+    assert opened
+    assert same_bytes(first, tmp_path / "again")
+    assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_less_memory_than_is_free_can_be_given(inputs, tmp_path):
+    needed = estimate_memory(views=9, width=48, height=36, gaussians=5500, fused=True)
+    config = TrainConfig(iterations=2, max_gaussians=6000, sh_degree=3)
+    with pytest.raises(TrainingError, match=f"but {needed.total / 1e6:,.0f} MB are free"):
+        run(config, inputs, tmp_path / "out", replace(CONTEXT, max_memory_bytes=needed.total))
+
+
 def test_a_count_at_its_cap_from_the_start_stays_there(inputs, tmp_path):
     summary = run(replace(OPEN, minutes=None, iterations=120, max_gaussians=20), inputs,
                   tmp_path / "out")

@@ -1,6 +1,7 @@
 """The options of a run as a later version reads them, and the memory that it will take."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -38,12 +39,22 @@ def needed(**changes):
     return estimate_memory(**(values | changes))
 
 
-def test_images_are_counted_as_bytes():
-    assert needed(gaussians=0).images == 100 * 640 * 360 * 3
+def test_images_are_counted_as_bytes_with_their_reduced_ones():
+    assert needed(gaussians=0).images == 100 * 640 * 360 * 3 * 5 / 4
 
 
 def test_a_mask_is_a_byte_a_pixel():
-    assert needed(masks=7).images - needed().images == 7 * 640 * 360
+    assert needed(masks=8).images - needed().images == 8 * 640 * 360 * 5 / 4
+
+
+def test_images_that_would_take_half_of_the_memory_lie_in_a_file():
+    images = needed().images
+    assert needed(views=1000, free=20 * images + 2) == replace(needed(views=1000), in_file=False)
+    stored = needed(views=1000, free=20 * images - 2)
+    assert stored.in_file
+    assert stored.images == 256 << 20
+    assert "at a time" in stored.describe()
+    assert needed(views=10_000, free=20 * images).total == stored.total
 
 
 def test_a_gaussian_takes_at_most_one_and_a_half_kilobytes():
