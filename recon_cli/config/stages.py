@@ -138,7 +138,7 @@ class TrainConfig(StageConfig):
     """How Gaussians are fitted; `train.plan` decides what is left automatic for a scene."""
 
     quality: str = option(
-        "normal", "Preset: 1500, 3000 or 8000 steps at 400, 600 or 800 pixels.",
+        "normal", "Preset: 1500, 2400 or 8000 steps at 400, 600 or 800 pixels.",
         choices=("draft", "normal", "high"))
     minutes: float | None = option(
         None, "Time budget.", unit="minutes", minimum=0.01, automatic="none")
@@ -224,7 +224,7 @@ class TrainConfig(StageConfig):
 class RunConfig(TrainConfig):
     """TrainConfig with numbers in place of what was automatic, as `train.plan` makes it."""
 
-    iterations: int = option(3000, "Optimization steps.", minimum=1)
+    iterations: int = option(2400, "Optimization steps.", minimum=1)
     max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)
     sh_degree: int = option(3, "Degree of the spherical harmonics.", minimum=0, maximum=3)
     max_gaussians: int = option(60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
@@ -392,4 +392,4 @@ class ComputeConfig(StageConfig):
         None, "CPU threads.", minimum=1, hashed=False, automatic="all cores")
     max_memory: float | None = option(
         None, "Memory that training may take; images that do not fit are read from the disk.",
-        unit="GB", minimum=0.1, hashed=False, automatic="what is free")
+        unit="GB", minimum=0.1, hashed=False, automatic="what is free", expert=True)

@@ -46,7 +46,7 @@ _SMALLEST_RUN = 100  # steps; fewer show nothing of a room
 _LONGEST_RUN = 100_000  # steps; three times the reference's
 _DETAIL = 4.0  # grey levels a pixel; camera noise stays below it after denoising
 _DETAIL_VIEWS = 16  # looked at; the mean of more differs by less than 3%
-_FULL_AT = 3000  # steps after which there may be a Gaussian for each pixel with detail
+_FULL_AT = 2400  # steps after which there may be a Gaussian for each pixel with detail
 _VIEWS_EACH = 8  # views that must show a Gaussian, about, to tell where it is
 _FIRST = 0.5  # of the cap, at the start
 _FEWEST = 5000
@@ -67,7 +67,7 @@ class Quality:
 
 # A draft takes 11 to 15 CPU seconds of one thread on living, office and fox (docs/benchmarks.md,
 # "Budgets of a training"); the others follow from what steps of their size and count take.
-QUALITIES = {"draft": Quality(1500, 400), "normal": Quality(3000, 600), "high": Quality(8000, 800)}
+QUALITIES = {"draft": Quality(1500, 400), "normal": Quality(2400, 600), "high": Quality(8000, 800)}
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def make_plan(
 def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
     """Returns the cap of the count: what was asked for, or what images, steps and memory bear.
 
-    A Gaussian for each pixel of a mean view that holds detail, after 3,000 steps; in other runs by
+    A Gaussian for each pixel of a mean view that holds detail, after 2,400 steps; in other runs by
     the square root of the steps, as a new Gaussian must still find its place. No more than an
     eighth of the detail of all views: what few views see fits each of them and nothing between. On
     living and office, doubling the cap gave .5 to 1.3 dB for 15 to 30% more time

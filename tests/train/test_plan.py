@@ -68,11 +68,11 @@ def test_the_same_numbers_given_make_the_same_config():
 
 def test_the_cap_grows_with_the_root_of_the_steps_and_with_the_detail():
     asked = TrainConfig()
-    assert plan.cap(asked, FACTS, 3000) == 60_000
-    assert plan.cap(asked, FACTS, 750) == 30_000
-    assert plan.cap(asked, replace(FACTS, detail=30_000), 3000) == 30_000
-    assert plan.cap(asked, replace(FACTS, views=2), 3000) == 15_000
-    assert plan.cap(asked, replace(FACTS, detail=0), 3000) == 5000
+    assert plan.cap(asked, FACTS, 2400) == 60_000
+    assert plan.cap(asked, FACTS, 600) == 30_000
+    assert plan.cap(asked, replace(FACTS, detail=30_000), 2400) == 30_000
+    assert plan.cap(asked, replace(FACTS, views=2), 2400) == 15_000
+    assert plan.cap(asked, replace(FACTS, detail=0), 2400) == 5000
     assert plan.cap(TrainConfig(max_gaussians=77), FACTS, 6000) == 77
 
 
