@@ -285,8 +285,8 @@ class EvaluateConfig(StageConfig):
         automatic="as in training")
 
 
-EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html", "points.ply",
-                  "colmap", "transforms.json")
+EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html", "lod",
+                  "points.ply", "colmap", "transforms.json")
 
 
 def read_matrix(path: str) -> list[float]:

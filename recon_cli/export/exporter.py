@@ -29,7 +29,8 @@ from recon_cli.io.ply import write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
 from recon_cli.io.splats.glb import nearest_axes, write_glb
 from recon_cli.io.splats.html import write_html
-from recon_cli.io.splats.registry import FORMATS
+from recon_cli.io.splats.lod import LOD_META, make_levels, write_lod
+from recon_cli.io.splats.registry import FORMATS, scene_file
 from recon_cli.io.splats.sog import SHARING, write_sog
 from recon_cli.io.splats.splat import write_splat
 from recon_cli.io.splats.spz import write_spz
@@ -106,20 +107,21 @@ class Exporter:
             "transforms.json": self._write_transforms}
         if name in others:
             return ExportedFile(file=others[name](splats).name)
-        path = self._out / f"splats.{name}"
+        path = scene_file(self._out, name)
         max_loss = self._config.max_loss
         if max_loss is None:
             max_loss = MAX_LOSS_DB.get(name, _MAX_LOSS_DB)
         gain = self._write_format(name, path, splats, max_loss)
-        size, whole = path.stat().st_size, (self._out / "splats.ply").stat().st_size
+        size, whole = _size(path), (self._out / "splats.ply").stat().st_size
         text = f"{name}: {whole / size:.1f}x smaller, {gain:+.2f} dB"
         if not gain >= -max_loss:  # a NaN fails too
             raise ReconstructionError(
                 f"{text} on {self._psnr.describe()}, but it may lose {max_loss:g} dB at most.",
                 hint="Leave this format out, or allow more with --max-loss.")
         logger.info("%s", text)
-        return ExportedFile(file=path.name, bytes=size, smaller=round(whole / size, 3),
-                            psnr_change_db=round(gain, 4))
+        return ExportedFile(
+            file=path.relative_to(self._out).as_posix(), bytes=size,
+            smaller=round(whole / size, 3), psnr_change_db=round(gain, 4))
 
     def _write_format(
         self, name: str, path: Path, splats: Splats, max_loss: float
@@ -128,14 +130,16 @@ class Exporter:
         def gain() -> float:
             return self._psnr.psnr_db(FORMATS[name].read(path)) - self._psnr_db_before(splats)
 
-        if name != "sog":
+        if name not in ("sog", "lod"):
             self._write_file(name, path, splats)
             return gain()
+        write = partial(write_sog, path, splats) if name == "sog" else partial(
+            write_lod, path, make_levels(splats))
         limited = self._config.max_mb is not None and name == self._config.formats[0]
         found = -math.inf
         for sharing in SHARING:
-            write_sog(path, splats, sharing=sharing)
-            if limited and path.stat().st_size > 1e6 * (self._config.max_mb or 0):
+            write(sharing=sharing)
+            if limited and _size(path) > 1e6 * (self._config.max_mb or 0):
                 break
             found = gain()
             if found >= -max_loss:
@@ -164,9 +168,9 @@ class Exporter:
 
         def size_of(splats: Splats) -> int:
             with tempfile.TemporaryDirectory(prefix="recon-size-") as folder:
-                path = Path(folder) / f"splats.{name}"
+                path = scene_file(Path(folder), name)
                 self._write_file(name, path, splats)
-                return path.stat().st_size
+                return _size(path)
 
         return size_of
 
@@ -275,3 +279,10 @@ class Exporter:
         if record and not self._has_views:
             return record.file
         return read_frame_list(self._inputs.folders["ingest"]).groups[0].name
+
+
+def _size(path: Path) -> int:
+    """Returns the bytes of a scene: of its file, or of all beside a lod-meta.json."""
+    if path.name != LOD_META:
+        return path.stat().st_size
+    return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())

@@ -1,4 +1,4 @@
-"""What other programs make of our .sog and .glb, and we of theirs; sizes and seconds.
+"""What other programs make of our .sog, levels and .glb, and we of theirs; sizes and seconds.
 
 `npm install --prefix FOLDER @playcanvas/splat-transform gltf-validator`, then
 `PYTHONPATH=tests python tests/bench/bench_interop_archives.py FOLDER [--ply SCENE.ply]`: the
@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.io.splats.glb import read_glb, write_glb
-from recon_cli.io.splats.sog import read_sog, write_sog
+from recon_cli.io.splats.lod import make_levels, read_lod, write_lod
+from recon_cli.io.splats.sog import Unpacked, read_files, read_sog, write_sog
 from recon_cli.render.registry import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -79,11 +80,20 @@ def interop(node: Path, folder: Path) -> None:
         # turned so that, with their own half turn, what was z is up
         convert(node, folder / "plain.ply", folder / "turned.glb", "-r", "90,0,180")
         write_glb(folder / "ours.glb", splats)
+        convert(node, folder / "plain.ply", folder / "theirs" / "lod-meta.json", "-l", "0")
+        convert(node, folder / "theirs" / "0_0" / "meta.json", folder / "lod.ply")
+        write_lod(folder / "lod" / "lod-meta.json", make_levels(splats))
+        convert(node, folder / "lod" / "0_0" / "meta.json", folder / "part.ply")
         for label, one, other in (
             ("our .sog, our reader against theirs", read_sog(folder / "ours.sog"),
              read_ply(folder / "ours.ply")),
             ("their .sog, our reader against theirs", read_sog(folder / "theirs.sog"),
              read_ply(folder / "theirs.ply")),
+            ("their lod-meta.json, our reader against the scene",
+             read_lod(folder / "theirs" / "lod-meta.json"), read_ply(folder / "lod.ply")),
+            ("a file of our lod-meta.json, our reader against theirs",
+             read_files(Unpacked(folder / "lod" / "0_0" / "meta.json")),
+             read_ply(folder / "part.ply")),
             ("their .glb, our reader against the scene",
              read_glb(folder / "theirs.glb", axes=THEIR_AXES), splats),
             ("their turned .glb against ours, as they are in the file",

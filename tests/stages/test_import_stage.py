@@ -16,7 +16,7 @@ from recon_cli.config.stages import ImportConfig, PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.splats.registry import FORMATS
+from recon_cli.io.splats.registry import FORMATS, scene_file
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import transformed
 from recon_cli.stages import evaluate, import_scene, prune
@@ -106,7 +106,7 @@ def test_without_views_nothing_is_moved_and_the_record_says_so(tmp_path):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_comes_in(tmp_path, name):
-    path = tmp_path / f"a.{name}"
+    path = scene_file(tmp_path, name)
     FORMATS[name].write(path, truth())
     summary = brought_in(path, None, tmp_path / "train")
     assert (summary.format, summary.gaussians) == (name, 60)

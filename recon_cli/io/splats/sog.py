@@ -74,11 +74,27 @@ def write_sog(
     and palette, in which an entry stands for the harmonics of `sharing` Gaussians. FormatError if
     there are no Gaussians, or a value is not finite.
     """
+    meta, images = pack_splats(splats, seed=seed, sharing=sharing)
+    write_bytes(path, pack_archive(meta, images))
+
+
+def pack_splats(
+    splats: Splats, groups: NDArray[np.int64] | None = None, *, seed: int = 0,
+    sharing: int = SHARING[0],
+) -> tuple[dict[str, Any], dict[str, Bytes]]:
+    """Returns what meta.json holds, and the images by name; see `write_sog`.
+
+    Gaussians of ascending `groups` [N] follow each other, if there are any; either all of them or
+    none have coefficients then.
+    """
+    if groups is not None and len(splats.sh_rest) not in (0, len(splats)):
+        raise ValueError(f"{len(splats.sh_rest)} of {len(splats)} grouped Gaussians are coloured")
     rng = np.random.default_rng(seed)
     table = to_arrays(splats, ".sog")
     low, high, places = pack_means(table["means"])
     plain = np.arange(len(splats)) >= len(splats.sh_rest)
-    order = np.lexsort((morton_codes(places.astype(np.uint64)), plain))
+    keys = (morton_codes(places.astype(np.uint64)), plain)
+    order = np.lexsort(keys if groups is None else (*keys, groups))
     table, places = {name: value[order] for name, value in table.items()}, places[order]
     scales, sh0 = fit_codebook(table["log_scales"], rng), fit_codebook(table["sh_dc"], rng)
     opacities = np.rint(sigmoid(table["logit_opacities"]) * 255).astype(np.uint8)
@@ -102,7 +118,7 @@ def write_sog(
         meta["shN"], palette = pack_harmonics(
             table["sh_rest"], len(splats.sh_rest), rng, sharing)
         images |= palette
-    write_bytes(path, pack_archive(meta, images))
+    return meta, images
 
 
 def _image(rows: Bytes) -> Bytes:
@@ -124,8 +140,12 @@ def read_sog(path: Path) -> Splats:
     Those behind the last one that has a coefficient other than zero are of degree 0. FormatError if
     the file is missing, damaged, of version 1, or does not hold what it promises.
     """
-    archive = Archive(path)
-    meta = archive.meta()
+    return read_files(Archive(path))
+
+
+def read_files(archive: SogFiles) -> Splats:
+    """Returns the Gaussians of the files of a .sog; see `read_sog`."""
+    path, meta = archive.path, archive.meta()
     means, scales, quats, sh0 = (
         archive.part(meta, name) for name in ("means", "scales", "quats", "sh0"))
     count = archive.whole(meta, "count", 1, _MAX_COUNT)
@@ -153,7 +173,9 @@ def read_sog(path: Path) -> Splats:
     })
 
 
-def _read_harmonics(archive: Archive, meta: dict[str, Any], rows: Callable[[str], Bytes]) -> Floats:
+def _read_harmonics(
+    archive: SogFiles, meta: dict[str, Any], rows: Callable[[str], Bytes]
+) -> Floats:
     """Returns coefficients [M, T, 3]."""
     if meta.get("shN") is None:
         return np.zeros((0, 0, 3), np.float32)
@@ -221,27 +243,18 @@ def pack_harmonics(
             "files": names}, dict(zip(names, (pixels, _image(rows)), strict=True))
 
 
-class Archive(UntrustedFile):
-    """An open .sog; every method raises FormatError if the file does not hold what it promises."""
+class SogFiles(UntrustedFile):
+    """The files of a .sog; every method raises FormatError if they hold not what they promise."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, _START, ".sog")
-        if self.data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
-            raise self.error(f"more than {_ENTRIES} entries: no .sog")
-        try:
-            self._zip = zipfile.ZipFile(io.BytesIO(self.data))
-        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-            raise self.error(f"a zip that is no .sog: {error}") from error
-        self._entries = {entry.filename: entry for entry in self._zip.infolist()}
-        if len(self._entries) < len(self._zip.infolist()):
-            raise self.error("two entries of one name")
-        for name in self._entries:
-            if _escapes(name):
-                raise self.error(f"the entry {name!r:.80}, which leaves the archive")
+    size: int  # of all files, bytes
+
+    def read(self, name: str, most: int) -> bytes:
+        """Returns the content of a file of at most `most` bytes."""
+        raise NotImplementedError
 
     def meta(self) -> dict[str, Any]:
         """Returns the object in meta.json of version 2."""
-        meta = self.json_object(self._read(META, _META_LIMIT))
+        meta = self.json_object(self.read(META, _META_LIMIT))
         if "version" not in meta and isinstance(meta.get("means"), dict):
             raise self.error("version 1 of the format, which is not supported")
         if self.whole(meta, "version", 0, sys.maxsize) != 2:
@@ -272,8 +285,8 @@ class Archive(UntrustedFile):
 
     def check_count(self, count: int) -> None:
         """Raises FormatError for implausibly many Gaussians: each takes about 16 bytes."""
-        if count > _SMALL + len(self.data):
-            raise self.error(f"{count} Gaussians in {len(self.data)} bytes, as it claims")
+        if count > _SMALL + self.size:
+            raise self.error(f"{count} Gaussians in {self.size} bytes, as it claims")
 
     def pixels(
         self, name: str, count: int, *, size: tuple[int, int] | None = None
@@ -283,7 +296,7 @@ class Archive(UntrustedFile):
         `size` is the (width, height) that it must have; None for any.
         """
         most = max(4 * count, _SMALL)
-        data = self._read(name, 4 * most + _HEADER)
+        data = self.read(name, 4 * most + _HEADER)
         if data[8:16] == b"WEBPVP8 ":
             raise self.error(f"{name}, which has lossy compression that destroys its values")
         if (claimed := _webp_size(data)) is not None:
@@ -309,7 +322,27 @@ class Archive(UntrustedFile):
             raise self.error(
                 f"{name} of {width}x{height} pixels, needed are {needed[0]}x{needed[1]}")
 
-    def _read(self, name: str, most: int) -> bytes:
+class Archive(SogFiles):
+    """An open .sog."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _START, ".sog")
+        self.size = len(self.data)
+        if self.data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
+            raise self.error(f"more than {_ENTRIES} entries: no .sog")
+        try:
+            self._zip = zipfile.ZipFile(io.BytesIO(self.data))
+        except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+            raise self.error(f"a zip that is no .sog: {error}") from error
+        self._entries = {entry.filename: entry for entry in self._zip.infolist()}
+        if len(self._entries) < len(self._zip.infolist()):
+            raise self.error("two entries of one name")
+        for name in self._entries:
+            if path_escapes(name):
+                raise self.error(f"the entry {name!r:.80}, which leaves the archive")
+
+    def read(self, name: str, most: int) -> bytes:
+        """Returns the content of a file of at most `most` bytes."""
         entry = self._entries.get(name)
         if entry is None:
             raise self.error(f"no entry {name!r:.80}")
@@ -324,6 +357,29 @@ class Archive(UntrustedFile):
             raise self.error(f"the entry {name}, which cannot be unpacked: {error}") from error
         if not whole:
             raise self.error(f"the entry {name}, which unpacks to more than {most} bytes")
+        return data
+
+
+class Unpacked(SogFiles):
+    """The files of an unpacked .sog: meta.json, and the images beside it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, b"{", META)
+        self.size = sum(file.stat().st_size for file in path.parent.iterdir() if file.is_file())
+
+    def read(self, name: str, most: int) -> bytes:
+        """Returns the content of a file of at most `most` bytes."""
+        if name == META:
+            return self.data
+        if "/" in name or path_escapes(name):
+            raise self.error(f"the name {name!r:.80}, which leaves the folder")
+        try:
+            with (self.path.parent / name).open("rb") as file:
+                data = file.read(most + 1)
+        except (OSError, ValueError) as error:
+            raise self.error(f"{name}, which cannot be read: {error}") from error
+        if len(data) > most:
+            raise self.error(f"{name}, which has more than {most} bytes")
         return data
 
 
@@ -356,7 +412,7 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
     return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
 
 
-def _escapes(name: str) -> bool:
+def path_escapes(name: str) -> bool:
     """Returns whether a path would lead out of the folder that it is unpacked to."""
     path = PurePosixPath(name.replace("\\", "/"))
     return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name

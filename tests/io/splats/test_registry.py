@@ -5,13 +5,13 @@ import torch
 from archive_splats import room
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.registry import FORMATS, format_of, read_splats
+from recon_cli.io.splats.registry import FORMATS, format_of, read_splats, scene_file
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_each_format_reads_what_it_wrote_by_the_end_of_its_name(name, tmp_path):
     splats = room(40, degree=0)
-    path = tmp_path / f"room.{name.upper()}"
+    path = tmp_path / ("LOD-META.JSON" if name == "lod" else f"room.{name.upper()}")
     FORMATS[name].write(path, splats)
     assert format_of(path).name == name
     back = read_splats(path)
@@ -25,7 +25,8 @@ def test_a_file_under_the_name_of_another_format_is_refused(name, tmp_path):
     path = tmp_path / "room"
     FORMATS[name].write(path, room(40, degree=0))
     for other in FORMATS.keys() - {name, "splat"}:
-        renamed = tmp_path / f"x.{other}"
+        renamed = scene_file(tmp_path, other)
+        renamed.parent.mkdir(exist_ok=True)
         renamed.write_bytes(path.read_bytes())
         with pytest.raises(FormatError) as caught:
             read_splats(renamed)
