@@ -44,6 +44,7 @@ MODULES = {
 }
 LICENCES = ("LICENSE-three.txt", "LICENSE-spark.txt", "LICENSE-fflate.txt")
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
+_LEVELS_FROM = 500_000  # Gaussians, of which Spark makes levels of detail
 _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is measured on
 _DEFAULT_LENS = (1200, 900, 1000.0)  # width, height and focal length in pixels
 
@@ -98,6 +99,7 @@ def _views(views: Sequence[View], splats: Splats, up: NDArray[np.float64]) -> st
     names = ("fx", "fy", "cx", "cy", "width", "height")
     value = {
         "up": up.tolist(), "middle": middle.tolist(), "reach": reach,
+        "lod": len(splats) >= _LEVELS_FROM,
         "lenses": [dict(zip(names, lens, strict=True)) for lens in lenses], "views": entries}
     # No name can close the element.
     text = json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -13,6 +13,7 @@ from browser import WatchedPage
 from PIL import Image
 from scenes import camera_at
 
+from recon_cli.io.splats import html
 from recon_cli.io.splats.html import read_html, write_html
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
@@ -88,6 +89,18 @@ def test_the_page_shows_what_recon_renders_and_asks_for_nothing(page, tmp_path, 
         assert psnr_db(seen, rendered(path, camera)) > AGREE_DB, number
         if degree:  # without its harmonics it would be another picture
             assert psnr_db(seen, rendered(path, camera, degree - 1)) < AGREE_DB - 8, number
+    page.assert_silent()
+    page.assert_offline()
+
+
+def test_a_page_with_levels_of_detail_shows_the_scene(page, tmp_path, monkeypatch):
+    monkeypatch.setattr(html, "_LEVELS_FROM", 3000)
+    path = made(tmp_path / "a.html", 0)
+    opened(page, path)
+    for number, camera in enumerate(cameras(), start=1):
+        page.page.evaluate(f"recon.show({number})")
+        # few enough for the finest level
+        assert psnr_db(picture(page), rendered(path, camera)) > AGREE_DB, number
     page.assert_silent()
     page.assert_offline()
 

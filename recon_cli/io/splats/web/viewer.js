@@ -13,6 +13,9 @@ const NEAR_SHARE = 0.02; // of how far the scene reaches
 const FAR = 1e4; // units of three.js
 const DILATION = 0.3; // pixels squared, which recon adds to the covariance of a projected Gaussian
 const CUTOFF = 2 * Math.log(255); // squared deviations at which an opaque Gaussian falls to 1/255
+// Gaussians of a frame where the scene has levels of detail and the browser draws on the CPU; for a
+// graphics card Spark chooses.
+const FEW = 200_000;
 const MOST_PIXELS = 2; // device pixels a CSS pixel; more cost time and show nothing
 
 const { bytes, scene } = window.reconPage;
@@ -20,6 +23,15 @@ const canvas = document.querySelector("canvas");
 const button = (name) => document.getElementById(name);
 
 const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
+
+// Whether the browser draws on the CPU.
+function drawsOnCpu() {
+  const gl = renderer.getContext();
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
 renderer.setClearColor(0x000000, 1);
 const spark = new SparkRenderer({
   renderer,
@@ -31,7 +43,8 @@ const spark = new SparkRenderer({
   maxStdDev: Math.sqrt(CUTOFF),
   minAlpha: 1 / 255,
   maxPixelRadius: 4096,
-  enableLod: false,
+  enableLod: scene.lod,
+  lodSplatCount: drawsOnCpu() ? FEW : undefined,
 });
 const camera = new THREE.PerspectiveCamera();
 const world = new THREE.Group();
@@ -171,9 +184,10 @@ setFlying(false);
 show(1);
 followHash();
 requestAnimationFrame(tick);
-const mesh = new SplatMesh({ fileBytes: bytes, fileType: "spz", extSplats: true });
+// Levels of detail are made in a worker, from Gaussians in which Spark has rounded the harmonics.
+const mesh = new SplatMesh({ fileBytes: bytes, fileType: "spz", extSplats: true, lod: scene.lod });
 await mesh.initialized;
-await restoreHarmonics(bytes, mesh.extSplats.extra);
+if (!scene.lod) await restoreHarmonics(bytes, mesh.extSplats.extra);
 mesh.quaternion.set(1, 0, 0, 0); // y and z of an SPZ file are those of the scene, negated
 world.add(mesh);
 loaded = needed = true;
