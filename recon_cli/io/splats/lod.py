@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from recon_cli.io.splats.coarsen import coarsen
 from recon_cli.io.splats.sog import (
     META,
     SHARING,
@@ -33,7 +34,6 @@ from recon_cli.io.splats.sog import (
     read_files,
 )
 from recon_cli.io.splats.values import Floats, UntrustedFile, normalize_quats
-from recon_cli.scene.coarsen import coarsen
 from recon_cli.scene.splats import Splats, joined, with_rows
 from recon_cli.workspace.atomic import write_bytes
 

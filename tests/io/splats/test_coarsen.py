@@ -5,9 +5,9 @@ import pytest
 import torch
 from scenes import camera_at
 
+from recon_cli.io.splats import coarsen as coarsening
+from recon_cli.io.splats.coarsen import coarsen
 from recon_cli.render.registry import render
-from recon_cli.scene import coarsen as coarsening
-from recon_cli.scene.coarsen import coarsen
 from recon_cli.scene.splats import Splats
 
 
