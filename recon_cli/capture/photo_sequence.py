@@ -85,7 +85,7 @@ def find_sequence(
 
     `record` keeps the measures for the next run.
     """
-    most = config.frames or max(config.max_frames, MANY)
+    most = config.frames or MANY
     if len(photos) <= most or not looks_numbered(photos):
         return None
     if record.exists():

@@ -21,7 +21,7 @@ class IngestConfig(StageConfig):
     frames: int | None = option(
         None, "Number of frames to choose from videos and sequences of images.", unit="frames",
         minimum=3, automatic="by camera motion, up to --max-frames")
-    max_frames: int = option(100, "Upper limit of the automatic number.", unit="frames", minimum=3)
+    max_frames: int = option(300, "Upper limit of the automatic number.", unit="frames", minimum=3)
     max_size: int = option(1920, "Longest side of a stored frame.", unit="pixels", minimum=64)
     holdout: str = option(
         "every:8", "Held-out test views: every:N (each Nth by name), segment:A:B (from share A to "
