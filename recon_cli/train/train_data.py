@@ -167,16 +167,22 @@ def gaussians_within(one: MemoryEstimate, free: int) -> int:
     return max(0, (free - one.total + each) // each)
 
 
-def refuse_what_does_not_fit(needed: MemoryEstimate, free: int) -> None:
-    """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes."""
+def refuse_what_does_not_fit(
+    needed: MemoryEstimate, free: int, *, limited: bool = False
+) -> None:
+    """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes.
+
+    `limited` says that more are free, but not to be used.
+    """
     if needed.total <= free:
         return
     by_size = needed.images + needed.pixel_buffers
     by_count = needed.gaussians + needed.gaussian_buffers
     lower = "--max-size" if by_size > by_count else "--max-gaussians"
     raise TrainingError(
-        f"Training needs {needed.describe()}, but {_megabytes(free)} are free.",
-        hint=f"Lower {lower}, or close other programs.")
+        f"Training needs {needed.describe()}, but {_megabytes(free)} "
+        f"{'may be used' if limited else 'are free'}.",
+        hint=f"Lower {lower}, or {'raise --max-memory' if limited else 'close other programs'}.")
 
 
 def _megabytes(count: int) -> str:
@@ -227,6 +233,6 @@ def check_memory(scene: Scene, config: RunConfig, ctx: StageContext) -> MemoryEs
     """Returns and logs the memory that the run will take; TrainingError where that is not free."""
     needed = _memory(scene, config, ctx, gaussians=config.max_gaussians)
     free = _free_bytes(ctx)
-    logger.info("training takes %s at most; %.0f MB are free", needed.describe(), free / 1e6)
-    refuse_what_does_not_fit(needed, free)
+    logger.info("training takes %s at most; %.0f MB may be used", needed.describe(), free / 1e6)
+    refuse_what_does_not_fit(needed, free, limited=free == ctx.max_memory_bytes)
     return needed
