@@ -48,6 +48,10 @@ class NullProgress:
         yield _NullBar()
 
 
+# of a bar of percent, whose count and rate would say nothing more
+_PERCENT = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
+
+
 class _TqdmBar:
     def __init__(self, bar: tqdm) -> None:
         self._bar = bar
@@ -80,6 +84,7 @@ class TqdmProgress:
         with tqdm(
             desc=label, total=total, unit=unit, initial=done, file=sys.stderr,
             mininterval=interval, maxinterval=max(10.0, interval), dynamic_ncols=True,
+            bar_format=_PERCENT if unit == "%" else None,
         ) as bar:
             yield _TqdmBar(bar)
 

@@ -123,12 +123,13 @@ class RunningCommand:
     def _run_once(self) -> int:
         """Returns the exit code, negative for a signal."""
         command = self._command
-        command.workspace.mkdir(parents=True, exist_ok=True)
-        _wait_until_free(command.workspace)
-        # In the workspace: `python -m` looks for modules in the current folder first. A session of
+        command.log.parent.mkdir(parents=True, exist_ok=True)
+        if command.workspace.is_dir():
+            _wait_until_free(command.workspace)
+        # Beside the log: `python -m` looks for modules in the current folder first. A session of
         # its own: Ctrl-C is passed on by `interrupt`, once.
         with command.log.open("wb") as log, subprocess.Popen(
-            [*PROGRAM, *command.words], cwd=command.workspace,
+            [*PROGRAM, *command.words], cwd=command.log.parent,
             stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
             env={**os.environ, CHILD: "1"},
         ) as process:

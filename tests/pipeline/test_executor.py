@@ -40,7 +40,7 @@ def command(tmp_path, *words):
 
 
 def starts(tmp_path):
-    return len((tmp_path / "scene" / "starts").read_text())
+    return len((tmp_path / "starts").read_text())
 
 
 @pytest.mark.usefixtures("stand_in")
@@ -74,12 +74,12 @@ def run_in_thread(local, given):
 def test_a_command_that_is_stopped_saves_what_it_has_and_none_starts_afterwards(tmp_path):
     local = LocalExecutor(1)
     thread, codes = run_in_thread(local, command(tmp_path, "wait"))
-    while not (tmp_path / "scene" / "waiting").exists():
+    while not (tmp_path / "waiting").exists():
         time.sleep(0.01)
     local.stop()
     thread.join()
     assert codes == [130]
-    assert (tmp_path / "scene" / "saved").exists()
+    assert (tmp_path / "saved").exists()
     assert local.run(command(tmp_path, "0")) == 130
     assert starts(tmp_path) == 1
 
@@ -91,7 +91,7 @@ def test_a_command_waits_for_a_process_that_still_holds_the_workspace(tmp_path):
     lock.acquire()
     thread, codes = run_in_thread(LocalExecutor(1), command(tmp_path, "0"))
     time.sleep(0.3)
-    assert not (tmp_path / "scene" / "starts").exists()
+    assert not (tmp_path / "starts").exists()
     lock.release()
     thread.join()
     assert codes == [0]
