@@ -188,10 +188,13 @@ def test_a_lost_head_is_an_error_and_the_work_so_far_is_kept(tmp_path):
             [*batch, "--on", "ray"], stdout=output, stderr=subprocess.STDOUT,
             env={**os.environ, "RAY_ADDRESS": made.address}) as process:
         wait_for(lambda: saved_steps(workspace) >= SAVE_EVERY)
+        training = training_process(workspace)
+        training.suspend()  # or it may end before anybody misses the head
         for daemon in psutil.Process(os.getpid()).children(recursive=True):
             if daemon.name() == "gcs_server":
                 daemon.send_signal(signal.SIGKILL)
         code = process.wait(120)
+    training.kill()
     made.shutdown()
     text = log.read_text()
     assert code == BackendError.exit_code, text
