@@ -6,15 +6,14 @@ from pathlib import Path
 
 import click
 
-from recon_cli import machine
 from recon_cli.commands import options
+from recon_cli.commands.jobs import start_executor
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.errors import ReconstructionError, WorkspaceError
 from recon_cli.lazy import load
 from recon_cli.pipeline.batch import CaptureResult, name_captures, run_batch
-from recon_cli.pipeline.executor import CORES, Executor, LocalExecutor
 from recon_cli.progress import TqdmProgress, format_duration, hide_bars
 from recon_cli.workspace.layout import disk_errors, hold_lock
 
@@ -32,13 +31,7 @@ def _check_assignments(
 @click.option(
     "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
     help="Folder of the workspaces, of batch.json and batch.html.")
-@click.option(
-    "--on", "place", type=click.Choice(["local", "ray"]), default="local",
-    help="Run in processes of this machine, or on the Ray cluster at RAY_ADDRESS.  "
-         "[default: local]")
-@click.option(
-    "--jobs", cls=options.Option, type=click.IntRange(min=1), metavar="N",
-    help=f"Captures at once.  [default: one for each {CORES} cores]")
+@options.executor("Captures")
 @click.option(
     "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
     help="Also prune in mid-training.  [default: on]")
@@ -78,7 +71,7 @@ def batch(
         raise WorkspaceError(f"{out} cannot be made: {error.strerror}.",
                              hint="Give another folder with --out.") from error
     with hold_lock(out, "batch", other="another folder with --out"):
-        executor, threads = _start(place, jobs, compute, out, inputs)
+        executor, threads = start_executor(place, jobs, compute, out, inputs)
         try:
             results = run_batch(
                 captures, out, [*words, "--threads", str(threads)], executor, TqdmProgress(),
@@ -93,21 +86,6 @@ def batch(
         raise ReconstructionError(
             f"{len(failed)} of {len(results)} captures have no scene.",
             hint=f"The reasons are above and in {page}; the same command tries them again.")
-
-
-def _start(
-    place: str, jobs: int | None, compute: ComputeConfig, out: Path, inputs: tuple[Path, ...]
-) -> tuple[Executor, int]:
-    """Returns what runs the commands, and how many threads each of them has."""
-    if place == "ray":
-        gpu = {"auto": None, "cpu": False, "cuda": True}[compute.device]
-        executor = load("recon_cli.pipeline.ray_executor.RayExecutor").connect(
-            cores=compute.threads, gpu=gpu, slots=jobs, folder=out.absolute(),
-            inputs=[path.absolute() for path in inputs])
-        return executor, executor.cores
-    cores = machine.usable_threads()
-    slots = jobs or max(1, cores // (compute.threads or CORES))
-    return LocalExecutor(slots), compute.threads or max(1, cores // slots)
 
 
 def _report(result: CaptureResult) -> None:

@@ -8,13 +8,16 @@ from typing import Any
 
 import click
 
+from recon_cli import machine
 from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import TrainCallback
+from recon_cli.lazy import load
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
+from recon_cli.pipeline.executor import CORES, Executor, LocalExecutor
 from recon_cli.pipeline.plan import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress, format_duration
 from recon_cli.stages import IMPORT, STAGES, Stage
@@ -47,7 +50,7 @@ def run_stages(
         callbacks, call.ranks)
     start = Start.IMPORTED if call.from_import else Start.AUTO
     targets = [
-        Target(row.name, config, () if row.needs else sources,
+        Target(row.name, config, sources if row.takes else (),
                start if row.name == IMPORT.name else Start.AUTO)
         for row, config in zip(rows, configs.values(), strict=True)]
     plan.run(job, verb, targets, again=call.again)
@@ -106,3 +109,18 @@ def _value_text(value: object) -> str:
     if isinstance(value, int):
         return f"{value:,}"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def start_executor(
+    place: str, jobs: int | None, compute: ComputeConfig, folder: Path, inputs: Sequence[Path] = ()
+) -> tuple[Executor, int]:
+    """Returns what runs commands on `folder`, and how many threads each of them has."""
+    if place == "ray":
+        gpu = {"auto": None, "cpu": False, "cuda": True}[compute.device]
+        executor = load("recon_cli.pipeline.ray_executor.RayExecutor").connect(
+            cores=compute.threads, gpu=gpu, slots=jobs, folder=folder.absolute(),
+            inputs=[path.absolute() for path in inputs])
+        return executor, executor.cores
+    cores = machine.usable_threads()
+    slots = jobs or max(1, cores // (compute.threads or CORES))
+    return LocalExecutor(slots), compute.threads or max(1, cores // slots)

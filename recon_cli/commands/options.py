@@ -27,6 +27,7 @@ from recon_cli.config.settings import (
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
+from recon_cli.pipeline.executor import CORES
 
 if TYPE_CHECKING:
     from click.types import OptionHelpExtra
@@ -189,6 +190,18 @@ def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
     where = compute(trains=config in (TrainConfig, PruneConfig)) if renders else of(
         ComputeConfig, only=("threads",))
     return stack([of(config), where, again, print_config, common()])
+
+
+def executor(what: str) -> Decorator:
+    """Returns a decorator that adds where commands run, and how many (of `what`) at once."""
+    return stack([
+        click.option(
+            "--on", "place", type=click.Choice(["local", "ray"]), default="local",
+            help="Run in processes of this machine, or on the Ray cluster at RAY_ADDRESS.  "
+                 "[default: local]"),
+        click.option(
+            "--jobs", cls=Option, type=click.IntRange(min=1), metavar="N",
+            help=f"{what} at once.  [default: one for each {CORES} cores]")])
 
 
 def compute(*, trains: bool = False, without: Sequence[str] = ()) -> Decorator:

@@ -19,6 +19,7 @@ from recon_cli.config.stages import (
     ExportConfig,
     ImportConfig,
     IngestConfig,
+    MergeConfig,
     PruneConfig,
     SfmConfig,
     TrainConfig,
@@ -33,7 +34,7 @@ SECTIONS: dict[str, type[StageConfig]] = {
     "prune": PruneConfig,
     "evaluate": EvaluateConfig,
     "export": ExportConfig,
-    "import": ImportConfig,
+    "import": ImportConfig, "merge": MergeConfig,
     "compute": ComputeConfig,
 }
 

@@ -380,6 +380,16 @@ class ImportConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class MergeConfig(StageConfig):
+    """How the blocks of a scene are put together."""
+
+    max_size: int = option(
+        600, "Longest side of the validation views on which seams are checked.", unit="pixels",
+        minimum=16)
+    validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
+
+
+@dataclass(frozen=True)
 class ComputeConfig(StageConfig):
     """Where the numerical work runs. Recorded in the manifest, never part of a fingerprint."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import statistics
 import time
@@ -29,7 +30,7 @@ from recon_cli.evaluation.metrics import (
 from recon_cli.evaluation.scores import MeanScore, ViewScore
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fit_camera, read_masked_image, to_uint8
-from recon_cli.io.records import read_frame_list
+from recon_cli.io.records import BlockRecord, read_frame_list
 from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.image_file import ImageFile
@@ -68,9 +69,12 @@ def held_out_names(ingest: Path) -> frozenset[str]:
 
 def load_scene(inputs: StageInputs, *, validation: float) -> Scene:
     """Returns the views and points that sfm left, split by what each may be used for."""
-    undistorted = inputs.folders["sfm"] / "undistorted"
-    return read_scene(
-        undistorted, held_out=held_out_names(inputs.folders["ingest"]), validation=validation)
+    sfm = inputs.folders["sfm"]
+    held_out, block = held_out_names(inputs.folders["ingest"]), BlockRecord.read(sfm)
+    if block is None:
+        return read_scene(sfm / "undistorted", held_out=held_out, validation=validation)
+    scene = read_scene(sfm / "undistorted", held_out=held_out, validation=block.validation)
+    return dataclasses.replace(scene, cell=block.cell)
 
 
 def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:

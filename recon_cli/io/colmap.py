@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
 
 _PINHOLE = 1  # COLMAP's id of the model with fx, fy, cx, cy
@@ -37,13 +38,15 @@ class Pinhole:
 
 
 def read_scene(
-    undistorted: Path, *, held_out: frozenset[str], validation: float, denoised: Path | None = None
+    undistorted: Path, *, held_out: frozenset[str], validation: float | frozenset[str],
+    denoised: Path | None = None,
 ) -> Scene:
     """Returns the registered views and the points of an undistorted model.
 
     `undistorted` has images/ and sparse/, as COLMAP's image_undistorter lays them out, and masks/
     with a gray image of the name of each masked frame; `denoised` defaults to denoised/ in it.
-    `held_out` are names of frames; `validation` is the share of the others for validation views.
+    `held_out` are names of frames; `validation` are those of the validation views, or their share
+    of the other frames.
     FormatError if the model is missing, damaged, empty or not of pinhole cameras, or an image or
     its mask is missing or not of its camera's size.
     """
@@ -138,6 +141,50 @@ def _read_point_rows(path: Path, hint: str) -> list[tuple[Any, ...]]:
         reader.skip(8 * reader.count(minimum=8))  # image id and observation of each in the track
     reader.end()
     return rows
+
+
+def read_observations(
+    sparse: Path,
+) -> tuple[list[str], NDArray[np.float64], Observations]:
+    """Returns the names of the views, the points [P, 3] and which view sees which point.
+
+    Views are sorted by name, and points by their id, as `read_points` sorts them.
+    """
+    model = pycolmap.Reconstruction(sparse)
+    names = sorted(model.image(number).name for number in model.reg_image_ids())
+    rows = {name: row for row, name in enumerate(names)}
+    views = {number: rows[model.image(number).name] for number in model.reg_image_ids()}
+    ids = sorted(model.points3D)
+    seen = [(views[element.image_id], row) for row, number in enumerate(ids)
+            for element in model.point3D(number).track.elements]
+    view, point = np.array(seen, np.int64).reshape(-1, 2).T
+    points = np.array([model.point3D(number).xyz for number in ids]).reshape(-1, 3)
+    return names, points, Observations(view, point, len(names), len(ids))
+
+
+def write_part(
+    sparse: Path, target: Path, names: Collection[str], points: NDArray[np.bool_]
+) -> int:
+    """Writes the views of these names into a new folder, with the `points` [P] that two see.
+
+    Points that came without tracks count as seen.
+
+    Points count in the order of their ids, as in `read_points`. Returns how many were written.
+    """
+    model = pycolmap.Reconstruction(sparse)
+    keep = dict(zip(sorted(model.points3D), points.tolist(), strict=True))
+    tracked = model.compute_num_observations() > 0
+    for number in sorted(model.reg_image_ids()):
+        image = model.image(number)
+        if image.name not in names:
+            model.deregister_frame(image.frame_id)
+    for number in sorted(model.points3D):
+        lost = tracked and model.point3D(number).track.length() < 2
+        if lost or not keep[number]:
+            model.delete_point3D(number)
+    target.mkdir(parents=True)
+    model.write_binary(target)
+    return int(model.num_points3D())
 
 
 def _check_size(path: Path, camera: Camera) -> None:

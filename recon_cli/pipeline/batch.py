@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from recon_cli.errors import ConfigError, ReconError, WorkspaceError
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job, last_sources
-from recon_cli.pipeline.executor import INTERRUPTED, KILLED, TRIES, Command, Executor
-from recon_cli.progress import Bar, Progress
+from recon_cli.pipeline.executor import Command, Executor, find_reason, run_all, watching
+from recon_cli.progress import Progress
 from recon_cli.stages import STAGES
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.layout import Workspace, disk_errors
@@ -24,7 +21,6 @@ from recon_cli.workspace.summaries import JsonRecord
 
 FILE = "batch.json"
 _VERSION = 1
-_LOOK_SECONDS = 1.0  # between two looks at how far the captures are
 # Percent of a run by its end, on the demo's room
 _DONE_AFTER = {"ingest": 4, "denoise": 6, "sfm": 32, "train": 76, "prune": 96, "evaluate": 99,
                "export": 100}
@@ -119,25 +115,20 @@ def run_batch(
             ("run", str(capture.source), "-w", str(capture.workspace), *words), capture.workspace,
             capture.log)
         try:
-            with progress.bar(capture.name, 100, unit="%") as bar, _watching(capture, bar):
+            with progress.bar(capture.name, 100, unit="%") as bar, watching(
+                    bar, lambda: _look(Workspace(capture.workspace))):
                 code = executor.run(command)
         except OSError as error:  # of a full disk, say
             return _read_result(capture, WorkspaceError.exit_code, str(error))
-        return _read_result(capture, code, _find_reason(capture.log, code))
+        return _read_result(capture, code, find_reason(capture.log, code))
+
+    def note(capture: Capture, result: CaptureResult) -> None:
+        results[capture] = result
+        _write(out, results.values())
+        report(result)
 
     _write(out, results.values())
-    with ThreadPoolExecutor(executor.slots) as threads:
-        futures = {threads.submit(run, capture): capture for capture in captures}
-        try:
-            for future in as_completed(futures):
-                results[futures[future]] = result = future.result()
-                _write(out, results.values())
-                report(result)
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            executor.stop()
-            raise
+    run_all(executor, captures, run, note)
     return tuple(results.values())
 
 
@@ -148,28 +139,6 @@ def _refuse_other_capture(capture: Capture) -> None:
         raise ConfigError(
             f"{capture.workspace} holds a scene of {before[0].path}, not of {capture.source}.",
             hint="Give another folder with --out, or move that one.")
-
-
-@contextmanager
-def _watching(capture: Capture, bar: Bar) -> Iterator[None]:
-    """Shows on a bar how far a command is, by what it leaves in its workspace."""
-    ended = threading.Event()
-
-    def watch() -> None:
-        shown = 0
-        while not ended.wait(_LOOK_SECONDS):
-            percent, text = _look(Workspace(capture.workspace))
-            bar.note(text)
-            bar.advance(max(0, percent - shown))
-            shown = max(percent, shown)
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def _look(workspace: Workspace) -> tuple[int, str]:
@@ -204,21 +173,6 @@ def _read_result(capture: Capture, code: int | None, reason: str) -> CaptureResu
         registered=fresh.get("sfm", {}).get("registered"), psnr_db=scores.get("psnr_db"),
         ssim=scores.get("ssim"), gaussians=export.get("gaussians"), bytes=export.get("bytes"),
         seconds=round(sum(stage.seconds or 0.0 for stage in stages if stage.name in fresh), 1))
-
-
-def _find_reason(log: Path, code: int) -> str:
-    """Returns why a command failed, by its last error message; empty where it did not."""
-    if code == 0:
-        return ""
-    if code == INTERRUPTED:
-        return "interrupted"
-    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
-    _, found, message = text.rpartition("\nerror: " if "\nerror: " in text else "error: ")
-    if found:
-        return message.partition("\nhint: ")[0].strip()
-    if code > KILLED:
-        return f"its process was killed by signal {code - KILLED}, {TRIES} times"
-    return text.strip().splitlines()[-1] if text.strip() else "it left no message"
 
 
 def _write(out: Path, results: Iterable[CaptureResult]) -> None:

@@ -11,8 +11,9 @@ import dataclasses
 import logging
 from enum import Enum
 
+from recon_cli.config.stages import MergeConfig
 from recon_cli.errors import ManifestError, StageError
-from recon_cli.stages import IMPORT, Stage
+from recon_cli.stages import IMPORT, MERGE, Stage
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import (
     Manifest,
@@ -36,8 +37,20 @@ class Start(Enum):
 
 
 def is_imported(key: ResultKey) -> bool:
-    """Returns whether a result is an imported scene: training itself reads no file of the user."""
+    """Returns whether a scene was imported or merged: training itself reads no file of the user."""
     return key.stage == IMPORT.name and bool(key.sources)
+
+
+def is_merged(key: ResultKey) -> bool:
+    """Returns whether a scene was merged from blocks."""
+    return is_imported(key) and set(key.config) == set(MergeConfig().hashed_fields())
+
+
+def origin_row(row: Stage, key: ResultKey) -> Stage:
+    """Returns the row that a result in the place of `row` came from."""
+    if not is_imported(key):
+        return row
+    return MERGE if is_merged(key) else IMPORT
 
 
 def may_resume(workspace: Workspace, partial: PartialRun) -> bool:

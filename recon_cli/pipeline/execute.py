@@ -74,7 +74,7 @@ def run_stage(
     """
     workspace = job.workspace
     if sources is None:
-        sources = () if row.needs else _read_last_sources(job, row)
+        sources = _read_last_sources(job, row) if row.takes else ()
     key = ResultKey(row.name, row.version, config.hashed_fields(), sources, checks.upstream(row))
     _warn_of_stale_uses(checks, row)
     key = dataclasses.replace(key, continues=find_start(workspace, row, key, start))

@@ -13,13 +13,20 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from filelock import FileLock, Timeout
 
+from recon_cli.progress import Bar
 from recon_cli.workspace.layout import LOCK
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 PROGRAM = (sys.executable, "-m", "recon_cli")
 CHILD = "RECON_JOB"  # environment variable of a process that ends with the one that started it
@@ -27,6 +34,7 @@ CORES = 4  # of a command where nothing is said; more shorten it by little
 TRIES = 3  # of a command whose process is killed, by the system for want of memory or by somebody
 INTERRUPTED = 130
 KILLED = 128  # exit code of a shell for a process that a signal ended, plus that signal
+_LOOK_SECONDS = 1.0  # between two looks at how far the commands are
 _LOCK_SECONDS = 60.0  # within which a process that lost its parent is gone
 _STOP_SECONDS = 60.0  # for saving a checkpoint
 
@@ -152,3 +160,64 @@ def _wait_until_free(workspace: Path) -> None:
     with contextlib.suppress(Timeout):
         lock.acquire(timeout=_LOCK_SECONDS)
         lock.release()
+
+
+def run_all(
+    executor: Executor, items: Sequence[T], run: Callable[[T], R], report: Callable[[T, R], None]
+) -> dict[T, R]:
+    """Returns what `run` returned for each item, as many at once as the executor has slots.
+
+    `report` gets each result when it is there. Where anything fails or the user interrupts, running
+    commands are stopped.
+    """
+    results = {}
+    with ThreadPoolExecutor(executor.slots) as threads:
+        futures = {threads.submit(run, item): item for item in items}
+        try:
+            for future in as_completed(futures):
+                item = futures[future]
+                results[item] = future.result()
+                report(item, results[item])
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            executor.stop()
+            raise
+    return {item: results[item] for item in items}
+
+
+@contextmanager
+def watching(bar: Bar, look: Callable[[], tuple[int, str]]) -> Iterator[None]:
+    """Shows on a bar of 100 what `look` returns: percent that are done, and what is going on."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        shown = 0
+        while not ended.wait(_LOOK_SECONDS):
+            percent, text = look()
+            bar.note(text)
+            bar.advance(max(0, percent - shown))
+            shown = max(percent, shown)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def find_reason(log: Path, code: int) -> str:
+    """Returns why a command failed, by its last error message; empty where it did not."""
+    if code == 0:
+        return ""
+    if code == INTERRUPTED:
+        return "interrupted"
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    _, found, message = text.rpartition("\nerror: " if "\nerror: " in text else "error: ")
+    if found:
+        return message.partition("\nhint: ")[0].strip()
+    if code > KILLED:
+        return f"its process was killed by signal {code - KILLED}, {TRIES} times"
+    return text.strip().splitlines()[-1] if text.strip() else "it left no message"

@@ -18,7 +18,7 @@ from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.errors import ConfigError, ManifestError
-from recon_cli.pipeline.continuation import is_imported, may_resume
+from recon_cli.pipeline.continuation import is_imported, may_resume, origin_row
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, read_source
 from recon_cli.workspace.layout import Workspace
@@ -102,8 +102,8 @@ class WorkspaceCheck:
         """
         if name not in self._checks:
             row, manifest = self.row(name), self._workspace.manifest(name)
-            if manifest and is_imported(manifest.key):
-                row = IMPORT
+            if manifest:
+                row = origin_row(row, manifest.key)
             config = self.config(row, manifest.key if manifest else None)
             self._checks[name] = self._compare(row, manifest, config)
         return self._checks[name]

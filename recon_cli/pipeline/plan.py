@@ -22,7 +22,7 @@ from typing import Any
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
 from recon_cli.errors import StageError
 from recon_cli.pipeline.compile_ahead import compile_ahead
-from recon_cli.pipeline.continuation import Start, is_imported, may_resume
+from recon_cli.pipeline.continuation import Start, is_imported, is_merged, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
 from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
 from recon_cli.stages import IMPORT, Stage
@@ -104,7 +104,8 @@ def run(
     with disk_errors(root, f"running {verb}"), job.workspace.writing(verb), _log_to(root / LOG):
         refuse_missing_backend(job, stages)
         if not again:
-            _refuse_to_replace(job, verb, targets)
+            refuse_to_replace(job, verb, [
+                target.stage for target in targets if target.start is not Start.IMPORTED])
         with compile_ahead(job, stages, again=again):
             job = dataclasses.replace(job, asked=tuple(stages))
             for target in targets:
@@ -114,17 +115,29 @@ def run(
     return tuple(outcomes)
 
 
-def _refuse_to_replace(job: Job, verb: str, targets: Sequence[Target]) -> None:
+def run_needs(job: Job, verb: str, stage: str) -> None:
+    """Runs what a stage needs, with the options that each had, as `run` would do before it."""
+    root = job.workspace.root
+    with disk_errors(root, f"running {verb}"), job.workspace.writing(verb), _log_to(root / LOG):
+        steps = plan(job.inspect(), stage)
+        job = dataclasses.replace(job, asked=(stage,))
+        with compile_ahead(job, [*(step.name for step in steps), stage], again=False):
+            for step in steps:
+                for outcome in _run_if_needed(job, step):
+                    job.report(outcome)
+
+
+def refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
     """Raises StageError where training or import would replace the scene of the other."""
-    stages = [target.stage for target in targets if target.start is not Start.IMPORTED]
     for row in [row for row in job.table if row.name == IMPORT.name and row.name in stages]:
         finished, partial = job.workspace.manifest(row.name), job.workspace.partial_run(row.name)
-        importing = row.verb == IMPORT.verb
+        importing = bool(row.takes)
         if finished and is_imported(finished.key) is not importing:
             if partial and partial.key.continues and may_resume(job.workspace, partial):
                 continue  # it is trained further already
             sources = finished.key.sources
-            scene = (f"the scene imported from {Path(sources[0].path).name}" if sources
+            scene = (f"the scene merged from {len(sources)} blocks" if is_merged(finished.key)
+                     else f"the scene imported from {Path(sources[0].path).name}" if sources
                      else "a scene that was trained")
         elif importing and partial and partial.done and not is_imported(partial.key):
             scene = f"a training that was interrupted at {partial.done} of {partial.total}"

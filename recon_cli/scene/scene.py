@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.cells import Cell
 
 _REACH = 20.0  # extents; a room reaches some
 _LEAST_EXTENT = 0.05  # of the median distance of the points; a step aside in a room
@@ -39,6 +40,7 @@ class Scene:
     colors: NDArray[np.uint8]  # [P, 3] uint8 their RGB colours
     # mean reprojection error of the points in pixels of the undistorted images; None if not known
     error_px: float | None = None
+    cell: Cell | None = None  # the part that is modelled, of a block of a larger scene; None: all
 
     @property
     def extent(self) -> float:
@@ -73,16 +75,21 @@ class Scene:
 
 
 def split_views(
-    views: Sequence[View], held_out: frozenset[str], *, validation: float
+    views: Sequence[View], held_out: frozenset[str], *, validation: float | frozenset[str]
 ) -> tuple[tuple[View, ...], tuple[View, ...], tuple[View, ...]]:
     """Returns (train, validation, test) views, each sorted by name.
 
     The test views are those named in `held_out`. Of the rest a share of `validation`, evenly
-    spread and at least one where the share is above 0 and four views remain, is set apart.
+    spread and at least one where the share is above 0 and four views remain, is set apart; or those
+    named in `validation`.
     """
     ordered = sorted(views, key=lambda view: view.name)
     test = tuple(view for view in ordered if view.name in held_out)
     rest = [view for view in ordered if view.name not in held_out]
+    if isinstance(validation, frozenset):
+        chosen = {i for i, view in enumerate(rest) if view.name in validation}
+        return (tuple(view for i, view in enumerate(rest) if i not in chosen),
+                tuple(rest[i] for i in sorted(chosen)), test)
     count = max(1, round(len(rest) * validation)) if validation > 0 and len(rest) >= 4 else 0
     chosen = {int((i + 0.5) * len(rest) / count) for i in range(count)}
     train = tuple(view for i, view in enumerate(rest) if i not in chosen)

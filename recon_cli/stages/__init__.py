@@ -1,6 +1,7 @@
 """The table of stages. A stage's module holds one `run(config, inputs, out, ctx) -> summary`.
 
-IMPORT is the row of an imported scene, which takes the place (and folder) of a trained one.
+IMPORT and MERGE are the rows of a scene that was imported, or merged from blocks that were trained
+apart: it takes the place (and folder) of a trained one.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from recon_cli.config.stages import (
     ExportConfig,
     ImportConfig,
     IngestConfig,
+    MergeConfig,
     PruneConfig,
     SfmConfig,
     TrainConfig,
@@ -25,6 +27,7 @@ from recon_cli.workspace.summaries import (
     ImportSummary,
     IngestSummary,
     JsonRecord,
+    MergeSummary,
     PruneSummary,
     SfmSummary,
     TrainSummary,
@@ -71,6 +74,10 @@ STAGES: tuple[Stage, ...] = (
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, takes="FILE")
+
+
+MERGE = Stage("train", "merge", ("ingest", "sfm"), (), MergeConfig, MergeSummary, 1, False,
+              "recon_cli.stages.merge", renders=True, takes="BLOCK")
 
 
 def stage(name: str) -> Stage:

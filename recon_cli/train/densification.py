@@ -198,8 +198,9 @@ def _reference(state: TrainState, task: Task) -> None:
         rule = DensifyRule(
             config.densify_gradient, config.densify_scale * task.extent, config.min_opacity,
             large, config.max_gaussians)
-        replace_splats(
-            state, *densify_reference(state.splats, state.gathered, rule, state.generator))
+        gathered = replace(
+            state.gathered, pull=state.gathered.pull * task.inside(state.splats.means))
+        replace_splats(state, *densify_reference(state.splats, gathered, rule, state.generator))
     if schedule.resets(state.iteration):
         rows = torch.arange(len(state.splats), device=task.device)
         state.optimizer.replace(cap_opacities(state.splats), rows)
@@ -214,7 +215,8 @@ def _budget(state: TrainState, task: Task) -> None:
             schedule.target(state.iteration, state.first_count), schedule.config.min_opacity,
             schedule.recipe.opacity_decay)
         replace_splats(state, *densify_budget(
-            state.splats, state.gathered.variance, rule, state.generator))
+            state.splats, state.gathered.variance * task.inside(state.splats.means), rule,
+            state.generator))
 
 
 STRATEGIES = {"reference": Strategy(_reference), "budget": Strategy(_budget, variance=True)}

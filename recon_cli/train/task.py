@@ -9,8 +9,10 @@ from functools import cache, cached_property
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
+from recon_cli.scene.cells import Cell
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
@@ -28,7 +30,15 @@ class Task:
     device: torch.device  # where the tensors live
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
+    cell: Cell | None = None  # where Gaussians may be added; None: everywhere
     ranks: ProcessGroup = SINGLE_PROCESS  # this process among those that take the steps together
+
+    def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
+        """Returns 1 for each position where Gaussians may be added, else 0."""
+        if self.cell is None:
+            return 1.0
+        owned = self.cell.owns(means.detach().cpu().numpy())
+        return torch.from_numpy(owned).to(means)
 
     @cached_property
     def pyramid(self) -> Pyramid:

@@ -61,7 +61,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
     return Task(
         train, load_views(scene.validation, config, ctx, file), Schedule(config), scene.extent,
-        ctx.backend, torch.device(ctx.device), camera_error=error)
+        ctx.backend, torch.device(ctx.device), camera_error=error, cell=scene.cell)
 
 
 def _refuse_tiny_units(scene: Scene) -> None:

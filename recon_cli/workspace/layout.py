@@ -30,6 +30,7 @@ from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, descri
 LOG = "recon.log"
 LOCK = ".lock"  # dropped by the system when its holder dies
 HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
+BLOCKS = "blocks"  # workspaces of `recon train --blocks`, by number
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
 
 logger = logging.getLogger("recon")
@@ -180,8 +181,8 @@ class Workspace:
         remove(self._old(stage))
 
     def scraps(self) -> list[Path]:
-        """Returns what no finished result needs: unfinished work, old results, other seeds."""
-        return [path for parent in (".partial", ".old", SEEDS)
+        """Returns what no finished result needs: unfinished work, old results, blocks, seeds."""
+        return [path for parent in (".partial", ".old", SEEDS, BLOCKS)
                 for path in sorted(self.root.glob(f"{parent}/*"))]
 
     def _refuse_foreign(self, stage: str) -> None:

@@ -386,6 +386,21 @@ class ImportSummary(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MergeSummary(JsonRecord):
+    """The scene put together from blocks, and what its seams cost."""
+
+    imported_from: str  # what it consists of, in words
+    blocks: int
+    gaussians: int
+    sh_degree: int
+    left_out: int  # Gaussians of blocks that lie in the cell of another one
+    seam_views: int  # validation views of more than one block; where 0, the next two are None
+    # their PSNR less that of the best block that trained beside them, mean and least
+    seam_change_db: float | None = None
+    worst_seam_db: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExportChange(JsonRecord):
     """What an option of export removed."""
 
