@@ -77,7 +77,7 @@ def _is_large(job: Job) -> bool:
     """Returns whether a capture has more frames than one model takes."""
     most = load("recon_cli.pipeline.blocks.MOST_VIEWS")
     ingest = job.workspace.manifest("ingest")
-    return ingest is not None and int(ingest.run.summary["frames"]) > most
+    return ingest is not None and int(ingest.run.summary.get("frames", 0)) > most
 
 
 def _report(text: str) -> None:

@@ -82,9 +82,8 @@ def sfm(call: Call) -> None:
     "--view", "with_view", is_flag=True, help="Show the training in the browser.  [default: off]")
 @click.option(
     "--blocks", default="auto", metavar="N",
-    help="Train in N blocks, each in a workspace of its own, and merge them; auto: if there are "
-         "more than 1,200 frames; off: never.  [default: auto]")
-@options.executor("Blocks")
+    help="Blocks to train: auto, N or off.  [default: auto]")
+@options.executor("Blocks", expert=True)
 @options.from_import
 @options.stage(TrainConfig, renders=True)
 @pass_call

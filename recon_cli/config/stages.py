@@ -129,7 +129,7 @@ def _check_scale_between(value: tuple[str, str, float] | None) -> None:
 
 
 MIN_GAUSSIANS = 4  # the first ones are as large as the mean distance to 3 neighbours
-_VALIDATION = "Share of the training views to use for validation."
+_VALIDATION = "Share of the views for validation."
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 
@@ -152,7 +152,7 @@ class TrainConfig(StageConfig):
         1, "Views per step and process; their mean gradient is used.", unit="views", minimum=1,
         expert=True)
     max_size: int | None = option(
-        None, "Longest side of a training image.", unit="pixels", minimum=16,
+        None, "Longest image side.", unit="pixels", minimum=16,
         automatic="by --quality")
     sh_degree: int | None = option(
         None, "Spherical harmonics degree.", minimum=0, maximum=3, automatic="by a trial")
@@ -225,7 +225,7 @@ class RunConfig(TrainConfig):
     """TrainConfig with numbers in place of what was automatic, as `train.plan` makes it."""
 
     iterations: int = option(2400, "Optimization steps.", minimum=1)
-    max_size: int = option(600, "Longest side of a training image.", unit="pixels", minimum=16)
+    max_size: int = option(600, "Longest image side.", unit="pixels", minimum=16)
     sh_degree: int = option(3, "Degree of the spherical harmonics.", minimum=0, maximum=3)
     max_gaussians: int = option(60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
 
