@@ -129,7 +129,7 @@ def _check_scale_between(value: tuple[str, str, float] | None) -> None:
 
 
 MIN_GAUSSIANS = 4  # the first ones are as large as the mean distance to 3 neighbours
-_VALIDATION = "Share of the views for validation."
+_VALIDATION = "Share of views for validation."
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 
