@@ -1,0 +1,117 @@
+"""What training in blocks costs: `python tests/bench/bench_blocks.py WORKSPACE OUT --blocks 3`.
+
+WORKSPACE has its sfm done and is only read: a capture with held-out views, such as the apartment of
+make_apartment.py. It is trained in blocks, then whole, with as many Gaussians as the merged model
+has and as many steps as all blocks took together. Printed are PSNR and SSIM on the held-out views,
+also of those alone that lie within a metre (--near) of a border between two blocks, with the CPU
+seconds of each training.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_reference_views, load_scene, score_views
+from recon_cli.io.ply import read_ply
+from recon_cli.io.records import BlockRecord
+from recon_cli.scene.cells import Cell
+
+PLACES = 500  # that are drawn around a camera
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A finished training."""
+
+    name: str
+    workspace: Path
+    cpu_seconds: float
+
+
+def train(name: str, source: Path, out: Path, options: list[str]) -> Trained:
+    """Trains a copy of a workspace by a command."""
+    if not out.exists():
+        shutil.copytree(source, out, ignore=shutil.ignore_patterns("train", "prune", "blocks"))
+    before = os.times()
+    subprocess.run([sys.executable, "-m", "recon_cli", "train", "-w", str(out), *options],
+                   check=True)
+    after = os.times()
+    return Trained(name, out, after.children_user + after.children_system
+                   - before.children_user - before.children_system)
+
+
+def read_cells(workspace: Path) -> list[Cell]:
+    """Returns the cells of the blocks of a workspace."""
+    folders = sorted(path for path in (workspace / "blocks").iterdir() if path.is_dir())
+    return [BlockRecord.read(folder / "sfm").cell for folder in folders]
+
+
+def owners(cells: list[Cell], positions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns the block of each position, [N]."""
+    return np.argmax([cell.owns(positions) for cell in cells], axis=0)
+
+
+def near_border(cells: list[Cell], centre: NDArray[np.float64], reach: float) -> bool:
+    """Returns whether a ball about a camera reaches into several cells."""
+    draws = np.random.default_rng(SEED)
+    offsets = draws.normal(size=(PLACES, 3))
+    offsets /= np.linalg.norm(offsets, axis=1, keepdims=True)
+    offsets *= reach * draws.random((PLACES, 1)) ** (1 / 3)
+    return len(np.unique(owners(cells, centre + offsets))) > 1
+
+
+@click.command()
+@click.argument("workspace", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--blocks", default=3, show_default=True)
+@click.option("--iterations", default=1500, show_default=True, help="Steps of each block.")
+@click.option("--max-gaussians", default=60_000, show_default=True, help="Cap of each block.")
+@click.option("--max-size", default=480, show_default=True)
+@click.option("--near", default=1.0, show_default=True, help="Scene units from a border.")
+@click.option("--set", "settings", multiple=True, metavar="OPTION", help="More options of train.")
+def main(
+    workspace: Path, out: Path, blocks: int, iterations: int, max_gaussians: int, max_size: int,
+    near: float, settings: tuple[str, ...],
+) -> None:
+    """Print the scores of WORKSPACE trained in blocks and as one model."""
+    common = ["--max-size", str(max_size), "--no-early-stop", *settings]
+    parts = train("blocks", workspace, out / "blocks", [
+        "--blocks", str(blocks), "--iterations", str(iterations), "--max-gaussians",
+        str(max_gaussians), *common])
+    merged = len(read_ply(parts.workspace / "train" / "splats.ply"))
+    whole = train("one model", workspace, out / "whole", [
+        "--blocks", "off", "--iterations", str(blocks * iterations), "--max-gaussians",
+        str(merged), *common])
+    ctx = StageContext(backend="numba")
+    folders = {name: workspace / name for name in ("ingest", "denoise", "sfm")}
+    scene = load_scene(StageInputs(folders), validation=0.0)
+    views = load_reference_views(scene.test, max_size, ctx)
+    cells = read_cells(parts.workspace)
+    border = np.array([near_border(cells, view.camera.center, near) for view in views])
+    click.echo(f"{len(views)} held-out views, {border.sum()} within {near:g} of a border\n")
+    click.echo("| model | Gaussians | PSNR / SSIM | near a border | CPU s |\n"
+               "|---|---:|---:|---:|---:|")
+    for trained in (whole, parts):
+        splats = read_ply(trained.workspace / "train" / "splats.ply")
+        scores = score_views(splats, views, splats.sh_degree, "numba").views
+        psnr = np.array([score.psnr_db for score in scores])
+        ssim = np.array([score.ssim for score in scores])
+        columns = [f"{psnr[rows].mean():.2f} / {ssim[rows].mean():.3f}" if rows.any() else ""
+                   for rows in (np.ones(len(views), bool), border)]
+        click.echo(f"| {trained.name} | {len(splats):,} | {columns[0]} | {columns[1]} "
+                   f"| {trained.cpu_seconds:.0f} |")
+
+
+if __name__ == "__main__":
+    main()
