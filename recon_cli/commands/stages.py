@@ -29,6 +29,8 @@ from recon_cli.stages import IMPORT, STAGES
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune while training goes on
+# fewer steps than a capture of one's own gets: this room scores as 3DGS does after them already
+DEMO: Settings = {**MID, "train": {"iterations": 2000}}
 FORMS = ("text", "markdown", "csv", "latex", "json")
 
 _inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))
@@ -221,5 +223,5 @@ def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
 @pass_call
 def demo(call: Call) -> None:
     """Run every stage on the bundled room video."""
-    run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=MID)
+    run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=DEMO)
     click.echo(f"The scene is in {call.workspace / 'export' / 'splats.ply'}")

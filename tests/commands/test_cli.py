@@ -80,6 +80,13 @@ def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
     assert not Path("elsewhere").exists()
 
 
+def test_demo_takes_fewer_steps_than_other_captures_get(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "SAMPLE", Path("room.mp4").absolute())
+    assert main(["demo"]) == 0
+    assert config_of("train", "demo")["iterations"] == 2000
+    assert config_of("prune", "demo")["at"] == "mid"
+
+
 def test_the_bundled_video_is_there(sample_video: Path) -> None:
     assert sample_video == stages.SAMPLE
     assert stages.SAMPLE.exists()
