@@ -89,6 +89,13 @@ def pair_names(path: Path) -> set[tuple[str, str]]:
     return {(min(pair), max(pair)) for pair in pairs}
 
 
+def matched_ids(path: Path) -> list[tuple[int, int]]:
+    """Returns the ids of the two images of each pair that was matched, successfully or not."""
+    with closing(_connect(path)) as connection:
+        return [divmod(pair, _PAIR_BASE)
+                for pair, in connection.execute("SELECT pair_id FROM matches")]
+
+
 def remove(path: Path) -> None:
     """Deletes a database together with SQLite's side files."""
     for suffix in ("", "-wal", "-shm", "-journal"):

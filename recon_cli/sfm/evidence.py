@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from recon_cli.sfm import database as database_file
 
 # A match agrees below the Sampson error, in pixels, at which COLMAP accepted it
 # (TwoViewGeometryOptions.ransac.max_error).
@@ -57,8 +59,8 @@ class MatchEvidence:
     @cached_property
     def shared(self) -> NDArray[np.int64]:
         """Points that two images both see, [N, N], zero on the diagonal."""
-        visible = self.visible.astype(np.float32)  # exact up to 16 million, and many times faster
-        shared = np.asarray(visible @ visible.T, np.int64)
+        visible = csr_matrix(self.visible, dtype=np.int64)
+        shared = np.asarray((visible @ visible.T).todense())
         np.fill_diagonal(shared, 0)
         return shared
 
@@ -73,14 +75,18 @@ def gather_evidence(
     if unknown:
         raise ValueError(f"the model holds other images: {unknown}")
     placed = {row[image.name]: image for image in images}
+    matched = database_file.matched_ids(database)  # before pycolmap opens it
     with pycolmap.Database.open(database) as opened:
         ids = {image.image_id: row[image.name] for image in opened.read_all_images()
                if image.name in row}
         if len(ids) != len(names):
             raise ValueError(f"{database} holds {len(ids)} of {len(names)} images")
         keypoints = {ids[i]: opened.read_keypoints(i)[:, :2].astype(np.float64) for i in ids}
-        tried = _read_matched_pairs(opened, ids)
         pairs, matches = _read_verified_pairs(opened, ids)
+    tried = np.zeros((len(names), len(names)), np.bool_)
+    for first, second in matched:
+        if first in ids and second in ids:
+            tried[ids[first], ids[second]] = tried[ids[second], ids[first]] = True
     centers = np.full((len(names), 3), np.nan)
     for index, image in placed.items():
         centers[index] = image.projection_center()
@@ -102,16 +108,6 @@ def gather_evidence(
         agreeing=_count_agreeing(placed, keypoints, pairs, matches),
         explained=_count_explained(model, placed, keypoints, pairs, matches),
         traced=traced, joined=joined)
-
-
-def _read_matched_pairs(opened: pycolmap.Database, ids: Mapping[int, int]) -> NDArray[np.bool_]:
-    """Returns which pairs were matched, [N, N]."""
-    tried = np.zeros((len(ids), len(ids)), np.bool_)
-    for first, second in combinations(ids, 2):
-        # Not read_num_matches: it leaves out the pairs in which nothing was found.
-        if opened.exists_matches(first, second):
-            tried[ids[first], ids[second]] = tried[ids[second], ids[first]] = True
-    return tried
 
 
 def _read_verified_pairs(

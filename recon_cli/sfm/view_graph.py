@@ -11,7 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import (
+    connected_components,
+    depth_first_order,
+    minimum_spanning_tree,
+)
 
 Weights = NDArray[np.float64]  # [N, N], symmetric, zero on the diagonal
 Order = NDArray[np.int64]  # [N], a permutation of the images
@@ -83,12 +88,22 @@ def strongest_ties(matrix: Weights, count: int) -> NDArray[np.bool_]:  # [N, N],
 
 def tree_cuts(forest: NDArray[np.bool_]) -> Iterator[Cut]:
     """Yields, for each edge of a forest, the images that it ties to the rest of its tree."""
-    rest = forest.copy()
-    for first, second in np.argwhere(np.triu(forest)):
-        rest[first, second] = rest[second, first] = False
-        _, labels = connected_components(rest, directed=False)
-        yield np.asarray(labels == labels[first])
-        rest[first, second] = rest[second, first] = True
+    graph, seen = csr_matrix(forest), np.zeros(len(forest), np.bool_)
+    for root in range(len(forest)):
+        if seen[root]:
+            continue
+        order, parents = depth_first_order(graph, root, directed=False)
+        seen[order] = True
+        # The images below one follow it in this order.
+        place = np.empty(len(forest), np.int64)
+        place[order] = np.arange(len(order))
+        below = np.ones(len(order), np.int64)
+        for node in order[:0:-1]:
+            below[place[parents[node]]] += below[place[node]]
+        for start in range(1, len(order)):
+            cut = np.zeros(len(forest), np.bool_)
+            cut[order[start:start + below[start]]] = True
+            yield cut
 
 
 def loose_orders(matrix: Weights) -> Iterator[Order]:

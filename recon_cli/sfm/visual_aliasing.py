@@ -13,6 +13,7 @@ cameras find is compared with what the pairs within the groups find at the same 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,16 +86,17 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
     row = {name: index for index, name in enumerate(evidence.names)}
     images = {row[model.image(i).name]: model.image(i) for i in model.reg_image_ids()}
     positions = np.array([point.xyz for _, point in sorted(model.points3D.items())]).reshape(-1, 3)
-    frames = {index: _project(image, positions) for index, image in sorted(images.items())}
-    samples = _sample(evidence, positions, frames)
-    cells = _cells(samples, np.ones_like(samples.image, np.bool_), count)
+    samples = _sample(evidence, positions, images)
+    everything = np.arange(len(samples.image))
+    cells = _cells(samples, everything, count)
     expected, confirmed = np.zeros((2, len(BANDS_DEG) + 1, count, count))
-    for other, frame in frames.items():
-        angles = _likely_angles(samples, positions, frame, evidence.centers[other], other)
-        likely = ~np.isnan(angles)
+    for other, image in images.items():
+        likely, angles = _likely_angles(
+            samples, positions, _project(image, positions), evidence.centers[other], other)
         should = _cells(samples, likely, count)
-        does = should & _cells(samples, likely & evidence.visible[other][samples.point], count, 1)
-        bands = _bands(samples, angles, count)
+        seen = likely[evidence.visible[other][samples.point[likely]]]
+        does = should & _cells(samples, seen, count, 1)
+        bands = _bands(samples, likely, angles, count)
         for band in range(len(expected)):
             expected[band, :, other] = (should & (bands == band)).sum(axis=1)
             confirmed[band, :, other] = (does & (bands == band)).sum(axis=1)
@@ -173,17 +175,19 @@ def _project(image: pycolmap.Image, positions: NDArray[np.float64]) -> NDArray[n
 
 
 def _sample(
-    evidence: MatchEvidence, positions: NDArray[np.float64], frames: dict[int, NDArray[np.float64]]
+    evidence: MatchEvidence, positions: NDArray[np.float64], images: Mapping[int, pycolmap.Image]
 ) -> _Samples:
     parts = [np.zeros((3, 0), np.int64)]
-    for index, frame in frames.items():
-        inside = np.flatnonzero(evidence.visible[index] & ~np.isnan(frame[:, 0]))
-        some = inside[np.linspace(0, len(inside) - 1, min(MAX_POINTS, len(inside))).astype(int)]
+    for index, image in sorted(images.items()):
+        seen = np.flatnonzero(evidence.visible[index])
+        frame = _project(image, positions[seen])
+        rows = np.flatnonzero(~np.isnan(frame[:, 0]))
+        some = rows[np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(int)]
         column, line = (frame[some] * GRID).astype(np.int64).T
         cells = (index * GRID + line) * GRID + column
-        parts.append(np.stack([np.full(len(some), index), some, cells]))
-    images, points, cells = np.concatenate(parts, axis=1)
-    return _Samples(images, points, cells, positions[points] - evidence.centers[images])
+        parts.append(np.stack([np.full(len(some), index), seen[some], cells]))
+    numbers, points, cells = np.concatenate(parts, axis=1)
+    return _Samples(numbers, points, cells, positions[points] - evidence.centers[numbers])
 
 
 def _likely_angles(
@@ -192,10 +196,9 @@ def _likely_angles(
     frame: NDArray[np.float64],  # [M, 2]
     center: NDArray[np.float64],  # [3]
     other: int,
-) -> NDArray[np.float64]:  # [S]
-    """Returns the angle, in degrees, at which another image should find samples; NaN if not."""
-    angles = np.full(len(samples.point), np.nan)
-    rows = np.flatnonzero(~np.isnan(frame[samples.point, 0]) & (samples.image != other))
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # [L], [L]
+    """Returns the samples that another image should find, and at which angles in degrees."""
+    rows = np.flatnonzero((~np.isnan(frame[:, 0]))[samples.point] & (samples.image != other))
     theirs = samples.rays[rows]
     ours = positions[samples.point[rows]] - center
     near, far = (np.sqrt(np.einsum("sk,sk->s", rays, rays)) for rays in (theirs, ours))
@@ -204,23 +207,22 @@ def _likely_angles(
         (cosines > np.cos(np.radians(MAX_ANGLE_DEG)))
         & (near < MAX_RATIO * far)
         & (far < MAX_RATIO * near))
-    angles[rows[likely]] = np.degrees(np.arccos(np.minimum(cosines[likely], 1.0)))
-    return angles
+    return rows[likely], np.degrees(np.arccos(np.minimum(cosines[likely], 1.0)))
 
 
 def _bands(
-    samples: _Samples, angles: NDArray[np.float64], count: int  # angles: [S]
+    samples: _Samples, likely: NDArray[np.int64], angles: NDArray[np.float64], count: int
 ) -> NDArray[np.int64]:  # [N, GRID * GRID]
     """Returns the band of the mean angle of the likely samples in each cell of `count` images."""
-    likely, size = ~np.isnan(angles), count * GRID * GRID
-    sums = np.bincount(samples.cell[likely], weights=angles[likely], minlength=size)
+    size = count * GRID * GRID
+    sums = np.bincount(samples.cell[likely], weights=angles, minlength=size)
     held = np.bincount(samples.cell[likely], minlength=size)
     return np.digitize(sums / np.maximum(held, 1), BANDS_DEG).reshape(count, -1)
 
 
 def _cells(
-    samples: _Samples, chosen: NDArray[np.bool_], count: int, least: int = MIN_POINTS
+    samples: _Samples, chosen: NDArray[np.int64], count: int, least: int = MIN_POINTS
 ) -> NDArray[np.bool_]:  # [N, GRID * GRID]
-    """Returns the cells of `count` images that hold at least so many of the chosen samples [S]."""
+    """Returns the cells of `count` images that hold at least so many of the chosen samples."""
     held = np.bincount(samples.cell[chosen], minlength=count * GRID * GRID)
     return np.asarray(held.reshape(count, -1) >= least)

@@ -208,18 +208,20 @@ def _explained_share(
 
 def _cuts(
     matches: Weights, order: NDArray[np.int64] | None
-) -> Iterator[tuple[Cut, NDArray[np.bool_]]]:
-    """Yields cuts, [N], and the pairs of images, [N, N], that count across each."""
-    ties = np.triu(view_graph.strongest_ties(matches, STRONGEST))
+) -> Iterator[tuple[Cut, tuple[NDArray[np.int64], NDArray[np.int64]]]]:
+    """Yields cuts, [N], and the pairs of images that count across each, [P] and [P]."""
+    first, second = np.nonzero(np.triu(view_graph.strongest_ties(matches, STRONGEST)))
     for cut in view_graph.tree_cuts(view_graph.spanning_forest(matches)):
-        yield cut, ties & (cut[:, None] ^ cut)
+        across = cut[first] != cut[second]
+        yield cut, (first[across], second[across])
     if order is None:
         return
     place = np.argsort(order)
-    near = np.triu(np.abs(place[:, None] - place) <= REACH, 1)
+    first, second = np.nonzero(np.triu(np.abs(place[:, None] - place) <= REACH, 1))
     for count in range(1, len(order)):
         cut = place < count
-        yield cut, near & (cut[:, None] ^ cut)
+        across = cut[first] != cut[second]
+        yield cut, (first[across], second[across])
 
 
 def _cut(
