@@ -21,7 +21,8 @@ class IngestConfig(StageConfig):
     frames: int | None = option(
         None, "Number of frames to choose from videos and sequences of images.", unit="frames",
         minimum=3, automatic="by camera motion, up to --max-frames")
-    max_frames: int = option(300, "Upper limit of the automatic number.", unit="frames", minimum=3)
+    max_frames: int = option(
+        3000, "Upper limit of the automatic number.", unit="frames", minimum=3)
     max_size: int = option(1920, "Longest side of a stored frame.", unit="pixels", minimum=64)
     holdout: str = option(
         "every:8", "Held-out test views: every:N (each Nth by name), segment:A:B (from share A to "
@@ -107,10 +108,21 @@ class SfmConfig(StageConfig):
     max_minutes: float | None = option(
         None, "Time limit.", unit="minutes", minimum=0.01, hashed=False,
         automatic="20, and 12 s more for each image above 100")
+    segments: str = option(
+        "auto", "Overlapping segments to map apart and join: auto (from 200 images on), N or off.",
+        metavar="N", hashed=False)
+    jobs: int | None = option(
+        None, "Segments at once.", minimum=1, hashed=False, expert=True,
+        automatic="one for each core")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_scale_between(self.scale_between)
+        if self.segments not in ("auto", "off") and not (
+                self.segments.isdigit() and int(self.segments) >= 1):
+            raise ConfigError(
+                f"segments is {self.segments!r}, but needs auto, off or a number of segments.",
+                hint="Type `recon sfm --segments 4`, for example.")
 
 
 def _check_scale_between(value: tuple[str, str, float] | None) -> None:

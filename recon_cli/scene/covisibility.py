@@ -60,8 +60,16 @@ def split_views(observations: Observations, blocks: int) -> NDArray[np.int64]:
     """
     if not 1 <= blocks <= max(1, observations.views // 2):
         raise ValueError(f"{blocks} blocks of {observations.views} views")
-    shared = (observations.matrix @ observations.matrix.T).astype(np.float64)
-    labels = np.zeros(observations.views, np.int64)
+    return cut_graph((observations.matrix @ observations.matrix.T).astype(np.float64), blocks)
+
+
+def cut_graph(
+    shared: csr_matrix | NDArray[np.float64],  # [V, V], symmetric
+    blocks: int,
+) -> NDArray[np.int64]:
+    """Returns the block of each view, [V], by the weight that every two views share."""
+    shared = csr_matrix(shared)
+    labels = np.zeros(shared.shape[0], np.int64)
     for new in range(1, blocks):
         rows = np.flatnonzero(labels == np.argmax(np.bincount(labels)))
         labels[rows[_cut(shared[rows][:, rows])]] = new

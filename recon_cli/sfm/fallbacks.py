@@ -19,7 +19,16 @@ from dataclasses import dataclass
 import pycolmap
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import checks, database, features, mapper, matching, merge_models, skeleton
+from recon_cli.sfm import (
+    checks,
+    database,
+    features,
+    join_segments,
+    mapper,
+    matching,
+    merge_models,
+    skeleton,
+)
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, StepLog, fresh_folder, publish
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.trusted_part import keep_trusted_part
@@ -29,6 +38,10 @@ from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
+SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
+# Frames up to which a capture whose segments gave no good model is mapped as a whole: of more, that
+# would take longer than all of its segments.
+WHOLE_MAX = 400
 # Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
 EXHAUSTIVE_MAX = 100
 # Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
@@ -89,7 +102,14 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         Fallback("retrieval", f"{count} frames are too many to match all pairs at once",
                  _near_or_similar, skeleton.map_coarse_first),
         relaxed, every)  # lower thresholds take less time than all pairs
-    if skeleton.is_continuous(job):
+    if job.segments:
+        joined = Fallback(
+            SEGMENTS, f"{count} frames were mapped in {len(job.segments)} segments",
+            lambda *_: set(), join_segments.map_joined)
+        if count > WHOLE_MAX:
+            return (joined,)
+        ways = (joined, *ways)
+    elif skeleton.is_continuous(job):
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_pairs, skeleton.complete), *ways)
     return (*ways, Fallback("global", "", lambda *_: set(), mapper.map_globally))
@@ -97,6 +117,8 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
 
 def find_features(job: MappingJob, report: Reporter) -> Result:
     """Fills the database with the features of all frames; see `features.extract_features`."""
+    if job.segments:
+        join_segments.collect_features(job)
     by_tracks = not job.known_poses and list_fallbacks(job)[0].name == TRACKS
     with skeleton.build_beside(job, report) if by_tracks and job.threads > 1 else nullcontext():
         return features.extract_features(job, report)
@@ -104,6 +126,8 @@ def find_features(job: MappingJob, report: Reporter) -> Result:
 
 def match_first(job: MappingJob, report: Reporter) -> Result:
     """Matches the pairs of the first fallback; SfmError if none matches, or none shows depth."""
+    if job.segments:
+        return join_segments.match_segments(job, report)
     matching.match_pairs(job, list_fallbacks(job)[0].choose_pairs(job, report), report)
     matching.check_motion(job)
     return matching.count_matches(job)
@@ -200,7 +224,8 @@ def _try_fallback(
     if wanted:
         matching.match_pairs(job, wanted, report)
     job = _linked_job(job, fallback.name)
-    candidate = merge_models.best_model(job, fallback.find_models(job, report))
+    candidate = merge_models.best_model(
+        job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS)
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
         return MapperAttempt(fallback.name, reason, seconds), None
@@ -257,7 +282,8 @@ def _publish_best(
 def _linked_job(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
     own = job.attempts / name / skeleton.LINKED
-    return dataclasses.replace(job, linked=own) if name == TRACKS else job
+    has_own = name == TRACKS or (name == SEGMENTS and job.tracks is not None)
+    return dataclasses.replace(job, linked=own) if has_own else job
 
 
 def _incremental(pairs: str, reason: str) -> Fallback:

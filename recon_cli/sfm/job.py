@@ -27,6 +27,8 @@ POLL_SECONDS = 0.25  # between looks at what native code has done
 CLIP_SECONDS = 1e6  # from the start of a clip to that of the next, in the times of a job
 LOG_FILE = "steps.json"  # in the stage's folder: the finished steps
 STEPS = ("features", "matches", "model", "sparse", "undistorted")
+SPLIT = "split"  # a step after the matches where a view graph is cut into segments
+_ORDER = (*STEPS[:2], SPLIT, *STEPS[2:])
 
 Result = dict[str, Any]  # JSON values only
 
@@ -68,6 +70,10 @@ class MappingJob:
     times: Mapping[str, float]  # presentation times in seconds by name, where known
     tracks: Path | None = None  # file of tracks through a video, see `io.tracks`
     linked: Path | None = None  # database to map from, where it is not that of the features
+    # names of the frames of each segment that was mapped apart, in folders of `segments`
+    segments: tuple[tuple[str, ...], ...] = ()
+    split: int = 0  # segments to cut the view graph into; none where 0
+    last: str = STEPS[-1]  # the last step to take
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -89,6 +95,10 @@ class MappingJob:
         """Models of the mappers that were tried, until one of them is the result."""
         return self.out / "rungs"
 
+    def segment(self, index: int) -> Path:
+        """The folder of a segment, laid out as that of the stage."""
+        return self.out / "segments" / str(index)
+
     @property
     def known_poses(self) -> bool:
         """Whether the cameras are given."""
@@ -100,7 +110,8 @@ class MappingJob:
         keep = self.known_poses and self.pose_use == "keep"
         if keep and self.given_points and all(group.lens for group in self.groups):
             return ("model", "sparse", "undistorted")
-        return STEPS
+        steps = [step for step in _ORDER if step != SPLIT or self.split]
+        return tuple(steps[:steps.index(self.last) + 1])
 
     def write(self, path: Path) -> None:
         """Writes the job for the mapping process."""
@@ -119,6 +130,7 @@ class MappingJob:
                 group["lens"] = Lens(**{**lens, "params": tuple(lens["params"])})
         value["groups"] = tuple(
             CameraGroup(**{**group, "names": tuple(group["names"])}) for group in value["groups"])
+        value["segments"] = tuple(map(tuple, value["segments"]))
         scale = value["scale_between"]
         value["scale_between"] = None if scale is None else tuple(scale)
         return cls(**value)
@@ -156,7 +168,7 @@ class StepLog:
 
     def forget_from(self, step: str) -> None:
         """Removes a step and all that build on it."""
-        for name in STEPS[STEPS.index(step):]:
+        for name in _ORDER[_ORDER.index(step):]:
             self._steps.pop(name, None)
         atomic.write_json(self._out / LOG_FILE, self._steps)
 

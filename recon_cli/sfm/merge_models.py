@@ -41,17 +41,19 @@ class ModelCandidate:
     rejected: Mapping[str, str]  # why frames were taken out, by name
 
 
-def best_model(job: MappingJob, models: Sequence[pycolmap.Reconstruction]) -> ModelCandidate | None:
+def best_model(
+    job: MappingJob, models: Sequence[pycolmap.Reconstruction], *, merging: bool = True
+) -> ModelCandidate | None:
     """Returns the largest model, merged with others and without wrong images; None without models.
 
     The models are adjusted; the result is sharp. A part is merged only where the model is trusted
-    no less with it than without it.
+    no less with it than without it, and not without `merging`.
     """
     if not models:
         return None
     largest, *others = sorted(models, key=mapper.model_size, reverse=True)
     best = drop_outliers(job, mapper.sharpen(largest))
-    for other in others:
+    for other in others if merging else ():
         joined = merge(job, best.model, other)
         if joined is None:
             continue

@@ -40,13 +40,10 @@ class PairChecks:
 
 
 def check_pairs(
-    path: Path, models: Sequence[pycolmap.Reconstruction],
+    path: Path, views: Mapping[str, PlacedView],
     geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
 ) -> PairChecks:
-    """Returns which verified pairs of a database agree with the cameras of models."""
-    views: dict[str, _View] = {}
-    for model in reversed(models):
-        views |= _list_views(model)
+    """Returns which verified pairs of a database agree with the cameras of views, by name."""
     agreeing, drifted, contradicting, unplaced = set(), set(), set(), set()
     with pycolmap.Database.open(path) as opened:
         keypoints = {
@@ -54,7 +51,7 @@ def check_pairs(
             for image in opened.read_all_images()}
     for pair, geometry in geometries.items():
         first, second = (views.get(name) for name in pair)
-        if first is None or second is None or first.model is not second.model:
+        if first is None or second is None or first.group != second.group:
             unplaced.add(pair)
             continue
         ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
@@ -74,10 +71,10 @@ def check_pairs(
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
-    """An image of a skeleton."""
+class PlacedView:
+    """An image with a camera."""
 
-    model: pycolmap.Reconstruction
+    group: int  # images of one group are in one frame
     image: pycolmap.Image
     near: float  # depth that no point is nearer than
     usual: float  # median depth of its points
@@ -89,24 +86,39 @@ class _View:
         return self.image.camera
 
 
-def _list_views(model: pycolmap.Reconstruction) -> dict[str, _View]:
-    views: dict[str, _View] = {}
-    places = {number: point.xyz for number, point in model.points3D.items()}
+def list_models(models: Sequence[pycolmap.Reconstruction]) -> dict[str, PlacedView]:
+    """Returns the images of models by name, each model in its own frame; the first one wins."""
+    views: dict[str, PlacedView] = {}
+    for index, model in reversed(list(enumerate(models))):
+        names = frozenset(model.image(number).name for number in model.reg_image_ids())
+        views |= list_views([(model, names)], group=index)
+    return views
+
+
+def list_views(
+    parts: Sequence[tuple[pycolmap.Reconstruction, Collection[str]]], *, group: int = 0
+) -> dict[str, PlacedView]:
+    """Returns images of models that lie in one frame, those named from each, by name."""
+    found: list[tuple[pycolmap.Image, float, float]] = []
+    for model, names in parts:
+        places = {number: point.xyz for number, point in model.points3D.items()}
+        for image in (model.image(number) for number in model.reg_image_ids()):
+            if image.name in names:
+                depths = seen_depths(image, places)
+                usual = float(np.median(depths)) if len(depths) else 0.0
+                found.append((image, nearest_depth(depths), usual))
+    views: dict[str, PlacedView] = {}
     travelled, last = 0.0, None
-    for image in sorted(
-            (model.image(number) for number in model.reg_image_ids()),
-            key=lambda image: image.name):
+    for image, near, usual in sorted(found, key=lambda entry: entry[0].name):
         center = image.projection_center()
         travelled += 0.0 if last is None else float(np.linalg.norm(center - last))
         last = center
-        depths = seen_depths(image, places)
-        usual = float(np.median(depths)) if len(depths) else 0.0
-        views[image.name] = _View(model, image, nearest_depth(depths), usual, travelled)
+        views[image.name] = PlacedView(group, image, near, usual, travelled)
     return views
 
 
 def _is_drift(
-    first: _View, ours: NDArray[np.float64], second: _View, theirs: NDArray[np.float64]
+    first: PlacedView, ours: NDArray[np.float64], second: PlacedView, theirs: NDArray[np.float64]
 ) -> bool:
     """Returns whether matches [M, 2] show a motion as near the skeleton's as drift leaves it.
 

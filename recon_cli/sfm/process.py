@@ -26,9 +26,10 @@ _DOING = {
     "matches": ("matching frames", "pair"),
     "skeleton": ("following frames", "frame"),
     "mapping": ("placing cameras", "frame"),
+    "joining": ("joining segments", "segment"),
     "undistorted": ("undistorting frames", "frame")}
 # The step that a phase belongs to, where the names differ.
-_STEP = {"skeleton": "features", "mapping": "model"}
+_STEP = {"skeleton": "features", "mapping": "model", "joining": "model"}
 LOG = "log.txt"
 _LOG_TAIL = 64 * 1024  # bytes
 _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
@@ -100,15 +101,19 @@ class Monitor:
         self._record(self._durable, len(steps) * frames)
 
 
+class CrashError(SfmError):
+    """The mapping process died of what is no fault of the capture."""
+
+
 def run_job(
     job: MappingJob, *, progress: Progress, record: Callable[[int, int], None],
-    on_idle: Callable[[], None],
+    on_idle: Callable[[], None], stop: threading.Event | None = None,
 ) -> None:
     """Runs a job in a process of its own; its results are in the step log. See also `Monitor`.
 
-    SfmError if there is no model to trust, the time is up, or the process died; FormatError if a
-    frame cannot be read; WorkspaceError if another process works in the folder; OSError as met in
-    the process: the disk is full or not writable.
+    SfmError if there is no model to trust, the time is up, or `stop` was set; CrashError if the
+    process died; FormatError if a frame cannot be read; WorkspaceError if another process works in
+    the folder; OSError as met in the process: the disk is full or not writable.
     """
     max_minutes = job.max_minutes
     deadline = time.monotonic() + 60 * max_minutes
@@ -120,6 +125,8 @@ def run_job(
             for event in _events(child):
                 if isinstance(event, (ReconError, OSError)):
                     raise event
+                if stop is not None and stop.is_set():
+                    raise SfmError("It was interrupted.")
                 if time.monotonic() > deadline:
                     raise _timeout_error(max_minutes, monitor)
                 if event is not None:
@@ -182,7 +189,7 @@ def _timeout_error(max_minutes: float, monitor: Monitor) -> SfmError:
         "use fewer frames (recon ingest --frames N) or --max-features 1024.")
 
 
-def _crash_error(log: Path, code: int, monitor: Monitor) -> SfmError:
+def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
     names = {number.value: number.name for number in signal.Signals}
     how = f"stopped with exit code {code}" if code >= 0 else (
         f"was ended by {names.get(-code, f'signal {-code}')}")
@@ -191,7 +198,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> SfmError:
         hint = (
             "The system may have run out of memory; try --max-features 1024 or fewer frames "
             "(recon ingest --frames N).")
-    return SfmError(
+    return CrashError(
         f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
         f"{last_error(log)}", hint=hint)
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import io
 import itertools
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,7 +30,7 @@ from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.matching import Pair, similar_pairs
-from recon_cli.sfm.pair_checks import check_pairs
+from recon_cli.sfm.pair_checks import check_pairs, list_models
 
 LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
 SKELETON = "skeleton"  # models in the folder of the attempts
@@ -152,7 +152,7 @@ def complete(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]
     source = replace(job, linked=None).database
     tracks = _read_tracks(job)
     geometries = read_verified(source)
-    checked = check_pairs(source, models, geometries)
+    checked = check_pairs(source, list_models(models), geometries)
     usable = {pair: geometry for pair, geometry in geometries.items()
               if pair not in checked.contradicting}
     if _most(models) < ENOUGH * len(job.names):
@@ -160,7 +160,7 @@ def complete(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]
         return mapper.map_relaxed(job, report)
     link(job, source, usable, tracks)
     fitted = _fit(job, models[0])
-    open_loops = check_pairs(source, [fitted], usable).drifted
+    open_loops = check_pairs(source, list_models([fitted]), usable).drifted
     if not open_loops:
         return [fitted]
     remapped = mapper.map_incrementally(job, report)
@@ -318,29 +318,51 @@ def _append_tracks(
 
 def overlapping_pairs(model: pycolmap.Reconstruction) -> set[Pair]:
     """Returns each image of a model with OVERLAPPING ones whose views have something in common."""
-    images = sorted(_images(model), key=lambda image: image.name)
-    share = _overlap(model, images)
+    images = _images(model)
+    return overlapping_images(images, [model] * len(images))
+
+
+def overlapping_images(
+    images: Sequence[pycolmap.Image],
+    models: Sequence[pycolmap.Reconstruction],  # that hold the points of each image
+    held: Mapping[str, Collection[int]] | None = None,
+) -> set[Pair]:
+    """Returns each image with OVERLAPPING ones whose views have something in common.
+
+    Where `held` names the segments that hold each image, only pairs of different ones.
+    """
+    order = sorted(range(len(images)), key=lambda index: images[index].name)
+    images = [images[index] for index in order]
+    places = {id(model): {number: point.xyz for number, point in model.points3D.items()}
+              for model in models}
+    share = _overlap(images, [
+        _sample_points(image, places[id(models[index])])
+        for image, index in zip(images, order, strict=True)])
     mutual = np.minimum(share, share.T)
     names, pairs = [image.name for image in images], set()
     for row, shares in enumerate(mutual):
-        others = [other for other in np.argsort(-shares, kind="stable")[:WIDEST].tolist()
-                  if shares[other] > MIN_OVERLAP]
+        others = [other for other in np.argsort(-shares, kind="stable").tolist()
+                  if shares[other] > MIN_OVERLAP and (
+                      held is None or set(held[names[row]]).isdisjoint(held[names[other]]))]
+        others = others[:WIDEST]
         count = min(OVERLAPPING, len(others))
         for place in np.linspace(0, max(len(others) - 1, 0), count).round().astype(int):
             pairs.add((names[min(row, others[place])], names[max(row, others[place])]))
     return pairs
 
 
+def _sample_points(
+    image: pycolmap.Image, places: Mapping[int, NDArray[np.float64]]
+) -> NDArray[np.float64]:  # [S, 3]
+    numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
+    step = max(1, len(numbers) // SAMPLED)
+    return np.array([places[number] for number in numbers[::step]]).reshape(-1, 3)
+
+
 def _overlap(
-    model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]
+    images: Sequence[pycolmap.Image], seen: Sequence[NDArray[np.float64]]  # [S, 3] each
 ) -> NDArray[np.float64]:  # [N, N]
     """Returns the share of the points of each image that another one should show, too."""
-    places = {number: point.xyz for number, point in model.points3D.items()}
-    seen = []
-    for image in images:
-        numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
-        step = max(1, len(numbers) // SAMPLED)
-        seen.append(np.array([places[number] for number in numbers[::step]]).reshape(-1, 3))
     owner = np.repeat(np.arange(len(images)), [len(points) for points in seen])
     points = np.concatenate([np.zeros((0, 3)), *seen])
     centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
@@ -353,11 +375,13 @@ def _overlap(
         bounds = np.array([camera.width / camera.focal_length_x,
                            camera.height / camera.focal_length_y]) / 2
         inside = (local[:, 2] > 0) & (np.abs(local[:, :2]) < bounds * local[:, 2:]).all(axis=1)
-        others = points - centers[column]
+        rows = np.flatnonzero(inside)  # few of many: a walk leaves most behind
+        others = points[rows] - centers[column]
         far = np.linalg.norm(others, axis=1)
-        alike = ((rays * others).sum(axis=1) > np.cos(np.radians(MAX_ANGLE_DEG)) * near * far) & (
-            near < MAX_RATIO * far) & (far < MAX_RATIO * near)
-        share[:, column] = np.bincount(owner, inside & alike, len(images))
+        cosines = (rays[rows] * others).sum(axis=1)
+        alike = (cosines > np.cos(np.radians(MAX_ANGLE_DEG)) * near[rows] * far) & (
+            near[rows] < MAX_RATIO * far) & (far < MAX_RATIO * near[rows])
+        share[:, column] = np.bincount(owner[rows[alike]], minlength=len(images))
     np.fill_diagonal(share, 0)
     return np.asarray(share / np.maximum(np.bincount(owner, minlength=len(images)), 1)[:, None])
 

@@ -20,8 +20,15 @@ import filelock
 
 from recon_cli import machine
 from recon_cli.errors import ReconError, WorkspaceError
-from recon_cli.sfm import database, fallbacks, known_poses, matching, undistort
-from recon_cli.sfm.job import LOCK, LOG_FILE, MappingJob, Reporter, Result, StepLog
+from recon_cli.sfm import (
+    database,
+    fallbacks,
+    join_segments,
+    known_poses,
+    matching,
+    undistort,
+)
+from recon_cli.sfm.job import LOCK, LOG_FILE, SPLIT, MappingJob, Reporter, Result, StepLog
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
@@ -35,6 +42,7 @@ def work(job: MappingJob, report: Reporter) -> None:
         "features": lambda: fallbacks.find_features(job, report),
         "matches": lambda: (
             known_poses.match_known if job.known_poses else fallbacks.match_first)(job, report),
+        SPLIT: lambda: join_segments.split_by_view_graph(job),
         "model": lambda: (
             known_poses.build_known_model(job, report) if job.known_poses
             else fallbacks.build_model(job, report, deadline=deadline)),

@@ -16,6 +16,7 @@ from recon_cli.io import records as store
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.io.records import FrameList
 from recon_cli.io.tracks import TRACKS
+from recon_cli.sfm.segments import MOST_WHOLE, expected_minutes
 from recon_cli.workspace.summaries import IngestSummary
 
 MIN_TRAINED = 2  # one view holds no depth
@@ -101,9 +102,10 @@ def _ingest(
               if not _is_photos(part[0])]
     scans = [from_video.scan(config, path, out / f"{prefix}{from_video.SCAN}", ctx)
              for path, prefix in videos]
+    numbers = from_video.frame_counts(config, scans)
+    _tell_many(config, sum(numbers), ctx)
     counts = dict(zip(
-        (prefix for _, prefix in videos),
-        zip(scans, from_video.frame_counts(config, scans), strict=True), strict=True))
+        (prefix for _, prefix in videos), zip(scans, numbers, strict=True), strict=True))
     ingested = []
     for part, prefix in zip(parts, prefixes, strict=True):
         if prefix in counts:
@@ -112,6 +114,15 @@ def _ingest(
         else:
             ingested.append(from_photos.ingest(config, part, out, ctx, prefix=prefix))
     return ingested
+
+
+def _tell_many(config: IngestConfig, frames: int, ctx: StageContext) -> None:
+    """Says how many frames a long video gets, and how long their cameras will take to find."""
+    if frames > MOST_WHOLE:
+        way = "" if config.frames else " for the way of the camera"
+        minutes = max(1, round(expected_minutes(frames, ctx.threads)))
+        ctx.notice(f"{frames:,} frames are chosen{way}; recon sfm will take about {minutes} "
+                   "minutes for them. --max-frames limits their number.")
 
 
 def _parts(sources: Sequence[Path]) -> list[list[Path]]:

@@ -15,7 +15,7 @@ from recon_cli.errors import FormatError, list_names
 from recon_cli.io import records as store
 from recon_cli.io.records import POSES, FrameList, describe_stretches, read_poses
 from recon_cli.io.tracks import TRACKS
-from recon_cli.sfm import process
+from recon_cli.sfm import process, segments
 from recon_cli.sfm.align_world import parse_place
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
@@ -54,22 +54,44 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
+    runs = _run_segments(config, job, ctx)
+    job = runs.job
     process.run_job(
         job, progress=ctx.progress, record=ctx.record, on_idle=ctx.on_idle)
-    summary = _summary(frames, job)
+    summary = _summary(frames, runs)
     _report(summary, frames, ctx)
+    segments.remove_segments(job)
     return summary
 
 
+def _run_segments(
+    config: SfmConfig, job: MappingJob, ctx: StageContext
+) -> segments.SegmentRuns:
+    """Maps a long capture in segments and tells which failed; leaves others as they are."""
+    mapped = not job.known_poses and (job.pairs == "auto" or config.segments != "auto")
+    count = segments.count_segments(len(job.names), config.segments) if mapped else 1
+    if count == 1:
+        segments.remove_segments(job)  # of a run with other options
+        return segments.SegmentRuns(job, {}, {})
+    runs = segments.map_segments(
+        job, count, config.jobs, progress=ctx.progress, record=ctx.record)
+    for index, reason in runs.failed.items():
+        names = runs.job.segments[index]
+        ctx.notice(f"Segment {index}, {names[0]} to {names[-1]}, has no model: {reason}")
+    return runs
+
+
 def _time_limit(config: SfmConfig, frames: FrameList, ctx: StageContext) -> float:
-    """Returns the limit in minutes, and tells it in advance where it follows from the images."""
-    if config.max_minutes is not None:
-        return config.max_minutes
-    more = MINUTES_PER_FRAME * max(0, len(frames.frames) - USUAL_FRAMES)
-    if more:
-        ctx.notice(f"{len(frames.frames)} images may take up to {MAX_MINUTES + more:.0f} minutes; "
-                   "--max-minutes sets another limit.")
-    return MAX_MINUTES + more
+    """Returns the limit in minutes, and tells in advance how long many images take."""
+    count = len(frames.frames)
+    limit = MAX_MINUTES + MINUTES_PER_FRAME * max(0, count - USUAL_FRAMES)
+    if config.max_minutes is None and count > USUAL_FRAMES:
+        parts = segments.count_segments(count, config.segments)
+        about = segments.expected_minutes(count, ctx.threads)
+        ctx.notice(f"{count} images{f' in {parts} segments' if parts > 1 else ''} take about "
+                   f"{max(1, round(about))} minutes, and up to {limit:.0f} minutes if they are "
+                   "hard to place; --max-minutes sets another limit.")
+    return limit if config.max_minutes is None else config.max_minutes
 
 
 def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:
@@ -95,7 +117,8 @@ def _check_frames(job: MappingJob) -> None:
                 hint=f"Run `recon {verb} --again`.")
 
 
-def _summary(frames: FrameList, job: MappingJob) -> SfmSummary:
+def _summary(frames: FrameList, runs: segments.SegmentRuns) -> SfmSummary:
+    job = runs.job
     results: dict[str, dict[str, Any]] = {}
     for step in job.steps:
         result = StepLog(job.out).result(step)
@@ -109,7 +132,9 @@ def _summary(frames: FrameList, job: MappingJob) -> SfmSummary:
         "unregistered": unregistered,
         "unregistered_held_out": [name for name in unregistered if name in held_out],
         "world": results["sparse"], "cameras": results["undistorted"]["cameras"],
-        "seconds": {step: result["seconds"] for step, result in results.items()}})
+        "segments": max(1, len(job.segments)),
+        "seconds": {**{f"segments: {step}": seconds for step, seconds in runs.seconds.items()},
+                    **{step: result["seconds"] for step, result in results.items()}}})
 
 
 def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:

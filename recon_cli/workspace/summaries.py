@@ -214,14 +214,19 @@ class SfmSummary(JsonRecord):
     world: WorldSummary
     cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
     left_out: tuple[str, ...] = ()  # names of the frames whose part of the model is not trusted
+    segments: int = 1  # that were mapped apart and joined; 1 for a capture mapped as a whole
 
     def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:
-        """Returns a reason if a part of a broken model was kept, but the options forbid that.
+        """Returns reasons if a part of a broken model was kept, or it was cut into other segments.
 
-        They are not hashed, so that a refused run can go on with other ones.
+        The options are not hashed, so that a refused run can go on with other ones.
         """
         forbids = options["accept_weak"] or not options["partial"]
-        return ("it keeps a part of a broken model",) if self.left_out and forbids else ()
+        reasons = ["it keeps a part of a broken model"] * bool(self.left_out and forbids)
+        asked = str(options.get("segments", "auto"))
+        if asked != "auto" and self.segments != (1 if asked == "off" else int(asked)):
+            reasons.append(f"it was mapped in {self.segments} segments")
+        return tuple(reasons)
 
     @property
     def trusted(self) -> bool | None:

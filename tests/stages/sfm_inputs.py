@@ -20,8 +20,11 @@ def every_nth(video, step, count):
     }
 
 
-def write_inputs(base, images, *, filtered=(), held_out=()):
-    """Writes the finished folders of ingest and denoise; `images` maps names to RGB pixels."""
+def write_inputs(base, images, *, filtered=(), held_out=(), fps=None):
+    """Writes the finished folders of ingest and denoise; `images` maps names to RGB pixels.
+
+    With `fps` the names are numbers of frames in a video.
+    """
     for stage in ("ingest", "denoise"):
         (base / stage / "frames").mkdir(parents=True)
     for name, rgb in images.items():
@@ -30,7 +33,8 @@ def write_inputs(base, images, *, filtered=(), held_out=()):
         write_png(base / "denoise" / "frames" / name, np.asarray(twin))
     height, width = next(iter(images.values())).shape[:2]
     FrameList("video", (Group("room.mp4", width, height),), tuple(
-        Frame(name, None, "room.mp4", None, name in held_out) for name in sorted(images)
+        Frame(name, int(name[:6]) / fps if fps else None, "room.mp4", None, name in held_out)
+        for name in sorted(images)
     )).write(base / "ingest")
     return base
 

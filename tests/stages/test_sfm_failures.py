@@ -42,7 +42,7 @@ def test_the_time_limit_follows_the_frames_and_is_told_in_advance(count, given, 
     notices = []
     frames = FrameList("photos", (Group("a", 9, 9),), tuple(
         Frame(f"{index:06d}.png", None, "a", None, held_out=False) for index in range(count)))
-    ctx = SimpleNamespace(notice=notices.append)
+    ctx = SimpleNamespace(notice=notices.append, threads=2)
     assert sfm._time_limit(SfmConfig(max_minutes=given), frames, ctx) == pytest.approx(limit)
     assert len(notices) == (limit > 20)
     assert all("up to 58 minutes" in notice for notice in notices)

@@ -1,0 +1,174 @@
+"""The cut into segments, and what becomes of them: kept, tried again, failed, interrupted."""
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon_cli.errors import ConfigError, SfmError
+from recon_cli.io.tracks import Tracks
+from recon_cli.progress import NullProgress
+from recon_cli.sfm import segments
+from recon_cli.sfm.job import SPLIT, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.process import CrashError
+
+
+def names_of(count):
+    return tuple(f"{index:06d}.png" for index in range(count))
+
+
+@pytest.mark.parametrize(("frames", "asked", "count"), [
+    (200, "auto", 1), (201, "auto", 2), (300, "auto", 3), (1200, "auto", 10), (1200, "off", 1),
+    (50, "2", 2), (1200, "1", 1)])
+def test_the_number_of_segments_follows_the_frames(frames, asked, count):
+    assert segments.count_segments(frames, asked) == count
+
+
+def test_more_segments_than_the_frames_allow_are_refused():
+    with pytest.raises(ConfigError, match="50 frames are too few for 6 segments") as caught:
+        segments.count_segments(50, "6")
+    assert "--segments 5" in caught.value.hint
+
+
+@pytest.mark.parametrize(("frames", "count"), [(201, 2), (300, 3), (1200, 10), (24, 2), (997, 7)])
+def test_segments_of_a_video_cover_every_frame_and_overlap_as_asked(frames, count):
+    names = names_of(frames)
+    parts = segments.split_by_time(names, count)
+    assert len(parts) == count
+    assert set().union(*parts) == set(names)
+    common = segments.overlap(frames, count)
+    assert 0 < common <= segments.OVERLAP
+    for before, after in itertools.pairwise(parts):
+        assert before[-common:] == after[:common]
+    for first, third in zip(parts, parts[2:], strict=False):
+        assert set(first).isdisjoint(third)
+    sizes = [len(part) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+    assert all(part == tuple(sorted(part)) for part in parts)
+
+
+@pytest.fixture
+def job(tmp_path):
+    """A video of 60 frames; each track is seen by three in a row."""
+    names = names_of(60)
+    image = np.repeat(np.arange(60, dtype=np.int32), 3)
+    track = np.concatenate([[index, index + 1, index + 2] for index in range(60)])
+    Tracks(names, image, track.astype(np.int32), np.zeros((180, 2), np.float32)).write(
+        tmp_path / "tracks")
+    return MappingJob(
+        frames=tmp_path, denoised=tmp_path, out=tmp_path / "out",
+        groups=(CameraGroup(names[:40], 9, 9), CameraGroup(names[40:], 9, 9)), masks=None,
+        poses=None, pose_use="keep", given_points=False, tracks=tmp_path / "tracks", pairs="auto",
+        max_features=2000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
+        scale_between=None, max_minutes=5.0, seed=0, threads=4, sharpness={},
+        times={name: float(index) for index, name in enumerate(names)})
+
+
+class Runner:
+    """In place of a mapping process: finishes the steps of a job, or fails as told."""
+
+    def __init__(self, **failures):
+        self.failures, self.jobs = failures, []
+
+    def __call__(self, job, **_):
+        self.jobs.append(job)
+        log = StepLog(job.out)
+        if all(log.result(step) for step in job.steps):
+            return
+        errors = self.failures.get(f"of_{job.out.name}", [])
+        if errors and (error := errors.pop(0)):
+            raise error
+        for step in job.steps:
+            log.finish(step, {"seconds": 2.0})
+
+    def ran(self):
+        return sorted(int(job.out.name) for job in self.jobs)
+
+
+def run(job, monkeypatch, runner, count=3):
+    monkeypatch.setattr(segments, "run_job", runner)
+    return segments.map_segments(
+        job, count, 2, progress=NullProgress(), record=lambda *_: None)
+
+
+def test_each_segment_is_a_job_on_its_frames_and_tracks(job, monkeypatch):
+    runner = Runner()
+    runs = run(job, monkeypatch, runner)
+    assert runs.failed == {}
+    assert runs.job.segments == segments.split_by_time(job.names, 3)
+    assert runs.seconds == {"features": 6.0, "matches": 6.0, "model": 6.0}
+    for each in runner.jobs:
+        part = runs.job.segments[int(each.out.name)]
+        assert each.names == part
+        assert each.steps == ("features", "matches", "model")
+        assert Tracks.read(each.tracks).names == part
+        assert each.threads == 2
+        assert all(group.names for group in each.groups)
+
+
+def test_a_segment_that_fails_stops_no_other_and_is_told(job, monkeypatch):
+    runner = Runner(of_1=[SfmError("No two frames match.")])
+    runs = run(job, monkeypatch, runner)
+    assert runs.failed == {1: "No two frames match."}
+    assert runner.ran() == [0, 1, 2]
+
+
+def test_a_segment_whose_process_is_killed_is_tried_again(job, monkeypatch):
+    runner = Runner(of_1=[CrashError("It was ended by SIGKILL."), None])
+    assert run(job, monkeypatch, runner).failed == {}
+    assert runner.ran() == [0, 1, 1, 2]
+    again = Runner(of_1=[CrashError("It was ended by SIGKILL.")] * segments.TRIES)
+    StepLog(job.segment(1)).forget_from("features")
+    assert run(job, monkeypatch, again).failed == {1: "It was ended by SIGKILL."}
+
+
+def test_no_segment_at_all_is_an_error(job, monkeypatch):
+    runner = Runner(**{f"of_{index}": [SfmError("Too dark.")] for index in range(3)})
+    with pytest.raises(SfmError, match="None of the 3 segments could be mapped: Too dark"):
+        run(job, monkeypatch, runner)
+
+
+def test_an_interrupted_run_keeps_what_is_finished(job, monkeypatch):
+    with pytest.raises(KeyboardInterrupt):
+        run(job, monkeypatch, Runner(of_2=[KeyboardInterrupt()]))
+    kept = job.segment(0) / "steps.json"
+    before = kept.stat().st_mtime_ns
+    assert run(job, monkeypatch, Runner()).failed == {}
+    assert kept.stat().st_mtime_ns == before
+    assert StepLog(job.segment(2)).result("model")
+
+
+def test_segments_of_another_cut_are_not_taken_for_these(job, monkeypatch):
+    run(job, monkeypatch, Runner())
+    run(job, monkeypatch, Runner(), count=2)
+    for index, names in enumerate(segments.split_by_time(job.names, 2)):
+        listed = (job.segment(index) / "frames.txt").read_text().split()
+        assert tuple(listed) == names
+    runner = Runner(of_0=[SfmError("It has to be mapped anew.")])
+    assert run(job, monkeypatch, runner).failed == {0: "It has to be mapped anew."}
+
+
+def test_photos_are_split_by_the_mapping_process(job, monkeypatch):
+    parts = [job.names[::2], job.names[1::2]]
+
+    class Splitter(Runner):
+        def __call__(self, each, **options):
+            if each.last == SPLIT:
+                assert each.steps == ("features", "matches", "split")
+                StepLog(each.out).finish(SPLIT, {"segments": parts})
+                return
+            super().__call__(each, **options)
+
+    photos = dataclasses.replace(job, times={}, tracks=None)
+    Path(photos.out).mkdir()
+    runs = run(photos, monkeypatch, Splitter(), count=2)
+    assert runs.job.segments == tuple(parts)
+    assert runs.job.steps == ("features", "matches", "split", "model", "sparse", "undistorted")
+
+
+def test_the_folders_of_segments_are_removed(job, monkeypatch):
+    run(job, monkeypatch, Runner())
+    segments.remove_segments(job)
+    assert not job.segment(0).parent.exists()

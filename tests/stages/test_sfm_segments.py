@@ -1,0 +1,144 @@
+"""Sfm in segments: real frames, killed processes, and a segment that shows nothing."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import psutil
+import pytest
+from sfm_inputs import every_nth, run, write_inputs
+
+from recon_cli.context import StageContext
+from recon_cli.io.colmap import read_images
+
+STEP, COUNT = 3, 30  # every third frame of the sample: two segments of 18, 7 of them in both
+FEATURES = 2048
+
+# A parent of its own, to be killed; its arguments: inputs, output.
+RUN = f"""
+import sys
+from pathlib import Path
+from recon_cli.config.stages import SfmConfig
+from recon_cli.stages import sfm
+from recon_cli.context import StageContext, StageInputs
+base = Path(sys.argv[1])
+sfm.run(SfmConfig(max_features={FEATURES}, segments="2"),
+        StageInputs({{"ingest": base / "ingest", "denoise": base / "denoise"}}), Path(sys.argv[2]),
+        StageContext(threads=2))
+"""
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory, sample_video):
+    images = every_nth(sample_video, STEP, COUNT)
+    return write_inputs(tmp_path_factory.mktemp("room"), images, fps=30)
+
+
+@pytest.fixture(scope="module")
+def mapped(room, tmp_path_factory):
+    out = tmp_path_factory.mktemp("mapped")
+    return out, run(room, out, max_features=FEATURES, segments="2")
+
+
+def rmse(out, shared_data):
+    """Of the camera centres against the rendered path, metres."""
+    lines = (shared_data / "rooms" / "office" / "traj.txt").read_text().splitlines()
+    poses = read_images(out / "sparse" / "images.bin")
+    found = np.array([-view[:3, :3].T @ view[:3, 3] for _, _, view in poses])
+    truth = np.array([
+        np.array(lines[int(name[:6])].split(), float).reshape(4, 4)[:3, 3] for name, _, _ in poses])
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = np.trace(np.diag(s) @ flip) / (a**2).sum()
+    return np.sqrt(((scale * a @ (u @ flip @ vt).T - b) ** 2).sum(axis=1).mean())
+
+
+def test_two_segments_of_a_room_become_one_model(mapped, shared_data):
+    out, summary = mapped
+    assert summary.registered == COUNT
+    assert summary.segments == 2
+    assert summary.trusted
+    assert summary.apart == ()
+    assert rmse(out, shared_data) < 0.03
+
+
+def test_the_record_says_what_supported_the_join(mapped):
+    out, _ = mapped
+    record = json.loads((out / "segments.json").read_text(encoding="utf-8"))
+    assert record["groups"] == [[0, 1]]
+    join, = record["joins"]
+    assert join["made"]
+    assert len(join["witnesses"]) >= 2
+    assert not (out / "segments").exists()
+
+
+def test_the_model_does_not_depend_on_how_many_segments_run_at_once(mapped, room, tmp_path):
+    run(room, tmp_path / "out", ctx=StageContext(threads=1), max_features=FEATURES, segments="2",
+        jobs=1)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (tmp_path / "out" / "sparse" / name).read_bytes() == (
+            mapped[0] / "sparse" / name).read_bytes(), name
+
+
+def noted(folder, step):
+    try:
+        return step in json.loads((folder / "steps.json").read_text())
+    except (OSError, ValueError):
+        return False
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_a_killed_segment_is_mapped_again_and_a_killed_run_goes_on(mapped, room, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    parent = subprocess.Popen([sys.executable, "-c", RUN, str(room), str(out)])
+    worker = None
+    while worker is None:
+        assert parent.poll() is None
+        worker = next((child for child in psutil.Process(parent.pid).children()
+                       if "/segments/1/" in " ".join(child.cmdline())), None)
+        time.sleep(0.05)
+    worker.kill()
+    while not (noted(out / "segments" / "0", "model") and noted(out / "segments" / "1", "model")):
+        assert parent.poll() is None, "the run ended with its killed segment"
+        time.sleep(0.02)
+    kept = (out / "segments" / "0" / "model" / "images.bin").stat().st_mtime_ns
+    children = psutil.Process(parent.pid).children(recursive=True)
+    parent.kill()
+    parent.wait()
+    psutil.wait_procs(children, timeout=20)
+    assert (out / "segments" / "0" / "model" / "images.bin").stat().st_mtime_ns == kept
+    summary = run(room, out, max_features=FEATURES, segments="2")
+    assert summary.registered == COUNT
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (out / "sparse" / name).read_bytes() == (
+            mapped[0] / "sparse" / name).read_bytes(), name
+
+
+def test_a_segment_that_shows_nothing_is_told_and_the_others_are_kept(
+    sample_video, tmp_path, caplog
+):
+    images = every_nth(sample_video, STEP, 2 * COUNT)
+    names = sorted(images)
+    for name in names[45:]:
+        images[name] = np.full_like(images[name], 128)
+    base = write_inputs(tmp_path, images, fps=30)
+    summary = run(base, tmp_path / "out", max_features=FEATURES, segments="4")
+    assert "Segment 3" in caplog.text
+    assert 40 <= summary.registered <= 45
+    assert set(names[45:]) <= set(summary.unregistered)
+
+
+def test_photos_are_cut_by_what_they_show(sample_video, tmp_path, shared_data):
+    images = every_nth(sample_video, STEP, COUNT)
+    base = write_inputs(tmp_path, images)  # without times they are no video
+    summary = run(base, tmp_path / "out", max_features=FEATURES, segments="2")
+    assert summary.segments == 2
+    assert summary.registered == COUNT
+    assert rmse(tmp_path / "out", shared_data) < 0.03
