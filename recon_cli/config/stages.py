@@ -123,6 +123,11 @@ class SfmConfig(StageConfig):
             raise ConfigError(
                 f"segments is {self.segments!r}, but needs auto, off or a number of segments.",
                 hint="Type `recon sfm --segments 4`, for example.")
+        if self.segments.isdigit() and self.pairs != "auto":
+            raise ConfigError(
+                f"segments is {self.segments} and pairs is {self.pairs}, but segments choose pairs "
+                "by themselves.",
+                hint="Leave out --segments or --pairs.")
 
 
 def _check_scale_between(value: tuple[str, str, float] | None) -> None:

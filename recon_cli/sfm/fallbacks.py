@@ -251,7 +251,9 @@ def _publish_best(
         counts = ", ".join(
             f"{attempt.name} was skipped for lack of time" if attempt.skipped else
             f"{attempt.name} found {len(attempt.registered)}" for attempt in attempts)
-        raise SfmError(f"{error.message} Cameras by mapper: {counts}.", hint=error.hint) from error
+        refused = "".join(f" {text}" for text in join_segments.read_refused(job))
+        raise SfmError(f"{error.message} Cameras by mapper: {counts}.{refused}",
+                       hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
     job = _linked_job(job, chosen.name)
     model = pycolmap.Reconstruction(job.attempts / chosen.name / "model")
@@ -275,7 +277,8 @@ def _publish_best(
         "left_out": [] if part is None else list(part.left_out),
         "rejected": {**chosen.rejected, **({} if part is None else part.candidate.rejected)},
         "verdict": verdict.to_json(),
-        "lines": [*([] if part is None else [part.sentence]), *verdict.lines()],
+        "lines": [*([] if part is None else [part.sentence]), *verdict.lines(),
+                  *join_segments.read_refused(job)],
         "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}
 
 

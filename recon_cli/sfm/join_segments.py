@@ -38,6 +38,9 @@ Pair = matching.Pair
 
 REPORT = "segments.json"  # in the stage's folder: what the segments and their joins said
 MODEL_FOLDER = "model"
+# Frames of other segments that each is matched with because they look alike: enough to find loops,
+# whose frames are matched with more of each other once the segments lie beside each other.
+ALIKE = 2
 
 
 def collect_features(job: MappingJob) -> None:
@@ -110,7 +113,7 @@ def match_segments(job: MappingJob, report: Reporter) -> Result:
     collect_matches(job)
     known = _inner_pairs(job.segments)
     pairs = skeleton.near_pairs(job, skeleton.ALWAYS) | matching.similar_pairs(
-        job.database, job.names, seed=job.seed, nearest=skeleton.SIMILAR, besides=known)
+        job.database, job.names, seed=job.seed, nearest=ALIKE, besides=known)
     matching.match_pairs(job, pairs, report)
     matching.check_motion(job)
     return matching.count_matches(job)
@@ -366,6 +369,14 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
     mapper.refine(job, model)
     held = model.num_reg_images()
     return mapper.extend_model(job, model) if held < len(job.names) else model
+
+
+def read_refused(job: MappingJob) -> list[str]:
+    """Returns which joins of segments were not made, a sentence each; none without segments."""
+    if not job.segments or not (job.out / REPORT).exists():
+        return []
+    refused: list[str] = atomic.read_json(job.out / REPORT)["refused"]
+    return [f"{text[:1].upper()}{text[1:]}." for text in refused]
 
 
 def _describe(

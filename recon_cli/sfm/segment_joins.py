@@ -142,7 +142,7 @@ def _similarity(
     if estimate is None or estimate["num_inliers"] < MIN_INLIERS:
         return None
     found = estimate["tgt_from_src"]
-    return Similarity(found.scale, found.rotation.matrix(), np.asarray(found.translation))
+    return Similarity(float(found.scale), found.rotation.matrix(), np.asarray(found.translation))
 
 
 def camera_residuals(

@@ -75,7 +75,7 @@ class SegmentRuns:
 
     job: MappingJob  # of the whole, which joins them
     failed: Mapping[int, str]  # why some have no model, by index
-    seconds: Mapping[str, float]  # that each step took, in all segments together
+    cpu_seconds: Mapping[str, float]  # that each step took, in all segments together
 
 
 def map_segments(
@@ -104,17 +104,15 @@ def map_segments(
     if len(failed) == len(parts):
         raise SfmError(f"None of the {len(parts)} segments could be mapped: {failed[0]}",
                        hint="Try --segments off, more frames, or a slower walk.")
-    seconds: dict[str, float] = {}
-    for each in jobs:
-        log = StepLog(each.out)
-        for step in each.steps:
-            seconds[step] = seconds.get(step, 0.0) + float((log.result(step) or {"seconds": 0})[
-                "seconds"])
+    steps = [(step, StepLog(each.out).result(step)) for each in jobs for step in each.steps]
+    cpu = dict.fromkeys((step for step, _ in steps), 0.0)
+    for step, result in steps:
+        cpu[step] += float((result or {}).get("cpu_seconds", 0.0))
     left = (deadline - time.monotonic()) / 60
     if left <= 0:
         raise SfmError(f"The segments were not mapped within {job.max_minutes:g} minutes.",
                        hint="Allow more time with --max-minutes: finished segments are kept.")
-    return SegmentRuns(dataclasses.replace(job, max_minutes=left), failed, seconds)
+    return SegmentRuns(dataclasses.replace(job, max_minutes=left), failed, cpu)
 
 
 def remove_segments(job: MappingJob) -> None:

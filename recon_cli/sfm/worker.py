@@ -57,9 +57,10 @@ def work(job: MappingJob, report: Reporter) -> None:
         log.forget_from(step)
         if step in ("features", "matches"):  # the models of finished attempts build on these
             (job.attempts / LOG_FILE).unlink(missing_ok=True)
-        start = time.monotonic()
+        start, cpu = time.monotonic(), time.process_time()
         result = actions[step]()
         result["seconds"] = round(time.monotonic() - start, 2)
+        result["cpu_seconds"] = round(time.process_time() - cpu, 2)
         log.finish(step, result, job.out / step if step in _FOLDERS else None)
 
 

@@ -68,8 +68,8 @@ def _run_segments(
     config: SfmConfig, job: MappingJob, ctx: StageContext
 ) -> segments.SegmentRuns:
     """Maps a long capture in segments and tells which failed; leaves others as they are."""
-    mapped = not job.known_poses and (job.pairs == "auto" or config.segments != "auto")
-    count = segments.count_segments(len(job.names), config.segments) if mapped else 1
+    whole = job.known_poses or job.pairs != "auto"
+    count = 1 if whole else segments.count_segments(len(job.names), config.segments)
     if count == 1:
         segments.remove_segments(job)  # of a run with other options
         return segments.SegmentRuns(job, {}, {})
@@ -133,8 +133,10 @@ def _summary(frames: FrameList, runs: segments.SegmentRuns) -> SfmSummary:
         "unregistered_held_out": [name for name in unregistered if name in held_out],
         "world": results["sparse"], "cameras": results["undistorted"]["cameras"],
         "segments": max(1, len(job.segments)),
-        "seconds": {**{f"segments: {step}": seconds for step, seconds in runs.seconds.items()},
-                    **{step: result["seconds"] for step, result in results.items()}}})
+        "seconds": {step: result["seconds"] for step, result in results.items()},
+        "cpu_seconds": {
+            **{f"{step} of segments": seconds for step, seconds in runs.cpu_seconds.items()},
+            **{step: result.get("cpu_seconds", 0.0) for step, result in results.items()}}})
 
 
 def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:

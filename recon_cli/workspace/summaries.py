@@ -215,6 +215,7 @@ class SfmSummary(JsonRecord):
     cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
     left_out: tuple[str, ...] = ()  # names of the frames whose part of the model is not trusted
     segments: int = 1  # that were mapped apart and joined; 1 for a capture mapped as a whole
+    cpu_seconds: Mapping[str, float] | None = None  # by step; those of segments together
 
     def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:
         """Returns reasons if a part of a broken model was kept, or it was cut into other segments.

@@ -88,7 +88,8 @@ def row(apartment: Path, count: int, workspace: Path, options: tuple[str, ...]) 
         "rotation": f"{errors.own_rotation_deg:.2f} / {errors.own_rotation_max_deg:.2f} deg",
         "MB": f"{manifest['peak_memory_bytes'] / 1e6:.0f}",
         "parts: CPU s": ", ".join(
-            f"{name} {seconds:.0f}" for name, seconds in summary["seconds"].items()),
+            f"{name} {seconds:.0f}"
+            for name, seconds in (summary.get("cpu_seconds") or summary["seconds"]).items()),
         "ended with": "trusted" if summary["verdict"]["trusted"] else "untrusted"}
 
 
