@@ -39,7 +39,7 @@ from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
-# Frames up to which a capture whose segments gave no good model is mapped as a whole: of more, that
+# Frames up to which a video whose segments gave no good model is mapped as a whole: of more, that
 # would take longer than all of its segments.
 WHOLE_MAX = 400
 # Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
@@ -106,7 +106,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         joined = Fallback(
             SEGMENTS, f"{count} frames were mapped in {len(job.segments)} segments",
             lambda *_: set(), join_segments.map_joined)
-        if count > WHOLE_MAX:
+        if count > WHOLE_MAX and job.tracks is not None:
             return (joined,)
         ways = (joined, *ways)
     elif skeleton.is_continuous(job):

@@ -117,3 +117,12 @@ def test_a_measurement_that_measures_nothing_is_refused(
 
 def test_build_ignores_other_sections() -> None:
     assert layers.build(IngestConfig, {"train": {"iterations": 3}}) == IngestConfig()
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    ({"segments": "many"}, "segments is 'many', but needs auto, off or a number"),
+    ({"segments": "0"}, "segments is '0'"),
+    ({"segments": "3", "pairs": "exhaustive"}, "segments is 3 and pairs is exhaustive")])
+def test_segments_that_cannot_be_are_refused(options: dict[str, str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        SfmConfig(**options)  # type: ignore[arg-type]

@@ -23,6 +23,7 @@ from recon_cli.capture import from_photos, from_video
 from recon_cli.config.stages import IngestConfig
 from recon_cli.io import images
 from recon_cli.io.tracks import Tracks
+from recon_cli.stages import ingest
 
 
 @pytest.fixture
@@ -360,3 +361,14 @@ def test_what_was_done_to_a_video_is_said_once_for_each_thing(tmp_path, notices)
     assert (summary.width, summary.height) == (171, 96)
     assert notices() == [
         "wide.mp4 has pixels of aspect 4/3: its frames of 128x96 are stretched to 171x96."]
+
+
+def test_many_frames_are_told_in_advance_with_what_sfm_will_take(
+    video, tmp_path, notices, monkeypatch
+):
+    take(video, tmp_path / "few")
+    assert not any("frames are chosen" in notice for notice in notices())
+    monkeypatch.setattr(ingest, "MOST_WHOLE", 10)
+    summary = take(video, tmp_path / "many")
+    notice, = (notice for notice in notices() if "frames are chosen" in notice)
+    assert_facts(notice, summary.frames, "for the way of the camera", "minutes", "--max-frames")

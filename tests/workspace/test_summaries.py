@@ -82,3 +82,12 @@ def test_a_part_of_a_broken_model_contradicts_options_that_keep_all_or_nothing(
 ):
     assert bool(replace(MAPPED, left_out=("d.png",)).contradictions(options)) == contradicted
     assert MAPPED.contradictions(options) == ()
+
+
+@pytest.mark.parametrize(("asked", "segments", "contradicted"), [
+    ("auto", 1, False), ("auto", 3, False), ("off", 1, False), ("off", 3, True), ("3", 3, False),
+    ("4", 3, True)])
+def test_a_model_of_other_segments_than_asked_for_is_stale(asked, segments, contradicted):
+    options = {"accept_weak": False, "partial": True, "segments": asked}
+    mapped = replace(MAPPED, segments=segments)
+    assert bool(mapped.contradictions(options)) == contradicted
