@@ -102,6 +102,9 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         Fallback("retrieval", f"{count} frames are too many to match all pairs at once",
                  _near_or_similar, skeleton.map_coarse_first),
         relaxed, every)  # lower thresholds take less time than all pairs
+    if skeleton.is_continuous(job):
+        ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
+                         skeleton.choose_pairs, skeleton.complete), *ways)
     if job.segments:
         joined = Fallback(
             SEGMENTS, f"{count} frames were mapped in {len(job.segments)} segments",
@@ -109,9 +112,6 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         if count > WHOLE_MAX and job.tracks is not None:
             return (joined,)
         ways = (joined, *ways)
-    elif skeleton.is_continuous(job):
-        ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
-                         skeleton.choose_pairs, skeleton.complete), *ways)
     return (*ways, Fallback("global", "", lambda *_: set(), mapper.map_globally))
 
 

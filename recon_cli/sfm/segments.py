@@ -29,8 +29,9 @@ MOST_WHOLE = 200  # frames up to which a capture is mapped as one
 # more on what they share, longer ones are fewer jobs.
 LENGTH, OVERLAP = 150, 25
 LEAST = 10  # frames of a segment
-# Of one core, measured on walks of 300 to 1,200 frames of 640x360: docs/scaling.md.
-SECONDS_PER_FRAME = 1.5
+# Of one core for a frame, in its segments and in the join, measured on walks of 640x360 pixels:
+# docs/scaling.md.
+SEGMENT_SECONDS, JOIN_SECONDS = 1.0, 0.5
 TRIES = 2  # of a segment whose process is killed, perhaps for want of memory beside others
 
 
@@ -52,8 +53,9 @@ def count_segments(frames: int, asked: str) -> int:
 
 
 def expected_minutes(frames: int, threads: int) -> float:
-    """Returns about how long sfm takes for so many frames; more threads than segments are idle."""
-    return frames * SECONDS_PER_FRAME / min(threads, count_segments(frames, "auto")) / 60
+    """Returns about how long sfm takes for so many frames; the join keeps to one thread."""
+    at_once = min(threads, count_segments(frames, "auto"))
+    return frames * (SEGMENT_SECONDS / at_once + JOIN_SECONDS) / 60
 
 
 def overlap(frames: int, count: int) -> int:

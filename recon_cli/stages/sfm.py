@@ -87,10 +87,10 @@ def _time_limit(config: SfmConfig, frames: FrameList, ctx: StageContext) -> floa
     limit = MAX_MINUTES + MINUTES_PER_FRAME * max(0, count - USUAL_FRAMES)
     if config.max_minutes is None and count > USUAL_FRAMES:
         parts = segments.count_segments(count, config.segments)
-        about = segments.expected_minutes(count, ctx.threads)
-        ctx.notice(f"{count} images{f' in {parts} segments' if parts > 1 else ''} take about "
-                   f"{max(1, round(about))} minutes, and up to {limit:.0f} minutes if they are "
-                   "hard to place; --max-minutes sets another limit.")
+        about = max(1, round(segments.expected_minutes(count, ctx.threads)))
+        usual = f" in {parts} segments take about {about} minutes, but" if parts > 1 else ""
+        ctx.notice(f"{count} images{usual} may take up to {limit:.0f} minutes; --max-minutes sets "
+                   "another limit.")
     return limit if config.max_minutes is None else config.max_minutes
 
 

@@ -20,7 +20,7 @@ from recon_cli.sfm.fallbacks import (
     reachable,
     shortfall,
 )
-from recon_cli.sfm.job import Reporter, StepLog
+from recon_cli.sfm.job import CameraGroup, Reporter, StepLog
 from recon_cli.sfm.merge_models import ModelCandidate
 
 NAMES = tuple(f"{index:06d}.png" for index in range(60))
@@ -242,3 +242,21 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
 
 def interrupt(*_, **__):
     raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("count", "video", "whole"), [
+    (300, True, True), (500, True, False), (500, False, True)])
+def test_a_long_video_is_not_mapped_as_a_whole_after_its_segments(
+    tmp_path, count, video, whole
+):
+    names = tuple(f"{index:06d}.png" for index in range(count))
+    job, _ = make_capture(tmp_path)
+    tracks = tmp_path / "tracks"
+    empty = np.zeros(0, np.int32)
+    Tracks(names, empty, empty, np.zeros((0, 2), np.float32)).write(tracks)
+    job = replace(job, groups=(CameraGroup(names, 9, 9),), segments=(names[:200], names[180:]),
+                  tracks=tracks if video else None)
+    first, *others = list_fallbacks(job)
+    assert first.name == "segments"
+    assert first.reason == f"{count} frames were mapped in 2 segments"
+    assert bool(others) == whole

@@ -12,7 +12,7 @@ from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import skeleton
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
-from recon_cli.sfm.pair_checks import check_pairs
+from recon_cli.sfm.pair_checks import check_pairs, list_models
 from recon_cli.sfm.skeleton import (
     build_skeleton,
     complete,
@@ -178,10 +178,10 @@ def test_pairs_that_look_alike_contradict_the_cameras(tmp_path):
     job = make_job(tmp_path, made)
     model = made.model()
     geometries = read_verified(job.database)
-    checked = check_pairs(job.database, [model], geometries)
+    checked = check_pairs(job.database, list_models([model]), geometries)
     assert checked.agreeing == set(geometries)
     turned = walk(motions=dict.fromkeys(range(8, 16), moved(1, 0, 0, 40))).model()
-    checked = check_pairs(job.database, [turned], geometries)
+    checked = check_pairs(job.database, list_models([turned]), geometries)
     across = {pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
     assert len(across - checked.contradicting) <= 1  # a turn about the vertical may fit a pair
     assert checked.contradicting <= across
@@ -193,7 +193,7 @@ def test_pairs_that_a_drift_explains_are_kept_apart(tmp_path):
     job = make_job(tmp_path, made)
     geometries = read_verified(job.database)
     bent = walk(motions=dict.fromkeys(range(8, 16), moved(0, 0.35, 0, 3))).model()
-    checked = check_pairs(job.database, [bent], geometries)
+    checked = check_pairs(job.database, list_models([bent]), geometries)
     across = {pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
     assert len(checked.drifted) > 0.6 * len(across)
     assert checked.drifted <= across
@@ -205,8 +205,8 @@ def test_a_single_pair_closes_no_loop(tmp_path):
     bent = walk(motions=dict.fromkeys(range(8, 16), moved(0, 0.35, 0, 3))).model()
     pair = made.names[5], made.names[9]
     geometries = read_verified(job.database)
-    assert pair in check_pairs(job.database, [bent], geometries).drifted
-    lonely = check_pairs(job.database, [bent], {pair: geometries[pair]})
+    assert pair in check_pairs(job.database, list_models([bent]), geometries).drifted
+    lonely = check_pairs(job.database, list_models([bent]), {pair: geometries[pair]})
     assert lonely.contradicting == {pair}
 
 
@@ -216,7 +216,7 @@ def test_images_of_different_models_are_no_contradiction(tmp_path):
     halves = [walk(unregistered=frozenset(range(8))).model(),
               walk(unregistered=frozenset(range(8, 16))).model()]
     geometries = read_verified(job.database)
-    checked = check_pairs(job.database, halves, geometries)
+    checked = check_pairs(job.database, list_models(halves), geometries)
     assert checked.unplaced == {
         pair for pair in geometries if pair[0] < made.names[8] <= pair[1]}
 
@@ -244,7 +244,7 @@ def test_tracks_place_what_looks_alike_where_it_is(repeated):
     models = build_skeleton(job, job.database)
     assert [model.num_reg_images() for model in models] == [24]
     assert errors(models[0], made).max() < 0.2
-    checked = check_pairs(job.database, models, read_verified(job.database))
+    checked = check_pairs(job.database, list_models(models), read_verified(job.database))
     alike = {pair for pair in read_verified(job.database)
              if made.names.index(pair[1]) - made.names.index(pair[0]) > 17}
     assert alike
