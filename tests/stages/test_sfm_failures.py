@@ -14,6 +14,7 @@ from recon_cli.errors import FormatError, SfmError
 from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.sfm import database
 from recon_cli.sfm.job import StepLog
+from recon_cli.sfm.segments import SegmentRuns
 from recon_cli.stages import sfm
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary
 
@@ -165,7 +166,8 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted(tmp_path):
     log.finish("sparse", {**known["world"], "seconds": 1.0})
     log.finish("undistorted", {"cameras": [], "seconds": 1.0})
     steps = ("model", "sparse", "undistorted")
-    summary = sfm._summary(frames, SimpleNamespace(out=tmp_path, steps=steps))
+    job = SimpleNamespace(out=tmp_path, steps=steps, segments=())
+    summary = sfm._summary(frames, SegmentRuns(job, {}, {}))
     assert summary.left_out == ("3.png", "4.png")
     assert summary.unregistered == ("3.png", "4.png", "5.png")  # no mapper found a place for 5
     assert summary.unregistered_held_out == ("4.png",)
