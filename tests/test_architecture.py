@@ -59,6 +59,7 @@ HOMES = {
     "triton": {"render"},
     "ray": {"pipeline"},
     "pycolmap": {"sfm", "io"},
+    "trimesh": {"io"},
 }
 
 

@@ -302,8 +302,9 @@ class EvaluateConfig(StageConfig):
         automatic="as in training")
 
 
+MESH_FORMATS = ("mesh.ply", "mesh.glb", "mesh.obj")
 EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html", "lod",
-                  "points.ply", "colmap", "transforms.json")
+                  "points.ply", "colmap", "transforms.json", *MESH_FORMATS)
 
 
 def read_matrix(path: str) -> list[float]:
@@ -357,6 +358,11 @@ class ExportConfig(StageConfig):
     max_loss: float | None = option(
         None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
         automatic="0.3; 3 for .splat, which has no harmonics")
+    max_triangles: int = option(
+        300_000, "Maximum number of triangles of a mesh.", minimum=4)
+    voxel: float | None = option(
+        None, "Side of the voxels that a mesh is made in, in units of the exported scene.",
+        minimum=0.0, automatic="1/128 of the median depth; 2 cm in a room", expert=True)
     spz_version: int = option(
         3, "Version of .spz: 3 is what most programs read; 2 is for older ones, with coarser "
         "rotations; 4 uses zstd.", minimum=2, maximum=4, expert=True)

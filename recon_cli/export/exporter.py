@@ -14,17 +14,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from recon_cli.config.stages import ExportConfig, RunConfig
+from recon_cli.config.stages import MESH_FORMATS, ExportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.evaluation.reference_views import evenly_spread, load_scene
 from recon_cli.export.cleanup import drop_floaters, drop_islands
 from recon_cli.export.coordinate_frame import ExportFrame
+from recon_cli.export.mesh.build import MeshResult, build_mesh
 from recon_cli.export.reduce import LowerDegrees, crop, fit_to_size, measure_change
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
-from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
+from recon_cli.export.verify import ReferencePsnr, load_reference_psnr, verify_mesh
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.images import fit_camera
+from recon_cli.io.meshes import write_mesh
 from recon_cli.io.ply import write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
 from recon_cli.io.splats.glb import nearest_axes, write_glb
@@ -65,6 +67,7 @@ class Exporter:
         self._last: tuple[Splats, float] | None = None
         self._whole: Splats | None = None
         self._lower: tuple[Splats, LowerDegrees] | None = None
+        self._mesh: tuple[Splats, MeshResult] | None = None
 
     def reduce(self, splats: Splats) -> tuple[Splats, list[ExportChange]]:
         """Returns the scene after the options that remove something, in order, and the changes.
@@ -104,7 +107,8 @@ class Exporter:
         """
         others: dict[str, Callable[[Splats], Path]] = {
             "points.ply": self._write_points, "colmap": self._write_colmap,
-            "transforms.json": self._write_transforms}
+            "transforms.json": self._write_transforms,
+            **{mesh: partial(self._write_mesh, mesh) for mesh in MESH_FORMATS}}
         if name in others:
             return ExportedFile(file=others[name](splats).name)
         path = scene_file(self._out, name)
@@ -223,6 +227,21 @@ class Exporter:
         views = [(f"{_IMAGES}/{name}", camera) for name, camera in self._copy_images()]
         write_transforms(
             path, views, held_out={f"{_IMAGES}/{view.name}" for view in self._scene.test})
+        return path
+
+    def _write_mesh(self, name: str, splats: Splats) -> Path:
+        """Writes the mesh, made once for all formats, and compares what reads back."""
+        path = self._out / name
+        if self._mesh is None or self._mesh[0] is not splats:
+            self._mesh = splats, build_mesh(
+                splats.map(lambda tensor: tensor.to(self._ctx.device)),
+                self._load_training_views(), self._similarity.points(self._scene.points), self._ctx,
+                max_triangles=self._config.max_triangles, voxel=self._config.voxel)
+        result = self._mesh[1]
+        axes = nearest_axes(self._up) if path.suffix == ".glb" else None
+        write_mesh(path, result.mesh, axes=axes)
+        verify_mesh(path, result.mesh, axes)
+        logger.info("%s: %s", name, result.describe())
         return path
 
     def _copy_images(self) -> list[tuple[str, Camera]]:

@@ -12,7 +12,12 @@ import torch
 from torch import Tensor
 
 from recon_cli.errors import BackendError
-from recon_cli.render.contract import Renderer, RenderOutput, check_inputs
+from recon_cli.render.contract import (
+    TRANSMITTANCE_MIN,
+    Renderer,
+    RenderOutput,
+    check_inputs,
+)
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
@@ -195,3 +200,36 @@ def render(
     """
     check_inputs(splats, camera, background, sh_degree, mask)
     return renderer(backend)(splats, camera, background, sh_degree, scores, mask)
+
+
+def find_crossing(
+    splats: Splats, camera: Camera, level: float = 0.5, *, backend: str = "torch"
+) -> Tensor:
+    """Returns which Gaussian of each pixel brings the transmittance down to `level`, [H, W] int64.
+
+    -1 where it stays above. At 1/2 it is the Gaussian of the median depth (2D Gaussian Splatting,
+    Huang et al. 2024). Fragments and their order are those of `render`; nothing is differentiable.
+    With triton the torch backend answers, on the same device: no training waits for this.
+
+    Args:
+        splats: N Gaussians.
+        camera: as in `render`.
+        level: transmittance, above 1e-4 and below 1.
+        backend: a name from `available_backends`.
+
+    Raises:
+        ValueError: a shape, dtype or device does not fit, or the level is none.
+        BackendError: there is no such backend here.
+    """
+    check_inputs(splats, camera, splats.means.new_zeros(3), 0, None)
+    if not TRANSMITTANCE_MIN < level < 1:
+        raise ValueError(f"level is {level}, needed between {TRANSMITTANCE_MIN} and 1")
+    with torch.no_grad():
+        if backend == "numba":
+            from recon_cli.render.numba.backend import find_crossing as numba_crossing
+
+            return numba_crossing(splats, camera, level)
+        renderer(backend)
+        from recon_cli.render.torch.tiles import find_crossing as torch_crossing
+
+        return torch_crossing(splats, camera, level)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.stages import MESH_FORMATS, ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import StageError
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame
@@ -22,7 +22,7 @@ from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import ExportSummary
 
 TRANSFORM = "transform.json"
-_CAMERA_FORMATS = ("colmap", "transforms.json")
+_VIEW_FORMATS = ("colmap", "transforms.json", *MESH_FORMATS)  # made of views
 
 
 def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> ExportSummary:
@@ -66,7 +66,7 @@ def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
             hint="Run `recon import` with another --frame, or from a file in the right one.")
     if has_views(inputs.folders):
         return
-    refused = [f"--format {name}" for name in config.formats if name in _CAMERA_FORMATS]
+    refused = [f"--format {name}" for name in config.formats if name in _VIEW_FORMATS]
     if config.drop_floaters:
         refused.append("--drop-floaters")
     if config.max_mb is not None:

@@ -78,7 +78,7 @@ def test_without_views_files_are_written_and_checked(alone, capsys):
 
 @pytest.mark.parametrize("words", [
     ("--max-mb", "1"), ("--drop-floaters",), ("--format", "colmap"),
-    ("--format", "transforms.json"),
+    ("--format", "transforms.json"), ("--format", "mesh.glb"),
     ("--scale-between", "a.png", "b.png", "1")])
 def test_what_only_views_can_tell_is_refused_without_them(alone, words, capsys):
     assert recon("export", alone, *words) == 4

@@ -31,7 +31,7 @@ from recon_cli.render.numba.view_pass import (
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
-KERNELS = 12  # that threads share; the progress counts these
+KERNELS = 13  # that threads share; the progress counts these
 _SCIPY = "scipy.linalg"
 _WAIT_SECONDS = 0.25  # between looks at how far another process is
 _READY = "ready"  # file in the cache folder once every kernel is there
@@ -48,10 +48,7 @@ def render(
 
     Raises ValueError unless the splats are float32 on the CPU.
     """
-    if splats.means.dtype != torch.float32 or splats.means.device.type != "cpu":
-        raise ValueError(
-            f"the numba backend takes float32 on the CPU, not {splats.means.dtype} on "
-            f"{splats.means.device}; the torch backend takes both")
+    _check(splats)
     statistics = Statistics.zeros(splats.means)
     tensors = list(splats.parameters().values())
     if min(sh_degree, splats.sh_degree) == 0:
@@ -61,6 +58,25 @@ def render(
         None if mask is None else mask.contiguous().numpy(), approximation)
     rgb, alpha, depth = _Render.apply(background, camera, settings, statistics, *tensors)
     return RenderOutput(rgb, alpha, depth, statistics)
+
+
+def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
+    """Returns which Gaussian brings T down to a level; see `registry.find_crossing`."""
+    _check(splats)
+    lease = Lease()
+    rows = torch.empty(camera.height, camera.width, dtype=torch.int32)
+    lease.view_pass.crossing(
+        PackedSplats.of(splats.parameters().values()), camera,
+        RenderSettings(np.zeros(3, np.float32), 0), level, rows.view(-1).numpy(),
+        Statistics.zeros(splats.means.detach()))
+    return rows.long()
+
+
+def _check(splats: Splats) -> None:
+    if splats.means.dtype != torch.float32 or splats.means.device.type != "cpu":
+        raise ValueError(
+            f"the numba backend takes float32 on the CPU, not {splats.means.dtype} on "
+            f"{splats.means.device}; the torch backend takes both")
 
 
 class _Render(torch.autograd.Function):
@@ -223,6 +239,7 @@ def _run_all() -> None:
     PhotometricStep()(splats, gradients, camera, photograph, StepOptions(3, 0.2))
     camera_gradient(splats, gradients, camera, 3)
     render(splats, camera, torch.zeros(3), 3, scores=True)
+    find_crossing(splats, camera, 0.5)
     groups = [tensor.reshape(-1) for tensor in gradients.parameters().values()]
     step(groups, groups, (groups, groups), [0.0] * len(groups), count=1, betas=(0.9, 0.999),
          epsilon=1e-15)

@@ -18,6 +18,7 @@ from recon_cli.render.contract import EXACT, Approximation, Statistics
 from recon_cli.render.numba import binning
 from recon_cli.render.numba.composite_backward import BACKWARD_FLOATS, composite_backward
 from recon_cli.render.numba.compositing import FORWARD_FLOATS, composite, tally
+from recon_cli.render.numba.crossing import find_crossing
 from recon_cli.render.numba.project_backward import GRADIENT_FLOATS, project_backward
 from recon_cli.render.numba.projection import compact, cull, project
 from recon_cli.render.numba.soa import (
@@ -132,6 +133,22 @@ class ViewPass:
                 total.zero_()
             tally(self.ids, self.slot_start, self.hits, self.weights, self.peaks,
                   *(total.numpy() for total in totals))
+
+    def crossing(
+        self, splats: PackedSplats, camera: Camera, settings: RenderSettings, level: float,
+        rows: NDArray[np.int32], statistics: Statistics,
+    ) -> None:
+        """Writes into `rows` [H * W] which Gaussian brings T down to `level`, -1 where none does.
+
+        No backward pass may follow.
+        """
+        self.view, self.terms = viewpoint(camera), 0
+        self.cutoff = np.float32(np.log2(settings.approximation.alpha_min))
+        self._project(splats, settings.approximation, statistics)
+        self._bin(settings.approximation.square)
+        pool.run(find_crossing, self.tile_start, self.members, self.records, self.ids,
+                 self.view.width, self.view.height, self.tiles_x, self.cutoff, np.float32(level),
+                 rows)
 
     def _project(
         self, splats: PackedSplats, approximation: Approximation, statistics: Statistics

@@ -58,6 +58,34 @@ def render(
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
+def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
+    """Returns which Gaussian brings T down to a level; see `registry.find_crossing`."""
+    projection = project(splats, camera, 0)
+    size = camera.height, camera.width
+    instances = bin_to_tiles(projection, camera.width, camera.height)
+    log_opacities = torch.nn.functional.logsigmoid(splats.logit_opacities[projection.ids])
+    means2d = projection.means2d
+    table = build_table(
+        means2d, projection.cov2d, projection.det, log_opacities,
+        means2d.new_zeros(len(means2d), CHANNELS - 1))
+    transmittance = _to_tiles(means2d.new_ones(*size, 1), instances)[..., 0]
+    rows = torch.full(transmittance.shape, -1, dtype=torch.int64, device=means2d.device)
+    monomials, scratch = pixel_monomials(means2d)[:3], Scratch(means2d)
+    ids = torch.nn.functional.pad(projection.ids, (0, 1), value=-1)
+    lists = InstanceLists.of(instances)
+    for tiles in lists.groups():
+        for block in lists.walk(tiles, transmittance):
+            affine = whitening_of(table, block, instances.tiles_x)
+            alpha = alphas(table, block, affine, monomials, scratch)
+            _, after, _ = composite(alpha, block.before, scratch)
+            crosses = (block.before > level) & (after[:, -1] <= level)
+            first = (after <= level).to(torch.uint8).argmax(1)  # [n, 256]
+            found = ids[block.rows].gather(1, first)
+            rows[block.tiles] = torch.where(crosses, found, rows[block.tiles])
+            transmittance[block.tiles] = after[:, -1]
+    return _to_image(rows[..., None], instances, size)[..., 0]
+
+
 @dataclass(frozen=True, eq=False)
 class _View:
     """What compositing reads beside the tensors that have gradients."""

@@ -1,0 +1,1 @@
+"""A triangle mesh of the surface that the training views show."""

@@ -1,0 +1,67 @@
+"""Meshes come back as they were, and are simplified to what was asked for."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+from recon_cli.errors import FormatError
+from recon_cli.io.meshes import SUFFIXES, Mesh, read_mesh, simplify, write_mesh
+from recon_cli.io.splats.glb import Z_UP
+
+
+def ball(subdivisions: int = 3) -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions)
+    colors = np.rint(127 + 120 * sphere.vertices).astype(np.uint8)
+    return Mesh(np.asarray(sphere.vertices) + 5, np.asarray(sphere.faces, np.int64), colors)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_mesh_comes_back_with_its_colours(suffix, tmp_path):
+    mesh = ball()
+    path = tmp_path / f"mesh.{suffix}"
+    write_mesh(path, mesh)
+    back = read_mesh(path)
+    assert np.allclose(back.vertices, mesh.vertices, atol=1e-5)
+    assert np.array_equal(back.faces, mesh.faces)
+    assert np.abs(back.colors.astype(int) - mesh.colors).max() <= 1
+
+
+def test_a_glb_is_in_the_axes_of_gltf(tmp_path):
+    write_mesh(tmp_path / "mesh.glb", ball(), axes=Z_UP)
+    data = (tmp_path / "mesh.glb").read_bytes()
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    assert (data[:4], kind) == (b"glTF", b"JSON")
+    gltf = json.loads(data[20:20 + length])
+    primitive = gltf["meshes"][0]["primitives"][0]
+    assert {"POSITION", "COLOR_0"} <= primitive["attributes"].keys()
+    assert np.allclose(read_mesh(tmp_path / "mesh.glb").vertices, ball().vertices @ Z_UP.T)
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"glTF" + bytes(40), b"v 1 2\nf 1 2 9\n"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_damaged_mesh_is_refused(content, suffix, tmp_path):
+    path = tmp_path / f"mesh.{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(FormatError):
+        read_mesh(path)
+
+
+def test_simplified_triangles_stay_on_the_surface():
+    mesh = ball(4)
+    vertices, faces = simplify(mesh.vertices, mesh.faces, 500, threads=1)
+    assert 300 < len(faces) <= 500
+    assert np.abs(np.linalg.norm(vertices - 5, axis=1) - 1).max() < 0.03
+    same = simplify(mesh.vertices, mesh.faces, len(mesh.faces), threads=1)
+    assert same == (mesh.vertices, mesh.faces)
+
+
+def test_few_triangles_are_as_many_as_were_asked_for():
+    mesh = ball()
+    vertices, faces = simplify(mesh.vertices, mesh.faces, 10, threads=1)
+    assert 0 < len(faces) <= 10
+    assert faces.max() < len(vertices)
