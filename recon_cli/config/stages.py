@@ -302,7 +302,8 @@ class EvaluateConfig(StageConfig):
         automatic="as in training")
 
 
-MESH_FORMATS = ("mesh.ply", "mesh.glb", "mesh.obj")
+PLAN = "plan.svg"
+MESH_FORMATS = ("mesh.ply", "mesh.glb", "mesh.obj", PLAN)
 EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html", "lod",
                   "points.ply", "colmap", "transforms.json", *MESH_FORMATS)
 

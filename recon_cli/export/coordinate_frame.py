@@ -8,17 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.stages import PLAN, ExportConfig
 from recon_cli.context import StageInputs
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, StageError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.io.records import ImportRecord, has_views
-from recon_cli.scene.gravity import camera_up, turn_onto
+from recon_cli.scene.gravity import camera_up, find_gravity, turn_onto
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.align_world import Measurement, ScaleBetween, measure
+from recon_cli.sfm.align_world import ARBITRARY, MEASURED, Measurement, ScaleBetween, measure
 from recon_cli.workspace.summaries import WorldSummary
 
 _UP = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
+
+_RIGID = 1e-6  # difference of a scale from 1
+# Relative error of --scale-between with two pixels: the depth of a pick in the middle was 0.5% and
+# 0.7% off in two rendered rooms; see sfm/align_world.py.
+_PICKED_SCALE_ERROR = 0.007
 
 logger = logging.getLogger("recon")
 
@@ -52,6 +57,42 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
                 "last column.") from error
         similarity = transform.after(similarity)
     return ExportFrame(similarity, similarity.rotation @ up, measurement)
+
+
+@dataclass(frozen=True, eq=False)
+class RoomFrame:
+    """What measures need to know of the exported world: its unit is the metre."""
+
+    up: NDArray[np.float64]  # [3] unit vector
+    scale_error: float  # relative standard error of the scale
+
+
+def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
+    """Returns what measures need; StageError if scale or up is not known, for none is guessed."""
+    world = WorldSummary.read(inputs.folders["sfm"])
+    source = world.evidence.scale_source if world else ARBITRARY
+    if frame.measurement is None and source == ARBITRARY:
+        raise StageError(
+            f"{PLAN} cannot be measured: the scale is arbitrary.",
+            hint="Give one known length with --scale-between A B METRES.")
+    scale = frame.similarity.scale / (frame.measurement.scale if frame.measurement else 1.0)
+    if abs(scale - 1) > _RIGID:
+        raise StageError(
+            f"{PLAN} cannot be measured: after --transform one unit is no metre.",
+            hint="Leave out the scale of --transform.")
+    picked = frame.measurement is not None or source == MEASURED
+    error = _PICKED_SCALE_ERROR if picked else 0.0
+    if world and world.evidence.up_found:
+        return RoomFrame(frame.similarity.rotation @ np.array(_UP["z"]), error)
+    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    points, _ = read_points(sparse / "points3D.bin")
+    gravity = find_gravity(
+        points, np.stack([viewmat for _, _, viewmat in read_images(sparse / "images.bin")]))
+    if gravity.up is None:
+        raise StageError(
+            f"{PLAN} cannot be measured: it is not known where up is, as {gravity.reason}.",
+            hint="Film some of the floor, level; or measure on the mesh.")
+    return RoomFrame(frame.similarity.rotation @ gravity.up, error)
 
 
 def _measure_scale(config: ExportConfig, inputs: StageInputs) -> Measurement | None:

@@ -11,22 +11,23 @@ from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from recon_cli.config.stages import MESH_FORMATS, ExportConfig, RunConfig
+from recon_cli.config.stages import MESH_FORMATS, PLAN, ExportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.evaluation.reference_views import evenly_spread, load_scene
 from recon_cli.export.cleanup import drop_floaters, drop_islands
-from recon_cli.export.coordinate_frame import ExportFrame
+from recon_cli.export.coordinate_frame import ExportFrame, find_room_frame
 from recon_cli.export.mesh.build import MeshResult, build_mesh
+from recon_cli.export.mesh.files import write_mesh_file, write_plan
 from recon_cli.export.reduce import LowerDegrees, crop, fit_to_size, measure_change
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
-from recon_cli.export.verify import ReferencePsnr, load_reference_psnr, verify_mesh
+from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.images import fit_camera
-from recon_cli.io.meshes import write_mesh
 from recon_cli.io.ply import write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
 from recon_cli.io.splats.glb import nearest_axes, write_glb
@@ -63,7 +64,7 @@ class Exporter:
         ctx: StageContext,
     ) -> None:
         self._config, self._inputs, self._out, self._ctx = config, inputs, out, ctx
-        self._similarity, self._up = frame.similarity, frame.up
+        self._similarity, self._up, self._frame = frame.similarity, frame.up, frame
         self._last: tuple[Splats, float] | None = None
         self._whole: Splats | None = None
         self._lower: tuple[Splats, LowerDegrees] | None = None
@@ -230,19 +231,18 @@ class Exporter:
         return path
 
     def _write_mesh(self, name: str, splats: Splats) -> Path:
-        """Writes the mesh, made once for all formats, and compares what reads back."""
-        path = self._out / name
+        """Writes the mesh, made once for all formats, or the plan of its walls."""
         if self._mesh is None or self._mesh[0] is not splats:
             self._mesh = splats, build_mesh(
                 splats.map(lambda tensor: tensor.to(self._ctx.device)),
                 self._load_training_views(), self._similarity.points(self._scene.points), self._ctx,
                 max_triangles=self._config.max_triangles, voxel=self._config.voxel)
-        result = self._mesh[1]
-        axes = nearest_axes(self._up) if path.suffix == ".glb" else None
-        write_mesh(path, result.mesh, axes=axes)
-        verify_mesh(path, result.mesh, axes)
-        logger.info("%s: %s", name, result.describe())
-        return path
+        if name == PLAN:
+            centers = np.stack([view.camera.center for view in self._scene.train])
+            return write_plan(
+                self._out, self._mesh[1], self._similarity.points(centers),
+                find_room_frame(self._inputs, self._frame))
+        return write_mesh_file(self._out / name, self._mesh[1], self._up)
 
     def _copy_images(self) -> list[tuple[str, Camera]]:
         """Copies the undistorted images, and returns all cameras, which are useless without."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recon_cli.config.stages import MESH_FORMATS, ExportConfig
+from recon_cli.config.stages import MESH_FORMATS, PLAN, ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import StageError
-from recon_cli.export.coordinate_frame import ExportFrame, choose_frame
+from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
 from recon_cli.export.exporter import Exporter
 from recon_cli.export.verify import verify_ply
 from recon_cli.io.ply import read_ply, write_ply
@@ -34,6 +34,8 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     _refuse_without_views(config, inputs)
     pruned = "prune" in inputs.folders and config.model != "base"
     frame = choose_frame(config, inputs)
+    if PLAN in config.formats:
+        find_room_frame(inputs, frame)  # refused before anything is written
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
     if not frame.similarity.is_identity:
         splats = transformed(splats, frame.similarity)

@@ -11,14 +11,17 @@ import pytest
 import torch
 from tiny_stages import CONTEXT
 
-from recon_cli.config.stages import EXPORT_FORMATS, ExportConfig
+from recon_cli.config.stages import EXPORT_FORMATS as EVERY_FORMAT
+from recon_cli.config.stages import PLAN, ExportConfig
 from recon_cli.context import StageInputs
-from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.errors import ConfigError, ReconstructionError, StageError
 from recon_cli.export import exporter
 from recon_cli.io.colmap import read_images
 from recon_cli.io.ply import read_ply, read_ply_points, write_ply
 from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
 from recon_cli.stages import export
+
+EXPORT_FORMATS = [name for name in EVERY_FORMAT if name != PLAN]  # the tiny scene has no scale
 
 
 @pytest.fixture
@@ -146,3 +149,10 @@ def test_without_other_formats_nothing_else_is_written(inputs, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["splats.ply", "transform.json"]
     assert torch.equal(read_ply(tmp_path / "splats.ply").means,
                        read_ply(inputs.folders["train"] / "splats.ply").means)
+
+
+def test_a_plan_without_a_scale_is_refused_before_anything_is_written(inputs, tmp_path):
+    with pytest.raises(StageError, match="the scale is arbitrary") as error:
+        export.run(ExportConfig(format="mesh.ply,plan.svg"), inputs, tmp_path, CONTEXT)
+    assert "--scale-between" in error.value.hint
+    assert not list(tmp_path.iterdir())

@@ -25,6 +25,7 @@ from recon_cli.io.meshes import Mesh, simplify
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.numba.view_pass import viewpoint
+from recon_cli.scene.planes import Plane
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 
@@ -47,6 +48,7 @@ class MeshResult:
     mesh: Mesh
     voxel: float  # world units
     triangles_before: int  # before they were simplified
+    planes: list[tuple[Plane, Plane | None]]  # its large planes, and what points make of them
 
     def describe(self) -> str:
         """Returns triangles and voxels as part of a sentence."""
@@ -89,7 +91,8 @@ def mesh_of(
     """Returns the mesh of depth maps; see `build_mesh`."""
     weigh_by_agreement(maps)
     voxel, farthest = _fit_voxel(maps, voxel or maps.median / _RESOLUTION, ctx)
-    pull_onto_planes(maps, surface_planes(maps, voxel, farthest, points), voxel)
+    planes = surface_planes(maps, voxel, farthest, points)
+    pull_onto_planes(maps, planes, voxel)
     vertices, faces = extract(fuse(maps, voxel, farthest, on_view))
     counts, _ = observe_all(maps, vertices, faces)
     shown = (counts[:, SHOWN] > 0) & (counts[:, SHOWN] >= 0.5 * counts[:, SEEN_THROUGH])
@@ -106,7 +109,8 @@ def mesh_of(
             f"Of {before:,} triangles none is left at --max-triangles {max_triangles}.",
             hint="Allow more.")
     _, colors = observe_all(maps, vertices, faces)
-    return MeshResult(Mesh(vertices, faces, _fill(vertices, colors)), voxel, before)
+    mesh = Mesh(vertices, faces, _fill(vertices, colors))
+    return MeshResult(mesh, voxel, before, planes)
 
 
 def _fit_voxel(maps: DepthMaps, voxel: float, ctx: StageContext) -> tuple[float, float]:
