@@ -29,7 +29,8 @@ from recon_cli.scene.planes import Plane
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 
-# Voxels in the median depth of all pixels: 2 cm in rooms seen from 2.6 m.
+# Voxels in the median depth of all pixels, or as many as there are pixels in the focal length of
+# small images: 2 cm in rooms seen from 2.6 m.
 _RESOLUTION = 128.0
 # Pixels that a voxel spans at least, beyond which depth says too little; and median depths.
 _LEAST_PIXELS, _FARTHEST = 0.75, 4.0
@@ -90,7 +91,7 @@ def mesh_of(
 ) -> MeshResult:
     """Returns the mesh of depth maps; see `build_mesh`."""
     weigh_by_agreement(maps)
-    voxel, farthest = _fit_voxel(maps, voxel or maps.median / _RESOLUTION, ctx)
+    voxel, farthest = _fit_voxel(maps, voxel, ctx)
     planes = surface_planes(maps, voxel, farthest, points)
     pull_onto_planes(maps, planes, voxel)
     vertices, faces = extract(fuse(maps, voxel, farthest, on_view))
@@ -113,10 +114,13 @@ def mesh_of(
     return MeshResult(mesh, voxel, before, planes)
 
 
-def _fit_voxel(maps: DepthMaps, voxel: float, ctx: StageContext) -> tuple[float, float]:
+def _fit_voxel(
+    maps: DepthMaps, voxel: float | None, ctx: StageContext
+) -> tuple[float, float]:
     """Returns the voxel whose volume fits into memory, and the depth up to which it is used."""
-    allowed, asked = min(_MOST_BYTES, _SHARE * free_memory_bytes()), voxel
     focal = float(np.median([max(camera.fx, camera.fy) for camera in maps.cameras]))
+    voxel = voxel or maps.median / min(_RESOLUTION, focal)
+    allowed, asked = min(_MOST_BYTES, _SHARE * free_memory_bytes()), voxel
     while voxel <= _MOST_COARSER * asked:
         farthest = min(focal * voxel / _LEAST_PIXELS, _FARTHEST * maps.median)
         needed = BYTES * len(find_blocks(maps, voxel, farthest))

@@ -1,0 +1,201 @@
+"""How near a mesh comes to a room whose depth is known.
+
+`PYTHONPATH=. python tests/bench/bench_mesh.py WORKSPACE ROOM [--room-of FOLDER]` with a workspace
+that was trained on ROOM (living, office) with its poses. For each way to take the depth it prints
+F-scores, precision and recall at 5 and 2 cm, triangles, seconds, CPU seconds and peak memory. The
+reference are the exact depth maps, fused at 3 cm; 1.5 cm are allowed for that spacing, and only
+what at least three training views show counts for the recall. Nothing is chosen here by test
+views: their exact depth is part of the reference alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_scene, load_views, render_on_black
+from recon_cli.export.mesh import build
+from recon_cli.export.mesh.depth_maps import DepthMaps, render_depth_maps, weigh, weigh_by_agreement
+from recon_cli.export.mesh.volume import extract, fuse, pixel_rays
+from recon_cli.io.ply import read_ply
+from recon_cli.progress import NullProgress
+from recon_cli.render.registry import use_threads
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.scene import Scene
+from recon_cli.scene.train_view import TrainView
+
+ROOMS = Path(__file__).resolve().parents[3] / "shared" / "data" / "rooms"
+SPACING, DENSE = 0.03, 0.01  # metres
+SAMPLES = 400_000
+THRESHOLDS = (0.05, 0.02)
+SIZE = 600
+
+
+def exact_depths(room: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float64]]]:
+    """Returns depth [H, W] in metres and viewmat [4, 4] of every view that has an exact depth."""
+    rows = []
+    for folder in (room, room / "test"):
+        poses = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
+        rows += [(cv2.imread(str(path), -1).astype(np.float32) / 6553.5,
+                  np.linalg.inv(poses[int(path.stem[5:])]))
+                 for path in sorted((folder / "results").glob("depth*.png"))]
+    return rows
+
+
+def thinned(points: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    """Returns in every cell of a grid the point that is nearest to the mean of all."""
+    cells = np.floor(points / spacing).astype(np.int64)
+    _, rows, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    rows = rows.reshape(-1)
+    means = np.stack([np.bincount(rows, column) for column in points.T], 1) / counts[:, None]
+    order = np.lexsort((np.linalg.norm(points - means[rows], axis=1), rows))
+    return points[order[np.searchsorted(rows[order], np.arange(len(counts)))]]
+
+
+def reference(room: Path, scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Returns the reference points [R, 3] and which of them three training views show."""
+    camera = scene.train[0].camera
+    clouds = []
+    for depth, viewmat in exact_depths(room):
+        own = dataclasses.replace(camera, viewmat=viewmat)
+        places = pixel_rays(own) * depth[..., None] @ viewmat[:3, :3] + own.center
+        clouds.append(places[depth > 0])
+    every = np.concatenate(clouds)
+    dense, points = thinned(every, DENSE), thinned(every, SPACING)
+    views = np.zeros(len(points), int)
+    for view in scene.train:
+        small = view.camera.resized(150, 85)
+        depth, inside, at = project(small, dense)
+        nearest = np.full(small.width * small.height, np.inf)
+        np.minimum.at(nearest, at[inside], depth[inside])
+        depth, inside, at = project(small, points)
+        views += inside & (depth <= 1.02 * nearest[at] + 0.03)
+    return points, views >= 3
+
+
+def project(
+    camera: Camera, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64]]:
+    """Returns depths, which points are in the image, and their pixels."""
+    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
+    with np.errstate(all="ignore"):
+        u = np.floor(camera.fx * x / z + camera.cx)
+        v = np.floor(camera.fy * y / z + camera.cy)
+    inside = (z > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    return z, inside, np.where(inside, v * camera.width + u, 0).astype(np.int64)
+
+
+def f_scores(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], points: NDArray[np.float64],
+    shown: NDArray[np.bool_],
+) -> str:
+    """Returns F-score, precision and recall at each threshold as cells of a table."""
+    generator = np.random.default_rng(0)
+    a, b, c = np.swapaxes(vertices[faces], 0, 1)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    rows = generator.choice(len(faces), SAMPLES, p=areas / areas.sum())
+    r, s = np.sqrt(generator.random((SAMPLES, 1))), generator.random((SAMPLES, 1))
+    samples = a[rows] * (1 - r) + b[rows] * r * (1 - s) + c[rows] * r * s
+    to_reference = cKDTree(points).query(samples, distance_upper_bound=0.3)[0]
+    to_mesh = cKDTree(samples).query(points[shown], distance_upper_bound=0.3)[0]
+    cells = []
+    for threshold in THRESHOLDS:
+        precision = float((to_reference <= threshold + SPACING / 2).mean())
+        recall = float((to_mesh <= threshold).mean())
+        cells.append(f"{2 * precision * recall / (precision + recall):.3f} "
+                     f"({precision:.3f}, {recall:.3f})")
+    return " | ".join(cells)
+
+
+def with_depths(maps: DepthMaps, depth_of: Callable[[Camera], NDArray[np.float32]]) -> DepthMaps:
+    """Returns maps with other depths and the cosines of `maps`."""
+    depths = [depth_of(camera) for camera in maps.cameras]
+    ones = [(gain > 0).astype(np.float32) for gain in maps.gains]
+    return weigh(maps.views, maps.cameras, depths, ones)
+
+
+def copy(maps: DepthMaps) -> DepthMaps:
+    """Returns maps that may be changed."""
+    return dataclasses.replace(
+        maps, depths=list(maps.depths), gains=[gain.copy() for gain in maps.gains])
+
+
+@click.command()
+@click.argument("workspace", type=click.Path(path_type=Path, exists=True))
+@click.argument("room")
+@click.option("--threads", default=2, show_default=True)
+@click.option("--triangles", default=300_000, show_default=True)
+def main(workspace: Path, room: str, threads: int, triangles: int) -> None:
+    """Prints the table."""
+    use_threads("numba", threads)
+    folders = {name: workspace / name for name in ("ingest", "sfm", "train")}
+    scene = load_scene(StageInputs(folders), validation=0.05)
+    splats = read_ply(workspace / "train" / "splats.ply")
+    ctx = StageContext(NullProgress(), "cpu", "numba", threads)
+    points, shown = reference(ROOMS / room, scene)
+    click.echo("| depth | F (precision, recall) at 5 cm | at 2 cm | triangles | s | CPU s | MB |")
+    click.echo("|---|---|---|---:|---:|---:|---:|")
+
+    def row(name: str, make: Callable[[], tuple[NDArray[np.float64], NDArray[np.int64]]]) -> None:
+        start, cpu = time.perf_counter(), time.process_time()
+        vertices, faces = make()
+        seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        click.echo(f"| {name} | {f_scores(vertices, faces, points, shown)} | {len(faces):,} | "
+                   f"{seconds:.1f} | {cpu:.1f} | {peak:.0f} |")
+
+    views = load_views(scene.train, SIZE, "not used")
+    maps = render_depth_maps(splats, views, "numba")
+
+    def fused(some: DepthMaps, *, agreement: bool) -> tuple[
+            NDArray[np.float64], NDArray[np.int64]]:
+        if agreement:
+            weigh_by_agreement(some)
+        voxel, farthest = build._fit_voxel(some, None, ctx)
+        return extract(fuse(some, voxel, farthest))
+
+    def built(some: list[TrainView]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        mesh = build.build_mesh(splats, some, scene.points, ctx, max_triangles=triangles).mesh
+        return mesh.vertices, mesh.faces
+
+    def expected(camera: Camera) -> NDArray[np.float32]:
+        output = render_on_black(splats, camera, 0, "numba")
+        depth = output.depth / output.alpha.clamp_min(1e-3)
+        return np.where(output.alpha > 0.5, depth, 0).astype(np.float32)
+
+    row("whole export, with rendering", lambda: built(views))
+    row("expected, fused", lambda: fused(with_depths(maps, expected), agreement=False))
+    row("median along the ray, fused", lambda: fused(copy(maps), agreement=False))
+    row("and weighed by agreement", lambda: fused(copy(maps), agreement=True))
+
+    def without_planes() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        mesh = build.mesh_of(copy(maps), np.empty((0, 3)), ctx, max_triangles=triangles).mesh
+        return mesh.vertices, mesh.faces
+
+    row("and only what views show", without_planes)
+
+    def exact() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        rows = exact_depths(ROOMS / room)
+        cameras = [dataclasses.replace(scene.train[0].camera, viewmat=pose) for _, pose in rows]
+        depths = [depth for depth, _ in rows]
+        blank = [TrainView(camera, np.zeros((camera.height, camera.width, 3), np.uint8))
+                 for camera in cameras]
+        whole = weigh(blank, cameras, depths, [np.ones_like(depth) for depth in depths])
+        mesh = build.mesh_of(whole, np.empty((0, 3)), ctx, max_triangles=triangles).mesh
+        return mesh.vertices, mesh.faces
+
+    row("exact depth, the same way", exact)
+
+
+if __name__ == "__main__":
+    main()
