@@ -30,6 +30,7 @@ from recon_cli.report.gallery import (
 )
 from recon_cli.report.headline import build_headline, format_facts
 from recon_cli.report.records import LABELS, build_scores, read_metrics
+from recon_cli.report.room import read_room
 from recon_cli.report.stage_status import (
     StageReports,
     inspect_stages,
@@ -123,7 +124,7 @@ def _template_values(
         "sweep": draw_prune_curve(root, stages), "rounds": draw_rounds(stages["prune"]),
         "sweep_command": f"recon prune --sweep -w {shlex.quote(str(root))}",
         "provenance": read_provenance(stages), "labels": LABELS,
-        "export": stages["export"].read_summary(ExportSummary),
+        "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),
         "longest": max(run.seconds for run in runs),
         "largest": max(run.peak_memory_bytes for run in runs),
         "gain": GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),

@@ -74,6 +74,7 @@ class ViewerContent:
     start: BrowserCamera
     distance: float  # from a camera to what it looks at, world units
     max_size: int  # longest side that views are rendered at, in pixels
+    metres: bool = False  # one world unit is a metre
 
 
 def load_workspace(job: Job, model: str) -> ViewerContent:
@@ -95,7 +96,7 @@ def load_workspace(job: Job, model: str) -> ViewerContent:
     distance = float(np.median(depths)) if len(depths) else scene.extent
     return ViewerContent(
         models, views, trained.up(), browser_camera(first, distance, _far_plane(models)), distance,
-        trained.max_size)
+        trained.max_size, trained.metres)
 
 
 def load_file(path: Path) -> ViewerContent:

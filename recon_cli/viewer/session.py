@@ -26,6 +26,7 @@ from recon_cli.viewer.content import (
     vertical_fov,
 )
 from recon_cli.viewer.gaussians import PackedSplats
+from recon_cli.viewer.measure_panel import MeasurePanel
 
 _FRUSTUM_SIZE = 0.03  # of the distance to what is looked at
 _HELD_OUT_COLOR, _FRUSTUM_COLOR = (255, 140, 40), (150, 170, 200)
@@ -95,6 +96,9 @@ class Session:
         if self._photos is not None:
             self._add_views()
         self._add_crop()
+        self._measure = MeasurePanel(
+            self._client, lambda: self._packed.splats, self._content.distance,
+            self._content.metres, self._submit)
         if any(packed.splats.sh_degree for packed in self._content.models.values()):
             gui.add_markdown(
                 "*Colours are as seen from where the camera last stopped: the browser does not "

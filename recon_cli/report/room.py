@@ -1,0 +1,50 @@
+"""The measures of the room and its plan, as export left them."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from recon_cli.errors import FormatError
+from recon_cli.export.mesh.files import MEASURES
+from recon_cli.report.stage_status import StageReport
+from recon_cli.workspace.atomic import read_json
+
+_MOST_BYTES = 3_000_000  # of a plan; the page has a limit of its own
+
+
+@dataclass(frozen=True)
+class Room:
+    """What the page shows."""
+
+    figures: tuple[tuple[str, str], ...]  # (label, value with its interval)
+    notes: tuple[str, ...]  # what was not found
+    plan: Markup | None  # data URI, in which nothing needs escaping; None if it cannot be shown
+
+
+def read_room(export: StageReport) -> Room | None:
+    """Returns the measures of the last export; None where it wrote no plan."""
+    path = export.folder / MEASURES
+    if not export.there or not path.exists():
+        return None
+    try:
+        value = read_json(path)
+        figures = [(label, f"{value[key]['value']:.2f} ± {max(value[key]['error'], 0.01):.2f} "
+                           f"{unit}")
+                   for key, label, unit in (("ceiling_height", "Ceiling height", "m"),
+                                            ("floor_area", "Floor area", "m²"))
+                   if value[key] is not None]
+        if value["walls"]:
+            figures.append(("Walls", ", ".join(
+                f"{wall['value']:.2f} ± {max(wall['error'], 0.01):.2f} m"
+                for wall in value["walls"])))
+        notes = [str(note) for note in value["notes"]]
+        drawing = (export.folder / "plan.svg").read_bytes()
+    except (FormatError, OSError, KeyError, TypeError, ValueError) as error:
+        return Room((), (f"The measures are not shown: {error}",), None)
+    plan = None
+    if len(drawing) <= _MOST_BYTES:
+        plan = Markup("data:image/svg+xml;base64," + base64.b64encode(drawing).decode())
+    return Room(tuple(figures), tuple(notes), plan)
