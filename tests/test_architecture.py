@@ -17,7 +17,7 @@ BASE = {"errors", "lazy", "progress", "machine"}
 RECORDS = BASE | {"workspace", "config"}
 READ = RECORDS | {"scene", "io"}
 DRAW = READ | {"context", "render", "evaluation"}
-MAKE = DRAW | {"capture", "sfm", "train", "export", "stages"}
+MAKE = DRAW | {"capture", "sfm", "train", "export", "trust", "stages"}
 RUN = MAKE | {"pipeline"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
@@ -35,6 +35,7 @@ ALLOWED: dict[str, set[str]] = {
     "evaluation": READ | {"context", "render"},
     "train": DRAW,
     "export": DRAW | {"sfm", "train"},
+    "trust": DRAW,
     "stages": MAKE,
     "pipeline": READ | {"context", "render", "stages"},
     "experiments": RUN,

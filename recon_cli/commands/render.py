@@ -40,10 +40,10 @@ def _color(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
     help="Render these views instead of a path: a set, or a frame by its name; may be repeated.  "
          "[default: none]")
 @click.option(
-    "--output", "outputs", default=OUTPUTS[0], metavar="rgb,depth,alpha", callback=_outputs,
+    "--output", "outputs", default=OUTPUTS[0], metavar="rgb,depth,alpha,trust", callback=_outputs,
     show_default=True,
     help="What to write. Depth is a 16-bit image, in millimetres if the scale is known, and a "
-         "coloured one; render.json says what it means.")
+         "coloured one; trust likewise is the expected error. render.json says what they mean.")
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
     help="Model to render; auto: pruned if it is fresh, else base.")

@@ -44,6 +44,9 @@ def status(call: Call, as_json: bool) -> None:
         logger.warning("there is no workspace at %s yet", job.workspace.root)
     click.echo(status_table(stages))
     for stage in stages:
+        if stage.state == "fresh":
+            for line in stage.summary.get("film_next") or ():
+                click.echo(line)
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)
 

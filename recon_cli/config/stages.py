@@ -300,6 +300,8 @@ class EvaluateConfig(StageConfig):
     max_size: int | None = option(
         None, "Longest side of rendered and scored views.", unit="pixels", minimum=16,
         automatic="as in training")
+    trust: bool = option(
+        True, "Measure where the scene can be trusted, and suggest where to film next.")
 
 
 PLAN = "plan.svg"

@@ -1,4 +1,5 @@
-"""The files of a flythrough: colour, 16-bit depth and its colours, alpha, and videos of them.
+"""The files of a flythrough: colour, 16-bit depth and trust with their colours, alpha, and
+videos of them.
 
 Videos are H.264 or AV1 in an .mp4, through PyAV, tagged as BT.709 of limited range: without the
 tags, players guess from the size of the picture.
@@ -26,16 +27,19 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import ConfigError
 from recon_cli.flythrough.paths import visible_depths
-from recon_cli.flythrough.request import ALPHA, DEPTH, RGB
+from recon_cli.flythrough.request import ALPHA, DEPTH, RGB, TRUST
 from recon_cli.io.images import read_image, to_uint8, write_png
 from recon_cli.render import RenderOutput
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
+from recon_cli.trust.heat_map import error_steps, heat_colors
 from recon_cli.workspace.atomic import replacing
 
-DEPTH_COLOR = "depth_color"
-VIDEO_FRAMES = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA}  # the frames of its video
-FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,)}
+DEPTH_COLOR, TRUST_COLOR = "depth_color", "trust_color"
+# the frames of its video, and of a single picture
+VIDEO_FRAMES = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA, TRUST: TRUST_COLOR}
+FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,),
+           TRUST: (TRUST, TRUST_COLOR)}
 FARTHEST = 65_535  # steps; greater depths are clipped to it
 _MIN_ALPHA = 0.5  # a pixel with less has no depth
 # Quantiles of depth. Where a camera comes close, few points cover much of a picture: the colours
@@ -92,15 +96,22 @@ def depth_scale(scene: Scene, *, metres: bool) -> DepthScale:
 
 def write_frame(
     folder: Path, name: str, output: RenderOutput, surfaces: RenderOutput, kinds: Sequence[str],
-    scale: DepthScale,
+    scale: DepthScale, expected: NDArray[np.float32] | None = None,
 ) -> None:
-    """Writes the pictures of one frame, each atomically; depth is that of `surfaces`."""
+    """Writes the pictures of one frame, each atomically; depth is that of `surfaces`.
+
+    `expected` [H, W] is the expected error, which trust needs.
+    """
     file = f"{name}.png"
     for kind in kinds:
         if kind == RGB:
             write_png(folder / RGB / file, to_uint8(output.rgb.cpu().numpy()))
         elif kind == ALPHA:
             write_png(folder / ALPHA / file, to_uint8(output.alpha.cpu().numpy()))
+        elif kind == TRUST:
+            assert expected is not None, "trust was not measured"
+            write_png(folder / TRUST / file, error_steps(expected))
+            write_png(folder / TRUST_COLOR / file, heat_colors(expected))
         else:
             depth, alpha = surfaces.depth.cpu().numpy(), surfaces.alpha.cpu().numpy()
             steps = depth_steps(depth, alpha, scale.step)

@@ -9,7 +9,7 @@ from pathlib import Path
 from recon_cli.errors import ConfigError
 
 TRAINING, ORBIT = "training", "orbit"  # values of --path besides a file
-RGB, DEPTH, ALPHA = OUTPUTS = ("rgb", "depth", "alpha")
+RGB, DEPTH, ALPHA, TRUST = OUTPUTS = ("rgb", "depth", "alpha", "trust")
 PNG, MP4 = FORMATS = ("png", "mp4")
 FPS, SECONDS = 30.0, 10.0  # defaults
 _CRF_LIMITS = {"h264": 51, "av1": 63}
@@ -24,7 +24,7 @@ class RenderRequest:
 
     path: str = TRAINING  # "training", "orbit" or a .json with cameras
     views: tuple[str, ...] = ()  # test, train, validation or names of frames, instead of a path
-    outputs: tuple[str, ...] = (RGB,)  # of rgb, depth, alpha
+    outputs: tuple[str, ...] = (RGB,)  # of rgb, depth, alpha, trust
     model: str = "auto"  # auto, base or pruned
     fps: float | None = None  # None takes that of the file, or 30
     seconds: float | None = None  # length of a path that is made here; None is 10

@@ -18,6 +18,7 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
 from recon_cli.flythrough.camera_path import write_camera_path
 from recon_cli.flythrough.camera_plan import CameraPlan, check_frame_memory, plan_cameras
+from recon_cli.flythrough.model_trust import load_trust
 from recon_cli.flythrough.output import (
     FOLDERS,
     VIDEO_FRAMES,
@@ -28,10 +29,11 @@ from recon_cli.flythrough.output import (
     encode_video,
     write_frame,
 )
-from recon_cli.flythrough.request import DEPTH, RenderRequest
+from recon_cli.flythrough.request import DEPTH, TRUST, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render import render
+from recon_cli.trust.scene_trust import Trust
 from recon_cli.workspace import layout
 from recon_cli.workspace.atomic import (
     LEFTOVERS,
@@ -54,7 +56,7 @@ logger = logging.getLogger("recon")
 class FrameFolder:
     """The frames in one folder, and the record of their settings.
 
-    `names` are the stems of all frames, in order; `outputs` are of rgb, depth, alpha.
+    `names` are the stems of all frames, in order; `outputs` are of rgb, depth, alpha, trust.
     """
 
     def __init__(self, root: Path, names: Sequence[str], outputs: Sequence[str]) -> None:
@@ -127,21 +129,24 @@ def render_frames(request: RenderRequest, job: Job) -> str:
     plan = plan_cameras(request, trained)
     encoding = _check(request, plan)
     ctx = render_context(job.compute, job.progress)
+    trust = load_trust(job, trained, ctx) if TRUST in request.outputs else None
     folder = _make_folders(request, plan, job.workspace.root)
     with disk_errors(folder, "rendering"), layout.hold_lock(
             folder, "render", other="another folder with --out"):
         frames = FrameFolder(folder, list(plan.cameras), request.outputs)
         scale = depth_scale(trained.scene, metres=trained.metres)
         missing = frames.prepare(
-            _frame_settings(request, plan, trained, scale),
+            _frame_settings(request, plan, trained, scale) | (
+                {} if trust is None else {"trust": trust.to_json()}),
             {"device": ctx.device, "backend": ctx.backend})
         if plan.path is not None:
             write_camera_path(folder / PATH, plan.path)
-        _render_missing(frames, missing, request, plan, trained, scale, ctx)
+        _render_missing(frames, missing, request, plan, trained, scale, trust, ctx)
         files = _encode_videos(frames, encoding, ctx) if encoding else []
     if request.out_file is not None:
         with disk_errors(request.out_file.absolute().parent, f"writing {request.out_file.name}"):
-            source = files[0] if files else frames.frame_path(frames.outputs[0], frames.names[0])
+            source = files[0] if files else frames.frame_path(
+                VIDEO_FRAMES[frames.outputs[0]], frames.names[0])
             write_bytes(request.out_file, source.read_bytes())
         files = [request.out_file]
     total = len(frames.names)
@@ -214,7 +219,7 @@ def _frame_settings(
 
 def _render_missing(
     frames: FrameFolder, missing: Sequence[str], request: RenderRequest, plan: CameraPlan,
-    trained: TrainedScene, scale: DepthScale, ctx: StageContext,
+    trained: TrainedScene, scale: DepthScale, trust: Trust | None, ctx: StageContext,
 ) -> None:
     splats = trained.splats.map(lambda tensor: tensor.to(ctx.device))
     background = torch.tensor(request.background, device=ctx.device) / 255
@@ -227,7 +232,9 @@ def _render_missing(
             output = render(splats, camera, background, degree, backend=ctx.backend)
             for_depth = output if surfaces is splats else render(
                 surfaces, camera, background, degree, backend=ctx.backend)
-            write_frame(frames.root, name, output, for_depth, request.outputs, scale)
+            expected = None if trust is None else trust.expected_error(
+                splats, camera, ctx.backend)
+            write_frame(frames.root, name, output, for_depth, request.outputs, scale, expected)
             bar.advance()
 
 

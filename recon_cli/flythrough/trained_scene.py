@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from dataclasses import dataclass
 
@@ -22,6 +21,7 @@ from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.train.train_data import read_config
+from recon_cli.trust.scene_trust import digest_of
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.summaries import SfmSummary
 
@@ -84,8 +84,8 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
         evidence = SfmSummary.from_json(manifests["sfm"].run.summary).world.evidence
         z_up, metres = evidence.up_found, evidence.metres
     return TrainedScene(
-        "pruned" if pruned else "base", splats, _digest(splats), config.sh_degree, config.max_size,
-        scene, z_up, metres, has_views=not viewless)
+        "pruned" if pruned else "base", splats, digest_of(splats), config.sh_degree,
+        config.max_size, scene, z_up, metres, has_views=not viewless)
 
 
 def _require_fresh(inspection: WorkspaceCheck, name: str, verb: str) -> Manifest:
@@ -106,12 +106,3 @@ def _use_pruned(inspection: WorkspaceCheck, model: str, verb: str) -> bool:
     if model == "auto" and check.manifest and not check.fresh:
         logger.warning("the pruned model is not used: it is %s", check.describe())
     return check.fresh and model != "base"
-
-
-def _digest(splats: Splats) -> str:
-    """Returns the digest of the parameters; the file may have been replaced since it was read."""
-    digest = hashlib.sha256()
-    for name, value in splats.parameters().items():
-        digest.update(f"{name}{tuple(value.shape)}".encode())
-        digest.update(value.numpy().tobytes())
-    return digest.hexdigest()

@@ -55,8 +55,9 @@ from recon_cli.io.records import Frame, ImportRecord, describe_stretches, read_f
 from recon_cli.scene.scene import Scene
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
+from recon_cli.trust.assess import TrustTask, assess
 from recon_cli.workspace.atomic import write_bytes, write_json
-from recon_cli.workspace.summaries import EvaluateSummary
+from recon_cli.workspace.summaries import EvaluateSummary, WorldSummary
 
 _GAIN = 4  # of the difference images
 _ANY_ITERATION = 1 << 62  # beyond the last
@@ -168,7 +169,11 @@ def run(
             means[f"{name}_{key}"] = round(getattr(model, key), 4)
         if model.gain_psnr_db is not None:
             means[f"{name}_gain_psnr_db"] = round(model.gain_psnr_db, 4)
-    return EvaluateSummary(**means)
+    trust = assess(TrustTask(
+        evaluation.folders, evaluation.config, evaluation.scene, evaluation.held_out,
+        config.max_size or evaluation.config.max_size, evaluation.import_record,
+        WorldSummary.read(inputs.folders["sfm"])), out, ctx) if config.trust else None
+    return EvaluateSummary(**means, film_next=tuple(trust.lines()) if trust else None)
 
 
 def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> _Evaluation:

@@ -9,16 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tiny_scene import VIEWS
-from tiny_stages import holding_out, mean_colour_psnr, run, without
+from tiny_stages import CONFIG, holding_out, mean_colour_psnr, run, without
 
 from recon_cli.config.stages import EvaluateConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.evaluation import reference_views
 from recon_cli.evaluation.metrics import psnr, ssim
-from recon_cli.io.images import read_image
+from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.io.images import read_image, write_png
+from recon_cli.io.ply import read_ply
+from recon_cli.io.records import ImportRecord
 from recon_cli.stages import evaluate
 from recon_cli.train.train_data import read_config, write_config
+from recon_cli.trust.scene_trust import Trust, TrustRecord, digest_of
 
 
 @pytest.fixture
@@ -159,3 +163,59 @@ def test_nothing_to_score_on_is_an_error(inputs, tmp_path):
     with pytest.raises(ReconstructionError, match="No held-out view"):
         run(evaluate, EvaluateConfig(), holding_out(inputs, tmp_path, held_out=False),
             tmp_path / "out")
+
+
+def test_trust_is_measured_checked_on_held_out_views_and_drawn(inputs, tmp_path):
+    out = tmp_path / "out"
+    summary = run(evaluate, EvaluateConfig(), inputs, out)
+    record = TrustRecord.read(out)
+    assert record.models == ("base", "pruned")
+    for name in record.models:
+        trust = record.of(name)
+        assert trust.agreement.views == VIEWS // 4
+        assert trust.agreement.ause < trust.agreement.ause_depth
+        assert trust.error.calibrated
+        assert trust.views == len(load_scene(inputs, validation=CONFIG.validation).train)
+        assert sorted(path.name for path in (out / "trust" / name).iterdir()) == [
+            f"{i:06d}.png" for i in range(0, VIEWS, 4)]
+    splats = read_ply(inputs.folders["prune"] / "splats.ply")
+    assert Trust.load(out, "pruned", digest_of(splats), 0).support.count.shape == (len(splats),)
+    assert Trust.load(out, "base", digest_of(splats), 0) is None  # of other Gaussians
+    # twelve cameras that all look the same way over no floor
+    assert len(summary.film_next) == 1
+    assert "up is not known" in summary.film_next[0]
+
+
+def test_held_out_views_calibrate_nothing(inputs, tmp_path):
+    changed = tmp_path / "sfm"
+    shutil.copytree(inputs.folders["sfm"], changed)
+    for i in range(0, VIEWS, 4):
+        path = changed / "undistorted" / "images" / f"{i:06d}.png"
+        write_png(path, 255 - read_image(path, 48, 36))
+    records = []
+    for number, sfm in enumerate((inputs.folders["sfm"], changed)):
+        given = without(StageInputs({**inputs.folders, "sfm": sfm}), "prune")
+        run(evaluate, EvaluateConfig(), given, tmp_path / f"out{number}")
+        records.append(TrustRecord.read(tmp_path / f"out{number}"))
+    assert records[0].base.error == records[1].base.error
+    assert records[0].base.agreement != records[1].base.agreement
+
+
+def test_without_trust_nothing_of_it_is_written(inputs, tmp_path):
+    summary = run(evaluate, EvaluateConfig(trust=False), without(inputs, "prune"), tmp_path / "out")
+    assert summary.film_next is None
+    assert not (tmp_path / "out" / "trust").exists()
+    assert TrustRecord.read(tmp_path / "out") is None
+
+
+def test_a_scene_whose_views_do_not_fit_has_no_trust_and_says_why(inputs, tmp_path):
+    folder = tmp_path / "train"
+    shutil.copytree(inputs.folders["train"], folder)
+    ImportRecord("room.ply", "ply", "0", 1, 0, z_up=True, views=True,
+                 doubt="it may not be in the frame of the views").write(folder)
+    given = without(StageInputs({**inputs.folders, "train": folder}), "prune")
+    run(evaluate, EvaluateConfig(), given, tmp_path / "out")
+    record = TrustRecord.read(tmp_path / "out")
+    assert record.models == ()
+    assert "may not be in the frame" in record.reason
+    assert record.lines() == []

@@ -1,0 +1,33 @@
+"""The trust of a trained scene: as `recon eval` left it, or measured now."""
+
+from __future__ import annotations
+
+import logging
+
+from recon_cli.context import StageContext
+from recon_cli.flythrough.trained_scene import TrainedScene
+from recon_cli.io.records import ImportRecord
+from recon_cli.pipeline.execute import Job
+from recon_cli.train.train_data import read_config
+from recon_cli.trust.scene_trust import Trust, measure_trust, refuse_without, views_looked_at
+
+logger = logging.getLogger("recon")
+
+
+def load_trust(job: Job, trained: TrainedScene, ctx: StageContext) -> Trust:
+    """Returns the trust of the model that was opened, on the device of `ctx`.
+
+    StageError for an imported scene without views, or whose views do not fit.
+    """
+    folder = job.workspace.folder
+    refuse_without(ImportRecord.read(folder("train")))
+    trust = None
+    if job.inspect().check("evaluate").fresh:
+        trust = Trust.load(folder("evaluate"), trained.model, trained.digest, trained.sh_degree)
+    splats = trained.splats.map(lambda tensor: tensor.to(ctx.device))
+    if trust is None:
+        logger.info("trust is measured on the training views now; `recon eval` keeps it")
+        with ctx.progress.bar("trust", views_looked_at(trained.scene), unit="view") as bar:
+            trust = measure_trust(splats, trained.scene, read_config(folder("train")),
+                                  trained.max_size, ctx, bar.advance)
+    return Trust(trust.support.to(splats.means.device), trust.error, trust.sh_degree)

@@ -1,0 +1,225 @@
+"""From what a pixel's Gaussians rest on to the error to expect there: a small monotone model.
+
+log E = bias + sum of weight x term, every weight at least 0, so that fewer views, a wider angle, a
+larger residual or a hole never lower the expected error. Fitted to the absolute errors of the
+validation views by Poisson's quasi-likelihood, whose means are right even where the errors are not
+Poisson's (Gourieroux, Monfort and Trognon 1984); few views say little about what lies off their
+path, so the weights are held near those that several captures agree on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from recon_cli.render import render
+from recon_cli.render.torch.projection import colors_from_sh
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.scene.train_view import TrainView
+from recon_cli.trust.support import Sight, Support, error_image
+from recon_cli.workspace.summaries import JsonRecord
+
+# Weights without any evidence, and where to the fit is drawn. Weights that the novel views of a
+# rendered room would give, rounded; on another room and on real captures they only had to hold.
+PRIOR: Mapping[str, float] = {
+    "hole": 0.8, "few": 0.3, "angle": 0.25, "residual": 0.7, "depth": 0.03, "color": 0.5,
+    "nearer": 0.5, "edges": 0.1}
+TERMS = tuple(PRIOR)
+# Pull towards PRIOR in the units of the mean deviance. AUSE on novel views changes by .003 from
+# .001 to 10; the reliability gap of two rooms is least from .1 to .3.
+_RIDGE = 0.1
+_MAX_WEIGHT = 6.0
+_PIXELS = 200_000  # that the fit looks at
+_COVERED = 1e-3  # alpha below which a pixel shows nothing
+_ANGLE = 0.05  # rad; smaller ones count alike, as one step of a walk
+_SPREAD = 0.02  # of the depth, and of the intensity: smaller spreads along a ray count alike
+_ERROR = 1e-3  # a quarter of an 8-bit step
+_SHARE = 1e-3  # of 1 / (1 + views)
+_EDGE = 3e-3  # intensity a pixel
+MIN_BIAS_ERROR = 1e-6
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorModel(JsonRecord):
+    """The calibrated model of a scene, as trust.json holds it."""
+
+    bias: float
+    weights: Mapping[str, float]  # by the names of TERMS
+    means: Mapping[str, float]  # of the terms over the pixels that it was fitted to
+    views: int  # that it was fitted to
+    calibrated: bool  # on validation views; else on training views, which flatter
+
+    def expect(self, terms: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Returns the expected absolute error, 0 to 1, for terms of one shape."""
+        log = sum(self.weights[name] * terms[name] for name in TERMS) + self.bias
+        return np.asarray(np.exp(np.minimum(log, 0)), np.float32)
+
+    def expect_gaussians(self, support: Support, sight: Sight) -> NDArray[np.float32]:
+        """Returns the expected error [N] of Gaussians as seen from one place.
+
+        What only a picture tells (holes, edges, spreads) is as in the mean.
+        """
+        means = {name: np.full(1, value, np.float32) for name, value in self.means.items()}
+        return self.expect(means | gaussian_terms(support, sight))
+
+    def expect_hole(self) -> float:
+        """Returns the expected error where nothing is drawn."""
+        values = {**self.means, "hole": 1.0, "few": 0.0, "angle": float(np.log1p(np.pi / _ANGLE))}
+        return float(self.expect({
+            name: np.full(1, value, np.float32) for name, value in values.items()})[0])
+
+
+def gaussian_terms(support: Support, sight: Sight) -> dict[str, NDArray[np.float32]]:
+    """Returns the terms [N] that are known for Gaussians without a picture."""
+    return _shape_terms(
+        (1 / (1 + support.count.float())).cpu().numpy(), sight.angle.cpu().numpy(),
+        support.residual.cpu().numpy(), sight.nearer.cpu().numpy())
+
+
+def _shape_terms(
+    few: NDArray[np.float32], angle: NDArray[np.float32], residual: NDArray[np.float32],
+    nearer: NDArray[np.float32],
+) -> dict[str, NDArray[np.float32]]:
+    return {"few": np.log(few.clip(0) + _SHARE), "angle": np.log1p(angle.clip(0) / _ANGLE),
+            "residual": np.log(residual.clip(0) + _ERROR), "nearer": nearer.clip(0)}
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A view with what the expected error follows from."""
+
+    rgb: NDArray[np.float32]  # [H, W, 3] on black, not clamped
+    alpha: NDArray[np.float32]  # [H, W]
+    depth: NDArray[np.float32]  # [H, W] expected depth, in units of the scene's median depth
+    terms: Mapping[str, NDArray[np.float32]]  # [H, W] by the names of TERMS
+
+
+def picture_terms(
+    splats: Splats, support: Support, camera: Camera, *, sh_degree: int, backend: str
+) -> Picture:
+    """Renders a view and the terms of its pixels, by two more passes with values for colours."""
+    device, dtype = splats.means.device, splats.means.dtype
+    black = torch.zeros(3, dtype=dtype, device=device)
+    with torch.no_grad():
+        output = render(splats, camera, black, sh_degree, backend=backend)
+        sight = support.seen_from(splats.means, camera.center)
+        few = 1 / (1 + support.count.to(dtype))
+        first = paint(splats, camera, [few, sight.angle, support.residual], backend)
+        rotation = torch.as_tensor(camera.viewmat[2], dtype=dtype, device=device)
+        depth = (splats.means @ rotation[:3] + rotation[3]).clamp_min(0)
+        scale = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
+        bright = _brightness(splats, camera, sh_degree)
+        second = paint(splats, camera, [(depth / scale).square(), sight.nearer, bright.square()],
+                       backend)
+    rgb, alpha = output.rgb.cpu().numpy(), output.alpha.cpu().numpy()
+    covered = alpha >= _COVERED
+    share = np.where(covered, alpha, 1)
+    mean_depth = output.depth.cpu().numpy() / share / scale
+    gray = rgb.mean(-1) / share
+    few_map, angle, residual = (np.where(covered, channel / share, empty) for channel, empty in zip(
+        np.moveaxis(first, -1, 0), (1.0, np.pi, float(support.residual.max())), strict=True))
+    square, nearer, brightness = (
+        np.where(covered, channel / share, 0) for channel in np.moveaxis(second, -1, 0))
+    spread = np.sqrt((square - mean_depth**2).clip(0)) / np.maximum(mean_depth, 1e-3)
+    uneven = np.sqrt((brightness - gray**2).clip(0))
+    terms = {
+        "hole": 1 - alpha, **_shape_terms(few_map, angle, residual, nearer),
+        "depth": np.where(covered, np.log1p(spread / _SPREAD), 0),
+        "color": np.where(covered, np.log1p(uneven / _SPREAD), 0), "edges": _edges(rgb)}
+    return Picture(rgb, alpha, np.asarray(mean_depth, np.float32), {
+        name: np.asarray(value, np.float32) for name, value in terms.items()})
+
+
+def paint(
+    splats: Splats, camera: Camera, values: Sequence[torch.Tensor], backend: str
+) -> NDArray[np.float32]:
+    """Returns three values at least 0 of each Gaussian, [N] each, composited as colours are."""
+    # as harmonics of degree 0: the rasterizer itself stays as it is
+    colors = (torch.stack(list(values), 1).to(splats.means.dtype) - 0.5) / SH_C0
+    plain = Splats(splats.means, splats.quats, splats.log_scales, splats.logit_opacities, colors,
+                   splats.sh_rest[:0, :0])
+    black = torch.zeros(3, dtype=colors.dtype, device=colors.device)
+    with torch.no_grad():
+        image: NDArray[np.float32] = render(
+            plain, camera, black, 0, backend=backend).rgb.cpu().numpy()
+    return image
+
+
+def _brightness(splats: Splats, camera: Camera, sh_degree: int) -> torch.Tensor:
+    """Returns the mean of the channels of each Gaussian's colour, [N]."""
+    place = torch.as_tensor(camera.center, dtype=splats.means.dtype, device=splats.means.device)
+    rows = torch.arange(len(splats), device=splats.means.device)
+    colors: torch.Tensor = colors_from_sh(
+        splats.means - place, splats.sh_dc, splats.sh_rest, rows,
+        min(sh_degree, splats.sh_degree))
+    return colors.mean(1)
+
+
+def _edges(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns the logarithm of the gradient of the brightness, [H, W]."""
+    gray = rgb.clip(0, 1).mean(-1)
+    across, down = (cv2.Sobel(gray, cv2.CV_32F, *order, ksize=3) / 8 for order in ((1, 0), (0, 1)))
+    return np.asarray(np.log(np.hypot(across, down) + _EDGE), np.float32)
+
+
+def calibrate(
+    splats: Splats, support: Support, validation: Sequence[TrainView],
+    train: Sequence[TrainView], *, sh_degree: int, backend: str, gains: bool = False,
+    on_view: Callable[[], None] = lambda: None,
+) -> ErrorModel:
+    """Returns the model fitted to the validation views, which no gradient came from.
+
+    Without any it keeps PRIOR, with the mean error of some training views.
+    """
+    views = validation or train
+    columns: dict[str, list[Array]] = {name: [] for name in TERMS}
+    errors: list[Array] = []
+    for view in views:
+        picture = picture_terms(splats, support, view.camera, sh_degree=sh_degree, backend=backend)
+        error, counts = error_image(picture.rgb, view, gains=gains)
+        used = counts > 0
+        errors.append(np.asarray(error[used], np.float64))
+        for name, column in columns.items():
+            column.append(np.asarray(picture.terms[name][used], np.float64))
+        on_view()
+    real: Array = np.concatenate(errors)
+    rows = slice(None, None, max(1, len(real) // _PIXELS))
+    terms = np.stack([np.concatenate(columns[name])[rows] for name in TERMS], 1)
+    bias, weights = fit_weights(terms, real[rows], fixed=not validation)
+    return ErrorModel(
+        bias=round(bias, 5), weights=dict(zip(TERMS, weights.round(5).tolist(), strict=True)),
+        means=dict(zip(TERMS, terms.mean(0).round(5).tolist(), strict=True)), views=len(views),
+        calibrated=bool(validation))
+
+
+def fit_weights(
+    terms: Array,  # [P, K], in the order of TERMS
+    errors: Array,  # [P]
+    *, fixed: bool = False,
+) -> tuple[float, Array]:
+    """Returns bias and weights [K]; with `fixed` the weights are those of PRIOR."""
+    prior = np.array([PRIOR[name] for name in TERMS])
+    mean = max(float(errors.mean()), MIN_BIAS_ERROR)
+    start = np.log(mean) - np.log(np.exp(np.minimum(terms @ prior, 50)).mean())
+    if fixed:
+        return float(start), prior
+
+    def loss(values: Array) -> tuple[float, Array]:
+        log = np.minimum(values[0] + terms @ values[1:], 50)
+        expected, off = np.exp(log), values[1:] - prior
+        gap = (expected - errors) / mean
+        return (float((expected - errors * log).mean() / mean + _RIDGE * off @ off),
+                np.concatenate([[gap.mean()], (terms * gap[:, None]).mean(0) + 2 * _RIDGE * off]))
+
+    result = minimize(loss, np.concatenate([[start], prior]), jac=True, method="L-BFGS-B",
+                      bounds=[(None, None)] + [(0, _MAX_WEIGHT)] * len(prior))
+    return float(result.x[0]), np.asarray(result.x[1:])

@@ -1,0 +1,239 @@
+"""The trust of a model: what its Gaussians rest on, the calibrated errors, and both on disk."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext
+from recon_cli.errors import ManifestError, StageError
+from recon_cli.evaluation.reference_views import ReferenceView, evenly_spread, load_reference_views
+from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.splats import Splats
+from recon_cli.trust.agreement import ause, reliability
+from recon_cli.trust.error_model import ErrorModel, calibrate, picture_terms
+from recon_cli.trust.film_next import Suggestion
+from recon_cli.trust.heat_map import FULL
+from recon_cli.trust.support import MAX_VIEWS, Support, error_image, measure_support
+from recon_cli.trust.surface import SurfaceShares, surface_shares
+from recon_cli.workspace.atomic import read_json, write_json
+from recon_cli.workspace.summaries import JsonRecord
+
+FOLDER = "trust"  # in that of evaluate
+RECORD = "trust.json"
+_AT_ONCE = 16  # training photos in memory
+_CALIBRATION = 12  # views that the errors are calibrated on, at most
+_PIXELS = 200_000  # of each view whose agreement is measured, at most
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement(JsonRecord):
+    """Expected against real errors of views that neither trained nor calibrated."""
+
+    views: int
+    ause: float  # of the expected error, mean over the views
+    ause_opacity: float  # of 1 - alpha, for comparison
+    ause_depth: float  # of the depth
+    expected: tuple[float, ...]  # mean errors in ten bins of equally many pixels
+    real: tuple[float, ...]
+    gap: float  # mean of |expected - real| / real over the bins
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelTrust(JsonRecord):
+    """What trust.json says about one model."""
+
+    views: int  # training views that were looked at
+    error: ErrorModel
+    surface: SurfaceShares
+    agreement: Agreement | None = None  # None without held-out views
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrustRecord(JsonRecord):
+    """trust.json: the models of a workspace, and where to film next."""
+
+    models: tuple[str, ...]
+    base: ModelTrust | None = None
+    pruned: ModelTrust | None = None
+    reason: str = ""  # why there is no trust; empty where there is
+    metres: bool = False  # world units are metres
+    film_next: tuple[Suggestion, ...] = ()
+    no_places: str = ""  # why no place is suggested
+
+    @staticmethod
+    def read(evaluate: Path) -> TrustRecord | None:
+        """Returns the record in evaluate's folder; None where an earlier version left none.
+
+        FormatError or ManifestError if it is damaged.
+        """
+        path = evaluate / FOLDER / RECORD
+        return TrustRecord.from_json(read_json(path)) if path.exists() else None
+
+    def write(self, evaluate: Path) -> None:
+        """Writes the record into evaluate's folder."""
+        write_json(evaluate / FOLDER / RECORD, self.to_json())
+
+    def of(self, model: str) -> ModelTrust | None:
+        """Returns what is said about base or pruned."""
+        return {"base": self.base, "pruned": self.pruned}[model]
+
+    @property
+    def unit(self) -> str:
+        """The unit of positions, for people."""
+        return "m" if self.metres else "scene units"
+
+    def lines(self) -> list[str]:
+        """Returns where to film next in words, a line each, or why there is none."""
+        if self.reason:
+            return []
+        if not self.film_next:
+            return [f"film next: {self.no_places}"]
+        return [f"film next ({number}) {suggestion.describe(self.unit)}"
+                for number, suggestion in enumerate(self.film_next, 1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Trust:
+    """The trust of a model, ready to be rendered."""
+
+    support: Support
+    error: ErrorModel
+    sh_degree: int
+
+    def expected_error(
+        self, splats: Splats, camera: Camera, backend: str
+    ) -> NDArray[np.float32]:
+        """Returns the expected absolute error of a view's pixels, [H, W] of 0 to 1."""
+        picture = picture_terms(
+            splats, self.support, camera, sh_degree=self.sh_degree, backend=backend)
+        return self.error.expect(picture.terms)
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns what a 16-bit picture of it means, for readers and as its fingerprint."""
+        return {"unit": "expected mean absolute error of the channels, whole range = 1",
+                "error_per_step": 1 / FULL, "views": len(self.support.rows),
+                "model": self.error.to_json()}
+
+    def save(self, evaluate: Path, model: str) -> None:
+        """Writes the support of a model; the rest stands in trust.json."""
+        (evaluate / FOLDER).mkdir(exist_ok=True)
+        self.support.save(evaluate / FOLDER / f"{model}.safetensors")
+
+    @staticmethod
+    def load(evaluate: Path, model: str, digest: str, sh_degree: int) -> Trust | None:
+        """Returns the trust of the Gaussians of a digest; None if evaluate has that of others."""
+        try:
+            record = TrustRecord.read(evaluate)
+        except ManifestError:  # of another version
+            return None
+        stored = record and record.of(model)
+        if not stored:
+            return None
+        support = Support.load(evaluate / FOLDER / f"{model}.safetensors")
+        return Trust(support, stored.error, sh_degree) if support.digest == digest else None
+
+
+def digest_of(splats: Splats) -> str:
+    """Returns the SHA-256 of the parameters; the file may have been replaced since it was read."""
+    digest = hashlib.sha256()
+    for name, value in splats.parameters().items():
+        digest.update(f"{name}{tuple(value.shape)}".encode())
+        digest.update(value.cpu().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def why_none(record: ImportRecord | None) -> str:
+    """Returns why a scene has no trust, as a sentence; empty where it has."""
+    if record is not None and not record.views:
+        return "The scene was imported without views, so nothing tells where it is right."
+    if record is not None and record.doubt:
+        return f"Trust is measured against views of the scene, but {record.doubt}."
+    return ""
+
+
+def refuse_without(record: ImportRecord | None) -> None:
+    """Raises StageError where a scene has no trust."""
+    reason = why_none(record)
+    if reason:
+        raise StageError(reason, hint=NEEDS_VIEWS_HINT)
+
+
+def views_looked_at(scene: Scene) -> int:
+    """Returns how many views `measure_trust` renders."""
+    calibration = scene.validation or scene.train
+    return len(evenly_spread(scene.train, MAX_VIEWS)) + len(
+        evenly_spread(calibration, _CALIBRATION))
+
+
+def measure_trust(
+    splats: Splats, scene: Scene, config: RunConfig, max_size: int, ctx: StageContext,
+    on_view: Callable[[], None] = lambda: None,
+) -> Trust:
+    """Returns the trust of a model: a pass over training views, then the validation views.
+
+    `max_size` is the longest side in pixels at which errors are compared.
+    """
+    gains, refined = config.exposure == "on", config.poses == "on"
+    support = measure_support(
+        splats, _in_turn(evenly_spread(scene.train, MAX_VIEWS), max_size, ctx.threads),
+        sh_degree=config.sh_degree, backend=ctx.backend, gains=gains, compare=not refined,
+        on_view=on_view, digest=digest_of(splats))
+    validation = load_reference_views(evenly_spread(scene.validation, _CALIBRATION), max_size)
+    train = [] if validation else load_reference_views(
+        evenly_spread(scene.train, _CALIBRATION), max_size)
+    error = calibrate(
+        splats, support, validation, train, sh_degree=config.sh_degree, backend=ctx.backend,
+        gains=gains, on_view=on_view)
+    return Trust(support, error, config.sh_degree)
+
+
+def _in_turn(views: Sequence[View], max_size: int, threads: int) -> Iterator[ReferenceView]:
+    """Yields views with their photos, few of them in memory at once."""
+    for begin in range(0, len(views), _AT_ONCE):
+        yield from load_reference_views(views[begin:begin + _AT_ONCE], max_size, threads=threads)
+
+
+def model_trust(
+    trust: Trust, splats: Splats, views: Sequence[ReferenceView], *, gains: bool, backend: str,
+    on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _error: None,
+) -> ModelTrust:
+    """Returns what is known about a model's trust, checked on views that did not calibrate it.
+
+    `on_view` gets each of the `views` and its expected error [H, W].
+    """
+    areas: list[tuple[float, ...]] = []
+    real, thought = [], []
+    for view in views:
+        picture = picture_terms(
+            splats, trust.support, view.camera, sh_degree=trust.sh_degree, backend=backend)
+        expected = trust.error.expect(picture.terms)
+        on_view(view, expected)
+        error, counts = error_image(picture.rgb, view, gains=gains)
+        used = counts > 0
+        pixels = slice(None, None, max(1, int(used.sum()) // _PIXELS))
+        errors, own = (np.asarray(image[used][pixels], np.float64) for image in (error, expected))
+        areas.append((ause(errors, own), *(
+            ause(errors, np.asarray(image[used][pixels], np.float64))
+            for image in (1 - picture.alpha, picture.depth))))
+        real.append(errors)
+        thought.append(own)
+    agreement = None
+    if views:
+        bins, means = reliability(real, thought), np.mean(areas, axis=0)
+        agreement = Agreement(
+            views=len(views), ause=round(float(means[0]), 4),
+            ause_opacity=round(float(means[1]), 4), ause_depth=round(float(means[2]), 4),
+            expected=tuple(round(value, 6) for value in bins.expected),
+            real=tuple(round(value, 6) for value in bins.real), gap=round(bins.gap, 4))
+    return ModelTrust(views=len(trust.support.rows), error=trust.error, agreement=agreement,
+                      surface=surface_shares(splats, trust.support))

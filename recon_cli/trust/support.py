@@ -1,0 +1,211 @@
+"""What each Gaussian rests on: the training views that show it, from where, and how well.
+
+One forward pass over the training views; held-out and validation views take no part.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from recon_cli.errors import FormatError
+from recon_cli.render import render
+from recon_cli.scene.splats import Splats
+from recon_cli.scene.train_view import TrainView
+from recon_cli.workspace.atomic import replacing
+
+CARRIES = 0.01  # of a pixel's colour, from which a view shows a Gaussian
+MAX_VIEWS = 300  # that are looked at, evenly spread; more show next to nothing new
+_VERSION = 1
+_BLUR = 3  # pixels across that a residual is read from: one alone is mostly noise
+_MAX_NEARER = 3.0  # natural logarithm of how much nearer a camera may be than all training views
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """How N Gaussians look from one place, compared with where training saw them from."""
+
+    angle: Tensor  # [N] rad to the nearest ray of a training view that shows it; pi without any
+    nearer: Tensor  # [N] log of the nearest of these views' distance over that of the place, >= 0
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """What the training views show of N Gaussians."""
+
+    rows: tuple[Tensor, ...]  # by view the Gaussians that it shows, [K] int64
+    centers: NDArray[np.float64]  # [V, 3] of these views, world units
+    residual: Tensor  # [N] mean absolute error of its pixels, 0 to 1, by weight; mean where unseen
+    count: Tensor  # [N] int64, number of views that show each
+    digest: str = ""  # of the Gaussians
+
+    @staticmethod
+    def of(
+        rows: Sequence[Tensor], centers: NDArray[np.float64], residual: Tensor, digest: str = ""
+    ) -> Support:
+        """Returns the support by `rows`, with the views of each Gaussian counted."""
+        count = torch.zeros(len(residual), dtype=torch.int64, device=residual.device)
+        for shown in rows:
+            count[shown] += 1
+        return Support(tuple(rows), centers, residual, count, digest)
+
+    def to(self, device: torch.device) -> Support:
+        """Returns the same on a device."""
+        return Support(tuple(rows.to(device) for rows in self.rows), self.centers,
+                       self.residual.to(device), self.count.to(device), self.digest)
+
+    def span(self, means: Tensor) -> Tensor:
+        """Returns the angle [N] in rad that the rays to each of `means` [N, 3] span.
+
+        Twice the greatest angle to their mean direction; 0 for fewer than two views.
+        """
+        total = torch.zeros_like(means)
+        for rows, center in zip(self.rows, self.centers, strict=True):
+            total[rows] += _directions(means[rows], center)[0]
+        middle = torch.nn.functional.normalize(total, dim=1)
+        cosine = torch.ones_like(self.residual)
+        for rows, center in zip(self.rows, self.centers, strict=True):
+            own = (_directions(means[rows], center)[0] * middle[rows]).sum(1)
+            cosine[rows] = torch.minimum(cosine[rows], own)
+        return 2 * torch.arccos(cosine.clamp(-1, 1)) * (self.count > 1)
+
+    def seen_from(self, means: Tensor, place: NDArray[np.float64]) -> Sight:
+        """Returns how Gaussians at `means` [N, 3] look from `place` [3]."""
+        toward, distance = _directions(means, place)
+        cosine = torch.full_like(self.residual, -1.0)
+        nearest = torch.full_like(self.residual, torch.inf)
+        for rows, center in zip(self.rows, self.centers, strict=True):
+            ray, apart = _directions(means[rows], center)
+            cosine[rows] = torch.maximum(cosine[rows], (ray * toward[rows]).sum(1))
+            nearest[rows] = torch.minimum(nearest[rows], apart)
+        nearer = torch.log(nearest / distance).clamp(0, _MAX_NEARER)
+        return Sight(torch.arccos(cosine.clamp(-1, 1)),
+                     torch.where(torch.isinf(nearest), torch.zeros_like(nearer), nearer))
+
+    def with_view(self, rows: Tensor, center: NDArray[np.float64]) -> Support:
+        """Returns what there would be with one more view that shows `rows`."""
+        count = self.count.clone()
+        count[rows] += 1
+        return Support((*self.rows, rows), np.vstack([self.centers, center]), self.residual, count,
+                       self.digest)
+
+    def thinned(self, most: int) -> Support:
+        """Returns the rays of at most so many of the views, evenly spread; counts stay."""
+        step = max(1, -(-len(self.rows) // most))
+        return replace(self, rows=self.rows[::step], centers=self.centers[::step])
+
+    def save(self, path: Path) -> None:
+        """Writes the support as safetensors, whole or not at all."""
+        shown = np.zeros((len(self.rows), len(self.residual)), bool)
+        for row, rows in zip(shown, self.rows, strict=True):
+            row[rows.cpu().numpy()] = True
+        head = {"version": _VERSION, "gaussians": len(self.residual), "digest": self.digest}
+        with replacing(path) as temporary:
+            save_file({"shown": torch.from_numpy(np.packbits(shown, axis=1)),
+                       "centers": torch.from_numpy(self.centers),
+                       "residual": self.residual.cpu().contiguous()},
+                      temporary, metadata={"support": json.dumps(head)})
+
+    @staticmethod
+    def load(path: Path) -> Support:
+        """Returns what `save` wrote; FormatError if the file is missing, damaged or of another."""
+        try:
+            with safe_open(path, framework="pt") as file:
+                head = json.loads((file.metadata() or {})["support"])
+                shown, centers, residual = (
+                    file.get_tensor(name) for name in ("shown", "centers", "residual"))
+            count = int(head["gaussians"])
+            if head["version"] != _VERSION or len(residual) != count or len(shown) != len(centers):
+                raise ValueError("its parts do not fit")
+            bits = np.unpackbits(shown.numpy(), axis=1, count=count)
+        except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+            raise FormatError(
+                f"{path} cannot be read: {error}.", hint="Run `recon eval --again`.") from error
+        rows = tuple(torch.from_numpy(np.nonzero(row)[0]) for row in bits)
+        return Support.of(rows, centers.numpy(), residual, str(head["digest"]))
+
+
+def _directions(means: Tensor, place: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+    """Returns unit vectors [K, 3] from a place to `means` [K, 3], and the distances [K]."""
+    offsets = means - torch.as_tensor(place, dtype=means.dtype, device=means.device)
+    distance = offsets.norm(dim=1).clamp_min(1e-9)
+    return offsets / distance[:, None], distance
+
+
+def measure_support(
+    splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str,
+    gains: bool = False, compare: bool = True, on_view: Callable[[], None] = lambda: None,
+    digest: str = "",
+) -> Support:
+    """Returns what training views show of the Gaussians, by one forward pass over them.
+
+    `gains` compares after the best gain per channel, as where exposures were trained. Without
+    `compare`, where cameras were refined and photos do not fit them, residuals are all alike.
+    """
+    device = splats.means.device
+    black = torch.zeros(3, dtype=splats.means.dtype, device=device)
+    weights = torch.zeros(len(splats), dtype=torch.float64, device=device)
+    errors = weights.clone()
+    shown: list[Tensor] = []
+    centers: list[NDArray[np.float64]] = []
+    for view in views:
+        centers.append(view.camera.center)
+        with torch.no_grad():
+            output = render(splats, view.camera, black, sh_degree, backend=backend, scores=True)
+        statistics = output.statistics
+        rows = torch.nonzero(statistics.blend_max >= CARRIES)[:, 0]
+        shown.append(rows)
+        if compare and len(rows):
+            error, counts = error_image(output.rgb.cpu().numpy(), view, gains=gains)
+            # the mean over the pixels around that count
+            blurred = cv2.blur(error * counts, (_BLUR, _BLUR)) / np.maximum(
+                cv2.blur(counts, (_BLUR, _BLUR)), 1e-6)
+            v, u = _pixels(splats.means[rows], view)
+            weight = statistics.blend_sum[rows].double() * torch.from_numpy(
+                counts)[v, u].to(device)
+            weights[rows] += weight
+            errors[rows] += weight * torch.from_numpy(blurred)[v, u].to(device)
+        on_view()
+    mean = float(errors.sum() / weights.sum().clamp_min(1e-12))
+    residual = torch.where(weights > 0, errors / weights.clamp_min(1e-12), mean)
+    return Support.of(
+        shown, np.reshape(centers, (-1, 3)), residual.to(splats.means.dtype), digest)
+
+
+def error_image(
+    rgb: NDArray[np.float32], view: TrainView, *, gains: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Returns the mean absolute error of each pixel, [H, W] of 0 to 1, and 1 where it counts.
+
+    `rgb` [H, W, 3] is the render; with `gains` it is compared after the best gain per channel.
+    """
+    truth = view.image.astype(np.float32) / 255
+    counts = np.ones(truth.shape[:2], np.float32) if view.mask is None else (
+        view.mask.astype(np.float32))
+    if gains:
+        weighted = rgb * counts[..., None]
+        energy = (weighted * rgb).sum((0, 1))
+        factor = (weighted * truth).sum((0, 1)) / np.maximum(energy, 1e-12)
+        rgb = rgb * np.where(energy > 0, factor, 1).astype(np.float32)
+    return np.abs(rgb.clip(0, 1) - truth).mean(-1), counts
+
+
+def _pixels(means: Tensor, view: TrainView) -> tuple[Tensor, Tensor]:
+    """Returns line and column [K] of the pixels that centres [K, 3] fall on, on the CPU."""
+    camera = view.camera
+    local = means.detach().cpu().double().numpy() @ camera.viewmat[:3, :3].T + (
+        camera.viewmat[:3, 3])
+    depth = np.maximum(local[:, 2], 1e-9)
+    u = np.floor(camera.fx * local[:, 0] / depth + camera.cx).clip(0, camera.width - 1)
+    v = np.floor(camera.fy * local[:, 1] / depth + camera.cy).clip(0, camera.height - 1)
+    return torch.from_numpy(v.astype(np.int64)), torch.from_numpy(u.astype(np.int64))

@@ -1,0 +1,72 @@
+"""How much of a room's surface is well seen: by enough views, from directions far enough apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon_cli.scene.splats import Splats
+from recon_cli.trust.support import Support
+from recon_cli.workspace.summaries import JsonRecord
+
+OPAQUE = 0.5  # opacity from which a Gaussian is a surface
+MIN_VIEWS = 3  # two views agree on much that is wrong
+MIN_SPAN_DEG = 10.0  # below, depth hangs on a fraction of a pixel
+# Median distances from the middle beyond which a surface is outside, as through a window. The
+# corner of an oblong room is two away.
+_ROOM = 3.0
+_CELL = 0.03  # median distances: some centimetres in a room
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceShares(JsonRecord):
+    """Shares of the surface that some training view shows; they add up to 1."""
+
+    well: float  # by MIN_VIEWS views or more that span MIN_SPAN_DEG or more
+    narrow: float  # by so many views, but from one direction
+    few: float  # by fewer views
+    cells: int  # of the surface
+
+
+def surface_rows(splats: Splats, support: Support) -> torch.Tensor:
+    """Returns rows [K] of the Gaussians that are the surface of the room, seen by a view."""
+    drawn = (splats.opacities >= OPAQUE) & (support.count > 0)
+    drawn &= torch.isfinite(splats.means).all(1)
+    rows = torch.nonzero(drawn)[:, 0]
+    if not len(rows):
+        return rows
+    inside = torch.from_numpy(_distances(splats, rows)[0] <= _ROOM)
+    return rows[inside.to(rows.device)]
+
+
+def _distances(splats: Splats, rows: torch.Tensor) -> tuple[NDArray[np.float64], float]:
+    """Returns the distances [K] of Gaussians from their middle over the median, and the median."""
+    means = splats.means[rows].detach().cpu().double().numpy()
+    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    median = max(float(np.median(distances)), 1e-9)
+    return distances / median, median
+
+
+def surface_shares(splats: Splats, support: Support) -> SurfaceShares:
+    """Returns the shares by area: cells of space that surfaces pass through, each counted once."""
+    rows = surface_rows(splats, support)
+    if not len(rows):
+        return SurfaceShares(well=0.0, narrow=0.0, few=0.0, cells=0)
+    means = splats.means[rows].detach().cpu().double().numpy()
+    size = _CELL * _distances(splats, rows)[1]
+    _, cell = np.unique(np.floor(means / size).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    opacity = splats.opacities[rows].detach().cpu().double().numpy()
+    several = (support.count >= MIN_VIEWS)[rows].cpu().numpy()
+    span = support.span(splats.means)[rows].cpu().numpy() >= np.radians(MIN_SPAN_DEG)
+    total = np.bincount(cell, opacity)
+
+    def share(which: NDArray[np.bool_]) -> float:
+        return float((np.bincount(cell, opacity * which) / total).mean())
+
+    return SurfaceShares(
+        well=round(share(several & span), 4), narrow=round(share(several & ~span), 4),
+        few=round(share(~several), 4), cells=len(total))

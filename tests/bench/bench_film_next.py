@@ -1,0 +1,143 @@
+"""Does filming from the suggested places help more than filming from anywhere?
+
+    python tests/bench/bench_film_next.py WORKSPACE... [--removed] [--max-size 320]
+
+A third of the training views is taken away in one stretch, the middle third by name, and with it
+the points that fewer than two of the others see. The rest is trained and suggestions are made; of
+the views taken away the one nearest to each suggestion is given back, and then as many at random,
+in several draws. Scores are those of the held-out views; with --removed, where these lie on the
+path, of every third view taken away, which is never given back. Prints one line a workspace.
+"""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401 - before pycolmap, which brings a zlib of its own
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import click
+import numpy as np
+
+from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_reference_views, load_scene, mean_psnr
+from recon_cli.machine import usable_threads
+from recon_cli.scene.covisibility import observe_points
+from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.splats import Splats
+from recon_cli.train.fit import fit
+from recon_cli.train.initialize import first_state
+from recon_cli.train.schedule import make_schedule
+from recon_cli.train.train_data import load_task
+from recon_cli.trust.assess import film_next
+from recon_cli.trust.film_next import Suggestion
+from recon_cli.trust.scene_trust import measure_trust
+from recon_cli.workspace.summaries import WorldSummary
+
+SEES = 2  # views that a point needs, as in any mapping
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture with a hole."""
+
+    scene: Scene  # without the stretch
+    taken: tuple[View, ...]  # that can be given back
+    scored: tuple[View, ...]
+    config: RunConfig
+    ctx: StageContext
+
+    def train(self, given: Sequence[View]) -> tuple[Splats, Scene]:
+        """Returns a short training with some views given back, and what it was trained on."""
+        scene = replace(self.scene, train=tuple(
+            sorted((*self.scene.train, *given), key=lambda view: view.name)))
+        sees = observe_points(scene.points, [view.camera for view in scene.train])
+        kept = np.bincount(sees.point, minlength=len(scene.points)) >= SEES
+        scene = replace(scene, points=scene.points[kept], colors=scene.colors[kept])
+        task = replace(load_task(scene, self.config, self.ctx), schedule=make_schedule(
+            self.config, None))
+        state = first_state(task, scene.points, scene.colors, most=self.config.max_gaussians // 2)
+        fit(state, task, self.config.iterations)
+        return state.splats.map(lambda tensor: tensor.detach()), scene
+
+    def psnr(self, splats: Splats) -> float:
+        """Returns the mean PSNR of the scored views."""
+        views = load_reference_views(self.scored, self.config.max_size)
+        return mean_psnr(splats, views, self.config.sh_degree, "numba", threads=self.ctx.threads)
+
+
+def nearest(suggestions: Sequence[Suggestion], views: Sequence[View], scene: Scene) -> list[View]:
+    """Returns for each suggestion the nearest view not taken yet: in place and direction.
+
+    A radian counts as the median distance of the points.
+    """
+    size, left, chosen = scene.nearness, list(views), []
+    for each in suggestions:
+        apart = [np.linalg.norm(view.camera.center - each.position) / size + np.arccos(
+            np.clip(view.camera.viewmat[2, :3] @ each.forward, -1, 1)) for view in left]
+        chosen.append(left.pop(int(np.argmin(apart))))
+    return chosen
+
+
+def open_capture(workspace: Path, max_size: int, iterations: int, *, removed: bool) -> Capture:
+    """Returns the capture of a workspace without its middle third."""
+    inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
+    scene = load_scene(inputs, validation=0.05)
+    every, third = scene.train, len(scene.train) // 3
+    stretch = every[third:2 * third]
+    names = {view.name for view in stretch}
+    low, high = min(names), max(names)
+    aside = stretch[1::3] if removed else ()
+    config = RunConfig(iterations=iterations, max_size=max_size, max_gaussians=30_000, sh_degree=1,
+                       images="original", far="off", exposure="off", poses="off")
+    return Capture(
+        replace(scene, train=tuple(view for view in every if view.name not in names),
+                # a validation view in the stretch would show what is missing
+                validation=tuple(view for view in scene.validation
+                                 if not low <= view.name <= high)),
+        tuple(view for view in stretch if view not in aside), aside or scene.test, config,
+        StageContext(backend="numba", threads=usable_threads()))
+
+
+@click.command()
+@click.argument("workspaces", nargs=-1, required=True,
+                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--removed", is_flag=True, help="Score views of the stretch.")
+@click.option("--max-size", default=320, show_default=True, help="Longest side in pixels.")
+@click.option("--iterations", default=1000, show_default=True, help="Steps of each training.")
+@click.option("--draws", default=5, show_default=True, help="Random choices.")
+def main(
+    workspaces: Sequence[Path], removed: bool, max_size: int, iterations: int, draws: int
+) -> None:
+    """Print PSNR with the nearest views to the suggestions, and with random ones."""
+    click.echo("| workspace | scored views | with a third missing | + suggested | + random | draws "
+               "| gain |\n|---|---:|---:|---:|---:|---|---:|")
+    details = []
+    for workspace in workspaces:
+        capture = open_capture(workspace, max_size, iterations, removed=removed)
+        splats, scene = capture.train(())
+        trust = measure_trust(splats, scene, capture.config, max_size, capture.ctx)
+        suggestions, why = film_next(
+            splats, trust, scene, WorldSummary.read(workspace / "sfm"), capture.ctx)
+        if not suggestions:
+            click.echo(f"| {workspace.name} | {why} | | | | | |")
+            continue
+        without = capture.psnr(splats)
+        chosen = nearest(suggestions, capture.taken, scene)
+        details += [f"{workspace.name}: {each.describe('units')} -> {view.name}"
+                    for each, view in zip(suggestions, chosen, strict=True)]
+        with_chosen = capture.psnr(capture.train(chosen)[0])
+        rng, scores = np.random.default_rng(0), []
+        for _ in range(draws):
+            rows = rng.choice(len(capture.taken), len(chosen), replace=False)
+            scores.append(capture.psnr(capture.train([capture.taken[row] for row in rows])[0]))
+        click.echo(
+            f"| {workspace.name} | {len(capture.scored)} | {without:.2f} | {with_chosen:.2f} | "
+            f"{np.mean(scores):.2f} | {' '.join(f'{score:.2f}' for score in scores)} | "
+            f"{with_chosen - np.mean(scores):+.2f} |")
+    click.echo("\n".join(["", *details]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""How well the expected error agrees with the real one on held-out views, and what it costs.
+
+    python tests/bench/bench_trust.py WORKSPACE...
+
+AUSE is the area to the oracle's sparsification curve, of absolute errors over the mean of a view;
+the last two AUSE columns say how low it can get: by the mean of the real errors in 5x5 pixels, and
+by chance. Held-out views calibrate nothing. The cost is the processor time of the pass over the
+training views and of the calibration, over that of the training; `recon eval` takes it, and
+training none.
+"""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401 - before pycolmap, which brings a zlib of its own
+from collections.abc import Sequence
+from pathlib import Path
+from time import process_time
+
+import click
+import cv2
+import numpy as np
+
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import ReferenceView, load_reference_views, load_scene
+from recon_cli.io.ply import read_ply
+from recon_cli.machine import usable_threads
+from recon_cli.scene.splats import Splats
+from recon_cli.train.runner import LOG, seconds_at
+from recon_cli.train.train_data import read_config
+from recon_cli.trust.agreement import ause
+from recon_cli.trust.error_model import picture_terms
+from recon_cli.trust.scene_trust import Trust, measure_trust, model_trust
+from recon_cli.trust.support import error_image
+
+
+def bounds(splats: Splats, trust: Trust, views: Sequence[ReferenceView]) -> tuple[float, float]:
+    """Returns the AUSE of the real error's local mean, and of a random order."""
+    rng, areas = np.random.default_rng(0), []
+    for view in views:
+        picture = picture_terms(splats, trust.support, view.camera, sh_degree=trust.sh_degree,
+                                backend="numba")
+        error = error_image(picture.rgb, view, gains=False)[0]
+        flat = error.ravel().astype(np.float64)
+        areas.append((ause(flat, cv2.blur(error, (5, 5)).ravel()),
+                      ause(flat, rng.random(len(flat)))))
+    low, high = np.mean(areas, axis=0)
+    return float(low), float(high)
+
+
+@click.command()
+@click.argument("workspaces", nargs=-1, required=True,
+                type=click.Path(exists=True, file_okay=False, path_type=Path))
+def main(workspaces: Sequence[Path]) -> None:
+    """Print AUSE, reliability, the surface's shares and the cost of each workspace."""
+    plots = []
+    click.echo("| workspace | views | AUSE | opacity | depth | 5x5 means | random | gap of bins | "
+               f"well seen | few | CPU s | of training |\n|---|{'---:|' * 11}")
+    for workspace in workspaces:
+        inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm", "train")})
+        config = read_config(workspace / "train")
+        scene = load_scene(inputs, validation=config.validation)
+        splats = read_ply(workspace / "train" / "splats.ply")
+        ctx = StageContext(backend="numba", threads=usable_threads())
+        start = process_time()
+        trust = measure_trust(splats, scene, config, config.max_size, ctx)
+        took = process_time() - start
+        views = load_reference_views(scene.test, config.max_size, ctx)
+        row = model_trust(trust, splats, views, gains=config.exposure == "on", backend="numba")
+        agreement, (low, high) = row.agreement, bounds(splats, trust, views)
+        assert agreement is not None
+        trained = seconds_at(workspace / "train" / LOG, 1 << 62, clock="cpu_seconds")
+        click.echo(
+            f"| {workspace.name} | {agreement.views} | {agreement.ause:.3f} | "
+            f"{agreement.ause_opacity:.3f} | {agreement.ause_depth:.3f} | {low:.3f} | {high:.3f} | "
+            f"{agreement.gap:.0%} | {row.surface.well:.0%} | {row.surface.few:.0%} | {took:.1f} | "
+            f"{took / max(trained, 1e-9):.1%} |")
+        plots.append(f"\n{workspace.name}: bias {trust.error.bias:.2f}, weights "
+                     f"{ {k: round(v, 2) for k, v in trust.error.weights.items()} }\n" + "\n".join(
+            f"  expected {expected:.4f} real {real:.4f} ratio {expected / real:.2f}"
+            for expected, real in zip(agreement.expected, agreement.real, strict=True)))
+    click.echo("\n".join(plots))
+
+
+if __name__ == "__main__":
+    main()
