@@ -49,6 +49,7 @@ def view(
     workspace = _workspace(call, item)
     if item is not None and workspace is None and model != "auto":
         raise click.UsageError("--model has no effect on a file.")
+    trust = None
     if workspace is None:
         content, photos = load("recon_cli.viewer.content.load_file")(item), None
     else:
@@ -56,9 +57,11 @@ def view(
         job = open_job(call)
         content = load("recon_cli.viewer.content.load_workspace")(job, model)
         photos = load("recon_cli.viewer.content.PhotoPairs")(job, content.max_size)
+        # an import without views has no trust
+        trust = load("recon_cli.viewer.trust_tint.TrustTint")(job) if content.views else None
     serve_scene = load("recon_cli.viewer.server.serve_scene")
     try:
-        with serve_scene(content, photos, host, port) as (_, address):
+        with serve_scene(content, photos, host, port, trust) as (_, address):
             click.echo(f"The scene is at {address} (Ctrl-C ends it)")
             if _at_a_desktop() if opening is None else opening:
                 webbrowser.open(address)

@@ -355,6 +355,9 @@ class ExportConfig(StageConfig):
     max_mb: float | None = option(
         None, "Maximum size of the first format; degree and number of Gaussians are reduced by "
         "validation PSNR.", unit="MB", minimum=0.0, automatic="no limit")
+    trust: bool = option(
+        False, "Add the property `expected_error` to the .ply: the error (0 to 1) to expect of a "
+        "Gaussian from where it is seen best.")
     format: str = option(
         "ply", "Formats besides the .ply, with commas between or repeated: "
         f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...", repeatable=True)

@@ -60,8 +60,15 @@ _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 logger = logging.getLogger("recon")
 
 
-def write_ply(path: Path, splats: Splats) -> None:
-    """Writes `splats` to `path`, whole or not at all."""
+def write_ply(
+    path: Path, splats: Splats, extra: Mapping[str, NDArray[np.float32]] | None = None
+) -> None:
+    """Writes `splats` to `path`, whole or not at all.
+
+    `extra` are further properties [N] by name, after all others; readers that do not know them
+    skip them.
+    """
+    extra = extra or {}
     n = len(splats)
     if not len(splats.sh_rest):
         splats = splats.with_degree(0)
@@ -72,9 +79,10 @@ def write_ply(path: Path, splats: Splats) -> None:
         "sh_rest": with_rows(raw["sh_rest"], n).transpose(1, 2).reshape(n, len(rest)),
         "logit_opacities": raw["logit_opacities"][:, None],
     }
-    table = torch.cat([columns[name] for name in _GROUPS], dim=1).numpy()
+    table = np.column_stack([
+        torch.cat([columns[name] for name in _GROUPS], dim=1).numpy(), *extra.values()])
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(n, splats.sh_degree))
+        file.write(_header(n, splats.sh_degree, tuple(extra)))
         file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
 
 
@@ -83,8 +91,9 @@ def _properties(sh_degree: int) -> list[str]:
     return [name for group in (_GROUPS | {"sh_rest": rest}).values() for name in group]
 
 
-def _header(n: int, sh_degree: int) -> bytes:
-    return format_header({"vertex": (n, [f"float {name}" for name in _properties(sh_degree)])})
+def _header(n: int, sh_degree: int, extra: Sequence[str] = ()) -> bytes:
+    names = (*_properties(sh_degree), *extra)
+    return format_header({"vertex": (n, [f"float {name}" for name in names])})
 
 
 def format_header(elements: Mapping[str, tuple[int, Sequence[str]]]) -> bytes:

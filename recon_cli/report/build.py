@@ -37,6 +37,7 @@ from recon_cli.report.stage_status import (
     read_decisions,
     read_provenance,
 )
+from recon_cli.report.trust_section import read_trust
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 from recon_cli.workspace.summaries import ExportSummary
@@ -118,6 +119,7 @@ def _template_values(
         "name": root.resolve().name, "stages": stages,
         "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"),
         "headline": build_headline(stages, metrics), "capture": read_capture(stages),
+        "trust": read_trust(stages),
         "curves": draw_training_curves(stages, metrics),
         "decisions": read_decisions(stages["train"]), "damaged": damaged,
         "scores": build_scores(metrics) if metrics and metrics.models else None,

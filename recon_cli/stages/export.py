@@ -9,15 +9,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from recon_cli.config.stages import MESH_FORMATS, PLAN, ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import StageError
+from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
 from recon_cli.export.exporter import Exporter
 from recon_cli.export.verify import verify_ply
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
-from recon_cli.scene.splats import transformed
+from recon_cli.scene.splats import Splats, transformed
+from recon_cli.train.train_data import read_config
+from recon_cli.trust.ply_property import PLY_PROPERTY, expected_errors, match_rows
+from recon_cli.trust.scene_trust import measure_trust, refuse_without, views_looked_at
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import ExportSummary
 
@@ -37,6 +44,7 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     if PLAN in config.formats:
         find_room_frame(inputs, frame)  # refused before anything is written
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
+    trained = splats
     if not frame.similarity.is_identity:
         splats = transformed(splats, frame.similarity)
     exporter = Exporter(config, inputs, out, frame, ctx)
@@ -44,7 +52,7 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     path = out / "splats.ply"
     others = [name for name in config.formats if name != "ply"]
     with ctx.progress.bar("export", 2 + len(others), unit="file") as bar:
-        write_ply(path, splats)
+        write_ply(path, splats, _expected_errors(config, inputs, frame, splats, trained, ctx))
         bar.advance()
         verify_ply(path, splats)
         bar.advance()
@@ -57,6 +65,24 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         model="pruned" if pruned else "base", file=path.name, gaussians=len(splats),
         bytes=path.stat().st_size, transform=frame.similarity.to_json(),
         changes=tuple(changes) or None, files=files or None)
+
+
+def _expected_errors(
+    config: ExportConfig, inputs: StageInputs, frame: ExportFrame, splats: Splats, trained: Splats,
+    ctx: StageContext,
+) -> dict[str, NDArray[np.float32]]:
+    """Returns the properties that --trust adds to the .ply of `splats`; `trained` are all."""
+    if not config.trust:
+        return {}
+    refuse_without(ImportRecord.read(inputs.folders["train"]))
+    run_config = read_config(inputs.folders["train"])
+    scene = load_scene(inputs, validation=run_config.validation)
+    with ctx.progress.bar("trust", views_looked_at(scene), unit="view") as bar:
+        errors = expected_errors(trained, measure_trust(
+            trained.map(lambda tensor: tensor.to(ctx.device)), scene, run_config,
+            run_config.max_size, ctx, bar.advance))
+    rows = match_rows(splats.means, frame.similarity.points(trained.means.double().numpy()))
+    return {PLY_PROPERTY: errors[rows]}
 
 
 def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:

@@ -30,7 +30,7 @@ from recon_cli.trust.scene_trust import (
     views_looked_at,
     why_none,
 )
-from recon_cli.trust.standing_places import find_places
+from recon_cli.trust.standing_places import StandingPlaces, find_places
 from recon_cli.workspace.summaries import WorldSummary
 
 
@@ -95,6 +95,19 @@ def film_next(
     splats: Splats, trust: Trust, scene: Scene, world: WorldSummary | None, ctx: StageContext
 ) -> tuple[list[Suggestion], str]:
     """Returns where to film next, or none and why."""
+    places, reason = standing_places(splats, trust, scene, world)
+    if places is None:
+        return [], reason
+    suggestions = suggest(splats, trust.support, trust.error, places,
+                          (*scene.train, *scene.validation), backend=ctx.backend)
+    return suggestions, "" if suggestions else (
+        "no place is suggested, as every free one looks at something too near")
+
+
+def standing_places(
+    splats: Splats, trust: Trust, scene: Scene, world: WorldSummary | None
+) -> tuple[StandingPlaces | None, str]:
+    """Returns where somebody could stand, or None and why."""
     views = (*scene.train, *scene.validation)
     gravity = find_gravity(scene.points, np.stack([view.camera.viewmat for view in views]))
     up, floor = gravity.up, gravity.floor.height if gravity.floor else None
@@ -102,11 +115,9 @@ def film_next(
         up = np.array([0.0, 0.0, 1.0])
         floor = 0.0 if world.evidence.floor_found else floor
     if up is None:
-        return [], f"no place is suggested, as up is not known: {gravity.reason}"
+        return None, f"no place is suggested, as up is not known: {gravity.reason}"
     cameras = np.stack([view.camera.center for view in views])
     places = find_places(splats, trust.support, up, floor, cameras, most=MAX_PLACES)
     if not len(places.eyes):
-        return [], "no place is suggested, as no free standing place was found near the cameras"
-    suggestions = suggest(splats, trust.support, trust.error, places, views, backend=ctx.backend)
-    return suggestions, "" if suggestions else (
-        "no place is suggested, as every free one looks at something too near")
+        return None, "no place is suggested, as no free standing place was found near the cameras"
+    return places, ""

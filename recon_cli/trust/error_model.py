@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,6 +72,18 @@ class ErrorModel(JsonRecord):
         means = {name: np.full(1, value, np.float32) for name, value in self.means.items()}
         return self.expect(means | gaussian_terms(support, sight))
 
+    def expect_seen(
+        self, count: Array, angle: Array, residual: Array, nearer: Array
+    ) -> Array:
+        """Returns the expected error of Gaussians, arrays that fit together by broadcasting.
+
+        `count` views show each, the nearest ray `angle` away in rad; `nearer` as in `Sight`.
+        """
+        terms = {name: np.full(1, value) for name, value in self.means.items()}
+        terms.update(_shape_terms(1 / (1 + count), angle, residual, nearer))
+        log = sum(self.weights[name] * terms[name] for name in TERMS) + self.bias
+        return np.asarray(np.exp(np.minimum(log, 0)), np.float64)
+
     def expect_hole(self) -> float:
         """Returns the expected error where nothing is drawn."""
         values = {**self.means, "hole": 1.0, "few": 0.0, "angle": float(np.log1p(np.pi / _ANGLE))}
@@ -86,9 +99,8 @@ def gaussian_terms(support: Support, sight: Sight) -> dict[str, NDArray[np.float
 
 
 def _shape_terms(
-    few: NDArray[np.float32], angle: NDArray[np.float32], residual: NDArray[np.float32],
-    nearer: NDArray[np.float32],
-) -> dict[str, NDArray[np.float32]]:
+    few: NDArray[Any], angle: NDArray[Any], residual: NDArray[Any], nearer: NDArray[Any]
+) -> dict[str, NDArray[Any]]:
     return {"few": np.log(few.clip(0) + _SHARE), "angle": np.log1p(angle.clip(0) / _ANGLE),
             "residual": np.log(residual.clip(0) + _ERROR), "nearer": nearer.clip(0)}
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial import cKDTree
 
@@ -23,6 +24,7 @@ _FAR = 2.5  # eye heights from the nearest camera; farther is guessed, or beyond
 _RAYS = 1_500  # a view, at most
 _STEPS = 48  # along a ray
 _SHORT = 0.92  # of a ray that counts as free: its end is a surface
+_CLEAR = 3  # cells to what stands in the way: half a metre, as somebody with a camera keeps
 _LEAST_RAYS = 3  # through a free cell
 _LEAST_SOLID = 2.0  # sum of the opacities of an obstacle in one cell
 _LOWEST = 0.02  # share of the surface that may lie under a floor that was not found
@@ -67,7 +69,7 @@ def find_places(
         surface) else np.zeros_like(free)
     own = grid.count(cameras @ axes.T) > 0
     # where a camera was somebody stood, whatever floats there
-    good = (free & ~binary_dilation(blocked)) | own
+    good = (free & ~binary_dilation(blocked, iterations=_CLEAR)) | own
     parts, _ = label(good, np.ones((3, 3)))
     good &= np.isin(parts, np.unique(parts[own & good]))
     flat = grid.centers(good)
@@ -130,12 +132,9 @@ def _carve(
 
 
 def _spread(places: Array, most: int) -> Array:
-    """Returns at most so many of `places` [K, 2], each the farthest from those before it."""
+    """Returns at most so many of `places` [K, 2], each in the middle of an equal share of them."""
     if len(places) <= most:
         return places
-    chosen = [int(np.argmin(np.linalg.norm(places - places.mean(0), axis=1)))]
-    distance = np.linalg.norm(places - places[chosen[0]], axis=1)
-    while len(chosen) < most:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    return places[chosen]
+    middles, _ = kmeans2(places, most, minit="++", rng=np.random.default_rng(0))
+    nearest = np.unique(cKDTree(places).query(middles)[1])  # where the middle itself is not free
+    return np.asarray(places[nearest])

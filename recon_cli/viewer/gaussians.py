@@ -63,12 +63,18 @@ def pack_splats(splats: Splats) -> PackedSplats:
 
 
 def _drop_non_finite(splats: Splats) -> Splats:
+    good = finite_rows(splats)
+    return splats if bool(good.all()) else splats.select(good)
+
+
+def finite_rows(splats: Splats) -> torch.Tensor:
+    """Returns which Gaussians are finite, and so are sent, [N] bool."""
     good = torch.ones(len(splats), dtype=torch.bool)
     for value in splats.parameters().values():
         finite = torch.isfinite(value)
         rows = finite[:, None] if value.ndim == 1 else finite.flatten(1)
         good[:len(value)] &= rows.all(dim=1)  # sh_rest may have fewer
-    return splats if bool(good.all()) else splats.select(good)
+    return good
 
 
 def _eight_bit(values: NDArray[np.floating]) -> NDArray[np.uint8]:

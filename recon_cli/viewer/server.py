@@ -17,6 +17,7 @@ import viser
 from recon_cli.errors import ConfigError
 from recon_cli.viewer.content import PhotoPairs, ViewerContent, set_initial_camera
 from recon_cli.viewer.session import UPS, Session
+from recon_cli.viewer.trust_tint import TrustTint
 
 HOST, PORT = "127.0.0.1", 8080
 _TRIED = 100  # ports after the first, if none is given
@@ -116,11 +117,13 @@ def _address(host: str, port: int) -> str:
 
 @contextmanager
 def serve_scene(
-    content: ViewerContent, photos: PhotoPairs | None, host: str, port: int | None
+    content: ViewerContent, photos: PhotoPairs | None, host: str, port: int | None,
+    trust: TrustTint | None = None,
 ) -> Iterator[tuple[Server, str]]:
     """Yields a server that shows a scene to every browser, and its address.
 
-    `photos` are of its views, None without views; the errors are those of `start_server`.
+    `photos` are of its views and `trust` tints it, both None without views; the errors are those of
+    `start_server`.
     """
     sessions: dict[int, Session] = {}
     with start_server(host, port, label="recon") as (server, address):
@@ -130,7 +133,7 @@ def serve_scene(
         set_initial_camera(server, content.start)
 
         def connect(client: viser.ClientHandle) -> None:
-            sessions[client.client_id] = Session(client, content, photos, work)
+            sessions[client.client_id] = Session(client, content, photos, work, trust)
 
         def disconnect(client: viser.ClientHandle) -> None:
             session = sessions.pop(client.client_id, None)

@@ -27,6 +27,7 @@ from recon_cli.viewer.content import (
 )
 from recon_cli.viewer.gaussians import PackedSplats
 from recon_cli.viewer.measure_panel import MeasurePanel
+from recon_cli.viewer.trust_tint import TrustTint
 
 _FRUSTUM_SIZE = 0.03  # of the distance to what is looked at
 _HELD_OUT_COLOR, _FRUSTUM_COLOR = (255, 140, 40), (150, 170, 200)
@@ -43,13 +44,15 @@ logger = logging.getLogger("recon")
 class Session:
     """Shows the content in one browser, from its connection until it leaves.
 
-    `photos` are of the views, None without views; `work` runs slow tasks one at a time.
+    `photos` are of the views and `trust` tints, both None without views; `work` runs slow tasks one
+    at a time.
     """
 
     def __init__(
         self, client: viser.ClientHandle, content: ViewerContent, photos: PhotoPairs | None,
-        work: Executor,
+        work: Executor, trust: TrustTint | None = None,
     ) -> None:
+        self._trust, self._tinted = trust, False
         self._client, self._content, self._photos, self._work = client, content, photos, work
         self._lock = threading.RLock()
         self._gone = False
@@ -65,7 +68,8 @@ class Session:
         with client.atomic():
             self._node = self._add_gaussians()
             self._add_panel()
-        if any(packed.splats.sh_degree for packed in content.models.values()):
+        if trust is not None or any(
+                packed.splats.sh_degree for packed in content.models.values()):
             client.camera.on_update(self._on_move)
 
     def leave(self) -> None:
@@ -81,7 +85,15 @@ class Session:
         self._seen_from = np.asarray(self._client.camera.position)
         return self._client.scene.add_gaussian_splats(
             "/gaussians", packed.centers, packed.covariances,
-            packed.colors(self._seen_from.tolist()), packed.opacities, scale=packed.scale)
+            self._colors(self._seen_from.tolist()), packed.opacities, scale=packed.scale)
+
+    def _colors(self, position: list[float]) -> NDArray[np.uint8]:
+        """Returns the colours [N, 3] as seen from a place, tinted if that is on."""
+        packed = self._packed
+        colors = packed.colors(position)
+        if self._trust is None or not self._tinted:
+            return colors
+        return self._trust.colors(self._model, packed, colors, position)
 
     def _add_panel(self) -> None:
         gui = self._client.gui
@@ -95,6 +107,11 @@ class Session:
             up.on_update(lambda _: self._client.scene.set_up_direction(UPS[up.value]))
         if self._photos is not None:
             self._add_views()
+        if self._trust is not None:
+            self._tint = gui.add_checkbox(
+                "Trust", False, hint="Tints the scene by the error to expect from where you stand: "
+                "blue is trusted, red is invented.")
+            self._tint.on_update(lambda _: self._set_tint())
         self._add_crop()
         self._measure = MeasurePanel(
             self._client, lambda: self._packed.splats, self._content.distance,
@@ -144,9 +161,27 @@ class Session:
         total = len(self._packed.splats)
         return f"**{len(self._rows):,}** of {total:,} Gaussians ({self._model})"
 
+    def _set_tint(self) -> None:
+        """Turns the tint on once the trust of the model is known, or off."""
+        wanted, trust, model = self._tint.value, self._trust, self._model
+        assert trust is not None
+
+        def show() -> None:
+            if wanted:
+                trust.prepare(model)
+            with self._lock:
+                if self._tint.value == wanted and self._model == model:
+                    self._tinted = wanted
+                    self._refresh()
+
+        self._submit(show)
+
     def _set_model(self, name: str) -> None:
         with self._lock:
             self._model = name
+            if self._tinted:
+                self._tinted = False  # until that of the other model is known
+                self._set_tint()
             self._refresh()
             if self._current is not None:
                 self._compare(self._current)
@@ -167,7 +202,7 @@ class Session:
         else:
             self._rows = np.arange(len(packed.splats))
         self._seen_from = np.asarray(self._client.camera.position)
-        colors = packed.colors(self._seen_from.tolist())
+        colors = self._colors(self._seen_from.tolist())
         rows = self._rows
         with self._client.atomic():
             self._node.visible = len(rows) > 0
@@ -193,7 +228,7 @@ class Session:
                 np.linalg.norm(position - self._seen_from) > _MOVED * self._content.distance)
             if far and len(self._rows):
                 self._seen_from = position
-                self._node.rgbs = self._packed.colors(position.tolist())[self._rows]
+                self._node.rgbs = self._colors(position.tolist())[self._rows]
 
     def _on_select(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
         if event.client is not None:  # the user, not the list that follows a jump

@@ -5,8 +5,9 @@
 A third of the training views is taken away in one stretch, the middle third by name, and with it
 the points that fewer than two of the others see. The rest is trained and suggestions are made; of
 the views taken away the one nearest to each suggestion is given back, and then as many at random,
-in several draws. Scores are those of the held-out views; with --removed, where these lie on the
-path, of every third view taken away, which is never given back. Prints one line a workspace.
+in several draws; last those that the score of the suggestions would choose among them. Scores are
+those of the held-out views; with --removed, where these lie on the path, of every third view taken
+away, which is never given back. Prints one line a workspace.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.schedule import make_schedule
 from recon_cli.train.train_data import load_task
-from recon_cli.trust.assess import film_next
-from recon_cli.trust.film_next import Suggestion
-from recon_cli.trust.scene_trust import measure_trust
+from recon_cli.trust.assess import film_next, standing_places
+from recon_cli.trust.film_next import Suggestion, choose_views
+from recon_cli.trust.scene_trust import Trust, measure_trust
 from recon_cli.workspace.summaries import WorldSummary
 
 SEES = 2  # views that a point needs, as in any mapping
@@ -80,6 +81,17 @@ def nearest(suggestions: Sequence[Suggestion], views: Sequence[View], scene: Sce
     return chosen
 
 
+def best_views(
+    splats: Splats, trust: Trust, scene: Scene, workspace: Path, capture: Capture, count: int
+) -> list[View]:
+    """Returns the views taken away that the score itself would choose."""
+    places, why = standing_places(splats, trust, scene, WorldSummary.read(workspace / "sfm"))
+    assert places is not None, why
+    rows = choose_views(splats, trust.support, trust.error, places, [
+        view.camera for view in capture.taken], count, backend="numba")
+    return [capture.taken[row] for row in rows]
+
+
 def open_capture(workspace: Path, max_size: int, iterations: int, *, removed: bool) -> Capture:
     """Returns the capture of a workspace without its middle third."""
     inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
@@ -112,7 +124,7 @@ def main(
 ) -> None:
     """Print PSNR with the nearest views to the suggestions, and with random ones."""
     click.echo("| workspace | scored views | with a third missing | + suggested | + random | draws "
-               "| gain |\n|---|---:|---:|---:|---:|---|---:|")
+               "| gain | + by score |\n|---|---:|---:|---:|---:|---|---:|---:|")
     details = []
     for workspace in workspaces:
         capture = open_capture(workspace, max_size, iterations, removed=removed)
@@ -121,13 +133,15 @@ def main(
         suggestions, why = film_next(
             splats, trust, scene, WorldSummary.read(workspace / "sfm"), capture.ctx)
         if not suggestions:
-            click.echo(f"| {workspace.name} | {why} | | | | | |")
+            click.echo(f"| {workspace.name} | {why} | | | | | | |")
             continue
         without = capture.psnr(splats)
         chosen = nearest(suggestions, capture.taken, scene)
         details += [f"{workspace.name}: {each.describe('units')} -> {view.name}"
                     for each, view in zip(suggestions, chosen, strict=True)]
         with_chosen = capture.psnr(capture.train(chosen)[0])
+        by_score = capture.psnr(capture.train(best_views(
+            splats, trust, scene, workspace, capture, len(chosen)))[0])
         rng, scores = np.random.default_rng(0), []
         for _ in range(draws):
             rows = rng.choice(len(capture.taken), len(chosen), replace=False)
@@ -135,7 +149,7 @@ def main(
         click.echo(
             f"| {workspace.name} | {len(capture.scored)} | {without:.2f} | {with_chosen:.2f} | "
             f"{np.mean(scores):.2f} | {' '.join(f'{score:.2f}' for score in scores)} | "
-            f"{with_chosen - np.mean(scores):+.2f} |")
+            f"{with_chosen - np.mean(scores):+.2f} | {by_score:.2f} |")
     click.echo("\n".join(["", *details]))
 
 

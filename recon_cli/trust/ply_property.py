@@ -1,0 +1,35 @@
+"""Trust as a property of each Gaussian in a .ply: one number, whatever it is seen from."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from recon_cli.scene.splats import Splats
+from recon_cli.trust.scene_trust import Trust
+from recon_cli.trust.support import Sight
+
+PLY_PROPERTY = "expected_error"
+
+
+def expected_errors(splats: Splats, trust: Trust) -> NDArray[np.float32]:
+    """Returns the expected error [N], 0 to 1, of Gaussians as seen from where a view showed them.
+
+    Those that no view shows are as if seen from the opposite side.
+    """
+    unseen = trust.support.count == 0
+    angle = torch.where(unseen, torch.pi, 0.0).to(splats.means.dtype)
+    sight = Sight(angle.to(trust.support.residual.device),
+                  torch.zeros_like(trust.support.residual))
+    return trust.error.expect_gaussians(trust.support, sight)
+
+
+def match_rows(means: Tensor, originals: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns for each of `means` [K, 3] the row of the nearest original [N, 3], [K].
+
+    What export removes, orders or moves leaves the centres of the rest in place.
+    """
+    return np.asarray(cKDTree(originals).query(means.detach().cpu().double().numpy())[1], np.int64)

@@ -1,0 +1,67 @@
+"""`recon export --trust`: the expected error of each Gaussian in the .ply."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tiny_stages import CONTEXT
+
+from recon_cli.config.stages import ExportConfig
+from recon_cli.errors import StageError
+from recon_cli.io.ply import read_header, read_ply, read_tables
+from recon_cli.io.records import ImportRecord
+from recon_cli.stages import export
+from recon_cli.trust.ply_property import PLY_PROPERTY, match_rows
+
+
+@pytest.fixture
+def inputs(tiny_learnt):
+    """A short training of the tiny scene, with harmonics."""
+    return tiny_learnt
+
+
+def exported(inputs, out, **options):
+    out.mkdir()
+    export.run(ExportConfig(**options), inputs, out, CONTEXT)
+    return read_tables(read_header(out / "splats.ply"))["vertex"]
+
+
+def test_the_property_comes_last_and_stays_with_its_gaussian(inputs, tmp_path):
+    plain = exported(inputs, tmp_path / "plain")
+    table = exported(inputs, tmp_path / "with", trust=True)
+    assert table.dtype.names == (*plain.dtype.names, PLY_PROPERTY)
+    errors = table[PLY_PROPERTY]
+    assert ((errors > 0) & (errors <= 1)).all()
+    assert len(np.unique(errors)) > len(errors) // 2
+    back = read_ply(tmp_path / "with" / "splats.ply")  # as others read it
+    assert torch.equal(back.means, read_ply(tmp_path / "plain" / "splats.ply").means)
+    middle = float(np.median(table["x"]))
+    moved = exported(
+        inputs, tmp_path / "moved", trust=True, crop=(-1e3, -1e3, -1e3, 2 * middle, 1e3, 1e3),
+        transform=(2.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    np.testing.assert_allclose(moved[PLY_PROPERTY], errors[table["x"] <= middle], rtol=1e-5)
+
+
+def test_other_properties_are_the_same_to_the_bit(inputs, tmp_path):
+    plain = exported(inputs, tmp_path / "plain")
+    table = exported(inputs, tmp_path / "with", trust=True)
+    for name in plain.dtype.names:
+        np.testing.assert_array_equal(table[name], plain[name])
+
+
+def test_a_scene_without_views_has_no_property_and_says_why(inputs, tmp_path):
+    train = inputs.folders["train"]
+    record = train / "import.json"
+    ImportRecord("room.ply", "ply", "0", 1, 0, z_up=True, views=False).write(train)
+    try:
+        with pytest.raises(StageError, match="imported without views"):
+            exported(inputs, tmp_path / "out", trust=True)
+    finally:
+        record.unlink()
+
+
+def test_rows_are_found_again_whatever_was_left_out():
+    means = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    rows = torch.tensor([40, 3, 17])
+    assert match_rows(means[rows], means.double().numpy()).tolist() == rows.tolist()
