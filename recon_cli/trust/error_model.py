@@ -37,7 +37,7 @@ TERMS = tuple(PRIOR)
 # .001 to 10; the reliability gap of two rooms is least from .1 to .3.
 _RIDGE = 0.1
 _MAX_WEIGHT = 6.0
-_PIXELS = 200_000  # that the fit looks at
+_PIXELS = 60_000  # that the fit looks at
 _COVERED = 1e-3  # alpha below which a pixel shows nothing
 _ANGLE = 0.05  # rad; smaller ones count alike, as one step of a walk
 _SPREAD = 0.02  # of the depth, and of the intensity: smaller spreads along a ray count alike

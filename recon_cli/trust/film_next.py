@@ -165,12 +165,13 @@ class _Walk:
             origins[each.origin] = each.camera.center
         weights /= kept[rows]
         sample = torch.from_numpy(rows).to(splats.means.device)
-        means = splats.means[sample].detach().cpu().double().numpy()
+        support = support.select(sample).thinned(_VIEWS)
+        on_device = splats.means[sample].detach()
+        means = on_device.cpu().double().numpy()
         rays, distance = _rays(places.eyes, means)
-        support = support.thinned(_VIEWS)
-        sights = [support.seen_from(splats.means, eye) for eye in places.eyes]
+        sights = [support.seen_from(on_device, eye) for eye in places.eyes]
         angle, nearer = (
-            np.stack([getattr(sight, name)[sample].cpu().double().numpy() for sight in sights])
+            np.stack([getattr(sight, name).cpu().double().numpy() for sight in sights])
             for name in ("angle", "nearer"))
         nearest = np.where(angle > np.pi - 1e-3, np.inf, distance * np.exp(nearer))
         centers = np.stack([each.camera.center for each in candidates])
@@ -178,8 +179,8 @@ class _Walk:
         forward = np.stack([each.camera.viewmat[2, :3] for each in candidates])
         return _Walk(
             model, candidates, rows, weights, shown, rays, distance, *_rays(origins, means), angle,
-            nearest, support.count[sample].cpu().double().numpy(),
-            support.residual[sample].cpu().double().numpy(),
+            nearest, support.count.cpu().double().numpy(),
+            support.residual.cpu().double().numpy(),
             (means @ places.up - places.floor) / places.eye,
             np.array([each.hole for each in candidates]),
             np.exp(-apart**2) * np.maximum(forward @ forward.T, 0))

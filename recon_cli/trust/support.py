@@ -99,6 +99,14 @@ class Support:
         return Support((*self.rows, rows), np.vstack([self.centers, center]), self.residual, count,
                        self.digest)
 
+    def select(self, rows: Tensor) -> Support:
+        """Returns the support of the Gaussians at `rows` [K], in that order."""
+        at = torch.full((len(self.residual),), -1, dtype=torch.int64, device=rows.device)
+        at[rows] = torch.arange(len(rows), device=rows.device)
+        shown = (at[view] for view in self.rows)
+        return Support(tuple(view[view >= 0] for view in shown), self.centers, self.residual[rows],
+                       self.count[rows])
+
     def thinned(self, most: int) -> Support:
         """Returns the rays of at most so many of the views, evenly spread; counts stay."""
         step = max(1, -(-len(self.rows) // most))
