@@ -366,9 +366,10 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
         assert job.tracks is not None
         skeleton.link(job, source.database, usable, Tracks.read(job.tracks))
     model = mapper.triangulate(job, _posed(job, joined))
+    if model.num_reg_images() < len(job.names):
+        return mapper.extend_model(job, model)  # which adjusts as much as `refine` does
     mapper.refine(job, model)
-    held = model.num_reg_images()
-    return mapper.extend_model(job, model) if held < len(job.names) else model
+    return model
 
 
 def read_refused(job: MappingJob) -> list[str]:
