@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,6 @@ from recon_cli.trust.film_next import MAX_PLACES, Suggestion, suggest
 from recon_cli.trust.heat_map import heat_colors
 from recon_cli.trust.scene_trust import (
     FOLDER,
-    ModelTrust,
     Trust,
     TrustRecord,
     measure_trust,
@@ -38,7 +37,8 @@ from recon_cli.workspace.summaries import WorldSummary
 class TrustTask:
     """What is assessed, and on which views."""
 
-    models: Mapping[str, Path]  # folders by the names of models
+    model: str  # base, or pruned where that is what export takes
+    folder: Path  # of its stage
     config: RunConfig  # of the training
     scene: Scene
     held_out: Sequence[ReferenceView]
@@ -57,22 +57,17 @@ def assess(task: TrustTask, out: Path, ctx: StageContext) -> TrustRecord:
         record.write(out)
         return record
     views = views_looked_at(task.scene) + len(task.held_out)
-    trusts: dict[str, ModelTrust] = {}
-    suggestions: list[Suggestion] = []
-    no_places = ""
-    with ctx.progress.bar("trust", len(task.models) * views, unit="view") as bar:
-        for name, folder in task.models.items():
-            splats = read_ply(folder / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
-            trust = measure_trust(
-                splats, task.scene, task.config, task.max_size, ctx, bar.advance)
-            trust.save(out, name)
-            trusts[name] = model_trust(
-                trust, splats, task.held_out, gains=task.config.exposure == "on",
-                backend=ctx.backend, on_view=_saver(out / FOLDER / name, bar.advance))
-            if name == "base":
-                suggestions, no_places = film_next(splats, trust, task.scene, task.world, ctx)
+    with ctx.progress.bar("trust", views, unit="view") as bar:
+        splats = read_ply(task.folder / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
+        trust = measure_trust(splats, task.scene, task.config, task.max_size, ctx, bar.advance)
+        trust.save(out, task.model)
+        assessed = model_trust(
+            trust, splats, task.held_out, gains=task.config.exposure == "on",
+            backend=ctx.backend, on_view=_saver(out / FOLDER / task.model, bar.advance))
+        suggestions, no_places = film_next(splats, trust, task.scene, task.world, ctx)
     record = TrustRecord(
-        models=tuple(trusts), base=trusts.get("base"), pruned=trusts.get("pruned"), metres=metres,
+        models=(task.model,), base=assessed if task.model == "base" else None,
+        pruned=assessed if task.model == "pruned" else None, metres=metres,
         film_next=tuple(suggestions), no_places=no_places)
     record.write(out)
     return record

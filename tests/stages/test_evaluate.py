@@ -169,15 +169,14 @@ def test_trust_is_measured_checked_on_held_out_views_and_drawn(inputs, tmp_path)
     out = tmp_path / "out"
     summary = run(evaluate, EvaluateConfig(), inputs, out)
     record = TrustRecord.read(out)
-    assert record.models == ("base", "pruned")
-    for name in record.models:
-        trust = record.of(name)
-        assert trust.agreement.views == VIEWS // 4
-        assert trust.agreement.ause < trust.agreement.ause_depth
-        assert trust.error.calibrated
-        assert trust.views == len(load_scene(inputs, validation=CONFIG.validation).train)
-        assert sorted(path.name for path in (out / "trust" / name).iterdir()) == [
-            f"{i:06d}.png" for i in range(0, VIEWS, 4)]
+    assert record.models == ("pruned",)  # what export takes
+    trust = record.pruned
+    assert trust.agreement.views == VIEWS // 4
+    assert trust.agreement.ause < trust.agreement.ause_depth
+    assert trust.error.calibrated
+    assert trust.views == len(load_scene(inputs, validation=CONFIG.validation).train)
+    assert sorted(path.name for path in (out / "trust" / "pruned").iterdir()) == [
+        f"{i:06d}.png" for i in range(0, VIEWS, 4)]
     splats = read_ply(inputs.folders["prune"] / "splats.ply")
     assert Trust.load(out, "pruned", digest_of(splats), 0).support.count.shape == (len(splats),)
     assert Trust.load(out, "base", digest_of(splats), 0) is None  # of other Gaussians
