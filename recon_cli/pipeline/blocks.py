@@ -45,7 +45,7 @@ from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord
 LIST, OPTIONS = "blocks.json", "train.toml"
 MOST_VIEWS = 1200  # of one model; the most that was ever trained as one
 LEAST_VIEWS = 20  # of a block, so that each view of it has neighbours
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(frozen=True)

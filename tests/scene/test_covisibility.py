@@ -82,6 +82,15 @@ def test_a_block_begins_with_all_of_its_points_and_a_quarter_of_the_others():
     assert (chosen == context_points(owned, seed=3)).all()
 
 
+def test_a_camera_does_not_see_the_next_room_through_a_wall():
+    camera = Camera(64, 48, 50, 50, 32, 24, np.eye(4))
+    x, y = np.meshgrid(np.linspace(-3, 3, 200), np.linspace(-3, 3, 200))
+    near = np.stack([x, y, np.full_like(x, 5.0)], axis=-1).reshape(-1, 3)
+    seen = observe_points(np.concatenate([near, near + [0, 0, 0.15]]), [camera]).point
+    assert 0 < len(seen)
+    assert (seen < len(near)).all()
+
+
 def test_a_camera_sees_no_point_behind_another():
     camera = Camera(64, 48, 50, 50, 32, 24, np.eye(4))
     x, y = np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60))
