@@ -86,8 +86,8 @@ def test_a_camera_does_not_see_the_next_room_through_a_wall():
     camera = Camera(64, 48, 50, 50, 32, 24, np.eye(4))
     x, y = np.meshgrid(np.linspace(-3, 3, 200), np.linspace(-3, 3, 200))
     near = np.stack([x, y, np.full_like(x, 5.0)], axis=-1).reshape(-1, 3)
-    seen = observe_points(np.concatenate([near, near + [0, 0, 0.15]]), [camera]).point
-    assert 0 < len(seen)
+    seen = observe_points(np.concatenate([near, near + np.array([0, 0, 0.15])]), [camera]).point
+    assert len(seen) > 0
     assert (seen < len(near)).all()
 
 
