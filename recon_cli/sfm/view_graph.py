@@ -87,7 +87,7 @@ def strongest_ties(matrix: Weights, count: int) -> NDArray[np.bool_]:  # [N, N],
 
 
 def tree_cuts(forest: NDArray[np.bool_]) -> Iterator[Cut]:
-    """Yields, for each edge of a forest, the images that it ties to the rest of its tree."""
+    """Yields, for each edge of a forest, the images on the side of its first one in its tree."""
     graph, seen = csr_matrix(forest), np.zeros(len(forest), np.bool_)
     for root in range(len(forest)):
         if seen[root]:
@@ -102,7 +102,8 @@ def tree_cuts(forest: NDArray[np.bool_]) -> Iterator[Cut]:
             below[place[parents[node]]] += below[place[node]]
         for start in range(1, len(order)):
             cut = np.zeros(len(forest), np.bool_)
-            cut[order[start:start + below[start]]] = True
+            cut[order] = order[start] > parents[order[start]]
+            cut[order[start:start + below[start]]] ^= True
             yield cut
 
 
