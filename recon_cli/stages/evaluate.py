@@ -169,9 +169,9 @@ def run(
             means[f"{name}_{key}"] = round(getattr(model, key), 4)
         if model.gain_psnr_db is not None:
             means[f"{name}_gain_psnr_db"] = round(model.gain_psnr_db, 4)
-    model, folder = list(evaluation.folders.items())[-1]  # what export takes
+    exported, folder = list(evaluation.folders.items())[-1]  # the pruned model, if there is one
     trust = assess(TrustTask(
-        model, folder, evaluation.config, evaluation.scene, evaluation.held_out,
+        exported, folder, evaluation.config, evaluation.scene, evaluation.held_out,
         config.max_size or evaluation.config.max_size, evaluation.import_record,
         WorldSummary.read(inputs.folders["sfm"])), out, ctx) if config.trust else None
     return EvaluateSummary(**means, film_next=tuple(trust.lines()) if trust else None)
