@@ -12,6 +12,7 @@ from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image, to_uint8
 from recon_cli.render import render
 from recon_cli.viewer.content import TRAINING
+from recon_cli.viewer.measure import locate_click
 from recon_cli.viewer.session import Session
 
 
@@ -143,3 +144,67 @@ def test_a_viewer_that_ends_lets_go_of_its_browsers(room, page):
         opened(page, shown)
         page.page.get_by_text("next", exact=True).click()
     assert not shown.server.get_clients()
+
+
+def test_two_clicked_points_have_the_distance_of_the_surfaces_under_them(
+    shown, page, sessions
+):
+    client = opened(page, shown)
+    page.page.set_viewport_size({"width": 1000, "height": 700})  # the panel covers no surface
+    page.page.get_by_text("next", exact=True).click()
+    page.page.get_by_text("PSNR").wait_for(timeout=60_000)
+    view = shown.content.views[0].view
+    until(page, lambda: np.allclose(client.camera.position, view.camera.center, atol=1e-4))
+    page.page.get_by_text("Measure", exact=True).click()
+    page.page.get_by_label("Click points").locator("visible=true").click()
+    page.page.wait_for_timeout(500)  # until the canvas listens
+    canvas = page.page.locator("canvas").first.bounding_box()
+    focal = canvas["height"] / 2 / math.tan(client.camera.fov / 2)
+    splats = shown.content.models["pruned"].splats
+
+    def surface(x, y):
+        ray = np.array([(x - canvas["width"] / 2) / focal, (y - canvas["height"] / 2) / focal, 1])
+        return locate_click(splats, view.camera.center, view.camera.viewmat[:3, :3].T @ ray,
+                            "torch")
+
+    grid = [(x, y) for x in np.linspace(0.1, 0.5, 9) * canvas["width"]
+            for y in np.linspace(0.4, 0.9, 6) * canvas["height"] if surface(x, y) is not None]
+    expected = []
+    for number, (x, y) in enumerate((grid[0], grid[-1]), start=1):
+        expected.append(surface(x, y))
+        page.page.mouse.move(canvas["x"] + x, canvas["y"] + y)
+        page.page.mouse.down()
+        page.page.wait_for_timeout(100)  # as long as people press
+        page.page.mouse.up()
+        until(page, lambda n=number: len(sessions[0]._measure._points) == n)
+    np.testing.assert_allclose(sessions[0]._measure._points, expected, atol=0.02)
+    distance = float(np.linalg.norm(expected[1] - expected[0]))
+    page.page.get_by_text("Distance:").wait_for(timeout=60_000)
+    shown_text = page.page.inner_text("body").split("Distance: ")[1].split()[0]
+    assert float(shown_text) == pytest.approx(distance, abs=0.02)
+    known = page.page.get_by_label("Known length (m)").locator("visible=true")
+    known.fill("3")
+    known.press("Enter")
+    page.page.get_by_text("Distance: 3.000 m").wait_for(timeout=60_000)
+    page.page.get_by_text("recon export --scale-between").wait_for(timeout=60_000)
+    page.page.get_by_text("undo", exact=True).click()
+    page.page.get_by_text("Click two points").wait_for(timeout=60_000)
+
+
+def test_trust_tints_the_scene_from_where_one_stands_and_takes_the_tint_off_again(
+    shown, page, sessions
+):
+    opened(page, shown)
+    session = sessions[0]
+    plain = session._node.rgbs.copy()
+    tint = page.page.get_by_label("Trust").locator("visible=true")
+    tint.click()
+    until(page, lambda: (session._node.rgbs != plain).any())
+    tinted = session._node.rgbs.copy()
+    page.page.get_by_text("next", exact=True).click()
+    until(page, lambda: (session._node.rgbs != tinted).any())
+    tint.click()
+    camera = shown.content.views[0].view.camera
+    packed = shown.content.models["pruned"]
+    until(page, lambda: np.abs(
+        session._node.rgbs.astype(int) - packed.colors(camera.center.tolist())).max() <= 1)

@@ -14,6 +14,7 @@ from browser import WatchedPage
 from recon_cli.pipeline.plan import Job
 from recon_cli.viewer.content import PhotoPairs, ViewerContent, load_workspace
 from recon_cli.viewer.server import HOST, Server, serve_scene
+from recon_cli.viewer.trust_tint import TrustTint
 from recon_cli.workspace.layout import Workspace
 
 T = TypeVar("T")
@@ -41,7 +42,7 @@ def view(workspace: Path) -> Iterator[Shown]:
     job = Job(Workspace(workspace))
     content = load_workspace(job, "auto")
     photos = PhotoPairs(job, content.max_size)
-    with serve_scene(content, photos, HOST, None) as (server, address):
+    with serve_scene(content, photos, HOST, None, TrustTint(job)) as (server, address):
         yield Shown(server, address, content)
 
 
