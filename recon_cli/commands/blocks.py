@@ -26,8 +26,8 @@ _TABLE = tuple(MERGE if row.name == MERGE.name else row for row in STAGES)
 def merge(call: Call) -> None:
     """Put the blocks of `recon train --blocks` together.
 
-    Each block keeps what lies in its cell. `recon train --blocks` does this at its end; this
-    command repeats it after a block was trained again by hand.
+    Each block keeps what lies in its cell; then all are fine-tuned together. `recon train --blocks`
+    does this at its end; this command repeats it after a block was trained again by hand.
     """
     _merge(call)
 

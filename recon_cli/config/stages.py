@@ -412,9 +412,12 @@ class ImportConfig(StageConfig):
 class MergeConfig(StageConfig):
     """How the blocks of a scene are put together."""
 
-    max_size: int = option(
-        600, "Longest side of the validation views on which seams are checked.", unit="pixels",
-        minimum=16)
+    iterations: int | None = option(
+        None, "Steps of fine-tuning the merged scene on all views; 0: none.", minimum=0,
+        automatic="a quarter of those of all blocks")
+    max_size: int | None = option(
+        None, "Longest side of the images.", unit="pixels", minimum=16,
+        automatic="that of the blocks")
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
 
 

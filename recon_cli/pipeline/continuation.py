@@ -11,7 +11,7 @@ import dataclasses
 import logging
 from enum import Enum
 
-from recon_cli.config.stages import MergeConfig
+from recon_cli.config.stages import ImportConfig
 from recon_cli.errors import ManifestError, StageError
 from recon_cli.stages import IMPORT, MERGE, Stage
 from recon_cli.workspace.layout import Workspace
@@ -43,7 +43,7 @@ def is_imported(key: ResultKey) -> bool:
 
 def is_merged(key: ResultKey) -> bool:
     """Returns whether a scene was merged from blocks."""
-    return is_imported(key) and set(key.config) == set(MergeConfig().hashed_fields())
+    return is_imported(key) and set(key.config) != set(ImportConfig().hashed_fields())
 
 
 def origin_row(row: Stage, key: ResultKey) -> Stage:

@@ -76,8 +76,8 @@ IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSum
                "recon_cli.stages.import_scene", renders=True, takes="FILE")
 
 
-MERGE = Stage("train", "merge", ("ingest", "sfm"), (), MergeConfig, MergeSummary, 1, False,
-              "recon_cli.stages.merge", renders=True, takes="BLOCK")
+MERGE = Stage("train", "merge", ("ingest", "sfm"), (), MergeConfig, MergeSummary, 2, False,
+              "recon_cli.stages.merge", ("log.jsonl",), renders=True, takes="BLOCK")
 
 
 def stage(name: str) -> Stage:

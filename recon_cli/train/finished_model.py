@@ -21,10 +21,10 @@ from recon_cli.io.ply import read_ply
 from recon_cli.io.records import ImportRecord
 from recon_cli.scene.splats import with_rows
 from recon_cli.train.feature_trials import PARTS, model_parts
-from recon_cli.train.initialize import new_parts, restore_state
+from recon_cli.train.initialize import begin_state, restore_state
 from recon_cli.train.runner import LOG
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import DensificationStats, TrainState, new_state, read_progress
+from recon_cli.train.state import DensificationStats, TrainState, read_progress
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_bytes
@@ -118,10 +118,7 @@ class FinishedModel:
         if not self.trained:
             splats = read_ply(self.folder / "splats.ply").with_degree(config.sh_degree)
             splats.sh_rest = with_rows(splats.sh_rest, len(splats))  # each may get harmonics
-            exposure, poses = new_parts(task)
-            return new_state(
-                splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
-                backend=task.backend, exposure=exposure, poses=poses)
+            return begin_state(splats, task)
         state = restore_state(self.folder / FINAL, task)
         state.iteration = state.steps
         state.jump, state.looks = None, []  # it may stop early again, by looks of its own

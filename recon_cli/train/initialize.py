@@ -94,6 +94,14 @@ def restore_state(path: Path, task: Task) -> TrainState:
         exposure=exposure, poses=poses)
 
 
+def begin_state(splats: Splats, task: Task) -> TrainState:
+    """Returns the state before the first step of a run that begins with these Gaussians."""
+    exposure, poses = new_parts(task)
+    return new_state(
+        splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.extent,
+        backend=task.backend, exposure=exposure, poses=poses)
+
+
 def make_finished_state(splats: Splats, task: Task) -> TrainState:
     """Returns the state of a run that ended with these Gaussians, trained elsewhere."""
     state = new_state(

@@ -401,6 +401,9 @@ class MergeSummary(JsonRecord):
     gaussians: int
     sh_degree: int
     left_out: int  # Gaussians of blocks that lie in the cell of another one
+    iterations: int = 0  # steps of fine-tuning on all views
+    validation_psnr_db: float | None = None  # after them; None where there were none
+    train_seconds: float = 0.0  # they took
     seam_views: int  # validation views of more than one block; where 0, the next two are None
     # their PSNR less that of the best block that trained beside them, mean and least
     seam_change_db: float | None = None

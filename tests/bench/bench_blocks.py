@@ -2,9 +2,10 @@
 
 WORKSPACE has its sfm done and is only read: a capture with held-out views, such as the apartment of
 make_apartment.py. It is trained in blocks, then whole, with as many Gaussians as the merged model
-has and as many steps as all blocks took together. Printed are PSNR and SSIM on the held-out views,
-also of those alone that lie within a metre (--near) of a border between two blocks, with the CPU
-seconds of each training; and, view by view, the best score of a block's model before the merge.
+has and as many steps as all blocks and the fine-tuning took together. Printed are PSNR and SSIM on
+the held-out views, also of those alone that lie within a metre (--near) of a border between two
+blocks, with the CPU seconds of each training; the merged model before its fine-tuning; and, view by
+view, the best score of a block's model before the merge.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from recon_cli.evaluation.reference_views import (
 from recon_cli.io.ply import read_ply
 from recon_cli.io.records import BlockRecord
 from recon_cli.scene.cells import Cell
+from recon_cli.train.train_data import read_config
 
 PLACES = 500  # that are drawn around a camera
 SEED = 0
@@ -44,13 +46,14 @@ class Trained:
     cpu_seconds: float
 
 
-def train(name: str, source: Path, out: Path, options: list[str]) -> Trained:
-    """Trains a copy of a workspace by a command."""
+def run_in_copy(
+    name: str, source: Path, out: Path, words: list[str], leave: tuple[str, ...]
+) -> Trained:
+    """Runs a command on a copy of a workspace without some of its folders."""
     if not out.exists():
-        shutil.copytree(source, out, ignore=shutil.ignore_patterns("train", "prune", "blocks"))
+        shutil.copytree(source, out, ignore=shutil.ignore_patterns(*leave, ".lock"))
     before = os.times()
-    subprocess.run([sys.executable, "-m", "recon_cli", "train", "-w", str(out), *options],
-                   check=True)
+    subprocess.run([sys.executable, "-m", "recon_cli", *words, "-w", str(out)], check=True)
     after = os.times()
     return Trained(name, out, after.children_user + after.children_system
                    - before.children_user - before.children_system)
@@ -101,13 +104,17 @@ def main(
 ) -> None:
     """Print the scores of WORKSPACE trained in blocks and as one model."""
     common = ["--max-size", str(max_size), "--no-early-stop", *settings]
-    parts = train("blocks", workspace, out / "blocks", [
-        "--blocks", str(blocks), "--iterations", str(iterations), "--max-gaussians",
-        str(max_gaussians), *common])
+    untrained = ("train", "prune", "blocks")
+    parts = run_in_copy("blocks", workspace, out / "blocks", [
+        "train", "--blocks", str(blocks), "--iterations", str(iterations), "--max-gaussians",
+        str(max_gaussians), *common], untrained)
+    plain = run_in_copy("blocks, not fine-tuned", parts.workspace, out / "plain", [
+        "merge", "--iterations", "0", "--again"], ())
     merged = len(read_ply(parts.workspace / "train" / "splats.ply"))
-    whole = train("one model", workspace, out / "whole", [
-        "--blocks", "off", "--iterations", str(blocks * iterations), "--max-gaussians",
-        str(merged), *common])
+    whole = run_in_copy("one model", workspace, out / "whole", [
+        "train", "--blocks", "off", "--iterations",
+        str(read_config(parts.workspace / "train").iterations), "--max-gaussians", str(merged),
+        *common], untrained)
     ctx = StageContext(backend="numba")
     folders = {name: workspace / name for name in ("ingest", "denoise", "sfm")}
     scene = load_scene(StageInputs(folders), validation=0.0)
@@ -117,7 +124,7 @@ def main(
     click.echo(f"{len(views)} held-out views, {border.sum()} within {near:g} of a border\n")
     click.echo("| model | Gaussians | PSNR / SSIM | near a border | CPU s |\n"
                "|---|---:|---:|---:|---:|")
-    for trained in (whole, parts):
+    for trained in (whole, parts, plain):
         count, psnr, ssim = score_model(trained.workspace / "train" / "splats.ply", views)
         columns = [f"{psnr[rows].mean():.2f} / {ssim[rows].mean():.3f}" if rows.any() else ""
                    for rows in (np.ones(len(views), bool), border)]

@@ -12,8 +12,16 @@ from recon_cli.io.ply import read_ply
 from recon_cli.io.records import BlockRecord
 from recon_cli.pipeline.blocks import Block, train_blocks
 from recon_cli.progress import NullProgress
+from recon_cli.stages import merge
+from recon_cli.train import runner
+from recon_cli.train.runner import CHECKPOINT
+from recon_cli.train.state import save_state
 
 FAST = ("--iterations", "10", "--max-size", "32", "--sh-degree", "0", "--threads", "1")
+
+
+class Killed(Exception):  # noqa: N818 - an event, not an error
+    """Stands for a kill right after the state was saved."""
 
 
 def recon(workspace, *words):
@@ -56,10 +64,8 @@ def state(workspace, capsys, stage="train"):
 @pytest.mark.integration
 def test_a_scene_trained_in_blocks_goes_through_the_stages_like_any_other(workspace, capsys):
     assert recon(workspace, "train", "--blocks", 2, *FAST) == 0
-    parts = [owned(workspace, number) for number in range(2)]
-    merged = read_ply(workspace / "train" / "splats.ply")
-    assert len(merged) == sum(map(len, parts)) > 0
-    assert torch.equal(merged.means, torch.cat([part.means for part in parts]))
+    assert state(workspace, capsys)["summary"]["iterations"] == 5  # a quarter of twice 10
+    assert len(read_ply(workspace / "train" / "splats.ply")) > 0
     for number in range(2):
         record = BlockRecord.read(block(workspace, number) / "sfm")
         log = (block(workspace, number) / "train" / "log.jsonl").read_text()
@@ -73,6 +79,62 @@ def test_a_scene_trained_in_blocks_goes_through_the_stages_like_any_other(worksp
     scores = json.loads((workspace / "evaluate" / "metrics.json").read_text())
     assert scores["models"]["pruned"]["gaussians"] < scores["models"]["base"]["gaussians"]
     assert "whoever trained it" not in (workspace / "evaluate" / "table.txt").read_text()
+
+
+@pytest.mark.integration
+def test_without_fine_tuning_each_block_keeps_its_cell_as_it_was_trained(workspace):
+    assert recon(workspace, "train", "--blocks", 2, *FAST) == 0
+    assert recon(workspace, "merge", "--iterations", 0) == 0
+    parts = [owned(workspace, number) for number in range(2)]
+    merged = read_ply(workspace / "train" / "splats.ply")
+    assert len(merged) == sum(map(len, parts)) > 0
+    assert torch.equal(merged.means, torch.cat([part.means for part in parts]))
+    assert not (workspace / "train" / "log.jsonl").exists()
+
+
+@pytest.mark.slow
+def test_fine_tuning_brings_the_blocks_closer_to_the_views(workspace):
+    assert recon(workspace, "train", "--blocks", 2, *FAST[2:], "--iterations", 60) == 0
+    scores = {}
+    for steps in (0, 100):
+        assert recon(workspace, "merge", "--iterations", steps, "--again") == 0
+        assert recon(workspace, "eval") == 0
+        scores[steps] = json.loads((workspace / "evaluate" / "metrics.json").read_text())
+    assert (scores[100]["models"]["base"]["psnr_db"] > scores[0]["models"]["base"]["psnr_db"] + 0.3)
+
+
+@pytest.mark.slow
+def test_a_merge_killed_while_it_fine_tunes_ends_with_the_same_bytes(workspace, monkeypatch):
+    assert recon(workspace, "train", "--blocks", 2, *FAST) == 0
+    model = workspace / "train" / "splats.ply"
+    steps = ("--iterations", 300)
+    assert recon(workspace, "merge", *steps) == 0
+    whole = model.read_bytes()
+    assert recon(workspace, "merge", "--iterations", 0) == 0
+
+    def save_then_die(path, state):
+        save_state(path, state)
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "save_state", save_then_die)
+        patch.setattr(runner.CheckpointThrottle, "allows", lambda _: True)
+        assert recon(workspace, "merge", *steps) == 1
+    assert (workspace / ".partial" / "train" / CHECKPOINT).exists()
+    assert recon(workspace, "merge", *steps) == 0
+    assert model.read_bytes() == whole
+    assert not (workspace / "train" / CHECKPOINT).exists()
+
+
+@pytest.mark.integration
+def test_a_merged_scene_too_large_to_train_is_kept_as_the_blocks_have_it(
+    workspace, capsys, monkeypatch
+):
+    assert recon(workspace, "train", "--blocks", 2, *FAST) == 0
+    monkeypatch.setattr(merge, "gaussians_that_fit", lambda *_: 1)
+    assert recon(workspace, "merge", "--iterations", 6) == 0
+    assert "memory has room to train 1: it is not fine-tuned" in capsys.readouterr().err
+    assert state(workspace, capsys)["summary"]["iterations"] == 0
 
 
 @pytest.mark.integration
