@@ -1,0 +1,99 @@
+"""Which weights of the error model fit what the views of a capture do not show?
+
+    python tests/bench/fit_trust_weights.py WORKSPACE... [--max-size 320]
+
+A third of the training views of each capture is taken away in one stretch, as bench_film_next.py
+does; the rest is trained, and the weights of the expected error are fitted to the real errors in
+the stretch, without the pull towards PRIOR, for each capture by itself and for all with a bias
+each. The last row is what PRIOR is rounded from. Held-out views are not looked at.
+"""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401 - before pycolmap, which brings a zlib of its own
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+import numpy as np
+from bench_film_next import open_capture
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from recon_cli.train.train_data import load_views
+from recon_cli.trust.error_model import PRIOR, TERMS, picture_terms
+from recon_cli.trust.scene_trust import measure_trust
+from recon_cli.trust.support import error_image
+
+PIXELS = 60_000  # of each capture
+MOST = 6.0  # of a weight
+
+Array = NDArray[np.float64]
+
+
+def read_stretch(workspace: Path, max_size: int, iterations: int) -> tuple[Array, Array]:
+    """Returns the terms [P, K] of pixels in the stretch that was taken away, and their errors."""
+    capture = open_capture(workspace, max_size, iterations, removed=False)
+    splats, scene = capture.train(())
+    support = measure_trust(splats, scene, capture.config, max_size, capture.ctx).support
+    columns: list[Array] = []
+    errors: list[Array] = []
+    for view in load_views(capture.taken, capture.config, capture.ctx):
+        picture = picture_terms(splats, support, view.camera, sh_degree=capture.config.sh_degree,
+                                backend="numba")
+        error, counts = error_image(picture.rgb, view, gains=False)
+        used = counts > 0
+        errors.append(np.asarray(error[used], np.float64))
+        columns.append(np.stack([picture.terms[name][used] for name in TERMS], 1).astype(float))
+    real = np.concatenate(errors)
+    rows = slice(None, None, max(1, len(real) // PIXELS))
+    return np.concatenate(columns)[rows], real[rows]
+
+
+def fit_together(captures: Sequence[tuple[Array, Array]]) -> Array:
+    """Returns the weights [K] that fit all captures best, each with a bias of its own.
+
+    Poisson's quasi-likelihood in units of a capture's mean error, as in `fit_weights`.
+    """
+    def loss(values: Array) -> tuple[float, Array]:
+        total, slope = 0.0, np.zeros_like(values)
+        for index, (terms, errors) in enumerate(captures):
+            log = np.minimum(values[index] + terms @ values[len(captures):], 50)
+            expected, mean = np.exp(log), errors.mean()
+            gap = (expected - errors) / mean
+            total += float((expected - errors * log).mean() / mean)
+            slope[index] = gap.mean()
+            slope[len(captures):] += (terms * gap[:, None]).mean(0)
+        return total, slope
+
+    prior = np.array([PRIOR[name] for name in TERMS])
+    biases = [np.log(errors.mean() / np.exp(terms @ prior).mean()) for terms, errors in captures]
+    result = minimize(
+        loss, np.concatenate([biases, prior]), jac=True, method="L-BFGS-B",
+        bounds=[(None, None)] * len(captures) + [(0, MOST)] * len(prior))
+    return np.asarray(result.x[len(captures):])
+
+
+@click.command()
+@click.argument("workspaces", nargs=-1, required=True,
+                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--max-size", default=320, show_default=True, help="Longest side in pixels.")
+@click.option("--iterations", default=1000, show_default=True, help="Steps of each training.")
+def main(workspaces: Sequence[Path], max_size: int, iterations: int) -> None:
+    """Print the weights of each capture and of all together."""
+    click.echo(f"| capture | {' | '.join(TERMS)} |\n|---|{'---:|' * len(TERMS)}")
+    captures = []
+    for workspace in workspaces:
+        captures.append(read_stretch(workspace, max_size, iterations))
+        show(workspace.name, fit_together(captures[-1:]))
+    show("all", fit_together(captures))
+    show("PRIOR", np.array([PRIOR[name] for name in TERMS]))
+
+
+def show(name: str, weights: Array) -> None:
+    """Prints a row of the table."""
+    click.echo(f"| {name} | {' | '.join(f'{weight:.2f}' for weight in weights)} |")
+
+
+if __name__ == "__main__":
+    main()
