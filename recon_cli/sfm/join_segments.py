@@ -41,6 +41,9 @@ MODEL_FOLDER = "model"
 # Frames of other segments that each is matched with because they look alike: enough to find loops,
 # whose frames are matched with more of each other once the segments lie beside each other.
 ALIKE = 2
+# Adjustments of the whole with new points in between, for each segment has settled by itself: five
+# take a tenth longer on 300 frames and leave 3.25 cm of 3.29.
+ROUNDS = 2
 
 
 def collect_features(job: MappingJob) -> None:
@@ -367,8 +370,8 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
         skeleton.link(job, source.database, usable, Tracks.read(job.tracks))
     model = mapper.triangulate(job, _posed(job, joined))
     if model.num_reg_images() < len(job.names):
-        return mapper.extend_model(job, model)  # which adjusts as much as `refine` does
-    mapper.refine(job, model)
+        return mapper.extend_model(job, model, ROUNDS)  # which adjusts as much as `refine` does
+    mapper.refine(job, model, ROUNDS)
     return model
 
 

@@ -63,10 +63,17 @@ def _adjusted(models: Mapping[int, pycolmap.Reconstruction]) -> list[pycolmap.Re
     return list(models.values())
 
 
-def extend_model(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Returns a model with the images that the mapper can add to it, adjusted as a whole."""
+def extend_model(
+    job: MappingJob, model: pycolmap.Reconstruction, rounds: int | None = None
+) -> pycolmap.Reconstruction:
+    """Returns a model with the images that the mapper can add to it, adjusted as a whole.
+
+    `rounds` is the most adjustments with new points in between, COLMAP's if not given.
+    """
     start, options = fresh_folder(job.attempts / START), _options(job)
     model.write(start)
+    if rounds is not None:
+        options.ba_global_max_refinements = rounds
     options.multiple_models = False
     models = pycolmap.incremental_mapping(
         job.database, job.frames, fresh_folder(job.attempts / MODELS), options, input_path=start)
@@ -126,8 +133,13 @@ def adjust(
     model.update_point_3d_errors()
 
 
-def refine(job: MappingJob, model: pycolmap.Reconstruction) -> None:
-    """Adjusts a model in place, and completes, merges and filters its points, until it settles."""
+def refine(
+    job: MappingJob, model: pycolmap.Reconstruction, rounds: int | None = None
+) -> None:
+    """Adjusts a model in place, and completes, merges and filters its points, until it settles.
+
+    `rounds` as for `extend_model`.
+    """
     with pycolmap.Database.open(job.database) as opened:
         cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
     options = _options(job)
@@ -136,7 +148,8 @@ def refine(job: MappingJob, model: pycolmap.Reconstruction) -> None:
     worker = pycolmap.IncrementalMapper(cache)
     worker.begin_reconstruction(model)
     worker.iterative_global_refinement(
-        options.ba_global_max_refinements, options.ba_global_max_refinement_change,
+        options.ba_global_max_refinements if rounds is None else rounds,
+        options.ba_global_max_refinement_change,
         options.mapper, adjustment, options.triangulation)
     worker.end_reconstruction(False)
 
