@@ -1,6 +1,6 @@
 """Does filming from the suggested places help more than filming from anywhere?
 
-    python tests/bench/bench_film_next.py WORKSPACE... [--removed] [--max-size 320]
+    python tests/bench/bench_film_next.py WORKSPACE... [--removed] [--model PLY]
 
 A third of the training views is taken away in one stretch, the middle third by name, and with it
 the points that fewer than two of the others see. The rest is trained and suggestions are made; of
@@ -8,6 +8,10 @@ the views taken away the one nearest to each suggestion is given back, and then 
 in several draws; last those that the score of the suggestions would choose among them. Scores are
 those of the held-out views; with --removed, where these lie on the path, of every third view taken
 away, which is never given back. Prints one line a workspace.
+
+With --model, a model of the whole scene in the workspace's frame, the pictures that are added are
+rendered from it, those from the suggested places themselves and those of the random frames; so are
+--everywhere N views that are scored, from random standing places to random sides.
 """
 
 from __future__ import annotations
@@ -16,14 +20,24 @@ import zlib  # noqa: F401 - before pycolmap, which brings a zlib of its own
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_reference_views, load_scene, mean_psnr
+from recon_cli.evaluation.reference_views import (
+    load_reference_views,
+    load_scene,
+    mean_psnr,
+    render_on_black,
+)
+from recon_cli.io.images import to_uint8, write_png
+from recon_cli.io.ply import read_ply
 from recon_cli.machine import usable_threads
+from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
@@ -81,6 +95,26 @@ def nearest(suggestions: Sequence[Suggestion], views: Sequence[View], scene: Sce
     return chosen
 
 
+def film(
+    cameras: Sequence[Camera], model: Splats, folder: Path, ctx: StageContext
+) -> list[View]:
+    """Returns views whose pictures are rendered from a model of the whole scene."""
+    views = []
+    for number, camera in enumerate(cameras):
+        path = folder / f"filmed_{number}.png"
+        write_png(path, to_uint8(render_on_black(
+            model, camera, model.sh_degree, ctx.backend).rgb.numpy()))
+        views.append(View(path.name, camera, path, path))
+    return views
+
+
+def cameras_at(suggestions: Sequence[Suggestion], like: Camera) -> list[Camera]:
+    """Returns level cameras at the suggested places; z is up wherever there are suggestions."""
+    return [replace(like, viewmat=looking_at(
+        np.array(each.position), np.array(each.position) + each.forward, np.array([0.0, 0.0, 1.0])))
+        for each in suggestions]
+
+
 def best_views(
     splats: Splats, trust: Trust, scene: Scene, workspace: Path, capture: Capture, count: int
 ) -> list[View]:
@@ -112,6 +146,42 @@ def open_capture(workspace: Path, max_size: int, iterations: int, *, removed: bo
         StageContext(backend="numba", threads=usable_threads()))
 
 
+def random_cameras(eyes: NDArray[np.float64], count: int, like: Camera) -> list[Camera]:
+    """Returns level cameras at some of the places [P, 3], each to a random side."""
+    rng = np.random.default_rng(1)
+    up = np.array([0.0, 0.0, 1.0])
+    cameras = []
+    for row, angle in zip(rng.integers(len(eyes), size=count), rng.uniform(0, 2 * np.pi, count),
+                          strict=True):
+        ahead = np.array([np.cos(angle), np.sin(angle), 0.0])
+        cameras.append(replace(like, viewmat=looking_at(eyes[row], eyes[row] + ahead, up)))
+    return cameras
+
+
+def compare_filmed(
+    name: str, capture: Capture, suggestions: Sequence[Suggestion], model: Splats, draws: int,
+    scored: Sequence[Camera],
+) -> None:
+    """Prints the row of a workspace whose added pictures, and those `scored`, are rendered."""
+    like, rng = capture.taken[0].camera, np.random.default_rng(0)
+    with TemporaryDirectory() as folder, TemporaryDirectory() as other:
+        if scored:
+            capture = replace(
+                capture, scored=tuple(film(scored, model, Path(other), capture.ctx)))
+
+        def psnr(cameras: Sequence[Camera]) -> float:
+            return capture.psnr(capture.train(
+                film(cameras, model, Path(folder), capture.ctx))[0])
+
+        without = capture.psnr(capture.train(())[0])
+        there = psnr(cameras_at(suggestions, like))
+        scores = [psnr([capture.taken[row].camera for row in rng.choice(
+            len(capture.taken), len(suggestions), replace=False)]) for _ in range(draws)]
+    click.echo(
+        f"| {name} | {len(capture.scored)} | {without:.2f} | {there:.2f} | {np.mean(scores):.2f} | "
+        f"{' '.join(f'{score:.2f}' for score in scores)} | {there - np.mean(scores):+.2f} | |")
+
+
 @click.command()
 @click.argument("workspaces", nargs=-1, required=True,
                 type=click.Path(exists=True, file_okay=False, path_type=Path))
@@ -119,10 +189,14 @@ def open_capture(workspace: Path, max_size: int, iterations: int, *, removed: bo
 @click.option("--max-size", default=320, show_default=True, help="Longest side in pixels.")
 @click.option("--iterations", default=1000, show_default=True, help="Steps of each training.")
 @click.option("--draws", default=5, show_default=True, help="Random choices.")
+@click.option("--everywhere", default=0, help="Views that are scored in place of the held-out.")
+@click.option("--model", type=click.Path(exists=True, path_type=Path), help="Renders the pictures.")
 def main(
-    workspaces: Sequence[Path], removed: bool, max_size: int, iterations: int, draws: int
+    workspaces: Sequence[Path], removed: bool, max_size: int, iterations: int, draws: int,
+    model: Path | None, everywhere: int,
 ) -> None:
     """Print PSNR with the nearest views to the suggestions, and with random ones."""
+    whole = None if model is None else read_ply(model)
     click.echo("| workspace | scored views | with a third missing | + suggested | + random | draws "
                "| gain | + by score |\n|---|---:|---:|---:|---:|---|---:|---:|")
     details = []
@@ -137,6 +211,13 @@ def main(
             continue
         without = capture.psnr(splats)
         chosen = nearest(suggestions, capture.taken, scene)
+        if whole is not None:
+            places, _ = standing_places(
+                splats, trust, scene, WorldSummary.read(workspace / "sfm"))
+            assert places is not None
+            compare_filmed(workspace.name, capture, suggestions, whole, draws, random_cameras(
+                places.eyes, everywhere, capture.taken[0].camera))
+            continue
         details += [f"{workspace.name}: {each.describe('units')} -> {view.name}"
                     for each, view in zip(suggestions, chosen, strict=True)]
         with_chosen = capture.psnr(capture.train(chosen)[0])
