@@ -85,9 +85,9 @@ def test_common_frames_give_the_similarity_between_two_segments(chain):
     assert join.frames
 
 
-def test_a_third_of_wrong_points_changes_nothing(chain):
+def test_a_tenth_of_wrong_points_changes_nothing(chain):
     shared = chain.shared(0, 1)
-    wrong = np.random.default_rng(1).permutation(len(shared.ours))[:len(shared.ours) // 3]
+    wrong = np.random.default_rng(1).permutation(len(shared.ours))[:len(shared.ours) // 10]
     theirs = shared.theirs.copy()
     theirs[wrong] = theirs[np.roll(wrong, 1)]
     join = judge_join(dataclasses.replace(shared, theirs=theirs), chain.cameras(0),
@@ -106,6 +106,28 @@ def test_most_points_wrong_contradict_a_join(chain):
                       chain.cameras(1), seed=0)
     assert not join.holds
     assert any("points of common frames" in text for text in join.contradictions)
+
+
+@pytest.mark.parametrize(("scale", "degrees"), [(0.8, 0), (1.25, 0), (1, 10)])
+def test_a_segment_that_is_broken_within_the_common_frames_is_not_joined(scale, degrees):
+    world = World([range(32), range(20, 52)], [STAY, FIRST])
+    shared, cameras = world.shared(0, 1), world.cameras(1)
+    middle = cameras.centers[5]  # frame 25 of 20 to 31 in common
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+
+    def break_off(points, after):
+        moved = middle + scale * (points - middle) @ turn.T
+        return np.where(after[:, None], moved, points)
+
+    later = np.arange(len(cameras.names)) > 5
+    broken = dataclasses.replace(
+        cameras, centers=break_off(cameras.centers, later),
+        rotations=np.where(later[:, None, None], cameras.rotations @ turn.T, cameras.rotations))
+    theirs = break_off(shared.theirs, shared.pair > 5)
+    assert judge_join(shared, world.cameras(0), cameras, seed=0).holds
+    join = judge_join(dataclasses.replace(shared, theirs=theirs), world.cameras(0), broken, seed=0)
+    assert not join.holds
+    assert join.contradictions
 
 
 def test_cameras_that_lie_elsewhere_contradict_points_that_agree(chain):
