@@ -31,12 +31,7 @@ from recon_cli.train.initialize import begin_state, restore_state
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.schedule import make_schedule
 from recon_cli.train.state import TrainState
-from recon_cli.train.train_data import (
-    gaussians_that_fit,
-    load_task,
-    read_config,
-    write_config,
-)
+from recon_cli.train.train_data import gaussians_that_fit, load_task, read_config, write_config
 from recon_cli.workspace.digests import digest_file, sha256_json
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.summaries import LogRow, MergeSummary
@@ -112,17 +107,15 @@ def _run_config(
     config: MergeConfig, blocks: Sequence[TrainedBlock], steps: int, count: int, degree: int
 ) -> RunConfig:
     """Returns the options of the fine-tuning: what the blocks were trained with."""
-    first = blocks[0].config
-
-    def any_has(part: str, value: str) -> bool:
-        return any(getattr(block.config, part) == value for block in blocks)
-
+    configs = [block.config for block in blocks]
+    denoised = all(each.images == "denoised" for each in configs)
+    drifting = steps > 0 and any(each.exposure == "on" for each in configs)
     return dataclasses.replace(
-        first, iterations=max(1, steps), validation=config.validation,
-        max_size=config.max_size or max(block.config.max_size for block in blocks),
+        configs[0], iterations=max(1, steps), validation=config.validation,
+        max_size=config.max_size or max(each.max_size for each in configs),
         sh_degree=degree, max_gaussians=max(MIN_GAUSSIANS, count), far="off", poses="off",
-        images="denoised" if all(block.config.images == "denoised" for block in blocks)
-        else "original", exposure="on" if any_has("exposure", "on") else "off", early_stop=False)
+        images="denoised" if denoised else "original", exposure="on" if drifting else "off",
+        early_stop=False)
 
 
 def _finetune(
