@@ -159,10 +159,13 @@ def random_cameras(eyes: NDArray[np.float64], count: int, like: Camera) -> list[
 
 
 def compare_filmed(
-    name: str, capture: Capture, suggestions: Sequence[Suggestion], model: Splats, draws: int,
-    scored: Sequence[Camera],
+    name: str, capture: Capture, splats: Splats, suggestions: Sequence[Suggestion], model: Splats,
+    draws: int, scored: Sequence[Camera],
 ) -> None:
-    """Prints the row of a workspace whose added pictures, and those `scored`, are rendered."""
+    """Prints the row of a workspace whose added pictures, and those `scored`, are rendered.
+
+    `splats` were trained without any, `model` renders them.
+    """
     like, rng = capture.taken[0].camera, np.random.default_rng(0)
     with TemporaryDirectory() as folder, TemporaryDirectory() as other:
         if scored:
@@ -173,7 +176,7 @@ def compare_filmed(
             return capture.psnr(capture.train(
                 film(cameras, model, Path(folder), capture.ctx))[0])
 
-        without = capture.psnr(capture.train(())[0])
+        without = capture.psnr(splats)
         there = psnr(cameras_at(suggestions, like))
         scores = [psnr([capture.taken[row].camera for row in rng.choice(
             len(capture.taken), len(suggestions), replace=False)]) for _ in range(draws)]
@@ -196,6 +199,8 @@ def main(
     model: Path | None, everywhere: int,
 ) -> None:
     """Print PSNR with the nearest views to the suggestions, and with random ones."""
+    if everywhere and model is None:
+        raise click.UsageError("--everywhere needs a --model that its views are rendered from.")
     whole = None if model is None else read_ply(model)
     click.echo("| workspace | scored views | with a third missing | + suggested | + random | draws "
                "| gain | + by score |\n|---|---:|---:|---:|---:|---|---:|---:|")
@@ -215,8 +220,9 @@ def main(
             places, _ = standing_places(
                 splats, trust, scene, WorldSummary.read(workspace / "sfm"))
             assert places is not None
-            compare_filmed(workspace.name, capture, suggestions, whole, draws, random_cameras(
-                places.eyes, everywhere, capture.taken[0].camera))
+            compare_filmed(
+                workspace.name, capture, splats, suggestions, whole, draws,
+                random_cameras(places.eyes, everywhere, capture.taken[0].camera))
             continue
         details += [f"{workspace.name}: {each.describe('units')} -> {view.name}"
                     for each, view in zip(suggestions, chosen, strict=True)]
