@@ -3,8 +3,8 @@
 import os
 
 from recon_cli.cli import main
+from recon_cli.executors.executor import CHILD
 from recon_cli.machine import end_with_parent
-from recon_cli.pipeline.executor import CHILD
 
 if os.environ.pop(CHILD, ""):
     end_with_parent()

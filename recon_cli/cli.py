@@ -43,6 +43,8 @@ VERBS = {
     "study": ("bench.study", "Repeat the paper's experiment: 3DGS against ours."),
 }
 
+HIDDEN = {"map-segment": "segments.map_segment"}  # verbs that recon types itself
+
 logger = logging.getLogger("recon")
 
 
@@ -50,7 +52,8 @@ class _LazyCommands(UserDict[str, Any]):
     """The commands by verb; a module is imported when its verb is looked up."""
 
     def __getitem__(self, verb: str) -> click.Command:
-        command: click.Command = load(f"recon_cli.commands.{VERBS[verb][0]}")
+        place = HIDDEN.get(verb) or VERBS[verb][0]
+        command: click.Command = load(f"recon_cli.commands.{place}")
         return command
 
 
@@ -68,7 +71,7 @@ class _LazyGroup(click.Group):
 
 
 @click.group(
-    cls=_LazyGroup, commands=_LazyCommands(dict.fromkeys(VERBS)),
+    cls=_LazyGroup, commands=_LazyCommands(dict.fromkeys((*VERBS, *HIDDEN))),
     context_settings={"max_content_width": MAX_WIDTH})
 @click.version_option(__version__, prog_name="recon")
 def cli() -> None:

@@ -17,7 +17,7 @@ BASE = {"errors", "lazy", "progress", "machine"}
 RECORDS = BASE | {"workspace", "config"}
 READ = RECORDS | {"scene", "io"}
 DRAW = READ | {"context", "render", "evaluation"}
-MAKE = DRAW | {"capture", "sfm", "train", "export", "trust", "stages"}
+MAKE = DRAW | {"capture", "executors", "sfm", "train", "export", "trust", "stages"}
 RUN = MAKE | {"pipeline"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
@@ -30,21 +30,22 @@ ALLOWED: dict[str, set[str]] = {
     "context": {"progress", "scene"},
     "render": {"errors", "machine", "scene"},
     "io": {"errors", "lazy", "workspace", "scene"},
+    "executors": BASE | {"workspace"},
     "capture": READ,
-    "sfm": READ,
+    "sfm": READ | {"executors"},
     "evaluation": READ | {"context", "render"},
     "train": DRAW,
     "export": DRAW | {"sfm", "train"},
     "trust": DRAW,
     "stages": MAKE,
-    "pipeline": READ | {"context", "render", "stages"},
+    "pipeline": READ | {"context", "executors", "render", "stages"},
     "experiments": RUN,
     "flythrough": RUN,
     "report": RUN,
     "viewer": RUN | {"flythrough"},
     "commands": RUN | {"experiments", "flythrough", "report", "viewer"},
     "cli": RUN | {"commands"},
-    "__main__": {"cli", "machine", "pipeline"},
+    "__main__": {"cli", "executors", "machine"},
 }
 # Packages that only some parts may import.
 HOMES = {
@@ -58,7 +59,7 @@ HOMES = {
     "llvmlite": {"render"},
     "tqdm": {"progress"},
     "triton": {"render"},
-    "ray": {"pipeline"},
+    "ray": {"executors"},
     "pycolmap": {"sfm", "io"},
     "trimesh": {"io"},
 }

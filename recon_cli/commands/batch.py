@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.jobs import start_executor
+from recon_cli.commands.jobs import open_executor
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
@@ -71,7 +71,7 @@ def batch(
         raise WorkspaceError(f"{out} cannot be made: {error.strerror}.",
                              hint="Give another folder with --out.") from error
     with hold_lock(out, "batch", other="another folder with --out"):
-        executor, threads = start_executor(place, jobs, compute, out, inputs)
+        executor, threads = open_executor(place, jobs, compute, out, inputs)
         try:
             results = run_batch(
                 captures, out, [*words, "--threads", str(threads)], executor, TqdmProgress(),

@@ -7,7 +7,7 @@ import dataclasses
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.jobs import open_job_with, run_stages, start_executor
+from recon_cli.commands.jobs import open_executor, open_job_with, run_stages
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config.stages import MergeConfig, TrainConfig
 from recon_cli.lazy import load
@@ -57,7 +57,7 @@ def train_in_blocks(call: Call, asked: str, place: str, jobs: int | None) -> boo
     blocks = load("recon_cli.pipeline.blocks.cut_blocks")(job, count, config)
     folder = blocks[0].workspace.parent
     with hold_lock(folder, "train --blocks", other="another workspace with -w"):
-        executor, threads = start_executor(place, jobs, job.compute, folder)
+        executor, threads = open_executor(place, jobs, job.compute, folder)
         words = ["--blocks", "off", "--threads", str(threads), "--device", job.compute.device,
                  "--backend", job.compute.backend]
         if job.compute.max_memory is not None:

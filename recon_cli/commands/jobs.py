@@ -8,16 +8,14 @@ from typing import Any
 
 import click
 
-from recon_cli import machine
 from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import TrainCallback
-from recon_cli.lazy import load
+from recon_cli.executors.executor import Executor, start_executor
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
-from recon_cli.pipeline.executor import CORES, Executor, LocalExecutor
 from recon_cli.pipeline.plan import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress, format_duration
 from recon_cli.stages import IMPORT, STAGES, Stage
@@ -111,16 +109,10 @@ def _value_text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def start_executor(
+def open_executor(
     place: str, jobs: int | None, compute: ComputeConfig, folder: Path, inputs: Sequence[Path] = ()
 ) -> tuple[Executor, int]:
     """Returns what runs commands on `folder`, and how many threads each of them has."""
-    if place == "ray":
-        gpu = {"auto": None, "cpu": False, "cuda": True}[compute.device]
-        executor = load("recon_cli.pipeline.ray_executor.RayExecutor").connect(
-            cores=compute.threads, gpu=gpu, slots=jobs, folder=folder.absolute(),
-            inputs=[path.absolute() for path in inputs])
-        return executor, executor.cores
-    cores = machine.usable_threads()
-    slots = jobs or max(1, cores // (compute.threads or CORES))
-    return LocalExecutor(slots), compute.threads or max(1, cores // slots)
+    gpu = {"auto": None, "cpu": False, "cuda": True}[compute.device]
+    return start_executor(
+        place, folder, inputs=inputs, slots=jobs, cores=compute.threads, gpu=gpu)

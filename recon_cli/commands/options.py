@@ -27,7 +27,7 @@ from recon_cli.config.settings import (
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
-from recon_cli.pipeline.executor import CORES
+from recon_cli.executors.executor import CORES
 
 if TYPE_CHECKING:
     from click.types import OptionHelpExtra

@@ -113,7 +113,10 @@ class SfmConfig(StageConfig):
         metavar="N", hashed=False)
     jobs: int | None = option(
         None, "Segments at once.", minimum=1, hashed=False, expert=True,
-        automatic="one for each core")
+        automatic="one for each core, or as many as the cluster has room for")
+    on: str = option(
+        "local", "Map segments in processes of this machine, or on the Ray cluster at RAY_ADDRESS.",
+        choices=("local", "ray"), hashed=False, expert=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from recon_cli.errors import ConfigError, ReconError, WorkspaceError
+from recon_cli.executors.executor import Command, Executor, find_reason, run_all, watching
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job, last_sources
-from recon_cli.pipeline.executor import Command, Executor, find_reason, run_all, watching
 from recon_cli.progress import Progress
 from recon_cli.stages import STAGES
 from recon_cli.workspace.atomic import write_json

@@ -21,10 +21,10 @@ from recon_cli import machine
 from recon_cli.config import settings as layers
 from recon_cli.config.stages import DenoiseConfig, IngestConfig, SfmConfig, TrainConfig
 from recon_cli.errors import ConfigError, ReconstructionError, StageError
+from recon_cli.executors.executor import Command, Executor, find_reason, run_all, watching
 from recon_cli.io import records
 from recon_cli.io.colmap import read_observations, read_scene, write_part
 from recon_cli.pipeline.execute import Job
-from recon_cli.pipeline.executor import Command, Executor, find_reason, run_all, watching
 from recon_cli.pipeline.plan import require_fresh, status
 from recon_cli.progress import Progress
 from recon_cli.scene.cells import Cell

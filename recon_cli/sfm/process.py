@@ -107,13 +107,13 @@ class CrashError(SfmError):
 
 def run_job(
     job: MappingJob, *, progress: Progress, record: Callable[[int, int], None],
-    on_idle: Callable[[], None], stop: threading.Event | None = None,
+    on_idle: Callable[[], None],
 ) -> None:
     """Runs a job in a process of its own; its results are in the step log. See also `Monitor`.
 
-    SfmError if there is no model to trust, the time is up, or `stop` was set; CrashError if the
-    process died; FormatError if a frame cannot be read; WorkspaceError if another process works in
-    the folder; OSError as met in the process: the disk is full or not writable.
+    SfmError if there is no model to trust or the time is up; CrashError if the process died;
+    FormatError if a frame cannot be read; WorkspaceError if another process works in the folder;
+    OSError as met in the process: the disk is full or not writable.
     """
     max_minutes = job.max_minutes
     deadline = time.monotonic() + 60 * max_minutes
@@ -125,8 +125,6 @@ def run_job(
             for event in _events(child):
                 if isinstance(event, (ReconError, OSError)):
                     raise event
-                if stop is not None and stop.is_set():
-                    raise SfmError("It was interrupted.")
                 if time.monotonic() > deadline:
                     raise _timeout_error(max_minutes, monitor)
                 if event is not None:

@@ -1,26 +1,42 @@
 """A long capture in overlapping segments, each mapped by a job of its own.
 
 A segment is a mapping job on some of the frames, in a folder laid out as that of the stage: it runs
-in a process of its own, keeps the steps that it finished, and fails alone. `join_segments` makes
-one model of them.
+by a command of its own, here or on another machine, keeps the steps that it finished, and fails
+alone. `join_segments` makes one model of them.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import shutil
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from pathlib import Path
 
-from recon_cli.errors import ConfigError, SfmError
+from recon_cli.errors import (
+    BackendError,
+    ConfigError,
+    FormatError,
+    SfmError,
+    WorkspaceError,
+)
+from recon_cli.executors.executor import (
+    KILLED,
+    Command,
+    Executor,
+    find_reason,
+    run_all,
+    watching,
+)
 from recon_cli.io.tracks import Tracks
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.sfm.job import SPLIT, MappingJob, StepLog
 from recon_cli.sfm.process import CrashError, run_job
+from recon_cli.workspace.atomic import read_json, write_json
+from recon_cli.workspace.layout import disk_errors
 
 Names = tuple[str, ...]
 
@@ -32,7 +48,15 @@ LEAST = 10  # frames of a segment
 # Of one core for a frame, in its segments and in the join, measured on walks of 640x360 pixels:
 # docs/scaling.md.
 SEGMENT_SECONDS, JOIN_SECONDS = 1.0, 0.5
-TRIES = 2  # of a segment whose process is killed, perhaps for want of memory beside others
+TRIES = 2  # of a mapping process that is killed, perhaps for want of memory beside others
+COMMAND = "map-segment"  # of recon, which takes JOB
+# in the folder of a segment: what to do, how much of it is done, and what the command printed
+JOB, PROGRESS, OUTPUT = "segment.json", "progress.json", "output.txt"
+_RECORD_SECONDS = 0.5  # between two writes of how much is done
+_ERRORS = {kind.exit_code: kind for kind in (FormatError, BackendError, WorkspaceError)}
+
+# Gives what runs so many commands, and the threads that each of them has.
+Start = Callable[[int], tuple[Executor, int]]
 
 
 def count_segments(frames: int, asked: str) -> int:
@@ -81,13 +105,13 @@ class SegmentRuns:
 
 
 def map_segments(
-    job: MappingJob, count: int, slots: int | None, *, progress: Progress,
+    job: MappingJob, count: int, start: Start, *, progress: Progress,
     record: Callable[[int, int], None],
 ) -> SegmentRuns:
-    """Maps a job in segments, `slots` at once; those that have a model already are kept.
+    """Maps a job in segments by commands of their own; those that have a model are kept.
 
-    A segment that fails stops no other. SfmError if all do, or the time is up; otherwise raises
-    what `run_job` raises.
+    A segment that fails stops no other. SfmError if all do, or the time is up; BackendError if the
+    machines cannot be reached any more; otherwise raises what `run_job` raises.
     """
     deadline = time.monotonic() + 60 * job.max_minutes
     if all(name in job.times for name in job.names):
@@ -100,9 +124,12 @@ def map_segments(
         assert split is not None, "the mapping process ended without a split"
         parts = tuple(map(tuple, split["segments"]))
     job = dataclasses.replace(job, segments=parts)
-    slots = min(slots or job.threads, len(parts))
-    jobs = [_segment_job(job, index, max(1, job.threads // slots)) for index in range(len(parts))]
-    failed = _run_all(jobs, slots, deadline, progress, record)
+    executor, threads = start(len(parts))
+    try:
+        jobs = [_segment_job(job, index, threads) for index in range(len(parts))]
+        failed = _run_all(jobs, executor, deadline, progress, record)
+    finally:
+        executor.close()
     if len(failed) == len(parts):
         raise SfmError(f"None of the {len(parts)} segments could be mapped: {failed[0]}",
                        hint="Try --segments off, more frames, or a slower walk.")
@@ -145,56 +172,66 @@ def _segment_job(job: MappingJob, index: int, threads: int) -> MappingJob:
 
 
 def _run_all(
-    jobs: Sequence[MappingJob], slots: int, deadline: float, progress: Progress,
+    jobs: Sequence[MappingJob], executor: Executor, deadline: float, progress: Progress,
     record: Callable[[int, int], None],
 ) -> dict[int, str]:
     """Returns why segments failed, by index."""
     total = sum(len(job.names) for job in jobs)
-    shares, failed = [0.0] * len(jobs), {}
-    lock, stop = threading.Lock(), threading.Event()
-    with progress.bar("mapping segments", total, unit="frame") as bar:
-        shown = 0
 
-        def note(index: int, share: float) -> None:
-            nonlocal shown
-            with lock:
-                shares[index] = max(shares[index], share)
-                done = int(sum(part * len(job.names)
-                               for part, job in zip(shares, jobs, strict=True)))
-                bar.advance(done - shown)
-                shown = done
-                record(done, 2 * total)  # the join is the other half
+    def look() -> tuple[int, str]:
+        done = int(sum(_share(job) * len(job.names) for job in jobs))
+        record(done, 2 * total)  # the join is the other half
+        return done, ""
 
-        def run(index: int) -> str:
-            reason = ""
-            for _ in range(TRIES):
-                limit = (deadline - time.monotonic()) / 60
-                if limit <= 0:
-                    return "there was no time left for it"
-                try:
-                    run_job(
-                        dataclasses.replace(jobs[index], max_minutes=limit),
-                        progress=NullProgress(), on_idle=lambda: None, stop=stop,
-                        record=lambda done, of: note(index, done / of))
-                except CrashError as error:
-                    reason = error.message
-                except SfmError as error:
-                    return error.message
-                else:
-                    return ""
-            return reason
+    def run(index: int) -> str:
+        folder = jobs[index].out
+        left = (deadline - time.monotonic()) / 60
+        if left <= 0:
+            return "there was no time left for it"
+        dataclasses.replace(jobs[index], max_minutes=left).write(folder / JOB)
+        code = executor.run(Command((COMMAND, str(folder / JOB)), folder, folder / OUTPUT))
+        reason = find_reason(folder / OUTPUT, code)
+        if 0 < code < KILLED and code != SfmError.exit_code:  # no fault of the segment
+            raise _ERRORS.get(code, SfmError)(
+                f"Segment {index} could not be mapped: {reason}",
+                hint=f"Finished segments are kept. What was printed is in {folder / OUTPUT}.")
+        return reason
 
-        with ThreadPoolExecutor(slots) as pool:
-            futures = {pool.submit(run, index): index for index in range(len(jobs))}
+    with progress.bar("mapping segments", total, unit="frame") as bar, watching(bar, look):
+        reasons = run_all(executor, range(len(jobs)), run, lambda *_: None)
+    return {index: reason for index, reason in reasons.items() if reason}
+
+
+def _share(job: MappingJob) -> float:
+    """Returns how much of a segment is done."""
+    if StepLog(job.out).result(job.last) is not None:
+        return 1.0
+    try:
+        done, total = read_json(job.out / PROGRESS)
+    except FormatError:  # it has not begun
+        return 0.0
+    return float(done) / float(total)
+
+
+def map_segment(file: Path) -> None:
+    """Runs the job of a segment, whose file is given; what another process can see of it is there.
+
+    Raises what `run_job` raises.
+    """
+    job = MappingJob.read(file)
+    last = -math.inf
+
+    def record(done: int, total: int) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _RECORD_SECONDS:
+            last = time.monotonic()
+            write_json(job.out / PROGRESS, [done, total])
+
+    with disk_errors(job.out, "mapping a segment"):
+        for left in reversed(range(TRIES)):
             try:
-                for future in as_completed(futures):
-                    index = futures[future]
-                    if reason := future.result():
-                        failed[index] = reason
-                    note(index, 1.0)
-            except BaseException:
-                for future in futures:
-                    future.cancel()
-                stop.set()
-                raise
-    return dict(sorted(failed.items()))
+                run_job(job, progress=NullProgress(), record=record, on_idle=lambda: None)
+                break
+            except CrashError:
+                if not left:
+                    raise

@@ -12,6 +12,7 @@ from typing import Any
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, list_names
+from recon_cli.executors.executor import Executor, start_executor
 from recon_cli.io import records as store
 from recon_cli.io.records import POSES, FrameList, describe_stretches, read_poses
 from recon_cli.io.tracks import TRACKS
@@ -74,11 +75,23 @@ def _run_segments(
         segments.remove_segments(job)  # of a run with other options
         return segments.SegmentRuns(job, {}, {})
     runs = segments.map_segments(
-        job, count, config.jobs, progress=ctx.progress, record=ctx.record)
+        job, count, lambda parts: _start_executor(config, job, parts, ctx.threads),
+        progress=ctx.progress, record=ctx.record)
     for index, reason in runs.failed.items():
         names = runs.job.segments[index]
         ctx.notice(f"Segment {index}, {names[0]} to {names[-1]}, has no model: {reason}")
     return runs
+
+
+def _start_executor(
+    config: SfmConfig, job: MappingJob, parts: int, threads: int
+) -> tuple[Executor, int]:
+    """Returns what maps segments, and the threads of each: on this machine they share `threads`."""
+    if config.on == "ray":
+        return start_executor(
+            config.on, job.out, inputs=[job.frames, job.denoised], slots=config.jobs, gpu=False)
+    slots = min(config.jobs or threads, parts)
+    return start_executor(config.on, job.out, slots=slots, cores=max(1, threads // slots))
 
 
 def _time_limit(config: SfmConfig, frames: FrameList, ctx: StageContext) -> float:

@@ -1,13 +1,15 @@
 """The cut into segments, and what becomes of them: kept, tried again, failed, interrupted."""
 
 import dataclasses
+import errno
 import itertools
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from recon_cli.errors import ConfigError, SfmError
+from recon_cli.errors import ConfigError, ReconError, SfmError, WorkspaceError
 from recon_cli.io.tracks import Tracks
 from recon_cli.progress import NullProgress
 from recon_cli.sfm import segments
@@ -66,17 +68,18 @@ def job(tmp_path):
         times={name: float(index) for index, name in enumerate(names)})
 
 
-class Runner:
-    """In place of a mapping process: finishes the steps of a job, or fails as told."""
+class Mapper:
+    """In place of `run_job`: finishes the steps of a job, or fails as told."""
 
     def __init__(self, **failures):
         self.failures, self.jobs = failures, []
 
-    def __call__(self, job, **_):
+    def __call__(self, job, *, record, **_):
         self.jobs.append(job)
         log = StepLog(job.out)
         if all(log.result(step) for step in job.steps):
             return
+        record(1, 4)
         errors = self.failures.get(f"of_{job.out.name}", [])
         if errors and (error := errors.pop(0)):
             raise error
@@ -87,19 +90,49 @@ class Runner:
         return sorted(int(job.out.name) for job in self.jobs)
 
 
-def run(job, monkeypatch, runner, count=3):
-    monkeypatch.setattr(segments, "run_job", runner)
-    return segments.map_segments(
-        job, count, 2, progress=NullProgress(), record=lambda *_: None)
+class InThisProcess:
+    """An executor that calls what the command would call, as many at once as there are slots."""
+
+    slots = 2
+
+    def __init__(self):
+        self.closed = False
+
+    def run(self, command):
+        verb, file = command.words
+        assert verb == segments.COMMAND
+        try:
+            segments.map_segment(Path(file))
+        except ReconError as error:
+            command.log.write_text(f"error: {error.message}\nhint: {error.hint}\n")
+            return error.exit_code
+        return 0
+
+    def stop(self):
+        pass
+
+    def close(self):
+        self.closed = True
+
+
+def run(job, monkeypatch, mapper, count=3, progress=None, record=lambda *_: None):
+    monkeypatch.setattr(segments, "run_job", mapper)
+    executor = InThisProcess()
+    try:
+        return segments.map_segments(
+            job, count, lambda parts: (executor, 2 if parts == count else 0),
+            progress=progress or NullProgress(), record=record)
+    finally:
+        assert executor.closed
 
 
 def test_each_segment_is_a_job_on_its_frames_and_tracks(job, monkeypatch):
-    runner = Runner()
-    runs = run(job, monkeypatch, runner)
+    mapper = Mapper()
+    runs = run(job, monkeypatch, mapper)
     assert runs.failed == {}
     assert runs.job.segments == segments.split_by_time(job.names, 3)
     assert runs.cpu_seconds == {"features": 6.0, "matches": 6.0, "model": 6.0}
-    for each in runner.jobs:
+    for each in mapper.jobs:
         part = runs.job.segments[int(each.out.name)]
         assert each.names == part
         assert each.steps == ("features", "matches", "model")
@@ -109,51 +142,77 @@ def test_each_segment_is_a_job_on_its_frames_and_tracks(job, monkeypatch):
 
 
 def test_a_segment_that_fails_stops_no_other_and_is_told(job, monkeypatch):
-    runner = Runner(of_1=[SfmError("No two frames match.")])
-    runs = run(job, monkeypatch, runner)
+    mapper = Mapper(of_1=[SfmError("No two frames match.")])
+    runs = run(job, monkeypatch, mapper)
     assert runs.failed == {1: "No two frames match."}
-    assert runner.ran() == [0, 1, 2]
+    assert mapper.ran() == [0, 1, 2]
 
 
 def test_a_segment_whose_process_is_killed_is_tried_again(job, monkeypatch):
-    runner = Runner(of_1=[CrashError("It was ended by SIGKILL."), None])
-    assert run(job, monkeypatch, runner).failed == {}
-    assert runner.ran() == [0, 1, 1, 2]
-    again = Runner(of_1=[CrashError("It was ended by SIGKILL.")] * segments.TRIES)
+    mapper = Mapper(of_1=[CrashError("It was ended by SIGKILL."), None])
+    assert run(job, monkeypatch, mapper).failed == {}
+    assert mapper.ran() == [0, 1, 1, 2]
+    again = Mapper(of_1=[CrashError("It was ended by SIGKILL.")] * segments.TRIES)
     StepLog(job.segment(1)).forget_from("features")
     assert run(job, monkeypatch, again).failed == {1: "It was ended by SIGKILL."}
 
 
+def test_a_full_disk_stops_the_run_and_is_no_failed_segment(job, monkeypatch):
+    error = OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(WorkspaceError, match="Segment 1 could not be mapped: The disk is full"):
+        run(job, monkeypatch, Mapper(of_1=[error]))
+
+
+def test_no_time_is_left_for_a_segment_that_would_begin_too_late(job, monkeypatch):
+    late = dataclasses.replace(job, max_minutes=0.0)
+    with pytest.raises(SfmError, match="there was no time left for it"):
+        run(late, monkeypatch, Mapper())
+
+
+def test_what_a_segment_has_done_is_seen_from_outside(job, monkeypatch):
+    class Slow(Mapper):
+        def __call__(self, each, *, record, **options):
+            if each.out.name == "0":
+                record(1, 2)
+                time.sleep(1.5)  # more than one look
+            super().__call__(each, record=record, **options)
+
+    seen = []
+    run(job, monkeypatch, Slow(), record=lambda *done: seen.append(done))
+    length = [len(part) for part in segments.split_by_time(job.names, 3)]
+    assert seen[0] == (length[0] // 2 + length[1] + length[2], 2 * sum(length))
+
+
 def test_no_segment_at_all_is_an_error(job, monkeypatch):
-    runner = Runner(**{f"of_{index}": [SfmError("Too dark.")] for index in range(3)})
+    mapper = Mapper(**{f"of_{index}": [SfmError("Too dark.")] for index in range(3)})
     with pytest.raises(SfmError, match="None of the 3 segments could be mapped: Too dark"):
-        run(job, monkeypatch, runner)
+        run(job, monkeypatch, mapper)
 
 
 def test_an_interrupted_run_keeps_what_is_finished(job, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
-        run(job, monkeypatch, Runner(of_2=[KeyboardInterrupt()]))
+        run(job, monkeypatch, Mapper(of_2=[KeyboardInterrupt()]))
     kept = job.segment(0) / "steps.json"
     before = kept.stat().st_mtime_ns
-    assert run(job, monkeypatch, Runner()).failed == {}
+    assert run(job, monkeypatch, Mapper()).failed == {}
     assert kept.stat().st_mtime_ns == before
     assert StepLog(job.segment(2)).result("model")
 
 
 def test_segments_of_another_cut_are_not_taken_for_these(job, monkeypatch):
-    run(job, monkeypatch, Runner())
-    run(job, monkeypatch, Runner(), count=2)
+    run(job, monkeypatch, Mapper())
+    run(job, monkeypatch, Mapper(), count=2)
     for index, names in enumerate(segments.split_by_time(job.names, 2)):
         listed = (job.segment(index) / "frames.txt").read_text().split()
         assert tuple(listed) == names
-    runner = Runner(of_0=[SfmError("It has to be mapped anew.")])
-    assert run(job, monkeypatch, runner).failed == {0: "It has to be mapped anew."}
+    mapper = Mapper(of_0=[SfmError("It has to be mapped anew.")])
+    assert run(job, monkeypatch, mapper).failed == {0: "It has to be mapped anew."}
 
 
 def test_photos_are_split_by_the_mapping_process(job, monkeypatch):
     parts = [job.names[::2], job.names[1::2]]
 
-    class Splitter(Runner):
+    class Splitter(Mapper):
         def __call__(self, each, **options):
             if each.last == SPLIT:
                 assert each.steps == ("features", "matches", "split")
@@ -169,6 +228,6 @@ def test_photos_are_split_by_the_mapping_process(job, monkeypatch):
 
 
 def test_the_folders_of_segments_are_removed(job, monkeypatch):
-    run(job, monkeypatch, Runner())
+    run(job, monkeypatch, Mapper())
     segments.remove_segments(job)
     assert not job.segment(0).parent.exists()

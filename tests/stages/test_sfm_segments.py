@@ -4,7 +4,9 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
+from importlib import import_module
 
 import numpy as np
 import psutil
@@ -101,8 +103,8 @@ def test_a_killed_segment_is_mapped_again_and_a_killed_run_goes_on(mapped, room,
     worker = None
     while worker is None:
         assert parent.poll() is None
-        worker = next((child for child in psutil.Process(parent.pid).children()
-                       if "/segments/1/" in " ".join(child.cmdline())), None)
+        worker = next((child for child in psutil.Process(parent.pid).children(recursive=True)
+                       if "/segments/1/job.json" in " ".join(child.cmdline())), None)
         time.sleep(0.05)
     worker.kill()
     while not (noted(out / "segments" / "0", "model") and noted(out / "segments" / "1", "model")):
@@ -142,3 +144,37 @@ def test_photos_are_cut_by_what_they_show(sample_video, tmp_path, shared_data):
     assert summary.segments == 2
     assert summary.registered == COUNT
     assert rmse(tmp_path / "out", shared_data) < 0.03
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    pytest.importorskip("ray")
+    yield from import_module("ray_clusters").cluster_for(monkeypatch)
+
+
+@pytest.mark.slow
+def test_segments_on_a_cluster_give_the_same_bytes_though_a_node_is_lost(
+    mapped, room, cluster, tmp_path
+):
+    clusters = import_module("ray_clusters")
+    nodes = [cluster.add_node(num_cpus=1, object_store_memory=clusters.STORE_BYTES)
+             for _ in range(2)]
+    cluster.wait_for_nodes()
+    out, lost = tmp_path / "out", []
+    out.mkdir()
+
+    def kill() -> None:
+        while not (found := [each for each in psutil.process_iter(["cmdline"])
+                             if f"{out}/segments/1/job.json" in (each.info["cmdline"] or [])]):
+            time.sleep(0.02)
+        lost.append(clusters.node_of(found[0], nodes))
+        cluster.remove_node(lost[0], allow_graceful=False)
+
+    thread = threading.Thread(target=kill, daemon=True)
+    thread.start()
+    summary = run(room, out, max_features=FEATURES, segments="2", on="ray")
+    assert lost
+    assert summary.registered == COUNT
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (out / "sparse" / name).read_bytes() == (
+            mapped[0] / "sparse" / name).read_bytes(), name

@@ -12,15 +12,14 @@ from posed_sets import make_replica
 
 from recon_cli import __version__
 from recon_cli.errors import BackendError, WorkspaceError
-from recon_cli.pipeline import ray_executor
-from recon_cli.pipeline.executor import Command
-from recon_cli.pipeline.ray_executor import RayExecutor, _check_node, _choose_resources, _probe
+from recon_cli.executors import ray_executor
+from recon_cli.executors.executor import Command
+from recon_cli.executors.ray_executor import RayExecutor, _check_node, _choose_resources, _probe
 from recon_cli.workspace.layout import Workspace
 
 ray = pytest.importorskip("ray")
-from ray.cluster_utils import Cluster  # noqa: E402
+from ray_clusters import STORE_BYTES, cluster_for, node_of, start_cluster  # noqa: E402
 
-STORE_BYTES = 100 << 20
 STEPS, SAVE_EVERY = 6000, 200
 
 
@@ -54,6 +53,12 @@ def test_without_ray_the_error_says_how_to_install_it(tmp_path, monkeypatch):
     with pytest.raises(BackendError, match="not installed") as caught:
         RayExecutor.connect(cores=None, gpu=None, slots=None, folder=tmp_path, inputs=[])
     assert "pip install 'recon-cli[ray]'" in caught.value.hint
+
+
+def test_what_ray_runs_does_not_wait_for_more_of_ray(tmp_path, monkeypatch):
+    monkeypatch.setenv(ray_executor._INSIDE, "1")
+    with pytest.raises(BackendError, match="cannot share out its work on Ray again"):
+        RayExecutor.connect(cores=None, gpu=None, slots=None, folder=tmp_path, inputs=[])
 
 
 def test_a_cluster_that_does_not_answer_is_an_error(tmp_path, monkeypatch):
@@ -92,9 +97,6 @@ def test_a_machine_that_cannot_run_a_command_is_refused(monkeypatch, answer, err
         _check_node("10.0.0.2", answer, Path("/shared/out"))
 
 
-# The tests below start clusters of this machine: every node is a raylet of its own.
-
-
 def words_of(source, workspace):
     settings = (f"train.iterations={STEPS}", "train.max_size=32",
                 f"train.checkpoint_every={SAVE_EVERY}")
@@ -115,26 +117,6 @@ def saved_steps(workspace):
     return partial.done if partial else 0
 
 
-def start_cluster(cpus):
-    return Cluster(initialize_head=True, head_node_args={
-        "num_cpus": cpus, "include_dashboard": False, "object_store_memory": STORE_BYTES})
-
-
-@pytest.fixture
-def cluster(monkeypatch):
-    """Yields a cluster of a head without CPUs, for the test to add nodes to."""
-    made = start_cluster(cpus=0)
-    monkeypatch.setenv("RAY_ADDRESS", made.address)
-    yield made
-    ray.shutdown()
-    made.shutdown()
-
-
-def raylet_above(process):
-    """Returns the raylet of the simulated node on which a process runs."""
-    return next(parent for parent in process.parents() if parent.name() == "raylet")
-
-
 def training_process(workspace):
     """Returns the process that trains on a workspace, wherever it runs."""
     for process in psutil.process_iter(["cmdline"]):
@@ -142,6 +124,11 @@ def training_process(workspace):
         if "recon_cli" in words and str(workspace) in words:
             return process
     return None
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    yield from cluster_for(monkeypatch)
 
 
 @pytest.mark.slow
@@ -161,10 +148,8 @@ def test_a_killed_node_costs_no_result(cluster, tmp_path):
 
     def kill():
         wait_for(lambda: saved_steps(workspace) >= 2 * SAVE_EVERY)
-        lost = raylet_above(training_process(workspace))
-        at = next(node for node in nodes
-                  if lost.pid in [p.process.pid for p in node.all_processes["raylet"]])
-        cluster.remove_node(at, allow_graceful=False)
+        lost = node_of(training_process(workspace), nodes)
+        cluster.remove_node(lost, allow_graceful=False)
         killed.append(saved_steps(workspace))
 
     thread = threading.Thread(target=kill)

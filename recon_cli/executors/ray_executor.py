@@ -23,13 +23,14 @@ except ImportError:  # `connect` says so
 
 from recon_cli import __version__
 from recon_cli.errors import BackendError, ReconError, WorkspaceError, list_names
-from recon_cli.pipeline.executor import CORES, INTERRUPTED, TRIES, Command, RunningCommand
+from recon_cli.executors.executor import CORES, INTERRUPTED, TRIES, Command, RunningCommand
 from recon_cli.workspace.atomic import write_bytes
 
 _PROBE_SECONDS = 60.0  # for a machine that is busy
 _STORE_BYTES = 100 << 20  # of objects that travel; ours are words
 _HEAD_SECONDS = 2.0  # between two looks at the head
 _HEAD_TRIES = 5  # looks in a row that find no head, before it is given up
+_INSIDE = "RECON_RUN_BY_RAY"  # environment variable of what Ray runs
 _WORKER_DIED = 137  # exit code where no process is left to tell one
 
 
@@ -53,13 +54,17 @@ class RayExecutor:
         """Connects to a cluster and checks each machine; None: as many as suit the cluster.
 
         Raises:
-            BackendError: Ray is missing, there is no cluster, a machine lacks recon or has another
-                version, or none has what a command needs.
+            BackendError: Ray is missing or runs this very command, there is no cluster, a machine
+                lacks recon or has another version, or none has what a command needs.
             WorkspaceError: a machine does not see `folder` or one of `inputs`.
         """
         if ray is None:
             raise BackendError(
                 "Ray is not installed.", hint="Run `pip install 'recon-cli[ray]'`.")
+        if os.environ.get(_INSIDE):  # it would wait for CPUs that whoever waits for it holds
+            raise BackendError(
+                "A command that Ray runs cannot share out its work on Ray again.",
+                hint="Give --on local, or leave `on` out of recon.toml and --set.")
         address = os.environ.get("RAY_ADDRESS")
         own = {} if address else {"include_dashboard": False, "object_store_memory": _STORE_BYTES}
         try:
@@ -144,6 +149,7 @@ def _shut_down_on_failure() -> Any:
 
 def _run_command(words: list[str], workspace: str, log: str) -> int:
     """Runs a command on the machine that Ray chose; Ray interrupts it as Ctrl-C does."""
+    os.environ[_INSIDE] = "1"
     running = RunningCommand(Command(tuple(words), Path(workspace), Path(log)))
     thread_code: list[int] = []
     thread = threading.Thread(target=lambda: thread_code.append(running.wait()))
@@ -209,7 +215,7 @@ def _check_node(address: str, answer: Any, folder: Path) -> None:
     if not found["sees"]:
         raise WorkspaceError(
             f"The machine {address} of the Ray cluster does not see {folder}, or cannot write it.",
-            hint="Give a folder that all machines see under the same path with --out.")
+            hint="Work in a folder that all machines see under the same path (-w, --out).")
     if found["missing"]:
         raise WorkspaceError(
             f"The machine {address} of the Ray cluster does not see "

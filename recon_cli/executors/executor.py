@@ -1,4 +1,4 @@
-"""Runs recon commands for other programs: in processes of this machine, or see `ray_executor`.
+"""Runs recon commands in processes of this machine, or has `ray_executor` do it.
 
 A command is what one would type. What it makes lies in a workspace whose stages commit atomically
 and resume: a retry is the same command, and nothing but an exit code has to come back. How far it
@@ -22,6 +22,8 @@ from typing import Protocol, TypeVar
 
 from filelock import FileLock, Timeout
 
+from recon_cli import machine
+from recon_cli.lazy import load
 from recon_cli.progress import Bar
 from recon_cli.workspace.layout import LOCK
 
@@ -151,6 +153,29 @@ class RunningCommand:
                 process.kill()  # where this thread is interrupted itself
 
 
+def start_executor(
+    place: str, folder: Path, *, inputs: Sequence[Path] = (), slots: int | None = None,
+    cores: int | None = None, gpu: bool | None = None,
+) -> tuple[Executor, int]:
+    """Returns what runs commands on `folder`, and how many threads each of them has.
+
+    `place` is "local" or "ray". None: as many commands at once, and as many cores for each of them,
+    as suit the machines; a GPU if they have one.
+
+    Raises:
+        BackendError: there is no Ray cluster, or it lacks what a command needs.
+        WorkspaceError: a machine of it does not see `folder` or one of `inputs`.
+    """
+    if place == "ray":
+        executor = load("recon_cli.executors.ray_executor.RayExecutor").connect(
+            cores=cores, gpu=gpu, slots=slots, folder=folder.absolute(),
+            inputs=[path.absolute() for path in inputs])
+        return executor, executor.cores
+    usable = machine.usable_threads()
+    slots = slots or max(1, usable // (cores or CORES))
+    return LocalExecutor(slots), cores or max(1, usable // slots)
+
+
 def _wait_until_free(workspace: Path) -> None:
     """Waits for a process whose parent was killed: it ends, but not at once.
 
@@ -188,16 +213,16 @@ def run_all(
 
 @contextmanager
 def watching(bar: Bar, look: Callable[[], tuple[int, str]]) -> Iterator[None]:
-    """Shows on a bar of 100 what `look` returns: percent that are done, and what is going on."""
+    """Shows on a bar what `look` returns: units that are done, and what is going on."""
     ended = threading.Event()
 
     def watch() -> None:
         shown = 0
         while not ended.wait(_LOOK_SECONDS):
-            percent, text = look()
+            done, text = look()
             bar.note(text)
-            bar.advance(max(0, percent - shown))
-            shown = max(percent, shown)
+            bar.advance(max(0, done - shown))
+            shown = max(done, shown)
 
     thread = threading.Thread(target=watch)
     thread.start()

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from recon_cli.pipeline import executor
-from recon_cli.pipeline.executor import Command, LocalExecutor
+from recon_cli.executors import executor
+from recon_cli.executors.executor import Command, LocalExecutor
 
 # Stands for recon: counts its starts in the folder in which it runs, and does what it is told.
 STAND_IN = """

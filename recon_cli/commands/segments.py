@@ -1,0 +1,17 @@
+"""`recon map-segment`, which `recon sfm` types for each segment of a long capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from recon_cli.commands.options import verb
+from recon_cli.lazy import load
+
+
+@verb("map-segment")
+@click.argument("job", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+def map_segment(job: Path) -> None:
+    """Map one segment of a capture, as JOB says."""
+    load("recon_cli.sfm.segments.map_segment")(job)
