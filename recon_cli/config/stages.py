@@ -186,6 +186,10 @@ class TrainConfig(StageConfig):
     far: str = option(
         "auto", "Add distant background Gaussians; auto: unless a trial lowers validation PSNR.",
         choices=("auto", "on", "off"))
+    planes: str = option(
+        "auto", "Start with Gaussians on walls and ceilings without texture, where points around "
+        "them lie in a plane; auto: unless a trial lowers validation PSNR.",
+        choices=("auto", "on", "off"))
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
         choices=("auto", "on", "off"))

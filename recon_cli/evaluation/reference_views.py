@@ -37,6 +37,7 @@ from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.workspace.summaries import WorldSummary
 
 LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}  # of the models of a workspace
 MASK_HINT = "Run `recon ingest` with masks that hide less."
@@ -71,10 +72,11 @@ def load_scene(inputs: StageInputs, *, validation: float) -> Scene:
     """Returns the views and points that sfm left, split by what each may be used for."""
     sfm = inputs.folders["sfm"]
     held_out, block = held_out_names(inputs.folders["ingest"]), BlockRecord.read(sfm)
-    if block is None:
-        return read_scene(sfm / "undistorted", held_out=held_out, validation=validation)
-    scene = read_scene(sfm / "undistorted", held_out=held_out, validation=block.validation)
-    return dataclasses.replace(scene, cell=block.cell)
+    scene = read_scene(sfm / "undistorted", held_out=held_out,
+                       validation=validation if block is None else block.validation)
+    world = WorldSummary.read(sfm)
+    up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
+    return dataclasses.replace(scene, up=up, cell=None if block is None else block.cell)
 
 
 def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:

@@ -67,7 +67,7 @@ def read_scene(
         raise model_error(sparse, f"{len(views)} views and {len(points)} points", _HINT)
     missing = sorted(held_out - {view.name for view in views})
     error = mean_point_error(sparse / "points3D.bin")
-    return Scene(train, chosen, test, tuple(missing), points, colors, error)
+    return Scene(train, chosen, test, tuple(missing), points, colors, error, sparse=sparse)
 
 
 def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
@@ -130,6 +130,31 @@ def mean_point_error(path: Path) -> float | None:
     """Returns the mean reprojection error of a points3D.bin in pixels, None if no point has any."""
     errors = [float(row[7]) for row in _read_point_rows(path, _HINT) if row[7] > 0]
     return float(np.mean(errors)) if errors else None
+
+
+def read_visibility(sparse: Path) -> dict[str, NDArray[np.int64]]:
+    """Returns the rows of the points that each view sees, by name; rows as in `read_points`.
+
+    FormatError if the model is missing or damaged.
+    """
+    reader = Reader(sparse / "images.bin", _HINT)
+    names = {}
+    for _ in range(reader.count(minimum=73)):
+        number = reader.take("<I7dI")[0]
+        names[number] = reader.text()
+        reader.skip(24 * reader.count(minimum=24))
+    reader.end()
+    reader = Reader(sparse / "points3D.bin", _HINT)
+    ids, tracks = [], []
+    for _ in range(reader.count(minimum=51)):
+        ids.append(reader.take("<Q3d3Bd")[0])
+        length = reader.count(minimum=8)
+        tracks.append(np.array(reader.take(f"<{2 * length}I"), np.int64)[::2])
+    reader.end()
+    order = np.argsort(ids, kind="stable")
+    rows = np.repeat(np.arange(len(ids)), [len(tracks[i]) for i in order])
+    views = np.concatenate([np.empty(0, np.int64), *(tracks[i] for i in order)])
+    return {name: np.unique(rows[views == number]) for number, name in names.items()}
 
 
 def _read_point_rows(path: Path, hint: str) -> list[tuple[Any, ...]]:

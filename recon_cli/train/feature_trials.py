@@ -2,8 +2,9 @@
 
 A part has a cheap sign that must speak for it first, then two short runs at a reduced size that
 differ in this part alone are scored on views that neither trained on. A part is off unless the
-trial shows a gain; far content is on unless it shows a loss. What was switched on is part of the
-trials that follow. `tests/bench/bench_trials.py` holds the choices against runs of full length.
+trial shows a gain; far content and planes are on unless it shows a loss. What was switched on is
+part of the trials that follow. `tests/bench/bench_trials.py` holds the choices against runs of full
+length.
 """
 
 from __future__ import annotations
@@ -110,7 +111,8 @@ LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and pa
 _STEPS = 400
 _POINTS = 5000
 _CAP = 10_000
-PARTS = ("far", "exposure", "poses", "images")
+LEAST_BLANK = 20  # points, a fifth of a square metre in a room
+PARTS = ("far", "planes", "exposure", "poses", "images")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
@@ -164,6 +166,10 @@ def examine(scene: Candidate) -> Needs:
     elif config.images == "auto":
         settle("images", "denoised", "")
     settle("far", "on" if bench.far.share > 0 else None, "points cover all that the views see")
+    blank = scene.task.blank
+    found = 0 if config.planes != "auto" or blank is None else len(blank.found.points)
+    settle("planes", "on" if found >= LEAST_BLANK else None,
+           f"{found} points lie on surfaces without texture")
     settle("exposure", "on" if bench.drift.drifts else None,
            f"brightness of the same points differs by {100 * bench.drift.spread:.1f}% only")
     task = scene.task
@@ -214,9 +220,10 @@ class _Bench:
             return [values[i] for i in telling]
 
         # Far content gains most, 1 to 3 dB on four of twelve captures, where few views gain much
-        # and the errors are large; it loses up to .5 dB on photos taken around a thing.
+        # and the errors are large; it loses up to .5 dB on photos taken around a thing. Planes
+        # gain off the path, where no view can be scored.
         return decide(part, (lambda: scores(without), lambda: scores(with_it)),
-                      unless_worse=part == "far")
+                      unless_worse=part in ("far", "planes"))
 
     def degree(self, config: RunConfig, decisions: list[TrialDecision]) -> int:
         """Returns the lowest degree of the colours that the highest does not beat by enough."""
@@ -266,7 +273,7 @@ class _Bench:
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         schedule = Schedule(config, dataclasses.replace(Schedule(config).recipe, levels=()))
         small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
-                     task.backend, task.device, camera_error=task.camera_error)
+                     task.backend, task.device, camera_error=task.camera_error, blank=task.blank)
         # reduced views would be reduced once more in the search for what lies far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)

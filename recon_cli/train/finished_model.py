@@ -77,10 +77,11 @@ class FinishedModel:
         """
         if self.trained:
             return model_parts(self.config)
-        if asked.far == "on":
-            raise ConfigError(
-                "far is on, but an imported scene has what background it has: distant Gaussians "
-                "are added to the points of sfm only.", hint="Leave out --far.")
+        for name in ("far", "planes"):
+            if getattr(asked, name) == "on":
+                raise ConfigError(
+                    f"{name} is on, but an imported scene has the Gaussians that it has: others "
+                    "are added to the points of sfm only.", hint=f"Leave out --{name}.")
         if asked.max_gaussians is not None and asked.max_gaussians < self.gaussians:
             raise ConfigError(
                 f"max_gaussians is {asked.max_gaussians:,}, but the imported scene has "

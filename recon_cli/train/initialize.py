@@ -67,13 +67,20 @@ def first_state(
     most: int,
     far: FarContent | None = None,
 ) -> TrainState:
-    """Returns the first state of a run: `most` Gaussians, some of them the background `far`."""
+    """Returns the first state of a run: `most` Gaussians, some of them the background `far`.
+
+    What lies far outside is told by the sparse points alone: walls have its colour behind them too.
+    """
     config = task.schedule.config
     if config.far != "on":
         far = None
     elif far is None:
         far = far_content(task.train, points, task.extent)
     gains = estimate_gains(task.train, points).log_gains if config.exposure == "on" else None
+    if config.planes == "on" and task.blank is not None:
+        surfaces = task.blank.found
+        points = np.concatenate([points, surfaces.points])
+        colors = np.concatenate([colors, surfaces.colors])
     splats = first_splats(config, points, colors, far, most=most)
     exposure, poses = new_parts(task, gains)
     return new_state(

@@ -15,6 +15,7 @@ from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.blank_surfaces import BlankSurfaces
 from recon_cli.train.schedule import Schedule
 
 
@@ -31,6 +32,7 @@ class Task:
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
+    blank: BlankSurfaces | None = None  # of the training views; None where they are not known
     ranks: ProcessGroup = SINGLE_PROCESS  # this process among those that take the steps together
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]

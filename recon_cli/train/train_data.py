@@ -9,12 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, TrainingError
 from recon_cli.evaluation import reference_views
+from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
@@ -22,6 +24,7 @@ from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.blank_surfaces import BlankSurfaces, SparseModel
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import read_json, write_bytes
@@ -51,7 +54,8 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     refuse_few_views(scene)
     _refuse_tiny_units(scene)
     file = image_file(ctx) if check_memory(scene, config, ctx).in_file else None
-    train = load_views(scene.train, config, ctx, file)
+    views = load_views(scene.train, config, ctx, file)
+    train: list[TrainView] = [*views]
     if len(train) < 2:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
@@ -60,8 +64,16 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         train = [view.page_locked() for view in train]
     error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
     return Task(
-        train, load_views(scene.validation, config, ctx, file), Schedule(config), scene.extent,
-        ctx.backend, torch.device(ctx.device), camera_error=error, cell=scene.cell)
+        train, [*load_views(scene.validation, config, ctx, file)], Schedule(config), scene.extent,
+        ctx.backend, torch.device(ctx.device), camera_error=error, cell=scene.cell,
+        blank=BlankSurfaces(train, lambda: _sparse_model(scene, [view.name for view in views])))
+
+
+def _sparse_model(scene: Scene, names: Sequence[str]) -> SparseModel:
+    """Returns what is known of the views of these names; nothing where points have no tracks."""
+    seen = {} if scene.sparse is None else read_visibility(scene.sparse)
+    nothing = np.empty(0, np.int64)
+    return SparseModel(scene.points, [seen.get(name, nothing) for name in names], scene.up)
 
 
 def _refuse_tiny_units(scene: Scene) -> None:
@@ -76,7 +88,7 @@ def _refuse_tiny_units(scene: Scene) -> None:
 
 def load_views(
     views: Sequence[View], config: RunConfig, ctx: StageContext, file: ImageFile | None = None
-) -> list[TrainView]:
+) -> list[reference_views.ReferenceView]:
     """Returns the views at the training size, without those whose mask leaves next to nothing."""
     return [*reference_views.load_views(
         views, config.max_size, "not trained on", ctx, denoised=config.images == "denoised",

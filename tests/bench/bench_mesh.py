@@ -1,7 +1,8 @@
 """How near a mesh comes to a room whose depth is known.
 
-`PYTHONPATH=. python tests/bench/bench_mesh.py WORKSPACE ROOM [--room-of FOLDER]` with a workspace
-that was trained on ROOM (living, office) with its poses. For each way to take the depth it prints
+`PYTHONPATH=. python tests/bench/bench_mesh.py WORKSPACE ROOM [--video]` with a workspace that was
+trained on ROOM (living, office) with its poses, or from its video alone: then the mesh is moved by
+the similarity of its cameras to the true ones. For each way to take the depth it prints
 F-scores, precision and recall at 5 and 2 cm, triangles, seconds, CPU seconds and peak memory. The
 reference are the exact depth maps, fused at 3 cm; 1.5 cm are allowed for that spacing, and only
 what at least three training views show counts for the recall. Nothing is chosen here by test
@@ -20,6 +21,7 @@ import click
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pose_errors import similarity
 from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext, StageInputs
@@ -124,6 +126,21 @@ def with_depths(maps: DepthMaps, depth_of: Callable[[Camera], NDArray[np.float32
     return weigh(maps.views, maps.cameras, depths, ones)
 
 
+def true_scene(
+    scene: Scene, room: Path
+) -> tuple[Scene, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
+    """Returns a scene of a video with the true cameras, and what moves its places to theirs."""
+    poses = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)
+    true = [poses[int(Path(view.name).stem)] for view in scene.train]
+    ours = np.stack([view.camera.center for view in scene.train])
+    scale, motion = similarity(np.stack([pose[:3, 3] for pose in true]), ours)
+    moved = tuple(dataclasses.replace(view, camera=Camera(
+        600, 340, 300.0, 300.0, 300.0, 170.0, np.linalg.inv(pose)))
+        for view, pose in zip(scene.train, true, strict=True))
+    return dataclasses.replace(scene, train=moved), lambda places: (
+        places - motion[:3, 3]) @ motion[:3, :3] / scale
+
+
 def copy(maps: DepthMaps) -> DepthMaps:
     """Returns maps that may be changed."""
     return dataclasses.replace(
@@ -135,14 +152,16 @@ def copy(maps: DepthMaps) -> DepthMaps:
 @click.argument("room")
 @click.option("--threads", default=2, show_default=True)
 @click.option("--triangles", default=300_000, show_default=True)
-def main(workspace: Path, room: str, threads: int, triangles: int) -> None:
+@click.option("--video", is_flag=True, help="The workspace was made from the video of ROOM.")
+def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) -> None:
     """Prints the table."""
     use_threads("numba", threads)
     folders = {name: workspace / name for name in ("ingest", "sfm", "train")}
     scene = load_scene(StageInputs(folders), validation=0.05)
     splats = read_ply(workspace / "train" / "splats.ply")
     ctx = StageContext(NullProgress(), "cpu", "numba", threads)
-    points, shown = reference(ROOMS / room, scene)
+    true, moved = true_scene(scene, ROOMS / room) if video else (scene, lambda places: places)
+    points, shown = reference(ROOMS / room, true)
     click.echo("| depth | F (precision, recall) at 5 cm | at 2 cm | triangles | s | CPU s | MB |")
     click.echo("|---|---|---|---:|---:|---:|---:|")
 
@@ -151,8 +170,9 @@ def main(workspace: Path, room: str, threads: int, triangles: int) -> None:
         vertices, faces = make()
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-        click.echo(f"| {name} | {f_scores(vertices, faces, points, shown)} | {len(faces):,} | "
-                   f"{seconds:.1f} | {cpu:.1f} | {peak:.0f} |")
+        scores = f_scores(moved(vertices), faces, points, shown)
+        click.echo(f"| {name} | {scores} | {len(faces):,} | {seconds:.1f} | {cpu:.1f} | "
+                   f"{peak:.0f} |")
 
     views = load_views(scene.train, SIZE, "not used")
     maps = render_depth_maps(splats, views, "numba")
@@ -183,6 +203,9 @@ def main(workspace: Path, room: str, threads: int, triangles: int) -> None:
         return mesh.vertices, mesh.faces
 
     row("and only what views show", without_planes)
+
+    if video:
+        return
 
     def exact() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         rows = exact_depths(ROOMS / room)

@@ -4,7 +4,14 @@ import pytest
 from PIL import Image
 
 from recon_cli.errors import FormatError
-from recon_cli.io.colmap import read_images, read_pinholes, read_points, read_scene
+from recon_cli.io.colmap import (
+    read_images,
+    read_observations,
+    read_pinholes,
+    read_points,
+    read_scene,
+    read_visibility,
+)
 
 WIDTH, HEIGHT = 8, 6
 NAMES = [f"{index:06d}.png" for index in range(5)]
@@ -75,6 +82,24 @@ def test_poses_agree_with_pycolmap(undistorted):
         np.testing.assert_allclose(
             view.camera.viewmat[:3], image.cam_from_world().matrix(), atol=1e-15)
         np.testing.assert_allclose(view.camera.center, image.projection_center(), atol=1e-15)
+
+
+def test_which_view_sees_which_point_is_as_pycolmap_has_it(undistorted):
+    seen = read_visibility(undistorted / "sparse")
+    assert sorted(seen) == NAMES
+    assert [seen[name].tolist() for name in NAMES] == [[0, 1]] * 3 + [[]] * 2
+    names, _, observations = read_observations(undistorted / "sparse")
+    for index, name in enumerate(names):
+        expected = np.sort(observations.point[observations.view == index])
+        assert seen[name].tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize("name", ["images.bin", "points3D.bin"])
+def test_visibility_of_a_damaged_model_is_an_error(undistorted, name):
+    path = undistorted / "sparse" / name
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(FormatError, match=name):
+        read_visibility(undistorted / "sparse")
 
 
 def test_points_and_colors_are_read_in_the_order_of_their_ids(undistorted):

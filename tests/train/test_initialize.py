@@ -1,12 +1,17 @@
 """The first Gaussians."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from tiny_task import CONFIG, tiny_task
 
 from recon_cli.errors import TrainingError
 from recon_cli.scene.splats import SH_C0
-from recon_cli.train.initialize import splats_from_points
+from recon_cli.train.blank_surfaces import SurfacePoints
+from recon_cli.train.initialize import first_state, splats_from_points
 
 GRID = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
 GREY = np.full((27, 3), 128, np.uint8)
@@ -44,3 +49,15 @@ def test_of_too_many_points_a_seeded_draw_is_taken():
 def test_too_few_points_are_refused():
     with pytest.raises(TrainingError, match="3 points"):
         splats_from_points(GRID[:3], GREY[:3], most=10, seed=0, sh_degree=3)
+
+
+@pytest.mark.parametrize(("planes", "more"), [("on", 3), ("off", 0), ("auto", 0)])
+def test_blank_surfaces_begin_with_gaussians_only_where_they_are_on(planes, more):
+    surfaces = SurfacePoints(GRID[:3] + 20, np.full((3, 3), 200, np.uint8))
+    config = replace(CONFIG, planes=planes)
+    task = replace(tiny_task(config), blank=SimpleNamespace(found=surfaces))
+    splats = first_state(task, GRID, GREY, most=100).splats
+    assert len(splats) == 27 + more
+    added = splats.means.detach().numpy()[27:]
+    assert added.tolist() == surfaces.points[:more].tolist()
+    assert torch.allclose(SH_C0 * splats.sh_dc[27:] + 0.5, torch.tensor(200 / 255), atol=1e-6)
