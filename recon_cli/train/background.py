@@ -33,6 +33,10 @@ _SAMPLES = 500  # points that this median is taken over
 _AGREE = 2  # views that must see nothing in front
 _SHARE = 0.1  # of the views that look there: elsewhere a surface lacks points in some views only
 _FACING = 5  # directions that must be free in a view that sees some of it; 50 square degrees
+# Of views that look at one thing: the median sine of the angle between axis and point is .03 to .13
+# on five captures of things and .37 to .96 on seven of rooms, and nine of ten come from within 18
+# degrees or more, on a walk down a corridor 5.
+_MISSED, _BEFORE, _SIDES_DEG = 0.25, 0.9, 10.0
 _FILL_DEGREES = 12.0  # directions this close to a far one become far: frames and trees hide some
 _OPACITY = 0.5
 _SPACING = 0.6  # of the distance between directions: the standard deviation
@@ -80,6 +84,28 @@ def faces(view: TrainView, content: FarContent, points: NDArray[np.float64]) -> 
     small = reduce_view(view, _LEVEL)
     _, column, line = project_points(small.camera, content.positions)
     return int((~_cover_mask(small, points)[line, column]).sum()) >= _FACING
+
+
+def look_at_one_thing(views: Sequence[TrainView]) -> bool:
+    """Tells whether the views stand around a thing and look at it, as opposed to a room or a walk.
+
+    Their optical axes then pass near one point before them, and meet there from different sides:
+    those of a walk straight ahead run side by side.
+    """
+    centers = np.stack([view.camera.center for view in views])
+    forward = np.stack([view.camera.viewmat[2, :3] for view in views])
+    across = np.eye(3) - forward[:, :, None] * forward[:, None]  # [V, 3, 3]
+    sums = across.sum(0), (across @ centers[..., None]).sum(0)[:, 0]
+    point = np.linalg.lstsq(*sums, rcond=None)[0]
+    offsets = point - centers
+    distance = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    ahead = (offsets * forward).sum(1)
+    missed = np.sqrt(np.maximum(1 - (ahead / distance) ** 2, 0))
+    sides = offsets / distance[:, None]
+    middle = sides.mean(0) / max(float(np.linalg.norm(sides.mean(0))), 1e-12)
+    spread = np.degrees(np.arccos(np.clip(sides @ middle, -1, 1)))
+    return bool(np.median(missed) < _MISSED and (ahead > 0).mean() > _BEFORE
+                and np.quantile(spread, _BEFORE) > _SIDES_DEG)
 
 
 def fibonacci_sphere(n: int) -> NDArray[np.float64]:

@@ -5,9 +5,15 @@ import pytest
 import torch
 
 from recon_cli.render import render
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.background import faces, far_content, fibonacci_sphere, splats_of
+from recon_cli.train.background import (
+    faces,
+    far_content,
+    fibonacci_sphere,
+    look_at_one_thing,
+    splats_of,
+)
 
 SKY = (40, 90, 200)
 EXTENT = 1.0
@@ -93,3 +99,27 @@ def test_its_gaussians_close_the_window_and_have_no_parallax():
     middle = slice(50, 70), slice(110, 150)
     assert pictures[0].alpha[middle].min() > 0.5
     assert (pictures[0].rgb - pictures[1].rgb)[middle].abs().max() < 0.1
+
+
+def views_from(centers, targets):
+    image = np.zeros((12, 16, 3), np.uint8)
+    return [TrainView(Camera(16, 12, 10.0, 10.0, 8.0, 6.0, looking_at(
+        np.asarray(center, float), np.asarray(target, float), np.array([0.0, 0, 1]))), image)
+        for center, target in zip(centers, targets, strict=True)]
+
+
+RING = [(3 * np.cos(angle), 3 * np.sin(angle), 1.5) for angle in np.linspace(0, 5, 20)]
+ACROSS = [(3.0, y, 1.5) for y in np.linspace(-1.5, 1.5, 20)]
+AHEAD = [(x, 0.02 * x, 1.5) for x in np.linspace(0, 5, 20)]
+
+
+@pytest.mark.parametrize(("centers", "targets", "one_thing"), [
+    (RING, [(0, 0, 1)] * 20, True),
+    (ACROSS, [(0, 0, 1)] * 20, True),  # from one side
+    (RING, [(2 * x, 2 * y, z) for x, y, z in RING], False),  # outwards, from one point
+    (RING, [(-x, y, z) for x, y, z in RING], False),  # across a room
+    (AHEAD, [(x + 10, y, 1.4) for x, y, _ in AHEAD], False),  # down a corridor
+    (RING[:1] * 20, [(np.cos(a), np.sin(a), 1) for a in np.linspace(0, 6, 20)], False),
+], ids=["around", "before", "outwards", "across", "ahead", "turning"])
+def test_views_that_look_at_one_thing_are_told_from_others(centers, targets, one_thing):
+    assert look_at_one_thing(views_from(centers, targets)) == one_thing
