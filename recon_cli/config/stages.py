@@ -184,8 +184,8 @@ class TrainConfig(StageConfig):
         "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
         choices=("auto", "denoised", "original"))
     far: str = option(
-        "auto", "Add distant background Gaussians; auto: unless a trial lowers validation PSNR, or, "
-        "where the views stand around a thing, if it improves it.",
+        "auto", "Add distant background Gaussians; auto: unless a trial lowers validation PSNR, "
+        "or, of views around a thing, if it improves it.",
         choices=("auto", "on", "off"))
     planes: str = option(
         "auto", "Start with Gaussians on walls and ceilings without texture, where points around "
