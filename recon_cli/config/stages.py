@@ -184,13 +184,12 @@ class TrainConfig(StageConfig):
         "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
         choices=("auto", "denoised", "original"))
     far: str = option(
-        "auto", "Add distant background Gaussians; auto: unless a trial lowers validation PSNR, "
-        "or, of views around a thing, if it improves it.",
+        "auto", "Add distant background Gaussians; auto: by a trial of validation PSNR.",
         choices=("auto", "on", "off"))
     planes: str = option(
         "auto", "Start with Gaussians on walls and ceilings without texture, where points around "
         "them lie in a plane; auto: unless a trial lowers validation PSNR.",
-        choices=("auto", "on", "off"))
+        choices=("auto", "on", "off"), expert=True)
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
         choices=("auto", "on", "off"))
