@@ -154,7 +154,10 @@ def read_visibility(sparse: Path) -> dict[str, NDArray[np.int64]]:
     order = np.argsort(ids, kind="stable")
     rows = np.repeat(np.arange(len(ids)), [len(tracks[i]) for i in order])
     views = np.concatenate([np.empty(0, np.int64), *(tracks[i] for i in order)])
-    return {name: np.unique(rows[views == number]) for number, name in names.items()}
+    by_view = np.argsort(views, kind="stable")
+    rows, views = rows[by_view], views[by_view]
+    return {name: np.unique(rows[slice(*np.searchsorted(views, [number, number + 1]))])
+            for number, name in names.items()}
 
 
 def _read_point_rows(path: Path, hint: str) -> list[tuple[Any, ...]]:
