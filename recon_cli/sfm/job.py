@@ -121,8 +121,11 @@ class MappingJob:
 
     @classmethod
     def read(cls, path: Path) -> MappingJob:
-        """Returns the job that `write` wrote."""
+        """Returns the job that `write` wrote; raises FormatError for any other file."""
         value: dict[str, Any] = atomic.read_json(path)
+        if not isinstance(value, dict) or value.keys() != cls.__dataclass_fields__.keys():
+            raise FormatError(f"{path} is no mapping job.",
+                              hint="`recon sfm` writes the jobs of segments; give it one of those.")
         for name in ("frames", "denoised", "out", "masks", "poses", "tracks", "linked"):
             value[name] = None if value[name] is None else Path(value[name])
         for group in value["groups"]:

@@ -73,6 +73,9 @@ def _run_segments(
     count = 1 if whole else segments.count_segments(len(job.names), config.segments)
     if count == 1:
         segments.remove_segments(job)  # of a run with other options
+        if config.on == "ray":
+            ctx.notice(f"The {len(job.names)} images are mapped as a whole, on this machine: only "
+                       "segments run on Ray (--segments).")
         return segments.SegmentRuns(job, {}, {})
     runs = segments.map_segments(
         job, count, lambda parts: _start_executor(config, job, parts, ctx.threads),

@@ -44,6 +44,14 @@ def test_what_is_written_is_read_back(tmp_path):
     assert MappingJob.read(tmp_path / "job.json") == told
 
 
+@pytest.mark.parametrize("text", ["[]", '{"frames": "/in/frames"}', "nonsense"])
+def test_another_file_is_no_job(tmp_path, text):
+    path = tmp_path / "job.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(FormatError, match="job"):
+        MappingJob.read(path)
+
+
 def test_poses_and_points_that_are_kept_leave_nothing_to_be_found():
     lens = Lens("PINHOLE", 80, 60, (70.0, 71.0, 40.5, 30.0))
     group = replace(job(4).groups[0], lens=lens)

@@ -14,6 +14,7 @@ import pytest
 from sfm_inputs import every_nth, run, write_inputs
 
 from recon_cli.context import StageContext
+from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images
 
 STEP, COUNT = 3, 30  # every third frame of the sample: two segments of 18, 7 of them in both
@@ -178,3 +179,10 @@ def test_segments_on_a_cluster_give_the_same_bytes_though_a_node_is_lost(
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (out / "sparse" / name).read_bytes() == (
             mapped[0] / "sparse" / name).read_bytes(), name
+
+
+def test_a_capture_without_segments_is_told_to_stay_on_this_machine(room, tmp_path, caplog):
+    with caplog.at_level("INFO"), pytest.raises(SfmError, match="minutes"):
+        run(room, tmp_path / "out", on="ray", max_minutes=0.01)
+    assert "on this machine" in caplog.text
+    assert "--segments" in caplog.text
