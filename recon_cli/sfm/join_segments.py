@@ -368,9 +368,9 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
                   if pair not in checked.contradicting}
         assert job.tracks is not None
         skeleton.link(job, source.database, usable, Tracks.read(job.tracks))
-    model = mapper.triangulate(job, _posed(job, joined))
+    model = mapper.triangulate(job, _posed(job, joined), rounds=1)
     if model.num_reg_images() < len(job.names):
-        return mapper.extend_model(job, model, ROUNDS)  # which adjusts as much as `refine` does
+        model = mapper.extend_model(job, model, rounds=0)
     mapper.refine(job, model, ROUNDS)
     return model
 

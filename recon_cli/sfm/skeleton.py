@@ -216,7 +216,7 @@ def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconst
     """Returns the cameras of a skeleton with the points that the matches give, adjusted."""
     poses = {image.name: image.cam_from_world() for image in _images(skeleton)}
     model = mapper.triangulate(
-        job, merge_models.build_posed_model(job.database, skeleton, poses))
+        job, merge_models.build_posed_model(job.database, skeleton, poses), rounds=1)
     mapper.refine(job, model)
     return mapper.extend_model(job, model) if len(poses) < len(job.names) else model
 
@@ -333,8 +333,8 @@ def overlapping_images(
     """
     order = sorted(range(len(images)), key=lambda index: images[index].name)
     images = [images[index] for index in order]
-    places = {id(model): {number: point.xyz for number, point in model.points3D.items()}
-              for model in models}
+    places = {key: {number: point.xyz for number, point in model.points3D.items()}
+              for key, model in {id(model): model for model in models}.items()}
     share = _overlap(images, [
         _sample_points(image, places[id(models[index])])
         for image, index in zip(images, order, strict=True)])

@@ -92,7 +92,8 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
     expected, confirmed = np.zeros((2, len(BANDS_DEG) + 1, count, count))
     for other, image in images.items():
         likely, angles = _likely_angles(
-            samples, positions, _project(image, positions), evidence.centers[other], other)
+            samples, positions, _project(image, positions), evidence.centers[other],
+            evidence.tried[other])
         should = _cells(samples, likely, count)
         seen = likely[evidence.visible[other][samples.point[likely]]]
         does = should & _cells(samples, seen, count, 1)
@@ -195,10 +196,10 @@ def _likely_angles(
     positions: NDArray[np.float64],  # [M, 3]
     frame: NDArray[np.float64],  # [M, 2]
     center: NDArray[np.float64],  # [3]
-    other: int,
+    tried: NDArray[np.bool_],  # [N], images that were matched with it; the others do not count
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # [L], [L]
     """Returns the samples that another image should find, and at which angles in degrees."""
-    rows = np.flatnonzero((~np.isnan(frame[:, 0]))[samples.point] & (samples.image != other))
+    rows = np.flatnonzero((~np.isnan(frame[:, 0]))[samples.point] & tried[samples.image])
     theirs = samples.rays[rows]
     ours = positions[samples.point[rows]] - center
     near, far = (np.sqrt(np.einsum("sk,sk->s", rays, rays)) for rays in (theirs, ours))

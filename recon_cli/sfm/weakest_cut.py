@@ -156,8 +156,8 @@ def _drop_wrong_cameras(links: _Links, registered: Cut, allowed: int) -> Cut:  #
         rows = np.flatnonzero(inliers)
         inner = np.ix_(rows, rows)
         ties = view_graph.strongest_ties(links.matches[inner], STRONGEST)
-        shares = [_quantile(links.shares[inner][image, row], WRONG)
-                  for image, row in enumerate(ties)]
+        shares = [_quantile(row[tied], WRONG)
+                  for row, tied in zip(links.shares[inner], ties, strict=True)]
         worst = int(np.argmin(shares)) if shares else 0
         if not shares or shares[worst] >= MIN_AGREEING:
             return inliers

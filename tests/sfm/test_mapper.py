@@ -77,6 +77,26 @@ def test_a_model_is_extended_by_the_images_that_fit(tmp_path):
     assert center_error(whole, truth) < 1e-3
 
 
+def test_a_model_is_extended_without_adjusting_the_whole_again(tmp_path):
+    job, truth = make_capture(tmp_path)
+    whole = mapper.extend_model(job, part(truth, job.names[:15]), rounds=0)
+    assert mapper.list_registered(whole) == list(job.names)
+    assert center_error(whole, truth) < 1e-2
+
+
+def test_triangulated_points_leave_the_cameras_where_they_are(tmp_path):
+    job, truth = make_capture(tmp_path)
+    bare = pycolmap.Reconstruction(truth)
+    for number in list(bare.point3D_ids()):
+        bare.delete_point3D(number)
+    model = mapper.triangulate(job, bare, rounds=1)
+    assert model.num_points3D() > 0.9 * truth.num_points3D()
+    assert model.compute_mean_reprojection_error() < 0.01
+    for number in truth.reg_image_ids():
+        np.testing.assert_allclose(model.image(number).cam_from_world().matrix(),
+                                   truth.image(number).cam_from_world().matrix(), atol=1e-12)
+
+
 def test_a_point_that_the_adjustment_lost_is_dropped(tmp_path, monkeypatch):
     _, model = make_capture(tmp_path)
     before, lost = model.num_points3D(), min(model.point3D_ids())
