@@ -326,10 +326,12 @@ def overlapping_images(
     images: Sequence[pycolmap.Image],
     models: Sequence[pycolmap.Reconstruction],  # that hold the points of each image
     held: Mapping[str, Collection[int]] | None = None,
+    *, most: int = OVERLAPPING, besides: Collection[Pair] = (),
 ) -> set[Pair]:
-    """Returns each image with OVERLAPPING ones whose views have something in common.
+    """Returns each image with `most` whose views have something in common, fewer by known pairs.
 
-    Where `held` names the segments that hold each image, only pairs of different ones.
+    Where `held` names the segments that hold each image, only pairs of different ones. Pairs in
+    `besides` are known, by names in order; they are not returned.
     """
     order = sorted(range(len(images)), key=lambda index: images[index].name)
     images = [images[index] for index in order]
@@ -344,10 +346,11 @@ def overlapping_images(
         others = [other for other in np.argsort(-shares, kind="stable").tolist()
                   if shares[other] > MIN_OVERLAP and (
                       held is None or set(held[names[row]]).isdisjoint(held[names[other]]))]
-        others = others[:WIDEST]
-        count = min(OVERLAPPING, len(others))
-        for place in np.linspace(0, max(len(others) - 1, 0), count).round().astype(int):
-            pairs.add((names[min(row, others[place])], names[max(row, others[place])]))
+        both = [(names[min(row, other)], names[max(row, other)]) for other in others]
+        new = [pair for pair in both if pair not in besides]
+        count = min(max(0, most - (len(both) - len(new))), len(new[:WIDEST]))
+        for place in np.linspace(0, max(len(new[:WIDEST]) - 1, 0), count):
+            pairs.add(new[round(place)])
     return pairs
 
 

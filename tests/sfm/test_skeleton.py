@@ -21,6 +21,7 @@ from recon_cli.sfm.skeleton import (
     link,
     map_coarse_first,
     near_pairs,
+    overlapping_images,
     overlapping_pairs,
     read_verified,
 )
@@ -126,6 +127,23 @@ def test_views_of_one_surface_overlap_and_those_of_others_do_not():
     assert max(gaps) < 15
     backwards = MadeModel(made.points, [moved(0, 0, 0, 180) * pose for pose in made.poses])
     assert overlapping_pairs(backwards.model()) == set()
+
+
+def test_known_pairs_that_overlap_take_the_place_of_others():
+    model = walk(12).model()
+    images = [model.image(number) for number in model.reg_image_ids()]
+    models = [model] * len(images)
+    held = {image.name: {index % 3} for index, image in enumerate(images)}
+    one_each = overlapping_images(images, models, held, most=1)
+    assert 6 <= len(one_each) <= 12
+    assert all(held[first].isdisjoint(held[second]) for first, second in one_each)
+    assert overlapping_images(images, models, held, most=1, besides=one_each) == set()
+    two_each = overlapping_images(images, models, held, most=2, besides=one_each)
+    assert two_each
+    assert not two_each & one_each
+    # those that see nothing in common, which an error may tie, take no place
+    ends = {(min(pair), max(pair)) for pair in [(images[0].name, images[-1].name)]}
+    assert overlapping_images(images, models, held, most=1, besides=ends) >= one_each - ends
 
 
 def test_pairs_are_read_in_order_of_their_names(tmp_path):
