@@ -321,6 +321,13 @@ def map_joined(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstructio
 
     `job.linked` names the database that is written and mapped from, where there are tracks.
     """
+    largest, *others = _join(job, report)
+    source = dataclasses.replace(job, linked=None)
+    return [_fit(job, largest), *(_posed(source, other) for other in others)]
+
+
+def _join(job: MappingJob, report: Reporter) -> list[JoinedModel]:
+    """Returns the groups of segments, and writes what joined them; what else was read is freed."""
     source = dataclasses.replace(job, linked=None)
     report.phase("joining", len(job.segments))
     collect_matches(source)
@@ -335,9 +342,7 @@ def map_joined(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstructio
             segments, find_shared_points(source, segments), seed=job.seed)
     report.phase("joining", len(job.segments))
     atomic.write_json(job.out / REPORT, _describe(job, joins, groups))
-    parts = [join_models(segments, group) for group in groups]
-    model = _fit(job, parts[0])
-    return [model, *(_posed(source, part) for part in parts[1:])]
+    return [join_models(segments, group) for group in groups]
 
 
 def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) -> set[Pair]:
