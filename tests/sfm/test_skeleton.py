@@ -141,9 +141,22 @@ def test_known_pairs_that_overlap_take_the_place_of_others():
     two_each = overlapping_images(images, models, held, most=2, besides=one_each)
     assert two_each
     assert not two_each & one_each
-    # those that see nothing in common, which an error may tie, take no place
-    ends = {(min(pair), max(pair)) for pair in [(images[0].name, images[-1].name)]}
-    assert overlapping_images(images, models, held, most=1, besides=ends) >= one_each - ends
+
+
+def test_known_pairs_that_cannot_see_the_same_take_no_place():
+    model = walk(30).model()
+    images = sorted((model.image(number) for number in model.reg_image_ids()),
+                    key=lambda image: image.name)
+    ends = images[0].name, images[-1].name
+    models = [model] * len(images)
+    assert ends not in overlapping_pairs(model)
+    assert overlapping_images(images, models, most=1, besides={ends}) == overlapping_images(
+        images, models, most=1)
+    # a pair that does see the same takes the only place of both
+    near = images[0].name, images[1].name
+    assert near in overlapping_images(images, models, most=1)
+    others = overlapping_images(images, models, most=1, besides={near})
+    assert not any(images[0].name in pair for pair in others)
 
 
 def test_pairs_are_read_in_order_of_their_names(tmp_path):
