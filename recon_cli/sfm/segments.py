@@ -45,8 +45,8 @@ MOST_WHOLE = 200  # frames up to which a capture is mapped as one
 # more on what they share, longer ones are fewer jobs.
 LENGTH, OVERLAP = 150, 25
 LEAST = 10  # frames of a segment
-# Of one core for a frame, in its segments and in the join, measured on walks of 640x360 pixels:
-# docs/scaling.md.
+# Of one core for a frame, in its segments and in the join, between those measured on two machines
+# with walks of 640x360 pixels: docs/scaling.md.
 SEGMENT_SECONDS, JOIN_SECONDS = 1.0, 0.5
 TRIES = 2  # of a mapping process that is killed, perhaps for want of memory beside others
 COMMAND = "map-segment"  # of recon, which takes JOB
