@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit  # scipy.stats takes a second to import
 
 from recon_cli.workspace.summaries import JsonRecord
 
@@ -85,6 +85,6 @@ def paired_t(ours: Sequence[float], theirs: Sequence[float]) -> Interval:
     mean = statistics.fmean(pairs)
     if len(pairs) < 2:
         return Interval(mean, None, None)
-    quantile = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(pairs) - 1))
+    quantile = float(stdtrit(len(pairs) - 1, (1 + CONFIDENCE) / 2))
     half = quantile * statistics.stdev(pairs) / math.sqrt(len(pairs))
     return Interval(mean, mean - half, mean + half)
