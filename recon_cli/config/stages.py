@@ -201,8 +201,9 @@ class TrainConfig(StageConfig):
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
         expert=True)
     means_rate: float = option(
-        1.6e-4, "Initial learning rate of the means, times the scene extent (and 6 with budget); "
-        "decays to a hundredth.", minimum=0.0, expert=True)
+        1.6e-4, "Initial learning rate of the means, times the scene extent (with budget times 10 "
+        "and the median distance of the points from a camera); decays to a hundredth.",
+        minimum=0.0, expert=True)
     quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)
     scales_rate: float = option(
         5e-3, "Learning rate of the log-scales; 4 times as high with budget.", minimum=0.0,

@@ -195,7 +195,7 @@ class _Probe:
 
     def _state(self, splats: Splats) -> TrainState:
         task = self._task
-        return new_state(splats, task.schedule.config, task.extent, backend=task.backend)
+        return new_state(splats, task.schedule.config, task.means_unit, backend=task.backend)
 
     def _step_ms(self, splats: Splats, level: int) -> float:
         """Returns the mean of a few steps in the middle of a level; at least of one."""

@@ -275,7 +275,8 @@ class _Bench:
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         schedule = Schedule(config, dataclasses.replace(Schedule(config).recipe, levels=()))
         small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
-                     task.backend, task.device, camera_error=task.camera_error, blank=task.blank)
+                     task.backend, task.device, nearness=task.nearness,
+                     camera_error=task.camera_error, blank=task.blank)
         # reduced views would be reduced once more in the search for what lies far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)

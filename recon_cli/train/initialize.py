@@ -84,7 +84,7 @@ def first_state(
     splats = first_splats(config, points, colors, far, most=most)
     exposure, poses = new_parts(task, gains)
     return new_state(
-        splats.map(lambda tensor: tensor.to(task.device)), config, task.extent,
+        splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
         backend=task.backend, exposure=exposure, poses=poses)
 
 
@@ -97,7 +97,7 @@ def restore_state(path: Path, task: Task) -> TrainState:
     """
     exposure, poses = new_parts(task)
     return load_state(
-        path, task.schedule.config, task.extent, task.device, backend=task.backend,
+        path, task.schedule.config, task.means_unit, task.device, backend=task.backend,
         exposure=exposure, poses=poses)
 
 
@@ -105,14 +105,14 @@ def begin_state(splats: Splats, task: Task) -> TrainState:
     """Returns the state before the first step of a run that begins with these Gaussians."""
     exposure, poses = new_parts(task)
     return new_state(
-        splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.extent,
+        splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.means_unit,
         backend=task.backend, exposure=exposure, poses=poses)
 
 
 def make_finished_state(splats: Splats, task: Task) -> TrainState:
     """Returns the state of a run that ended with these Gaussians, trained elsewhere."""
     state = new_state(
-        splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.extent,
+        splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.means_unit,
         backend=task.backend)
     state.iteration = task.schedule.config.iterations
     state.jump = 0, state.iteration

@@ -28,18 +28,18 @@ class SplatOptimizer:
     Values (copied from `splats`), gradients and moments lie in buffers with room for more
     Gaussians; memory that was never used costs nothing. `self.splats`, leaves of autograd, and
     `self.gradients` are views of them. numba and triton write into `gradients` and move all
-    parameters by one kernel; with torch, autograd leaves the gradients in `splats`. `extent` is in
-    world units.
+    parameters by one kernel; with torch, autograd leaves the gradients in `splats`. `means_unit`
+    is that of the means' rate, in world units (`Task.means_unit`).
     """
 
     def __init__(
-        self, splats: Splats, config: RunConfig, extent: float, *, backend: str = "torch"
+        self, splats: Splats, config: RunConfig, means_unit: float, *, backend: str = "torch"
     ) -> None:
-        self._extent, self._backend = extent, backend
+        self._means_unit, self._backend = means_unit, backend
         recipe = RECIPES[config.densify]
         self._betas = recipe.momentum, _BETAS[1]
         self._rates = {
-            "means": config.means_rate * extent, "quats": config.quats_rate,
+            "means": config.means_rate * means_unit, "quats": config.quats_rate,
             "log_scales": recipe.scales_rate * config.scales_rate,
             "logit_opacities": config.opacities_rate, "sh_dc": recipe.sh_rate * config.sh_rate,
             "sh_rest": recipe.sh_rest_rate * config.sh_rate * _REST_FACTOR}
@@ -142,12 +142,12 @@ class SplatOptimizer:
     ) -> None:
         """Moves the parameters against their gradients, which are then used up.
 
-        `means_rate` is in units of the scene extent; `factor` scales all other rates. Without
-        `sh_rest` the higher SH degrees stay. `counted` [1] int32 is zero on the device where
-        nothing is to be moved (triton only).
+        `means_rate` is in units of `means_unit`; `factor` scales all other rates. Without `sh_rest`
+        the higher SH degrees stay. `counted` [1] int32 is zero on the device where nothing is to be
+        moved (triton only).
         """
         self._factor = factor
-        self._rates["means"] = means_rate * self._extent / factor
+        self._rates["means"] = means_rate * self._means_unit / factor
         names = self._names(sh_rest=sh_rest)
         if self._backend == "triton":
             load("recon_cli.render.triton.optimizer.step")(

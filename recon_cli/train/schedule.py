@@ -7,6 +7,7 @@ reset) are counted in steps and have a floor; everything else scales with the ru
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from recon_cli.config.stages import RunConfig
 
@@ -49,6 +50,8 @@ class Recipe:
     sh_every: int  # the higher degrees are moved every so many steps
     opacity_decay: float  # opacities are multiplied by this at each densification
     resets: bool  # opacities are lowered to .01 now and then, as in the reference
+    # of the means' rate: the extent of the cameras, or their nearness to the points
+    means_unit: Literal["extent", "nearness"]
     # factors of the options of these names: short runs have to go as far as the reference's 30,000
     means_rate: float = 1.0
     scales_rate: float = 1.0
@@ -64,12 +67,12 @@ class Recipe:
 REFERENCE = Recipe(
     densify_from=500 / 30_000, densify_until=0.5, full_at=0.5, levels=(),
     sh_at=(1000 / 30_000, 2000 / 30_000, 3000 / 30_000), sh_every=1, opacity_decay=1.0,
-    resets=True)
+    resets=True, means_unit="extent")
 BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
-    sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False, means_rate=6.0,
-    scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8, final_from=0.8,
-    final_rate=0.1)
+    sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False,
+    means_unit="nearness", means_rate=10.0, scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0,
+    momentum=0.8, final_from=0.8, final_rate=0.1)
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 
@@ -132,7 +135,7 @@ class Schedule:
                    sum(before >= share * self.config.iterations for share in self.recipe.sh_at))
 
     def means_rate(self, iteration: int) -> float:
-        """Returns the learning rate of the means in units of the scene extent."""
+        """Returns the learning rate of the means in units of `Task.means_unit`."""
         first = self.recipe.means_rate * self.config.means_rate
         return float(first * self.recipe.means_final**self.share(iteration))
 

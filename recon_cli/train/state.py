@@ -110,14 +110,14 @@ class TrainState:
 
 
 def new_state(
-    splats: Splats, config: RunConfig, extent: float, *, backend: str = "torch",
+    splats: Splats, config: RunConfig, means_unit: float, *, backend: str = "torch",
     exposure: Exposure | None = None, poses: Poses | None = None,
 ) -> TrainState:
     """Returns the state before the first step."""
     generator = torch.Generator().manual_seed(config.seed)
     gathered = DensificationStats.zeros(len(splats), splats.means.device)
     return TrainState(
-        SplatOptimizer(splats, config, extent, backend=backend), gathered, generator,
+        SplatOptimizer(splats, config, means_unit, backend=backend), gathered, generator,
         first_count=len(splats), exposure=exposure, poses=poses)
 
 
@@ -149,8 +149,8 @@ def tensors_of(state: TrainState) -> dict[str, Tensor]:
 
 
 def load_state(
-    path: Path, config: RunConfig, extent: float, device: torch.device, *, backend: str = "torch",
-    exposure: Exposure | None = None, poses: Poses | None = None,
+    path: Path, config: RunConfig, means_unit: float, device: torch.device, *,
+    backend: str = "torch", exposure: Exposure | None = None, poses: Poses | None = None,
 ) -> TrainState:
     """Returns the state that `save_state` wrote; `exposure` and `poses` take theirs back.
 
@@ -169,7 +169,7 @@ def load_state(
         tensors = {name: value.to(device) for name, value in tensors.items()}
         splats = Splats(**_under("splats.", tensors))
         state = TrainState(
-            SplatOptimizer(splats, config, extent, backend=backend),
+            SplatOptimizer(splats, config, means_unit, backend=backend),
             DensificationStats(**_under("gathered.", tensors)), generator,
             int(scalars["iteration"]),
             [int(i) for i in scalars["queue"]], int(scalars["first_count"]),

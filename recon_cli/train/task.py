@@ -26,9 +26,10 @@ class Task:
     train: list[TrainView]  # views that gradients come from
     validation: list[TrainView]  # views that are only looked at
     schedule: Schedule  # when things happen
-    extent: float  # of the scene, world units
+    extent: float  # of the cameras, world units
     backend: str  # name of the rasterizer
     device: torch.device  # where the tensors live
+    nearness: float | None = None  # `Scene.nearness`; None where there are no points
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
@@ -41,6 +42,16 @@ class Task:
             return 1.0
         owned = self.cell.owns(means.detach().cpu().numpy())
         return torch.from_numpy(owned).to(means)
+
+    @property
+    def means_unit(self) -> float:
+        """World units in which the rate of the means is given.
+
+        A walk through a house has a large extent, but what it shows is as near as in one room.
+        """
+        if self.schedule.recipe.means_unit == "extent" or self.nearness is None:
+            return self.extent
+        return self.nearness
 
     @cached_property
     def pyramid(self) -> Pyramid:

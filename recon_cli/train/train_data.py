@@ -62,10 +62,12 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
             hint=reference_views.MASK_HINT)
     if ctx.device == "cuda":
         train = [view.page_locked() for view in train]
+    nearness = scene.nearness if len(scene.points) else None
     error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
     return Task(
         train, [*load_views(scene.validation, config, ctx, file)], Schedule(config), scene.extent,
-        ctx.backend, torch.device(ctx.device), camera_error=error, cell=scene.cell,
+        ctx.backend, torch.device(ctx.device), nearness=nearness, camera_error=error,
+        cell=scene.cell,
         blank=BlankSurfaces(train, lambda: _sparse_model(scene, [view.name for view in views])))
 
 

@@ -20,7 +20,7 @@ every_kind = pytest.mark.parametrize("backend", BACKENDS)
 
 def optimizer_of(n, *, backend, config=CONFIG):
     splats = random_splats(n, dtype=torch.float32)
-    return SplatOptimizer(splats, config, extent=2.0, backend=backend)
+    return SplatOptimizer(splats, config, means_unit=2.0, backend=backend)
 
 
 def gradients_of(n, step):

@@ -16,7 +16,7 @@ from recon_cli.train.schedule import ContinuedSchedule, RecoverySchedule
 def test_a_fit_is_the_same_after_it_was_handed_over():
     config = dataclasses.replace(CONFIG, batch_views=2, exposure="on")
     plan = RecoverySchedule(config, first=3, until=9)
-    task = dataclasses.replace(tiny_task(config), schedule=plan, camera_error=0.25)
+    task = dataclasses.replace(tiny_task(config), schedule=plan, camera_error=0.25, nearness=2.0)
     task.train[2] = dataclasses.replace(task.train[2], mask=np.eye(30, 40) > 0)
     state = first_state(config)
     state.exposure, state.poses = new_parts(task)
@@ -29,6 +29,7 @@ def test_a_fit_is_the_same_after_it_was_handed_over():
     for one in (first, unpack_fit(second, ranks)):
         assert one.task.schedule == plan
         assert (one.task.camera_error, one.task.extent, one.threads) == (0.25, 1.0, 3)
+        assert one.task.nearness == 2.0
         assert same(one.state, state)
         for mine, theirs in zip(task.train, one.task.train, strict=True):
             assert np.array_equal(mine.image, theirs.image)

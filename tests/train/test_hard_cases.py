@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from wall_scene import CONFIG, scene
+from wall_scene import CONFIG, EXTENT, scene
 
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
@@ -49,13 +49,15 @@ def scaled(candidate, factor):
         return TrainView(replace(view.camera, viewmat=viewmat), view.image)
 
     task = replace(candidate.task, train=[larger(view) for view in candidate.task.train],
-                   extent=factor * candidate.task.extent)
+                   extent=factor * candidate.task.extent,
+                   nearness=factor * candidate.task.nearness)
     return replace(candidate, task=task, points=factor * candidate.points)
 
 
 @pytest.fixture(scope="module")
 def plain():
     candidate = scene(views=12)
+    candidate = replace(candidate, task=replace(candidate.task, nearness=EXTENT))
     return candidate, psnr(trained(candidate), candidate.task.train)
 
 

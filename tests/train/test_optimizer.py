@@ -25,7 +25,7 @@ BYTES = 1500  # a Gaussian may take in training: what is promised for a million 
 
 def stepped(splats, times=3, densify="reference"):
     optimizer = SplatOptimizer(
-        splats.map(lambda t: t.float()), RunConfig(densify=densify), extent=2.0)
+        splats.map(lambda t: t.float()), RunConfig(densify=densify), means_unit=2.0)
     for _ in range(times):
         loss = sum(p.square().sum() for p in optimizer.splats.parameters().values())
         loss.backward()
@@ -211,7 +211,7 @@ def test_what_a_checkpoint_holds_comes_back_bit_by_bit(backend, other):
     saved = held(optimizer)
     values = {name.removeprefix("splats."): value
               for name, value in saved.items() if name.startswith("splats.")}
-    resumed = SplatOptimizer(Splats(**values), CONFIG, extent=2.0, backend=other)
+    resumed = SplatOptimizer(Splats(**values), CONFIG, means_unit=2.0, backend=other)
     resumed.restore(saved)
     for name, value in held(resumed).items():
         assert torch.equal(value, saved[name]), name

@@ -31,7 +31,7 @@ def filled(optimizer):
 ])
 @pytest.mark.parametrize("degree", [1, 3])
 def test_moments_of_coefficients_follow_their_gaussian(backend, colored, after, source, degree):
-    optimizer = SplatOptimizer(some(9, 3, colored), CONFIG, extent=2.0, backend=backend)
+    optimizer = SplatOptimizer(some(9, 3, colored), CONFIG, means_unit=2.0, backend=backend)
     filled(optimizer)
     before = held(optimizer)
     new = some(len(source), degree, after, seed=3)
@@ -54,7 +54,8 @@ def test_moments_of_coefficients_follow_their_gaussian(backend, colored, after, 
 def test_every_kind_steps_alike_whatever_the_share(degree, colored):
     found = []
     for backend in BACKENDS:
-        optimizer = SplatOptimizer(some(9, degree, colored), CONFIG, extent=2.0, backend=backend)
+        optimizer = SplatOptimizer(
+            some(9, degree, colored), CONFIG, means_unit=2.0, backend=backend)
         for step in range(5):
             gradients = with_harmonics(gradients_of(9, step), degree, colored)
             feed(optimizer, gradients)
@@ -66,7 +67,7 @@ def test_every_kind_steps_alike_whatever_the_share(degree, colored):
 
 @every_kind
 def test_no_memory_is_held_for_coefficients_that_nobody_has(backend):
-    optimizer = SplatOptimizer(some(9, 3, 9), CONFIG, extent=2.0, backend=backend)
+    optimizer = SplatOptimizer(some(9, 3, 9), CONFIG, means_unit=2.0, backend=backend)
     optimizer.replace(some(9, 3, 4), torch.arange(9))
     assert all(len(buffer) == 4 for buffer in optimizer._buffers["sh_rest"].values())
     optimizer.replace(some(9, 3, 9), torch.arange(9))

@@ -1,12 +1,17 @@
 """Reduced views: the same scene through the same camera, at fewer pixels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scenes import camera_at, random_splats
+from tiny_task import CONFIG, EXTENT, same, tiny_task
 
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.fit import fit
+from recon_cli.train.initialize import begin_state
 from recon_cli.train.task import Pyramid, reduce_view
 
 # A picture that is rendered small and one that is rendered large and averaged differ by what a
@@ -64,3 +69,26 @@ def test_a_pyramid_makes_each_size_once():
     pyramid = Pyramid([view()])
     assert pyramid.view(0, 2) is pyramid.view(0, 2)
     assert pyramid.view(0, 1).image.shape == (48, 64, 3)
+
+
+def moved(task):
+    state = begin_state(random_splats(40, seed=1, dtype=torch.float32), task)
+    fit(state, task, 3)
+    return state
+
+
+def test_a_longer_walk_past_the_same_things_moves_no_gaussian_further():
+    task = replace(tiny_task(replace(CONFIG, densify="budget")), nearness=0.5)
+    assert same(moved(task), moved(replace(task, extent=10 * EXTENT)))
+    assert not same(moved(task), moved(replace(task, nearness=1.0)))
+
+
+def test_without_points_the_extent_counts():
+    task = tiny_task(replace(CONFIG, densify="budget"))
+    assert not same(moved(task), moved(replace(task, extent=10 * EXTENT)))
+
+
+def test_the_reference_moves_means_by_the_extent():
+    task = replace(tiny_task(replace(CONFIG, densify="reference")), nearness=0.5)
+    assert not same(moved(task), moved(replace(task, extent=10 * EXTENT)))
+    assert same(moved(task), moved(replace(task, nearness=1.0)))
