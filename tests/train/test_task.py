@@ -1,4 +1,4 @@
-"""Reduced views: the same scene through the same camera, at fewer pixels."""
+"""Reduced views are the same scene at fewer pixels; how far a task moves its Gaussians."""
 
 from dataclasses import replace
 
