@@ -122,10 +122,19 @@ class MappingJob:
     @classmethod
     def read(cls, path: Path) -> MappingJob:
         """Returns the job that `write` wrote; raises FormatError for any other file."""
-        value: dict[str, Any] = atomic.read_json(path)
-        if not isinstance(value, dict) or value.keys() != cls.__dataclass_fields__.keys():
-            raise FormatError(f"{path} is no mapping job.",
-                              hint="`recon sfm` writes the jobs of segments; give it one of those.")
+        value = atomic.read_json(path)
+        try:
+            if value.keys() != cls.__dataclass_fields__.keys():
+                raise KeyError("fields")
+            return cls._of(value)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise FormatError(
+                f"{path} is no mapping job.",
+                hint="`recon sfm` writes the jobs of segments; give it one of those.") from error
+
+    @classmethod
+    def _of(cls, value: dict[str, Any]) -> MappingJob:
+        """Returns the job of JSON values; what `read` catches where they are of other types."""
         for name in ("frames", "denoised", "out", "masks", "poses", "tracks", "linked"):
             value[name] = None if value[name] is None else Path(value[name])
         for group in value["groups"]:

@@ -2,6 +2,7 @@
 
 import errno
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,6 +43,19 @@ def test_what_is_written_is_read_back(tmp_path):
     assert told.names == ("a.png", "b.png", "c.png")
     told.write(tmp_path / "job.json")
     assert MappingJob.read(tmp_path / "job.json") == told
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("frames", 3), ("groups", [{"names": ["a.png"]}]), ("groups", 7), ("segments", [1]),
+    ("groups", [{"names": ["a.png"], "width": 8, "height": 6, "focal_px": None,
+                 "lens": {"model": "NONE", "width": 8, "height": 6, "params": []}}])])
+def test_a_job_with_values_of_other_types_is_none(tmp_path, name, value):
+    path = tmp_path / "job.json"
+    job(4).write(path)
+    fields = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**fields, name: value}), encoding="utf-8")
+    with pytest.raises(FormatError, match="no mapping job"):
+        MappingJob.read(path)
 
 
 @pytest.mark.parametrize("text", ["[]", '{"frames": "/in/frames"}', "nonsense"])
