@@ -62,8 +62,8 @@ def assess(task: TrustTask, out: Path, ctx: StageContext) -> TrustRecord:
         trust = measure_trust(splats, task.scene, task.config, task.max_size, ctx, bar.advance)
         trust.save(out, task.model)
         assessed = model_trust(
-            trust, splats, task.held_out, ctx, gains=task.config.exposure == "on",
-            on_view=_saver(out / FOLDER / task.model, bar.advance))
+            trust, splats, task.held_out, gains=task.config.exposure == "on",
+            backend=ctx.backend, on_view=_saver(out / FOLDER / task.model, bar.advance))
         suggestions, no_places = film_next(splats, trust, task.scene, task.world, ctx)
     record = TrustRecord(
         models=(task.model,), base=assessed if task.model == "base" else None,
@@ -94,8 +94,7 @@ def film_next(
     if places is None:
         return [], reason
     suggestions = suggest(splats, trust.support, trust.error, places,
-                          (*scene.train, *scene.validation), backend=ctx.backend,
-                          threads=ctx.threads)
+                          (*scene.train, *scene.validation), backend=ctx.backend)
     return suggestions, "" if suggestions else (
         "no place is suggested, as every free one looks at something too near")
 

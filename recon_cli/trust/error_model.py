@@ -10,7 +10,6 @@ path, so the weights are held near those that several captures agree on.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,6 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from recon_cli.context import StageContext
 from recon_cli.render import render
 from recon_cli.render.torch.projection import colors_from_sh
 from recon_cli.scene.camera import Camera
@@ -187,35 +185,33 @@ def _edges(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def calibrate(
-    splats: Splats, support: Support, views: Sequence[TrainView], ctx: StageContext, *,
-    trained: bool, sh_degree: int, gains: bool = False,
+    splats: Splats, support: Support, validation: Sequence[TrainView],
+    train: Sequence[TrainView], *, sh_degree: int, backend: str, gains: bool = False,
     on_view: Callable[[], None] = lambda: None,
 ) -> ErrorModel:
-    """Returns the model fitted to validation views, which no gradient came from.
+    """Returns the model fitted to the validation views, which no gradient came from.
 
-    With `trained` ones it keeps PRIOR, with their mean error. `on_view` is called in one of
-    `ctx.threads`.
+    Without any it keeps PRIOR, with the mean error of some training views.
     """
-    def look(view: TrainView) -> tuple[Array, Array]:  # errors [P], terms [P, K]
-        picture = picture_terms(
-            splats, support, view.camera, sh_degree=sh_degree, backend=ctx.backend)
+    views = validation or train
+    columns: dict[str, list[Array]] = {name: [] for name in TERMS}
+    errors: list[Array] = []
+    for view in views:
+        picture = picture_terms(splats, support, view.camera, sh_degree=sh_degree, backend=backend)
         error, counts = error_image(picture.rgb, view, gains=gains)
         used = counts > 0
+        errors.append(np.asarray(error[used], np.float64))
+        for name, column in columns.items():
+            column.append(np.asarray(picture.terms[name][used], np.float64))
         on_view()
-        return np.asarray(error[used], np.float64), np.stack(
-            [np.asarray(picture.terms[name][used], np.float64) for name in TERMS], 1)
-
-    # besides the kernels, most of it keeps to one core
-    with ThreadPoolExecutor(ctx.threads) as pool:
-        errors, columns = zip(*pool.map(look, views), strict=True)
     real: Array = np.concatenate(errors)
     rows = slice(None, None, max(1, len(real) // _PIXELS))
-    terms = np.concatenate(columns)[rows]
-    bias, weights = fit_weights(terms, real[rows], fixed=trained)
+    terms = np.stack([np.concatenate(columns[name])[rows] for name in TERMS], 1)
+    bias, weights = fit_weights(terms, real[rows], fixed=not validation)
     return ErrorModel(
         bias=round(bias, 5), weights=dict(zip(TERMS, weights.round(5).tolist(), strict=True)),
         means=dict(zip(TERMS, terms.mean(0).round(5).tolist(), strict=True)), views=len(views),
-        calibrated=not trained)
+        calibrated=bool(validation))
 
 
 def fit_weights(

@@ -9,8 +9,7 @@ filmed, and the others are scored again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,7 +79,7 @@ class _Candidate:
 
 def suggest(
     splats: Splats, support: Support, model: ErrorModel, places: StandingPlaces,
-    views: Sequence[View], *, backend: str, threads: int = 1,
+    views: Sequence[View], *, backend: str, on_view: Callable[[], None] = lambda: None,
 ) -> list[Suggestion]:
     """Returns the best places, the best one first; none without standing places.
 
@@ -88,7 +87,7 @@ def suggest(
     """
     if not len(places.eyes):
         return []
-    candidates = _render_candidates(splats, places, views[0].camera, backend, threads)
+    candidates = _render_candidates(splats, places, views[0].camera, backend, on_view)
     if not candidates:
         return []
     walk = _Walk.of(splats, support, model, places, candidates, candidates)
@@ -102,10 +101,10 @@ def suggest(
 
 def choose_views(
     splats: Splats, support: Support, model: ErrorModel, places: StandingPlaces,
-    cameras: Sequence[Camera], count: int, *, backend: str, threads: int = 1,
+    cameras: Sequence[Camera], count: int, *, backend: str,
 ) -> list[int]:
     """Returns which of some cameras that nothing was trained on would help most, best first."""
-    around = _render_candidates(splats, places, cameras[0], backend, threads)
+    around = _render_candidates(splats, places, cameras[0], backend, lambda: None)
     own = [_render(splats, _reduced(camera), number, backend)
            for number, camera in enumerate(cameras)]
     if not around:
@@ -262,20 +261,18 @@ class _Walk:
 
 
 def _render_candidates(
-    splats: Splats, places: StandingPlaces, lens: Camera, backend: str, threads: int
+    splats: Splats, places: StandingPlaces, lens: Camera, backend: str, on_view: Callable[[], None]
 ) -> list[_Candidate]:
-    small = _reduced(lens)
-
-    def look(number: int) -> list[_Candidate]:
-        eye = places.eyes[number]
-        return [_render(
-            splats, replace(small, cx=small.width / 2, cy=small.height / 2,
-                            viewmat=looking_at(eye, eye + forward, places.up)),
-            number, backend, near=places.eye / 3) for forward in _directions(places.up)]
-
-    with ThreadPoolExecutor(threads) as pool:
-        return [candidate for around in pool.map(look, range(len(places.eyes)))
-                for candidate in around if candidate.blocked <= _TOO_NEAR]
+    small, candidates = _reduced(lens), []
+    for number, eye in enumerate(places.eyes):
+        for forward in _directions(places.up):
+            camera = replace(small, cx=small.width / 2, cy=small.height / 2,
+                             viewmat=looking_at(eye, eye + forward, places.up))
+            candidate = _render(splats, camera, number, backend, near=places.eye / 3)
+            on_view()
+            if candidate.blocked <= _TOO_NEAR:
+                candidates.append(candidate)
+    return candidates
 
 
 def _reduced(camera: Camera) -> Camera:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,6 @@ from recon_cli.trust.support import MAX_VIEWS, Support, error_image, measure_sup
 from recon_cli.trust.surface import SurfaceShares, surface_shares
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.summaries import JsonRecord
-
-Array = NDArray[np.float64]
 
 FOLDER = "trust"  # in that of evaluate
 RECORD = "trust.json"
@@ -191,13 +188,12 @@ def measure_trust(
         splats, _in_turn(evenly_spread(scene.train, MAX_VIEWS), max_size, ctx.threads),
         sh_degree=config.sh_degree, backend=ctx.backend, gains=gains, compare=not refined,
         on_view=on_view, digest=digest_of(splats))
-    views = load_reference_views(evenly_spread(scene.validation, _CALIBRATION), max_size)
-    trained = not views  # masks may have left none
-    if trained:
-        views = load_reference_views(evenly_spread(scene.train, _CALIBRATION), max_size)
+    validation = load_reference_views(evenly_spread(scene.validation, _CALIBRATION), max_size)
+    train = [] if validation else load_reference_views(
+        evenly_spread(scene.train, _CALIBRATION), max_size)
     error = calibrate(
-        splats, support, views, ctx, trained=trained, sh_degree=config.sh_degree, gains=gains,
-        on_view=on_view)
+        splats, support, validation, train, sh_degree=config.sh_degree, backend=ctx.backend,
+        gains=gains, on_view=on_view)
     return Trust(support, error, config.sh_degree)
 
 
@@ -208,31 +204,31 @@ def _in_turn(views: Sequence[View], max_size: int, threads: int) -> Iterator[Ref
 
 
 def model_trust(
-    trust: Trust, splats: Splats, views: Sequence[ReferenceView], ctx: StageContext, *, gains: bool,
+    trust: Trust, splats: Splats, views: Sequence[ReferenceView], *, gains: bool, backend: str,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _error: None,
 ) -> ModelTrust:
     """Returns what is known about a model's trust, checked on views that did not calibrate it.
 
-    `on_view` gets each of the `views` and its expected error [H, W], in one of `ctx.threads`.
+    `on_view` gets each of the `views` and its expected error [H, W].
     """
-    def look(view: ReferenceView) -> tuple[list[float], Array, Array]:  # AUSEs; [P], [P] errors
+    areas: list[tuple[float, ...]] = []
+    real, thought = [], []
+    for view in views:
         picture = picture_terms(
-            splats, trust.support, view.camera, sh_degree=trust.sh_degree,
-            backend=ctx.backend)
+            splats, trust.support, view.camera, sh_degree=trust.sh_degree, backend=backend)
         expected = trust.error.expect(picture.terms)
         on_view(view, expected)
         error, counts = error_image(picture.rgb, view, gains=gains)
         used = counts > 0
         pixels = slice(None, None, max(1, int(used.sum()) // _PIXELS))
         errors, own = (np.asarray(image[used][pixels], np.float64) for image in (error, expected))
-        others = (np.asarray(image[used][pixels], np.float64)
-                  for image in (1 - picture.alpha, picture.depth))
-        return [ause(errors, each) for each in (own, *others)], errors, own
-
+        areas.append((ause(errors, own), *(
+            ause(errors, np.asarray(image[used][pixels], np.float64))
+            for image in (1 - picture.alpha, picture.depth))))
+        real.append(errors)
+        thought.append(own)
     agreement = None
     if views:
-        with ThreadPoolExecutor(ctx.threads) as pool:
-            areas, real, thought = zip(*pool.map(look, views), strict=True)
         bins, means = reliability(real, thought), np.mean(areas, axis=0)
         agreement = Agreement(
             views=len(views), ause=round(float(means[0]), 4),

@@ -65,7 +65,7 @@ def main(workspaces: Sequence[Path]) -> None:
         trust = measure_trust(splats, scene, config, config.max_size, ctx)
         took = process_time() - start
         views = load_reference_views(scene.test, config.max_size, ctx)
-        row = model_trust(trust, splats, views, ctx, gains=config.exposure == "on")
+        row = model_trust(trust, splats, views, gains=config.exposure == "on", backend="numba")
         agreement, (low, high) = row.agreement, bounds(splats, trust, views)
         assert agreement is not None
         trained = seconds_at(workspace / "train" / LOG, 1 << 62, clock="cpu_seconds")

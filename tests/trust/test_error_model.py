@@ -5,7 +5,6 @@ import pytest
 import torch
 from small_room import camera, dots, photo, room
 
-from recon_cli.context import StageContext
 from recon_cli.render import render
 from recon_cli.scene.splats import SH_C0
 from recon_cli.trust.error_model import (
@@ -66,11 +65,10 @@ def test_holes_and_sides_that_no_view_shows_are_not_trusted():
     eyes = [[0, y, 1.5] for y in (-0.5, 0.0, 0.5)]
     views = [photo(splats, camera(eye, [2, eye[1], 1.2])) for eye in eyes]  # the wall at x = 2
     support = measure_support(splats, views, sh_degree=0, backend="torch")
-    ctx = StageContext(backend="torch")
-    model = calibrate(splats, support, [photo(splats, camera([0, 0.25, 1.5], [2, 0.2, 1.2]))], ctx,
-                      trained=False, sh_degree=0)
+    model = calibrate(splats, support, [photo(splats, camera([0, 0.25, 1.5], [2, 0.2, 1.2]))],
+                      views, sh_degree=0, backend="torch")
     assert model.calibrated
-    assert not calibrate(splats, support, views, ctx, trained=True, sh_degree=0).calibrated
+    assert calibrate(splats, support, [], views, sh_degree=0, backend="torch").calibrated is False
 
     def expect(target):
         picture = picture_terms(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from small_room import EYE, UP, camera, dots, photo, room
 
-from recon_cli.context import StageContext
 from recon_cli.scene.scene import View
 from recon_cli.trust.error_model import calibrate
 from recon_cli.trust.film_next import Suggestion, suggest
@@ -22,8 +21,7 @@ def suggestions(tmp_path_factory):
     cameras = [camera([0.2, y, EYE], [2, y, 1.2]) for y in (-0.8, -0.3, 0.3, 0.8)]
     photos = [photo(splats, taken) for taken in cameras]
     support = measure_support(splats, photos, sh_degree=0, backend="torch")
-    model = calibrate(splats, support, photos[:1], StageContext(backend="torch"),
-                      trained=False, sh_degree=0)
+    model = calibrate(splats, support, photos[:1], photos, sh_degree=0, backend="torch")
     views = [View(f"{i}.png", taken, folder, folder) for i, taken in enumerate(cameras)]
     places = StandingPlaces(np.array([[0.6, 0, EYE], [-0.4, 0, EYE]]), UP, 0.0, EYE)
     return suggest(splats, support, model, places, views, backend="torch"), views
@@ -63,7 +61,6 @@ def test_without_a_place_nothing_is_suggested():
     taken = camera([0, 0, EYE], [2, 0, 1])
     views = [photo(splats, taken)]
     support = measure_support(splats, views, sh_degree=0, backend="torch")
-    model = calibrate(splats, support, views, StageContext(backend="torch"), trained=False,
-                      sh_degree=0)
+    model = calibrate(splats, support, views, views, sh_degree=0, backend="torch")
     none = StandingPlaces(np.zeros((0, 3)), UP, 0.0, EYE)
     assert suggest(splats, support, model, none, [], backend="torch") == []
