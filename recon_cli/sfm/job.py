@@ -135,7 +135,9 @@ class MappingJob:
     @classmethod
     def _of(cls, value: dict[str, Any]) -> MappingJob:
         """Returns the job of JSON values; what `read` catches where they are of other types."""
-        for name in ("frames", "denoised", "out", "masks", "poses", "tracks", "linked"):
+        for name in ("frames", "denoised", "out"):
+            value[name] = Path(value[name])
+        for name in ("masks", "poses", "tracks", "linked"):
             value[name] = None if value[name] is None else Path(value[name])
         for group in value["groups"]:
             if (lens := group["lens"]) is not None:

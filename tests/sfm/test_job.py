@@ -46,7 +46,8 @@ def test_what_is_written_is_read_back(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "value"), [
-    ("frames", 3), ("groups", [{"names": ["a.png"]}]), ("groups", 7), ("segments", [1]),
+    ("frames", 3), ("out", None), ("groups", [{"names": ["a.png"]}]), ("groups", 7),
+    ("segments", [1]),
     ("groups", [{"names": ["a.png"], "width": 8, "height": 6, "focal_px": None,
                  "lens": {"model": "NONE", "width": 8, "height": 6, "params": []}}])])
 def test_a_job_with_values_of_other_types_is_none(tmp_path, name, value):
