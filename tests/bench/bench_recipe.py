@@ -2,7 +2,8 @@
 
 WORKSPACES have their sfm done and are only read. Optional parts are as `--set` says, far content
 on where it is not said; no trial is made, no step is skipped, all views that are not held out are
-trained on. Each row is one change, the first none:
+trained on. To choose between changes, score validation views instead (`--validation .15`): a choice
+made by held-out views would flatter it. Each row is one change, the first none:
 
     python tests/bench/bench_recipe.py living --set sh_degree=0 --change means_rate=2 \
         --change final_from=.6,final_rate=.03 --change max_gaussians=40000
@@ -82,7 +83,7 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
         ctx: StageContext) -> str:
     """Returns the means over seeds as a line of a table."""
     size = task.schedule.config.max_size
-    held_out = load_reference_views(scene.test, size, ctx)
+    scored = load_reference_views(scene.validation or scene.test, size, ctx)
     shown = task.train[::max(1, -(-len(task.train) // SHOWN))]
     found = []
     for seed in seeds:
@@ -92,7 +93,7 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
         seconds = time.process_time() - begin
         splats = state.splats.map(lambda tensor: tensor.detach())
         test, train = (score_as_ply(splats, views, run.schedule.config.sh_degree, ctx)[0]
-                       for views in (held_out, shown))
+                       for views in (scored, shown))
         found.append((test.psnr_db, test.ssim, train.psnr_db, seconds, len(splats)))
     middle = [statistics.mean(column) for column in zip(*found, strict=True)]
     spread = f"{statistics.stdev(f[0] for f in found):.2f}" if len(found) > 1 else ""
@@ -111,16 +112,19 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
 @click.option("--max-size", default=600, show_default=True)
 @click.option("--max-gaussians", default=100_000, show_default=True)
 @click.option("--threads", default=1, show_default=True)
+@click.option("--validation", default=0.0, help="Share of the training views to score instead.")
 def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[str, ...],
-         seeds: str, iterations: int, max_size: int, max_gaussians: int, threads: int) -> None:
+         seeds: str, iterations: int, max_size: int, max_gaussians: int, threads: int,
+         validation: float) -> None:
     """Print held-out and training PSNR of each change."""
     use_threads("numba", threads)
     ctx = StageContext(backend="numba")
     first, _, last = seeds.partition("-")
     chosen = range(int(first), int(last) + 1) if last else range(int(first))
     base = RunConfig(
-        iterations=iterations, max_size=max_size, max_gaussians=max_gaussians, validation=0.0,
-        images="original", far="on", exposure="off", poses="off", early_stop=False)
+        iterations=iterations, max_size=max_size, max_gaussians=max_gaussians,
+        validation=validation, images="original", far="on", exposure="off", poses="off",
+        early_stop=False)
     shared = {name: value for text in common for name, value in parsed(text).items()}
     click.echo("| scene | change | PSNR / SSIM | deviation | training views | Gaussians | CPU s |\n"
                "|---|---|---:|---:|---:|---:|---:|")
