@@ -3,8 +3,9 @@
 `reference` is the adaptive density control of Kerbl et al. 2023, section 5.2: small Gaussians with
 a large gradient of the projected mean are cloned, large ones are split in two, transparent and
 oversized ones are deleted. `budget` follows LiteGS (score from the variance of the per-fragment
-gradient, opacity decay instead of resets), with a split along the longest axis; the count never
-exceeds what the schedule allows, so that the time of a step is known before the run.
+gradient, opacity decay instead of resets), with a split along the longest axis; those that are to
+blame for the least error make room for splits elsewhere. The count never exceeds what the schedule
+allows, so that the time of a step is known before the run.
 """
 
 from __future__ import annotations
@@ -112,6 +113,7 @@ class BudgetRule:
     target: int  # count that it aims at and never exceeds
     min_opacity: float  # below this a Gaussian is deleted
     decay: float  # all opacities are multiplied by this first; what the views need comes back
+    replaced: float = 0.0  # share of those with a score, deleted from the least: others may split
 
 
 def densify_budget(
@@ -123,6 +125,9 @@ def densify_budget(
     """
     splats = decay_opacities(splats, rule.decay)
     alive = splats.opacities >= rule.min_opacity
+    known = alive & (score > 0)  # no view showed the others: nothing is known of them
+    order = torch.argsort(torch.where(known, score, math.inf), stable=True)
+    alive[order[:int(rule.replaced * int(known.sum()))]] = False
     room = rule.target - int(alive.sum())
     split = draw_rows(score * alive, min(room, int(_GROWTH * len(splats))), generator)
     alive[split] = False
@@ -213,7 +218,7 @@ def _budget(state: TrainState, task: Task) -> None:
     if schedule.densifies(state.iteration):
         rule = BudgetRule(
             schedule.target(state.iteration, state.first_count), schedule.config.min_opacity,
-            schedule.recipe.opacity_decay)
+            schedule.recipe.opacity_decay, schedule.replaced)
         replace_splats(state, *densify_budget(
             state.splats, state.gathered.variance * task.inside(state.splats.means), rule,
             state.generator))

@@ -50,6 +50,10 @@ class Recipe:
     sh_every: int  # the higher degrees are moved every so many steps
     opacity_decay: float  # opacities are multiplied by this at each densification
     resets: bool  # opacities are lowered to .01 now and then, as in the reference
+    # Gaussians of the least error that make room for others, of all: at one densification at most,
+    # and in the course of a run. The one alone would replace all of them in a long one.
+    replaced_at_once: float
+    replaced: float
     # of the means' rate: the extent of the cameras, or their nearness to the points
     means_unit: Literal["extent", "nearness"]
     # factors of the options of these names: short runs have to go as far as the reference's 30,000
@@ -68,12 +72,12 @@ class Recipe:
 REFERENCE = Recipe(
     densify_from=500 / 30_000, densify_until=0.5, full_at=0.5, levels=(),
     sh_at=(1000 / 30_000, 2000 / 30_000, 3000 / 30_000), sh_every=1, opacity_decay=1.0,
-    resets=True, means_unit="extent")
+    resets=True, replaced_at_once=0.0, replaced=0.0, means_unit="extent")
 BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
     sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False,
-    means_unit="nearness", means_rate=10.0, means_again=0.5, scales_rate=4.0, sh_rate=2.0,
-    sh_rest_rate=4.0, momentum=0.8, final_from=0.8, final_rate=0.1)
+    replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=10.0, means_again=0.5,
+    scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8, final_from=0.8, final_rate=0.1)
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 
@@ -158,6 +162,13 @@ class Schedule:
                     round(self.recipe.densify_from * self.steps))
         return (self.gathers(iteration) and iteration - self.first >= start
                 and iteration % self.config.densify_every == 0)
+
+    @property
+    def replaced(self) -> float:
+        """Share of the Gaussians that one densification replaces by others."""
+        every = self.config.densify_every
+        times = sum(map(self.densifies, range(every, self.config.iterations + 1, every)))
+        return min(self.recipe.replaced_at_once, self.recipe.replaced / max(1, times))
 
     def gathers(self, iteration: int) -> bool:
         """Tells whether densification still needs this step's gradients."""

@@ -70,6 +70,25 @@ def test_a_gaussian_that_was_never_seen_is_never_split():
     assert source.tolist() == [0, 2, 3, -1, -1]
 
 
+def test_those_to_blame_for_least_make_room_for_splits_elsewhere():
+    splats = joined(*[splat() for _ in range(10)])
+    score = torch.tensor([5.0, 0.1, 5.0, 0.0, 0.2, 5.0, 5.0, 5.0, 5.0, 5.0])
+    rule = BudgetRule(target=10, min_opacity=0.005, decay=1.0, replaced=0.25)
+    result, source = densify_budget(splats, score, rule, seeded())
+    kept = source[source >= 0].tolist()
+    assert len(result) == 10
+    assert not {1, 4} & set(kept)  # a quarter of the nine of which something is known
+    assert 3 in kept  # no view showed it
+    assert len(kept) == 6  # two of the others were split
+
+
+def test_nothing_is_replaced_where_the_share_is_less_than_one():
+    splats = joined(*[splat() for _ in range(8)])
+    rule = BudgetRule(target=8, min_opacity=0.005, decay=1.0, replaced=0.1)
+    _, source = densify_budget(splats, torch.ones(8), rule, seeded())
+    assert source.tolist() == list(range(8))
+
+
 def test_equal_scores_are_drawn_alike_and_the_draw_follows_the_weights():
     generator = seeded()
     counts = torch.zeros(4)

@@ -102,3 +102,17 @@ def test_a_run_that_goes_on_stops_early_by_shares_of_its_own_steps():
     assert [at for (at, _), to in zip(looks, jumps, strict=True) if to == 2800] == [
         2650, 2700, 2750]
     assert set(jumps) == {None, 2800}
+
+
+@pytest.mark.parametrize(("iterations", "at_once"), [(1, 0.03), (400, 0.03), (2400, 0.4 / 14)])
+def test_short_runs_replace_few_gaussians_at_once(iterations, at_once):
+    assert Schedule(RunConfig(iterations=iterations)).replaced == pytest.approx(at_once)
+
+
+@pytest.mark.parametrize("first", [0, 3000])
+def test_a_long_run_replaces_no_more_gaussians_in_all_than_a_short_one(first):
+    for steps in (2400, 30_000):
+        plan = ContinuedSchedule(RunConfig(iterations=first + steps), first=first)
+        times = sum(plan.densifies(i) for i in range(first + 1, first + steps + 1))
+        assert times > 10
+        assert plan.replaced * times == pytest.approx(0.4, rel=0.05)
