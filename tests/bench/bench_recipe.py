@@ -29,7 +29,7 @@ from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
-from recon_cli.train.plan import first_count
+from recon_cli.train.plan import Facts, count_detail, first_count, useful_cap
 from recon_cli.train.schedule import RECIPES, Recipe, Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
@@ -98,7 +98,7 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
     middle = [statistics.mean(column) for column in zip(*found, strict=True)]
     spread = f"{statistics.stdev(f[0] for f in found):.2f}" if len(found) > 1 else ""
     words = ",".join(f"{key}={value}" for key, value in changes.items()) or "nothing"
-    return (f"| {name} | {words} | {middle[0]:.2f} / {middle[1]:.3f} | {spread} | {middle[2]:.2f} "
+    return (f"| {name} | {words} | {middle[0]:.2f} / {middle[1]:.4f} | {spread} | {middle[2]:.2f} "
             f"| {middle[4]:,.0f} | {middle[3]:.0f} |")
 
 
@@ -110,7 +110,7 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
 @click.option("--seeds", default="1", show_default=True, help="N for 0 to N - 1, or A-B.")
 @click.option("--iterations", default=3000, show_default=True)
 @click.option("--max-size", default=600, show_default=True)
-@click.option("--max-gaussians", default=100_000, show_default=True)
+@click.option("--max-gaussians", default=100_000, show_default=True, help="0: by the plan.")
 @click.option("--threads", default=1, show_default=True)
 @click.option("--validation", default=0.0, help="Share of the training views to score instead.")
 def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[str, ...],
@@ -122,7 +122,7 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
     first, _, last = seeds.partition("-")
     chosen = range(int(first), int(last) + 1) if last else range(int(first))
     base = RunConfig(
-        iterations=iterations, max_size=max_size, max_gaussians=max_gaussians,
+        iterations=iterations, max_size=max_size, max_gaussians=max_gaussians or 1000,
         validation=validation, images="original", far="on", exposure="off", poses="off",
         early_stop=False)
     shared = {name: value for text in common for name, value in parsed(text).items()}
@@ -132,6 +132,9 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
         inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
         scene = load_scene(inputs, validation=base.validation)
         task = load_task(scene, base, ctx)
+        if max_gaussians == 0:
+            facts = Facts(count_detail(task.train), len(task.train), len(scene.points), 0)
+            task = planned(task, {"max_gaussians": useful_cap(facts, iterations)}, 0)
         trained(planned(task, {"iterations": WARM}, 0), scene)
         for changes in ({}, *map(parsed, changed)):
             click.echo(row(workspace.name, task, scene, {**shared, **changes}, chosen, ctx))
