@@ -14,6 +14,7 @@ from recon_cli.cli import VERBS, cli, main
 from recon_cli.commands import jobs, stages, workspace
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import StageStatus
+from recon_cli.train.plan import QUALITIES
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -83,7 +84,7 @@ def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
 def test_demo_takes_fewer_steps_than_other_captures_get(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stages, "SAMPLE", Path("room.mp4").absolute())
     assert main(["demo"]) == 0
-    assert config_of("train", "demo")["iterations"] == 2000
+    assert config_of("train", "demo")["iterations"] < QUALITIES["normal"].iterations
     assert config_of("prune", "demo")["at"] == "mid"
 
 
