@@ -121,7 +121,8 @@ def densify_budget(
 ) -> tuple[Splats, Tensor]:
     """Returns the new Gaussians and the old row [M] that each continues, -1 for new ones.
 
-    The probability of a split is proportional to `score` [N], the error that each is to blame for.
+    The probability of a split is proportional to `score` [N], the error that each is to blame for;
+    those of the least score above zero are deleted first, as many as `rule.replaced` says.
     """
     splats = decay_opacities(splats, rule.decay)
     alive = splats.opacities >= rule.min_opacity

@@ -122,8 +122,9 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
     first, _, last = seeds.partition("-")
     chosen = range(int(first), int(last) + 1) if last else range(int(first))
     base = RunConfig(
-        iterations=iterations, max_size=max_size, max_gaussians=max_gaussians or 1000,
-        validation=validation, images="original", far="on", exposure="off", poses="off",
+        iterations=iterations, max_size=max_size, validation=validation,
+        max_gaussians=max_gaussians or 1000,  # until the plan's is known
+        images="original", far="on", exposure="off", poses="off",
         early_stop=False)
     shared = {name: value for text in common for name, value in parsed(text).items()}
     click.echo("| scene | change | PSNR / SSIM | deviation | training views | Gaussians | CPU s |\n"
