@@ -3,7 +3,9 @@
 WORKSPACES have their sfm done and are only read. Optional parts are as `--set` says, far content
 on where it is not said; no trial is made, no step is skipped, all views that are not held out are
 trained on. To choose between changes, score validation views instead (`--validation .15`): a choice
-made by held-out views would flatter it. Each row is one change, the first none:
+made by held-out views would flatter it. `--stretches` scores how the model looks off the path: of
+each 30 views by name nine in a row are taken away, with the points that fewer than two others see,
+and the middle three of them scored. Each row is one change, the first none:
 
     python tests/bench/bench_recipe.py living --set sh_degree=0 --change means_rate=2 \
         --change final_from=.6,final_rate=.03 --change max_gaussians=40000
@@ -20,12 +22,14 @@ from typing import Any
 from unittest.mock import patch
 
 import click
+import numpy as np
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_reference_views, load_scene
 from recon_cli.experiments.runner import score_as_ply
 from recon_cli.render.registry import use_threads
+from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
@@ -37,6 +41,8 @@ from recon_cli.train.train_data import load_task
 
 WARM = 20  # steps that load what is compiled
 SHOWN = 20  # training views that are scored, at most
+EVERY, GAP, MIDDLE = 30, 9, 3  # views from one stretch to the next, in a stretch, scored of it
+SEES = 2  # views that a point needs, as in any mapping
 FIELDS = {field.name for field in dataclasses.fields(Recipe)}
 
 
@@ -102,6 +108,19 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
             f"| {middle[4]:,.0f} | {middle[3]:.0f} |")
 
 
+def without_stretches(scene: Scene) -> Scene:
+    """Returns the scene without stretches of its training views, whose middle is validated."""
+    views = sorted(scene.train, key=lambda view: view.name)
+    place = np.arange(len(views)) % EVERY - (EVERY // 2 - 1)
+    away, scored = (np.abs(place) <= count // 2 for count in (GAP, MIDDLE))
+    train = tuple(view for view, gone in zip(views, away, strict=True) if not gone)
+    sees = observe_points(scene.points, [view.camera for view in train])
+    kept = np.bincount(sees.point, minlength=len(scene.points)) >= SEES
+    return dataclasses.replace(
+        scene, train=train, points=scene.points[kept], colors=scene.colors[kept],
+        validation=tuple(view for view, own in zip(views, scored, strict=True) if own))
+
+
 @click.command()
 @click.argument("workspaces", nargs=-1, required=True,
                 type=click.Path(exists=True, file_okay=False, path_type=Path))
@@ -113,9 +132,10 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
 @click.option("--max-gaussians", default=100_000, show_default=True, help="0: by the plan.")
 @click.option("--threads", default=1, show_default=True)
 @click.option("--validation", default=0.0, help="Share of the training views to score instead.")
+@click.option("--stretches", is_flag=True, help="Score views in the middle of what is taken away.")
 def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[str, ...],
          seeds: str, iterations: int, max_size: int, max_gaussians: int, threads: int,
-         validation: float) -> None:
+         validation: float, stretches: bool) -> None:
     """Print held-out and training PSNR of each change."""
     use_threads("numba", threads)
     ctx = StageContext(backend="numba")
@@ -132,6 +152,7 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
     for workspace in workspaces:
         inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
         scene = load_scene(inputs, validation=base.validation)
+        scene = without_stretches(scene) if stretches else scene
         task = load_task(scene, base, ctx)
         if max_gaussians == 0:
             facts = Facts(count_detail(task.train), len(task.train), len(scene.points), 0)
