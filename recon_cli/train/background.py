@@ -8,7 +8,7 @@ colour that these views show.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,7 +24,9 @@ from recon_cli.train.task import reduce_view
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart
 _VIEWS = 50  # looked at, at most
-_LEVEL = 4  # images are reduced by this for the search
+# pixels of the longer side of an image in the search, whatever the size that is trained at: in
+# smaller ones the points around a window would close it
+_SEARCH_SIDE = 150
 # a surface covers this many times the median distance of its points in the image around each,
 # within these reduced pixels: between dense points a window stays open, sparse ones close a wall
 _COVER = 3.0
@@ -62,7 +64,7 @@ def far_content(
     looked_at, empty = np.zeros(len(sphere)), np.zeros(len(sphere))
     total = np.zeros((len(sphere), 3))
     for view in views[::max(1, -(-len(views) // _VIEWS))]:
-        small = reduce_view(view, _LEVEL)
+        small = _for_search(view)
         covered = _cover_mask(small, points)
         rows, column, line = project_points(small.camera, sphere)
         looked_at[rows] += 1
@@ -81,7 +83,7 @@ def far_content(
 
 def faces(view: TrainView, content: FarContent, points: NDArray[np.float64]) -> bool:
     """Tells whether a view sees some of what lies far outside, past the points [P, 3]."""
-    small = reduce_view(view, _LEVEL)
+    small = _for_search(view)
     _, column, line = project_points(small.camera, content.positions)
     return int((~_cover_mask(small, points)[line, column]).sum()) >= _FACING
 
@@ -129,19 +131,27 @@ def project_points(
     return rows, u[rows].astype(np.int64), v[rows].astype(np.int64)
 
 
+def _for_search(view: TrainView) -> TrainView:
+    """Returns a view as large as the search wants it; a smaller one as it is."""
+    return reduce_view(view, max(1.0, max(view.camera.width, view.camera.height) / _SEARCH_SIDE))
+
+
 def _cover_mask(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Returns where a point lies near, [H, W]."""
-    _, column, line = project_points(view.camera, points)
-    hit = np.zeros((view.camera.height, view.camera.width), np.uint8)
+    """Returns where a point lies near, [H, W]; it may lie outside the image."""
+    camera, edge = view.camera, _COVER_RANGE[1]
+    wider = replace(camera, width=camera.width + 2 * edge, height=camera.height + 2 * edge,
+                    cx=camera.cx + edge, cy=camera.cy + edge)
+    _, column, line = project_points(wider, points)
+    hit = np.zeros((wider.height, wider.width), np.uint8)
     hit[line, column] = 1
     pixels = np.argwhere(hit)
     if len(pixels) < 2:
-        return hit > 0
+        return hit[edge:-edge, edge:-edge] > 0
     some = pixels[::max(1, len(pixels) // _SAMPLES)]
     distance = cKDTree(pixels).query(some, k=2)[0][:, 1]
     radius = int(np.clip(round(_COVER * float(np.median(distance)) / 2), *_COVER_RANGE))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    return np.asarray(cv2.dilate(hit, disc) > 0)
+    return np.asarray(cv2.dilate(hit, disc)[edge:-edge, edge:-edge] > 0)
 
 
 def _fill_gaps(

@@ -62,7 +62,7 @@ class Task:
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 
 
-def reduce_view(view: TrainView, factor: int) -> TrainView:
+def reduce_view(view: TrainView, factor: float) -> TrainView:
     """Returns a view and its camera reduced by area; unchanged where it would be too small."""
     camera = view.camera
     width, height = round(camera.width / factor), round(camera.height / factor)
