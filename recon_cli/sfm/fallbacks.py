@@ -42,8 +42,8 @@ SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where 
 # Frames up to which a video whose segments gave no good model is mapped as a whole: of more, that
 # would take longer than all of its segments.
 WHOLE_MAX = 400
-# Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
-EXHAUSTIVE_MAX = 100
+# Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
+FEW = 30
 # Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
 # held all of them; a slow walk that fell into four to seven models 76 to 82%.
 ENOUGH = 0.9
@@ -98,13 +98,15 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         return (_incremental(job.pairs, "it was asked for"),)
     relaxed = Fallback("relaxed", "", lambda *_: set(), mapper.map_relaxed)
     every = _incremental("exhaustive", f"{count} frames are few enough to match all pairs")
-    ways: tuple[Fallback, ...] = (every, relaxed) if count <= EXHAUSTIVE_MAX else (
-        Fallback("retrieval", f"{count} frames are too many to match all pairs at once",
-                 _near_or_similar, skeleton.map_coarse_first),
+    ways: tuple[Fallback, ...] = (every, relaxed) if count <= matching.EXHAUSTIVE_MAX else (
+        _incremental("retrieval", f"{count} frames are too many to match all pairs at once"),
         relaxed, every)  # lower thresholds take less time than all pairs
     if skeleton.is_continuous(job):
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
-                         skeleton.choose_pairs, skeleton.complete), *ways)
+                         skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
+    elif count > FEW and not job.split and not job.segments:
+        ways = (Fallback("coarse", f"the coarsest features of {count} frames show which overlap",
+                         skeleton.choose_coarse_pairs, skeleton.complete_coarse), *ways)
     if job.segments:
         joined = Fallback(
             SEGMENTS, f"{count} frames were mapped in {len(job.segments)} segments",
@@ -293,13 +295,7 @@ def _incremental(pairs: str, reason: str) -> Fallback:
     return Fallback(pairs, reason, _PAIRS[pairs], mapper.map_incrementally)
 
 
-def _near_or_similar(job: MappingJob, _: Reporter) -> set[matching.Pair]:
-    """Returns the neighbours among the frames of each camera, and frames that look alike."""
-    near = set().union(*(matching.sequential_pairs(group.names) for group in job.groups))
-    return near | matching.similar_pairs(job.database, job.names, seed=job.seed, besides=near)
-
-
 _PAIRS: dict[str, Callable[[MappingJob, Reporter], set[matching.Pair]]] = {
     "exhaustive": lambda job, _: matching.exhaustive_pairs(job.names),
     "sequential": lambda job, _: matching.sequential_pairs(job.names),
-    "retrieval": _near_or_similar}
+    "retrieval": lambda job, _: matching.near_or_similar_pairs(job)}

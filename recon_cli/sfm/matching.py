@@ -35,6 +35,8 @@ WORDS = 64  # 32, or all keypoints in place of the coarsest 1000, chose no bette
 COARSEST = 1000  # keypoints of an image, largest scale first: they are seen from more places
 SAMPLE = 20_000  # descriptors that k-means runs on
 ROUNDS = 10  # of k-means
+# Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
+EXHAUSTIVE_MAX = 100
 CHUNK = 4096  # descriptors compared with the words at a time, to bound the memory
 
 Pair = tuple[str, str]  # file names in order
@@ -180,10 +182,18 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(rows / np.where(lengths > 0, lengths, 1), np.float32)
 
 
-def match_pairs(job: MappingJob, pairs: Iterable[Pair], report: Reporter) -> None:
+def near_or_similar_pairs(job: MappingJob) -> set[Pair]:
+    """Returns the neighbours among the images of each camera, and images that look alike."""
+    near = set().union(*(sequential_pairs(group.names) for group in job.groups))
+    return near | similar_pairs(job.database, job.names, seed=job.seed, besides=near)
+
+
+def match_pairs(
+    job: MappingJob, pairs: Iterable[Pair], report: Reporter, *, phase: str = "matches"
+) -> None:
     """Matches and verifies image pairs in the database, except those that are there already."""
     wanted, there = set(pairs), database.pair_names(job.database)
-    report.phase("matches", len(wanted | there), done=len(there))
+    report.phase(phase, len(wanted | there), done=len(there))
     listed = job.attempts / "pairs.txt"
     job.attempts.mkdir(exist_ok=True)
     listed.write_text("".join(

@@ -25,11 +25,14 @@ _DOING = {
     "features": ("finding features", "frame"),
     "matches": ("matching frames", "pair"),
     "skeleton": ("following frames", "frame"),
+    "coarse": ("matching coarse features", "pair"),
+    "first": ("placing first cameras", "frame"),
     "mapping": ("placing cameras", "frame"),
     "joining": ("joining segments", "segment"),
     "undistorted": ("undistorting frames", "frame")}
 # The step that a phase belongs to, where the names differ.
-_STEP = {"skeleton": "features", "mapping": "model", "joining": "model"}
+_STEP = {"skeleton": "features", "coarse": "matches", "first": "matches", "mapping": "model",
+         "joining": "model"}
 LOG = "log.txt"
 _LOG_TAIL = 64 * 1024  # bytes
 _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code

@@ -43,12 +43,22 @@ def sized(job, count):
         job.groups[0], names=tuple(f"{index}.png" for index in range(count))),))
 
 
-def test_a_small_capture_begins_with_all_pairs_and_a_large_one_with_some(capture):
+def test_a_small_capture_begins_with_all_pairs_and_a_large_one_with_its_coarsest_features(capture):
     job, _ = capture
-    assert [fallback.name for fallback in list_fallbacks(sized(job, 100))] == [
+    assert [fallback.name for fallback in list_fallbacks(sized(job, 30))] == [
         "exhaustive", "relaxed", "global"]
+    assert [fallback.name for fallback in list_fallbacks(sized(job, 100))] == [
+        "coarse", "exhaustive", "relaxed", "global"]
     assert [fallback.name for fallback in list_fallbacks(sized(job, 101))] == [
-        "retrieval", "relaxed", "exhaustive", "global"]
+        "coarse", "retrieval", "relaxed", "exhaustive", "global"]
+
+
+def test_a_capture_that_is_cut_into_segments_needs_no_cameras_of_the_whole_first(capture):
+    job, _ = capture
+    assert list_fallbacks(replace(sized(job, 300), split=2))[0].name == "retrieval"
+    halves = tuple(f"{index}.png" for index in range(300)), ("299.png",)
+    assert [fallback.name for fallback in list_fallbacks(
+        replace(sized(job, 300), segments=halves))][:2] == ["segments", "retrieval"]
 
 
 def test_a_video_begins_with_its_tracks_where_they_link_its_frames(capture):

@@ -9,17 +9,18 @@ import pytest
 from made_model import HEIGHT, WIDTH, MadeModel, along, moved, wall
 
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import skeleton
+from recon_cli.sfm import database, matching, skeleton
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 from recon_cli.sfm.skeleton import (
     build_skeleton,
-    complete,
+    choose_coarse_pairs,
+    complete_coarse,
+    complete_tracked,
+    copy_coarsest,
     is_continuous,
-    keep_coarsest,
     link,
-    map_coarse_first,
     near_pairs,
     overlapping_images,
     overlapping_pairs,
@@ -287,7 +288,7 @@ def test_a_model_is_completed_without_what_only_looks_alike(repeated):
     made, job = repeated
     (folder := job.attempts / skeleton.SKELETON / "0").mkdir(parents=True)
     build_skeleton(job, job.database)[0].write(folder)
-    models = complete(linked(job), SILENT)
+    models = complete_tracked(linked(job), SILENT)
     assert [model.num_reg_images() for model in models] == [24]
     assert errors(models[0], made).max() < 0.02
 
@@ -302,36 +303,84 @@ def test_models_that_tracks_leave_apart_are_joined_by_matches(tmp_path):
     for index, model in enumerate(models):
         (job.attempts / skeleton.SKELETON / str(index)).mkdir(parents=True)
         model.write(job.attempts / skeleton.SKELETON / str(index))
-    completed = complete(linked(job), SILENT)
+    completed = complete_tracked(linked(job), SILENT)
     assert [model.num_reg_images() for model in completed] == [16]
     assert errors(completed[0], made).max() < 0.02
 
 
-def test_matches_of_the_coarsest_keypoints_are_kept(tmp_path, monkeypatch):
+def make_photos(folder, made):
+    """A job whose database holds features, those of one point alike in all images, and no match."""
+    job = make_job(folder, made)
+    looks = np.random.default_rng(3).integers(0, 60, (len(made.points), 128), dtype=np.uint8)
+    with pycolmap.Database.open(job.database) as opened:
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+        for index in range(len(made.names)):
+            opened.write_descriptors(index + 1, pycolmap.FeatureDescriptors(
+                pycolmap.FeatureExtractorType.SIFT, looks[made._seen(index)[0]]))
+    return job
+
+
+def features(path):
+    """Keypoints and descriptors of each image."""
+    with pycolmap.Database.open(path) as opened:
+        return [(np.asarray(opened.read_keypoints(image.image_id)),
+                 np.asarray(opened.read_descriptors(image.image_id).data))
+                for image in opened.read_all_images()]
+
+
+def test_the_coarsest_features_are_copied_and_no_matches(tmp_path, monkeypatch):
     monkeypatch.setattr(skeleton, "COARSEST", 17)
-    made = walk(6)
-    job = make_job(tmp_path, made)
-    before = read_verified(job.database)
-    keep_coarsest(job.database, tmp_path / "coarse.db")
-    after = read_verified(tmp_path / "coarse.db")
-    assert after
-    assert after.keys() < before.keys()  # too few are left of some
-    for pair, geometry in after.items():
-        rows = before[pair].inlier_matches
-        np.testing.assert_array_equal(
-            geometry.inlier_matches, rows[(rows < 17).all(axis=1)])
-    np.testing.assert_equal(len(read_verified(job.database)), len(before))
+    job = make_photos(tmp_path, walk(6))
+    matching.match_pairs(job, [("000000.png", "000001.png")], SILENT)
+    copy_coarsest(job.database, tmp_path / "coarse.db")
+    for before, after in zip(
+            features(job.database), features(tmp_path / "coarse.db"), strict=True):
+        for rows, first in zip(before, after, strict=True):
+            assert len(rows) > 17
+            np.testing.assert_array_equal(first, rows[:17])
+    assert len(read_verified(job.database)) == 1
+    assert not database.pair_names(tmp_path / "coarse.db")
+    with pycolmap.Database.open(tmp_path / "coarse.db") as opened:
+        assert not opened.num_matched_image_pairs()
 
 
-@pytest.mark.parametrize("coarsest", [120, 0])
-def test_cameras_of_coarse_features_get_the_points_of_all(tmp_path, monkeypatch, coarsest):
-    monkeypatch.setattr(skeleton, "COARSEST", coarsest)
-    made = walk()
-    job = make_job(tmp_path, made)
-    models = map_coarse_first(job, SILENT)
-    assert [model.num_reg_images() for model in models] == [16]
-    assert errors(models[0], made).max() < 0.01
-    seen = [point.point2D_idx for found in models[0].points3D.values()
+def test_photos_that_overlap_by_their_coarsest_features_are_matched_in_full(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(skeleton, "COARSEST", 120)
+    monkeypatch.setattr(skeleton, "SIMILAR", 0)
+    made = walk(36)
+    job = make_photos(tmp_path, made)
+    (job.attempts / f"{skeleton.COARSE_SKELETON}.mapping").mkdir()  # what a killed run left
+    (job.attempts / f"{skeleton.COARSE_SKELETON}.found" / "0").mkdir(parents=True)
+    pairs = choose_coarse_pairs(job, SILENT)
+    gaps = [made.names.index(second) - made.names.index(first) for first, second in pairs]
+    assert min(np.bincount([made.names.index(name) for pair in pairs for name in pair])) >= 5
+    assert max(gaps) < 15  # those of 630 pairs that see the same
+    assert not database.pair_names(job.database)
+    # What was found is not found again.
+    monkeypatch.setattr(skeleton, "build_coarse_skeleton", lambda *_: pytest.fail("built again"))
+    assert choose_coarse_pairs(job, SILENT) == pairs
+    matching.match_pairs(job, pairs, SILENT)
+    model, = complete_coarse(job, SILENT)
+    assert model.num_reg_images() == 36
+    assert errors(model, made).max() < 0.02
+    seen = [point.point2D_idx for found in model.points3D.values()
             for point in found.track.elements]
     assert max(seen) > 150
-    assert not (job.attempts / "coarse.db").exists()
+
+
+def test_photos_are_mapped_from_their_matches_where_coarse_features_place_too_few(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(skeleton, "COARSEST", 10)  # fewer than a pair needs
+    monkeypatch.setattr(skeleton, "SIMILAR", 6)
+    made = walk()
+    job = make_photos(tmp_path, made)
+    pairs = choose_coarse_pairs(job, SILENT)
+    assert len(pairs) >= 3 * len(made.names)  # as many as look alike
+    matching.match_pairs(job, pairs, SILENT)
+    model, = complete_coarse(job, SILENT)
+    assert model.num_reg_images() == 16
+    assert errors(model, made).max() < 0.02

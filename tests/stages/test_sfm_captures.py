@@ -10,6 +10,7 @@ from sfm_inputs import run, texture, write_inputs
 
 from recon_cli.errors import SfmError
 from recon_cli.io.records import Frame, FrameList, Group
+from recon_cli.sfm import database
 from recon_cli.sfm.verdict import find_jumps
 from recon_cli.stages import sfm
 
@@ -57,6 +58,15 @@ def test_photos_of_other_things_are_named_and_not_in_the_model(sample_video, tmp
     assert summary.registered == 16
     assert summary.unregistered == tuple(sorted(wrong))
     assert [attempt.name for attempt in summary.rungs] == ["exhaustive"]
+
+
+@pytest.mark.integration
+def test_photos_are_matched_where_their_coarsest_features_overlap(sample_video, tmp_path):
+    images = frames(sample_video, step=2, count=36)
+    summary = run(write_inputs(tmp_path / "in", images), tmp_path / "out")
+    assert summary.registered == 36
+    assert [attempt.name for attempt in summary.rungs] == ["coarse"]
+    assert len(database.pair_names(tmp_path / "out" / "database.db")) < 36 * 35 / 2 * 0.75
 
 
 @pytest.mark.integration
