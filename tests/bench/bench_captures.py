@@ -145,7 +145,7 @@ def called(script: str, *arguments: Path) -> None:
 
 
 CAPTURES = {
-    "fox": Capture(given("fox/images"), fox, options={"sfm": ("--pairs", "exhaustive")}),
+    "fox": Capture(given("fox/images"), fox),
     "fox, noise 20": Capture(noisy_fox, fox, options={
         "denoise": ("--force", "--filter", "bilateral"), "sfm": ("--pairs", "sequential")}),
     "living": Capture(given("rooms/living/video.mp4"), room("living"), metric=True),

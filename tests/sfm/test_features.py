@@ -125,12 +125,14 @@ def test_a_large_image_is_reduced_where_that_leaves_enough(tmp_path, monkeypatch
     gray = 20 + 200 * (spread := cv2.GaussianBlur(spots, None, 7.0)) / spread.max()
     picture = np.repeat(np.rint(gray)[:, :, None], 3, axis=2).astype(np.uint8)
     found = {}
-    for most in (200, 50_000):
+    for most in (200, 12_000, 50_000):
         job = make_job(tmp_path / str(most), [picture], max_features=most)
         extract_features(job, SILENT)
         found[most] = keypoints(job)["a.png"]
     assert len(found[200]) == 200
     assert 960 <= len(found[50_000]) < 50_000  # all of them, at full size
+    # Half of what is wanted is enough: the full size, which has more, is not looked at.
+    assert 6_000 <= len(found[12_000]) < len(found[50_000])
     y, x = np.nonzero(spots)
     middles = np.column_stack([x, y]) + 0.5
     places = np.concatenate([middles, middles + 20])  # the spots, and the dips between them
