@@ -384,3 +384,17 @@ def test_photos_are_mapped_from_their_matches_where_coarse_features_place_too_fe
     model, = complete_coarse(job, SILENT)
     assert model.num_reg_images() == 16
     assert errors(model, made).max() < 0.02
+
+
+def test_what_looks_alike_is_matched_where_the_models_do_not_show_it_to_overlap(
+    tmp_path, monkeypatch
+):
+    made = walk(12, step=1.0)  # from one end to the other nothing is seen twice
+    job = make_photos(tmp_path, made)
+    first, last = made.names[0], made.names[-1]
+    overlap = overlapping_pairs(made.model(), skeleton.WIDEST)
+    chosen = set(sorted(overlap)[::2])
+    monkeypatch.setattr(skeleton, "similar_pairs", lambda *_, besides, **__: (
+        {(first, last)} | overlap) - set(besides))
+    assert skeleton._unexpected_pairs(job, [made.model()], chosen) == {(first, last)}
+    assert skeleton._unexpected_pairs(job, [], chosen) == {(first, last)} | overlap - chosen
