@@ -85,8 +85,8 @@ class SfmConfig(StageConfig):
         "keep", "Poses of a data set: keep them, refine them with the points, or ignore them.",
         choices=("keep", "refine", "ignore"))
     pairs: str = option(
-        "auto", "Image pairs to match. auto: all pairs of up to 100 images, else neighbours and "
-        "similar images; then more pairs and other mappers if the model is poor.",
+        "auto", "Image pairs to match. auto: what overlaps by first cameras, from a video's tracks "
+        "or photos' coarsest features; then more pairs and other mappers if the model is poor.",
         choices=("auto", "exhaustive", "retrieval", "sequential"))
     max_features: int = option(
         3000, "Maximum SIFT keypoints per image; the coarsest are kept.", unit="keypoints",
