@@ -50,7 +50,7 @@ CONTINUOUS = 0.5
 # overlap: the closest tell little about depth. Errors of the cameras of two rooms with 10, 8 and 6
 # of them, in cm: .17 and .09, .17 and .10, .20 and .10.
 OVERLAPPING, WIDEST = 8, 60
-# The same of photos, which have no neighbours. 50 frames of each of the rooms as photos: .017 and
+# The same of photos, which have no neighbours. 50 frames of each of the rooms as photos: .024 and
 # .045% of the extent with 8, .020 and .034% with 12, .013 and .034% with all pairs.
 OVERLAPPING_PHOTOS = 12
 # Pairs per image that look alike. Of some 240 on the videos of the two rooms 97% overlap by the
@@ -60,8 +60,8 @@ ALWAYS = 3  # neighbours that are matched in any case
 # Two views overlap as far as a point of one lies in the other, at a like angle and distance.
 MAX_ANGLE_DEG, MAX_RATIO, MIN_OVERLAP = 30.0, 2.0, 0.2
 SAMPLED = 150  # points per image
-# Keypoints of a photo, the coarsest, from which cameras are found first. With 1000 a pair takes
-# three times as long as with 400, where a third of the verified pairs is lost.
+# Keypoints of a photo, the coarsest, from which cameras are found first. Of the 1225 pairs of 50
+# photos 914 are verified with 1000, 743 with 600 and 566 with 400, in 17, 10 and 4 CPU s.
 COARSEST = 600
 
 

@@ -386,6 +386,23 @@ def test_photos_are_mapped_from_their_matches_where_coarse_features_place_too_fe
     assert errors(model, made).max() < 0.02
 
 
+def test_a_photo_without_features_hinders_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(skeleton, "COARSEST", 120)
+    job = make_photos(tmp_path, walk(12))
+    with pycolmap.Database.open(job.database) as opened:
+        kept = {image.image_id: opened.read_descriptors(image.image_id)
+                for image in opened.read_all_images()}
+        kept[6] = pycolmap.FeatureDescriptors(
+            pycolmap.FeatureExtractorType.SIFT, np.zeros((0, 128), np.uint8))
+        opened.clear_descriptors()
+        opened.update_keypoints(6, np.zeros((0, 6), np.float32))
+        for number, rows in kept.items():
+            opened.write_descriptors(number, rows)
+    matching.match_pairs(job, choose_coarse_pairs(job, SILENT), SILENT)
+    model, = complete_coarse(job, SILENT)
+    assert model.num_reg_images() == 11
+
+
 def test_what_looks_alike_is_matched_where_the_models_do_not_show_it_to_overlap(
     tmp_path, monkeypatch
 ):
