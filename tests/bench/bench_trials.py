@@ -2,9 +2,9 @@
 
 WORKSPACES have their sfm done and are only read. For each, the trials of `recon train` choose the
 optional parts of the model; then runs of full length differ from the chosen one in one part each.
-Both are scored on the validation views, a fifth of the training views, each after its best gain.
-`gain` is what a part is worth in the full run, `lost` what the choice gives away: never more than
-.1 dB is the aim.
+Both are scored on the validation views, a fifth of the training views, each after its best gain;
+exposure, as in its trial, by the mean of the PSNR without and with that gain. `gain` is what a part
+is worth in the full run, `lost` what the choice gives away: never more than .1 dB is the aim.
 
     python tests/bench/bench_trials.py living fox --iterations 3000 --iterations 10000
 """
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene, mean_psnr
+from recon_cli.evaluation.reference_views import load_scene, view_psnr
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.feature_trials import PARTS
@@ -71,7 +71,7 @@ class Capture:
         return dataclasses.replace(config, **{part: value})  # type: ignore[arg-type]
 
     def scores(self, config: RunConfig) -> NDArray[np.float64]:
-        """Returns the PSNR in dB of each validation view after a run."""
+        """Returns the PSNR in dB of each validation view after a run, without and with gain."""
         if config not in self._scores:
             train = self.task.train
             if config.images == "denoised":
@@ -82,7 +82,7 @@ class Capture:
                                 most=first_count(config, len(self.scene.points)))
             fit(state, task, config.iterations)
             self._scores[config] = np.array([
-                mean_psnr(state.splats, [view], config.sh_degree, task.backend, corrected=True)
+                view_psnr(state.splats, view, config.sh_degree, task.backend)
                 for view in self.task.validation])
         return self._scores[config]
 
@@ -97,8 +97,10 @@ class Capture:
         seconds = time.process_time() - start
         on = (config.sh_degree > 0 if part == DEGREE
               else getattr(config, part) == SWITCHED[part][1])
-        gains = (chosen - changed) * (1 if on else -1)
+        both = (chosen - changed) * (1 if on else -1)  # [V, 2]
+        gains = both.mean(axis=1) if part == "exposure" else both[:, 1]
         mean, error = gains.mean(), gains.std(ddof=1) / math.sqrt(len(gains))
+        as_is, corrected = both.mean(axis=0)
         trial = next((d for d in self.needs.decisions if d.name.startswith(
             "harmonics above degree 0" if part == DEGREE else part)), None)
         tried = ("no sign" if trial is None or trial.mean_db is None
@@ -106,7 +108,8 @@ class Capture:
         choice = str(config.sh_degree) if part == DEGREE else ("on" if on else "off")
         lost = max(0.0, -mean if on else mean)
         return (f"| {self.name} | {part} | {tried} | {choice} | {iterations:,} "
-                f"| {chosen.mean():.2f} | {mean:+.2f} ± {error:.2f} | {lost:.2f} | {seconds:.0f} |")
+                f"| {chosen[:, 1].mean():.2f} | {as_is:+.2f} | {corrected:+.2f} "
+                f"| {mean:+.2f} ± {error:.2f} | {lost:.2f} | {seconds:.0f} |")
 
 
 @click.command()
@@ -123,8 +126,9 @@ def main(workspaces: tuple[Path, ...], lengths: tuple[int, ...], parts: tuple[st
     """Print what each part is worth in the trial and in runs of full length, in dB."""
     use_threads("numba", threads)
     ctx = StageContext(backend="numba")
-    click.echo("| capture | part | trial | chosen | steps | PSNR | gain in full | lost | CPU s |\n"
-               "|---|---|---:|---|---:|---:|---:|---:|---:|")
+    click.echo("| capture | part | trial | chosen | steps | PSNR | gain as it is | after gain "
+               "| counted | lost | CPU s |\n"
+               "|---|---|---:|---|---:|---:|---:|---:|---:|---:|---:|")
     for workspace in workspaces:
         capture = Capture(workspace, TrainConfig(
             max_size=max_size, validation=VALIDATION), ctx)
