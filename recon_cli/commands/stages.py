@@ -30,7 +30,7 @@ from recon_cli.stages import IMPORT, STAGES
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune while training goes on
 # fewer steps than a capture of one's own gets: this room scores as 3DGS does after them already
-DEMO: Settings = {**MID, "train": {"iterations": 1800}}
+DEMO: Settings = {**MID, "train": {"iterations": 1700}}
 FORMS = ("text", "markdown", "csv", "latex", "json")
 
 _inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))

@@ -84,7 +84,7 @@ def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
 def test_demo_takes_fewer_steps_than_other_captures_get(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stages, "SAMPLE", Path("room.mp4").absolute())
     assert main(["demo"]) == 0
-    assert config_of("train", "demo")["iterations"] == 1800 < QUALITIES["normal"].iterations
+    assert config_of("train", "demo")["iterations"] == 1700 < QUALITIES["normal"].iterations
     assert config_of("prune", "demo")["at"] == "mid"
 
 
