@@ -193,15 +193,6 @@ def mean_psnr(
     return statistics.fmean(_measure(splats, views, sh_degree, backend, score, threads=threads))
 
 
-def view_psnr(
-    splats: Splats, view: TrainView, sh_degree: int, backend: str
-) -> tuple[float, float]:
-    """Returns the PSNR in dB of a view as it is, and after the best gain of each channel."""
-    image = np.asarray(
-        render_on_black(splats, view.camera, sh_degree, backend).rgb.cpu().numpy(), np.float32)
-    return psnr(image, view.image, view.mask), corrected_psnr(image, view.image, view.mask)
-
-
 def mean_score(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str
 ) -> MeanScore:

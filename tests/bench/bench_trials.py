@@ -3,8 +3,9 @@
 WORKSPACES have their sfm done and are only read. For each, the trials of `recon train` choose the
 optional parts of the model; then runs of full length differ from the chosen one in one part each.
 Both are scored on the validation views, a fifth of the training views, each after its best gain;
-exposure, as in its trial, by the mean of the PSNR without and with that gain. `gain` is what a part
-is worth in the full run, `lost` what the choice gives away: never more than .1 dB is the aim.
+exposure by the mean of the PSNR without and with it, as the .ply has no gains; how far views of the
+same place differ stands behind its trial. `gain` is what a part is worth in the full run, `lost`
+what the choice gives away: never more than .1 dB is the aim.
 
     python tests/bench/bench_trials.py living fox --iterations 3000 --iterations 10000
 """
@@ -22,9 +23,11 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene, view_psnr
+from recon_cli.evaluation.metrics import corrected_psnr, psnr
+from recon_cli.evaluation.reference_views import load_scene, render_on_black
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
+from recon_cli.train.exposure import estimate_gains
 from recon_cli.train.feature_trials import PARTS
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
@@ -81,9 +84,12 @@ class Capture:
             state = first_state(task, self.scene.points, self.scene.colors,
                                 most=first_count(config, len(self.scene.points)))
             fit(state, task, config.iterations)
-            self._scores[config] = np.array([
-                view_psnr(state.splats, view, config.sh_degree, task.backend)
-                for view in self.task.validation])
+            rows = []
+            for view in self.task.validation:
+                rgb = render_on_black(
+                    state.splats, view.camera, config.sh_degree, task.backend).rgb.numpy()
+                rows.append([score(rgb, view.image, view.mask) for score in (psnr, corrected_psnr)])
+            self._scores[config] = np.array(rows)
         return self._scores[config]
 
     def row(self, part: str, iterations: int) -> str | None:
@@ -105,6 +111,9 @@ class Capture:
             "harmonics above degree 0" if part == DEGREE else part)), None)
         tried = ("no sign" if trial is None or trial.mean_db is None
                  else f"{trial.mean_db:+.2f} ± {trial.standard_error_db:.2f}")
+        if part == "exposure":  # how far views of the same place differ
+            local = estimate_gains(self.task.train, self.scene.points).local
+            tried += f" ({local:.2f})"
         choice = str(config.sh_degree) if part == DEGREE else ("on" if on else "off")
         lost = max(0.0, -mean if on else mean)
         return (f"| {self.name} | {part} | {tried} | {choice} | {iterations:,} "

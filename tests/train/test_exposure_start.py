@@ -80,6 +80,40 @@ def test_a_view_that_shares_no_point_has_no_gain_and_no_say():
     assert found.log_gains[:-1] == pytest.approx(centered(GAINS), abs=ROUNDING)
 
 
+def along_a_wall(log_gains):
+    """Views that step along the wall, each with a gain of its own."""
+    images = []
+    for at, log_gain in zip(np.linspace(-1.5, 1.5, len(log_gains)), log_gains, strict=True):
+        viewmat = np.eye(4)
+        viewmat[0, 3] = -at
+        image = np.roll(wall(), -round(at / 3 * 100), axis=1) * np.exp(log_gain)
+        images.append(TrainView(replace(CAMERA, viewmat=viewmat), np.rint(image).astype(np.uint8)))
+    return images
+
+
+def wide_points():
+    rng = np.random.default_rng(0)
+    return np.column_stack([
+        rng.uniform([-3.3, -1.3], [3.3, 1.3], (2000, 2)), np.full(2000, 3.0)])
+
+
+def test_an_exposure_that_follows_the_place_is_told_from_one_of_each_view():
+    slow = 0.2 * np.sin(np.linspace(0, 2 * np.pi, 30))
+    jumps = 0.2 * np.random.default_rng(1).permutation(np.linspace(-1, 1, 30))
+    followed = estimate_gains(along_a_wall(slow), wide_points())
+    own = estimate_gains(along_a_wall(jumps), wide_points())
+    assert followed.drifts
+    assert own.drifts
+    assert followed.follows_place
+    assert followed.local < 0.1
+    assert not own.follows_place
+    assert own.local > 0.6
+    # whatever the order of the views
+    mixed = np.random.default_rng(2).permutation(30)
+    shuffled = estimate_gains([along_a_wall(slow)[i] for i in mixed], wide_points())
+    assert shuffled.local == pytest.approx(followed.local, rel=0.1)
+
+
 def test_without_points_nothing_is_known():
     found = estimate_gains(views(), np.zeros((0, 3)))
     assert (found.spread, found.compared) == (0.0, 0)

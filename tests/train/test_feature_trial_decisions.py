@@ -42,6 +42,11 @@ def test_a_gain_that_rests_on_one_view_does_not_count():
     assert "not more than the 0.41 dB" in decision.reason
 
 
+def test_a_gain_that_need_not_be_sure_counts_from_the_threshold_on():
+    assert decided([2.0, 0, 0, 0, 0, 0, 0, 0], errors=0).on
+    assert not decided([0.3, 0, 0, 0, 0, 0, 0, 0], errors=0).on
+
+
 def test_a_loss_keeps_the_part_off():
     assert not decided([-0.5] * 8).on
 
