@@ -65,8 +65,8 @@ _DARK, _BRIGHT = 12 / 255, 243 / 255  # means over a block; beyond, pixels of it
 _DRIFTS = 0.025
 _FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known better
 # How far views of the same place differ, from which the exposure is a view's own. Measured (the
-# variance, of any two views 1): .01 to .23 in 17 captures by phone, drone and camera, where it
-# follows the place; .62 to .83 where each view has an exposure of its own or a lamp flickers.
+# variance, of any two views 1): .01 to .23 in 15 captures by phone, drone and camera and two
+# renderings with a drift; .62 to .83 where most of it changes from view to view.
 _OWN = 1 / 3
 
 

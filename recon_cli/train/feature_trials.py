@@ -57,7 +57,7 @@ def decide(
 ) -> TrialDecision:
     """Returns whether the second arm is better than the first.
 
-    On, if the mean gain is above the threshold and above so many standard errors of the paired
+    On, if the mean gain is above the threshold and above `errors` standard errors of the paired
     differences; with `unless_worse` also if it is not below zero by the threshold and one standard
     error. Each arm, without and with the part, trains and returns the scores of the same views in
     dB.
@@ -236,8 +236,8 @@ class _Bench:
             return config.sh_degree
         for low in (0, 1):
             few = replace(config, sh_degree=low)
-            # A gain need not be sure: of twelve captures all gained by harmonics in the end, and
-            # two left out for want of certainty lost .6 and 1.2 dB in long runs.
+            # A gain need not be sure: after 3,000 steps all of twelve captures gained by harmonics,
+            # and two left out for want of certainty lost .6 and 1.2 dB in longer runs.
             decisions.append(decide(
                 f"harmonics above degree {low}",
                 (partial(self._run, few), partial(self._run, config)), errors=0))
