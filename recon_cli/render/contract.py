@@ -55,7 +55,6 @@ class Statistics:
     blend_sum: Tensor  # [N] sum of alpha T over the pixels
     blend_max: Tensor  # [N] greatest alpha T
     means2d_grad: Tensor  # [N, 2] gradient of the loss by the projected mean, per pixel
-    absolute_grad: Tensor  # [N, 2] the same with the magnitude of each pixel's part
     variance: Tensor  # [N] sum s^2 - (sum s)^2 / n over its n pixels, s = o dL/do = alpha dL/dalpha
     # [N] sum of ||alpha T (c - B)||^2, B the colour composited behind: the squared error that
     # removing this one Gaussian causes.
@@ -72,8 +71,8 @@ class Statistics:
         return Statistics(
             radii=like.new_zeros(n), hits=like.new_zeros(n, dtype=torch.int64),
             blend_sum=like.new_zeros(n), blend_max=like.new_zeros(n),
-            means2d_grad=like.new_zeros(n, 2), absolute_grad=like.new_zeros(n, 2),
-            variance=like.new_zeros(n), loo=like.new_zeros(n))
+            means2d_grad=like.new_zeros(n, 2), variance=like.new_zeros(n),
+            loo=like.new_zeros(n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,7 @@ class RenderOutput:
     alpha: Tensor  # [H, W] coverage, 1 minus the final transmittance
     depth: Tensor  # [H, W] sum of alpha T z, world units; over alpha it is the expected depth
     # Without `scores=True` hits, blend weights and loo stay zero, and with the torch backend
-    # absolute_grad and variance too.
+    # variance too.
     statistics: Statistics
 
 
@@ -103,7 +102,7 @@ class StepOptions:
 
     sh_degree: int  # highest in use, as in `recon_cli.render.registry.render`
     ssim_weight: float  # w in [0, 1] of the loss (1 - w) L1 + w (1 - SSIM)
-    details: bool = False  # absolute_grad and variance too
+    details: bool = False  # variance too
     scores: bool = False  # hits and blend weights too, over the mask; else they mean nothing
     loo: bool = False  # likewise
     harmonics: bool = True  # without, the gradient of sh_rest may be left as it is

@@ -43,7 +43,7 @@ _RATE, _BETAS, _EPSILON = 1e-3, (0.9, 0.999), 1e-15
 _SSIM_WEIGHT = 0.2
 _DEGREE = 3
 _REPEATS = 4  # of a step: CUDA graphs are recorded at the third time and replayed from then on
-_STATISTICS = "radii", "blend_sum", "means2d_grad", "absolute_grad", "loo"
+_STATISTICS = "radii", "blend_sum", "means2d_grad", "loo"
 _AdamGroups = tuple[
     list[Tensor], list[Tensor], tuple[list[Tensor], list[Tensor]], list[float | None]]
 _DRIVER = Path("/proc/driver/nvidia/version")

@@ -32,8 +32,8 @@ from recon_cli.render.numba import (
 )
 from recon_cli.render.numba.thread_pool import pool
 
-STATISTICS = ("radii", "hits", "blend_sum", "blend_max", "means2d_grad", "absolute_grad",
-              "variance", "loo")
+STATISTICS = ("radii", "hits", "blend_sum", "blend_max", "means2d_grad", "variance",
+              "loo")
 _MODULES = (binning, loss, optimizer, projection, project_backward, composite_backward,
             compositing, step)
 

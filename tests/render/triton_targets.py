@@ -35,7 +35,7 @@ TYPES = {
     "centers": "*fp64", "depths": "*fp32", "touched": "*i32", "radii": "*fp32", "broken": "*i32",
     "keys": "*i64", "owners": "*i32", "g_means": "*fp32", "g_quats": "*fp32",
     "g_log_scales": "*fp32", "g_logits": "*fp32", "g_sh_dc": "*fp32", "g_sh_rest": "*fp32",
-    "means2d_grad": "*fp32", "absolute_grad": "*fp32", "variance": "*fp32", "loo": "*fp32",
+    "means2d_grad": "*fp32", "variance": "*fp32", "loo": "*fp32",
     "background": "*fp32", "width": "i32", "height": "i32", "tiles_x": "i32", "rgb": "*fp32",
     "alpha": "*fp32", "depth": "*fp32", "final": "*fp32", "last": "*i32", "slots": "*i64",
     "counting": "*u8", "hits": "*i32", "weights": "*fp32", "peaks": "*fp32", "grad_rgb": "*fp32",

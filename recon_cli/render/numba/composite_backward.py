@@ -22,11 +22,11 @@ from recon_cli.render.numba.compositing import (
 from recon_cli.render.numba.kernel import kernel
 from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
-    absolute, bits, broadcast, count_bits, exp2, fetch_add, fill, fma, largest, load, lowest_bit,
+    bits, broadcast, count_bits, exp2, fetch_add, fill, fma, largest, load, lowest_bit,
     minimum, select, store, totals)
 from recon_cli.render.numba.soa import (
     BATCH, BLUE, DEPTH, GREEN, LOG2_ALPHA_MAX, PATCHES, RED, SLOT, TILE_HEIGHT, TILE_PIXELS,
-    TILE_WIDTH, U_X, U_Y, V_Y)
+    TILE_WIDTH)
 
 _T, _R, _LAST, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH = (i * TILE_PIXELS for i in range(7))
 _BEHIND_RED, _BEHIND_GREEN, _BEHIND_BLUE = (i * TILE_PIXELS for i in range(7, 10))
@@ -45,7 +45,7 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
 
     The arguments are those of `compositing.composite`, and `grad_*`, dL/d(rgb, alpha, depth), the
     latter two empty for zeros. Written are `sums` [E * 16] by slot, see `soa`: with `details` also
-    |s u|, |s y|, s^2 and the fragments, with `scores` what leaving one out would change, over
+    s^2 and the fragments, with `scores` what leaving one out would change, over
     `counting`.
     """
     has_alpha, has_depth = len(grad_alpha) > 0, len(grad_depth) > 0
@@ -114,7 +114,7 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                 pairs += count_bits(needed) * LANES
                 g_red, g_green, g_blue, g_depth = zero, zero, zero, zero
                 s_0, s_u, s_v, s_uu, s_uv, s_vv = zero, zero, zero, zero, zero, zero
-                abs_x, abs_y, squared, hits, loo = zero, zero, zero, zero, zero
+                squared, hits, loo = zero, zero, zero
                 i = k * LOCAL
                 while needed != 0:
                     at = lowest_bit(needed) * LANES
@@ -146,9 +146,6 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                     s_0, s_u, s_v = s_0 + s, s_u + su, s_v + sv
                     s_uu, s_uv, s_vv = fma(su, u, s_uu), fma(su, v, s_uv), fma(sv, v, s_vv)
                     if details:
-                        abs_x = abs_x + absolute(su)
-                        abs_y = abs_y + absolute(fma(
-                            su, broadcast(batch, i + U_Y), sv * broadcast(batch, i + V_Y)))
                         squared = fma(s, s, squared)
                         hits = hits + select(part, 1.0, zero)
                     if scores:
@@ -166,14 +163,13 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                         error = fma(away, away, error)
                         loo = fma(weight * weight * load(scratch, _COUNTS + at), error, loo)
                 to = np.int64(slots[first + k]) * SLOT
-                abs_x = abs_x * broadcast(batch, i + U_X)
                 if LANES == 16:
                     store(sums, to, totals((
                         g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu, s_uv, s_vv,
-                        abs_x, abs_y, squared, hits, loo, zero)))
+                        squared, hits, loo, zero, zero, zero)))
                 else:
                     store(sums, to, totals((g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu)))
                     store(sums, to + 8, totals((
-                        s_uv, s_vv, abs_x, abs_y, squared, hits, loo, zero)))
+                        s_uv, s_vv, squared, hits, loo, zero, zero, zero)))
             end = first
     fetch_add(evaluated, 0, pairs)

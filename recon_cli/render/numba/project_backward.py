@@ -15,7 +15,7 @@ from recon_cli.render.numba.simd import LANES
 from recon_cli.render.numba.simd_functions import (
     exp2, fetch_add, fill, fma, load, maximum, minimum, select, square_root, store, transpose)
 from recon_cli.render.numba.soa import (
-    ABS_X, ABS_Y, BLOCK, BLUE, COUNT, GRAD_BLUE, GRAD_DEPTH, GRAD_GREEN, GRAD_RED, GREEN,
+    BLOCK, BLUE, COUNT, GRAD_BLUE, GRAD_DEPTH, GRAD_GREEN, GRAD_RED, GREEN,
     LEAVE_ONE_OUT, LOG2_E, P_BASIS, P_DX, P_DY, P_DZ, P_LOGIT, P_REST, P_S0, P_S1, P_S2, P_X, P_Y,
     P_Z, PROJECTION_FLOATS, RECORD, RED, S_SQUARED, S_U, S_UU, S_UV, S_V, S_VV, SLOT, SQUARE, U_X,
     U_Y, V_Y, S, gather, image_axes, planes_to_rows, terms_of_group, unit_quaternion)
@@ -28,7 +28,7 @@ _SUMS = PROJECTION_FLOATS // LANES
 _RECORD = _SUMS + SLOT
 _GRAD = _RECORD + RECORD  # mean 3, quaternion 4, scales 3, logit 1, base colour 3, rest 45
 G_MEAN, G_QUAT, G_SCALE, G_LOGIT, G_DC, G_REST = (_GRAD + i for i in (0, 3, 7, 10, 11, 14))
-G_MEAN2D, G_ABSOLUTE, G_VARIANCE = (_GRAD + 59 + i for i in (0, 2, 4))
+G_MEAN2D, G_VARIANCE = (_GRAD + 59 + i for i in (0, 2))
 _PULL = _GRAD + 64
 GRADIENT_FLOATS = (_PULL + 15) * LANES
 
@@ -37,7 +37,7 @@ GRADIENT_FLOATS = (_PULL + 15) * LANES
 def project_backward(counter, ids, block_starts, slot_start, sums, depths, means, quats, log_scales,
                      logits, sh_dc, sh_rest, stride, terms, harmonics, view, records, g_means,
                      g_quats, g_log_scales, g_logits, g_sh_dc, g_sh_rest, means2d_grad,
-                     absolute_grad, variance, loo, scratch):
+                     variance, loo, scratch):
     """Writes the gradients of all Gaussians, zero for those that were not seen.
 
     Without `harmonics`, g_sh_rest is left alone.
@@ -57,7 +57,6 @@ def project_backward(counter, ids, block_starts, slot_start, sums, depths, means
         if harmonics and terms > 0:
             clear(g_sh_rest, min(stride * low, len(sh_rest)), min(stride * high, len(sh_rest)))
         clear(means2d_grad, 2 * low, 2 * high)
-        clear(absolute_grad, 2 * low, 2 * high)
         clear(variance, low, high)
         clear(loo, low, high)
         for first in range(block_starts[block], block_starts[block + 1], LANES):
@@ -96,7 +95,6 @@ def project_backward(counter, ids, block_starts, slot_start, sums, depths, means
                 g_logits[i] = scratch[G_LOGIT * LANES + k]
                 for c in range(2):
                     means2d_grad[2 * i + c] = scratch[(G_MEAN2D + c) * LANES + k]
-                    absolute_grad[2 * i + c] = scratch[(G_ABSOLUTE + c) * LANES + k]
                 variance[i] = scratch[G_VARIANCE * LANES + k]
                 loo[i] = scratch[(_SUMS + LEAVE_ONE_OUT) * LANES + k]
             if harmonics and used > 0:
@@ -169,8 +167,6 @@ def shape_gradient(scratch, view):
     d_x, d_y = _WHITE * (u_x * s_u), _WHITE * (u_y * s_u + v_y * s_v)
     store(scratch, G_MEAN2D * LANES, d_x)
     store(scratch, (G_MEAN2D + 1) * LANES, d_y)
-    store(scratch, G_ABSOLUTE * LANES, _WHITE * plane(scratch, _SUMS + ABS_X))
-    store(scratch, (G_ABSOLUTE + 1) * LANES, _WHITE * plane(scratch, _SUMS + ABS_Y))
     hits = maximum(plane(scratch, _SUMS + COUNT), 1.0)
     store(scratch, G_VARIANCE * LANES,
           maximum(plane(scratch, _SUMS + S_SQUARED) - s * s / hits, 0.0))

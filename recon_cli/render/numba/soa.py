@@ -45,7 +45,7 @@ BATCH = 64  # instances of a tile that are prepared at a time, a bit each
 # What the backward pass sums over the pixels of an instance, in its slot; s = alpha dL/dalpha.
 SLOT = 16
 (GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_DEPTH, S, S_U, S_V, S_UU, S_UV, S_VV,
- ABS_X, ABS_Y, S_SQUARED, COUNT, LEAVE_ONE_OUT) = range(15)
+ S_SQUARED, COUNT, LEAVE_ONE_OUT) = range(13)
 
 LOG2_E = math.log2(math.e)
 LOG2_ALPHA_MAX = math.log2(0.99)

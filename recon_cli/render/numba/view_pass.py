@@ -228,8 +228,8 @@ class ViewPass:
         """Writes gradients and statistics of all N Gaussians for the last forward pass.
 
         `image` holds the gradients of the loss; sh_rest of `gradients` is left alone at degree 0
-        and without `harmonics`. With `details` absolute_grad and variance are written too, with
-        `loo` that, over the pixels that counted in the forward pass.
+        and without `harmonics`. With `details` variance is written too, with `loo` that, over the
+        pixels that counted in the forward pass.
         """
         sums = self.take("sums", len(self.members) * SLOT)
         evaluated = np.zeros(1, np.int64)
@@ -245,7 +245,7 @@ class ViewPass:
             splats.sh_rest, splats.stride, self.terms, harmonics, self.view, self.records,
             gradients.means, gradients.quats, gradients.log_scales, gradients.logit_opacities,
             gradients.sh_dc, gradients.sh_rest, flat(statistics.means2d_grad),
-            flat(statistics.absolute_grad), flat(statistics.variance), flat(statistics.loo))
+            flat(statistics.variance), flat(statistics.loo))
 
 
 _MOST_FREE = 2  # passes that are kept for their next use

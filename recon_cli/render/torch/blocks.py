@@ -226,26 +226,3 @@ def gradients_of(
     f = uv[:, None] * p + vv[:, None] * q
     pull = torch.stack([l11[:, None] * e, l12[:, None] * e + l22[:, None] * f], dim=1)
     return torch.stack([l11 * u, l12 * u + l22 * v], dim=-1), pull * scales, e * p + f * q
-
-
-def sum_magnitudes(
-    slope: Tensor, weights: Tensor, affine: Tensor, monomials: Tensor, scratch: Scratch
-) -> Tensor:
-    """Returns [n, K, 4]: sum |s y| along x and y, sum s^2, and the number of fragments.
-
-    s y is a pixel's part of the gradient by the mean, as in `gradients_of`. `slope` [n, K, 256] is
-    s, `weights` [n, K, 256] alpha T, positive where there is a fragment; `affine` [n, K, 5] is of
-    `whitening_of`, `monomials` [3, 256] are 1, x, y at the pixels. The buffer "q" is overwritten.
-    """
-    n, k, pixels = slope.shape
-    _, l11, l12, v0, l22 = affine.unbind(-1)
-    along_x = l11[..., None] * affine[..., :3]
-    along_y = l12[..., None] * affine[..., :3]
-    along_y += l22[..., None] * torch.stack([v0, torch.zeros_like(v0), l22], dim=-1)
-    totals = []
-    for along in (along_x, along_y):
-        part = torch.mm(along.reshape(n * k, 3).to(slope.dtype), monomials,
-                        out=scratch.take("q", (n * k, pixels)))
-        totals.append(part.mul_(slope.view(n * k, pixels)).abs_().sum(-1).view(n, k))
-    squares = torch.linalg.vector_norm(slope, dim=-1).square()
-    return torch.stack([*totals, squares, (weights > 0).sum(-1).to(slope.dtype)], dim=-1)

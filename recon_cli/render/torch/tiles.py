@@ -26,7 +26,6 @@ from recon_cli.render.torch.blocks import (
     composite,
     gradients_of,
     pixel_monomials,
-    sum_magnitudes,
     whiten_moments,
     whitening_of,
 )
@@ -162,7 +161,7 @@ class _Rasterize(torch.autograd.Function):
         behind = means2d.new_zeros(len(instances.counts), PIXELS)  # sum of w (g . f) behind
         composited = left * background if view.scores else None  # colour behind, not divided by T
         features = means2d.new_zeros(len(instances.gaussians) + 1, CHANNELS + 6)
-        scored = means2d.new_zeros(len(instances.gaussians) + 1, 5) if view.scores else None
+        scored = means2d.new_zeros(len(instances.gaussians) + 1, 3) if view.scores else None
         upper = means2d.new_ones(DEPTH, DEPTH).triu(1)
 
         def descend_group(blocks: list[Block]) -> None:
@@ -174,7 +173,7 @@ class _Rasterize(torch.autograd.Function):
                 grad = grads[block.tiles]
                 used = table.channels[block.rows]
                 if composited is not None and scored is not None:
-                    scored[block.positions, 4] = _leave_one_out(
+                    scored[block.positions, 2] = _leave_one_out(
                         used, odds, live, composited, block, upper[:k, :k], counting)
                 shade = torch.bmm(
                     used, grad.transpose(1, 2), out=scratch.take("q", alpha.shape)).mul_(live)
@@ -192,8 +191,8 @@ class _Rasterize(torch.autograd.Function):
                 features[block.positions, CHANNELS:] = whiten_moments(
                     moments.view(n, k, 6), affine).to(means2d.dtype)
                 if scored is not None:
-                    scored[block.positions, :4] = sum_magnitudes(
-                        slope, odds, affine, monomials[:3], scratch)
+                    scored[block.positions, 0] = torch.linalg.vector_norm(slope, dim=-1).square()
+                    scored[block.positions, 1] = (odds > 0).sum(-1).to(slope.dtype)
 
         for blocks in groups:
             descend_group(blocks)
@@ -231,12 +230,11 @@ def _leave_one_out(
 def _write_scores(
     scored: Tensor, per_gaussian: Tensor, ids: Tensor, statistics: Statistics
 ) -> None:
-    """Writes the statistics of the backward pass: sums [M, 5] of `sum_magnitudes`, and loo."""
-    statistics.absolute_grad[ids] = scored[:, :2]
-    squares, count = scored[:, 2].double(), scored[:, 3].double().clamp_min(1)
+    """Writes the statistics of the backward pass: sums [M, 3] of s^2, fragments and loo."""
+    squares, count = scored[:, 0].double(), scored[:, 1].double().clamp_min(1)
     variance = squares - per_gaussian[:, 10].double().square() / count
     statistics.variance[ids] = variance.clamp_min(0).to(scored.dtype)
-    statistics.loo[ids] = scored[:, 4]
+    statistics.loo[ids] = scored[:, 2]
 
 
 class _Tally:

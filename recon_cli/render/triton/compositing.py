@@ -154,9 +154,8 @@ def composite_backward(order, first, members, offsets, records, background, widt
     The arguments are those of `composite`, and `grad_*`, dL/d(rgb, alpha, depth). With PLAIN the
     loss depends on colours alone, and the latter two are not read. Written are `sums` [E, SLOT] by
     slot, zeros before: dL/d(red, green, blue, depth) and the sums of s times 1, u, v, uu, uv, vv;
-    with DETAILS those of |s y| along x and y (y the whitened offset brought back, without its
-    factor) and of s^2, and the fragments; with SCORES what leaving the instance out would change,
-    over the pixels in `counting`.
+    with DETAILS that of s^2, and the fragments; with SCORES what leaving the instance out would
+    change, over the pixels in `counting`.
     """
     tile = tl.load(order + tl.program_id(0))
     begin = tl.load(first + tile)
@@ -213,11 +212,8 @@ def composite_backward(order, first, members, offsets, records, background, widt
         tl.store(to + 8, tl.sum(su * v))
         tl.store(to + 9, tl.sum(sv * v))
         if DETAILS:
-            u_x, u_y, v_y = tl.load(record), tl.load(record + 1), tl.load(record + 2)
-            tl.store(to + 10, tl.sum(tl.abs(su)) * u_x)
-            tl.store(to + 11, tl.sum(tl.abs(tl.fma(su, u_y, sv * v_y))))
-            tl.store(to + 12, tl.sum(s * s))
-            tl.store(to + 13, tl.sum(part.to(tl.float32)))
+            tl.store(to + 10, tl.sum(s * s))
+            tl.store(to + 11, tl.sum(part.to(tl.float32)))
         if SCORES:
             away_red, away_green, away_blue = (
                 red - behind_red, green - behind_green, blue - behind_blue)
@@ -225,4 +221,4 @@ def composite_backward(order, first, members, offsets, records, background, widt
             behind_green = tl.fma(a, away_green, behind_green)
             behind_blue = tl.fma(a, away_blue, behind_blue)
             error = away_red * away_red + away_green * away_green + away_blue * away_blue
-            tl.store(to + 14, tl.sum(tl.where(counts, weight * weight * error, 0.0)))
+            tl.store(to + 12, tl.sum(tl.where(counts, weight * weight * error, 0.0)))

@@ -85,7 +85,7 @@ class BackwardOptions:
     """What the backward pass computes beside the gradients."""
 
     plain: bool = False  # the loss depends on colours alone
-    details: bool = True  # absolute_grad and variance are wanted
+    details: bool = True  # variance is wanted
     loo: bool = False
 
 
@@ -231,7 +231,7 @@ def project_splats_backward(
         project_backward[(triton.cdiv(n, BLOCK),)](
             splats.means, splats.quats, splats.log_scales, splats.logit_opacities, splats.sh_rest,
             source.view, n, len(splats.sh_rest), lists.records, lists.starts, sums, counted,
-            *gradients.parameters().values(), statistics.means2d_grad, statistics.absolute_grad,
+            *gradients.parameters().values(), statistics.means2d_grad,
             statistics.variance, statistics.loo, STRIDE=3 * TERMS[splats.sh_degree],
             TERMS=source.terms, GATED=counted is not None, PLAIN=options.plain,
             DETAILS=options.details, SCORES=options.loo, BLOCK=BLOCK)

@@ -40,14 +40,14 @@ WHITE = tl.constexpr(1.0 / UNIT.value)  # u and v hold sqrt(log2(e) / 2)
 @triton.jit(do_not_specialize=("count", "colored"))
 def project_backward(means, quats, log_scales, logits, sh_rest, view, count, colored, records,
                      starts, sums, counted, g_means, g_quats, g_log_scales, g_logits, g_sh_dc,
-                     g_sh_rest, means2d_grad, absolute_grad, variance, loo, STRIDE: tl.constexpr,
+                     g_sh_rest, means2d_grad, variance, loo, STRIDE: tl.constexpr,
                      TERMS: tl.constexpr, GATED: tl.constexpr, PLAIN: tl.constexpr,
                      DETAILS: tl.constexpr, SCORES: tl.constexpr, BLOCK: tl.constexpr):
     """Writes the gradients of all Gaussians, zero for those that no pixel shows.
 
     `sums` [E, SLOT] are of `compositing.composite_backward`. Written are the gradients `g_*`
-    (g_sh_rest not at degree 0) and the statistics, see `contract.Statistics`: absolute_grad and
-    variance with DETAILS, loo with SCORES. With GATED all are zero where `counted` [1] int32 is.
+    (g_sh_rest not at degree 0) and the statistics, see `contract.Statistics`: variance
+    with DETAILS, loo with SCORES. With GATED all are zero where `counted` [1] int32 is.
     With PLAIN `sums` hold nothing of depths.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -58,8 +58,7 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
     drawn = slot < end
     zero = slot.to(tl.float32) * 0.0
     red, green, blue, depth, s, s_u, s_v = zero, zero, zero, zero, zero, zero, zero
-    s_uu, s_uv, s_vv, abs_x, abs_y, squared, hits, left_out = (
-        zero, zero, zero, zero, zero, zero, zero, zero)
+    s_uu, s_uv, s_vv, squared, hits, left_out = zero, zero, zero, zero, zero, zero
     while tl.max(end - slot) > 0:
         # several at once: their loads wait together, and the order of the sums stays
         for _ in tl.static_range(AT_ONCE):
@@ -76,12 +75,10 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
             s_uv += tl.load(at + 8, mask=more, other=0.0)
             s_vv += tl.load(at + 9, mask=more, other=0.0)
             if DETAILS:
-                abs_x += tl.load(at + 10, mask=more, other=0.0)
-                abs_y += tl.load(at + 11, mask=more, other=0.0)
-                squared += tl.load(at + 12, mask=more, other=0.0)
-                hits += tl.load(at + 13, mask=more, other=0.0)
+                squared += tl.load(at + 10, mask=more, other=0.0)
+                hits += tl.load(at + 11, mask=more, other=0.0)
             if SCORES:
-                left_out += tl.load(at + 14, mask=more, other=0.0)
+                left_out += tl.load(at + 12, mask=more, other=0.0)
             slot += 1
     record = records + i * FLOATS
     red = tl.where(tl.load(record + 4, mask=drawn, other=0.0) > 0.0, red, 0.0)
@@ -124,8 +121,6 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
     tl.store(means2d_grad + 2 * i, d_x, mask=here)
     tl.store(means2d_grad + 2 * i + 1, d_y, mask=here)
     if DETAILS:
-        tl.store(absolute_grad + 2 * i, abs_x * (WHITE * WHITE), mask=here)
-        tl.store(absolute_grad + 2 * i + 1, abs_y * (WHITE * WHITE), mask=here)
         total = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
         tl.store(variance + i, tl.maximum(total, 0.0).to(tl.float32), mask=here)
     if SCORES:
