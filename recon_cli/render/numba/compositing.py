@@ -183,7 +183,8 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
         records: [M * 16].
         cutoff: log2 of the least alpha of a fragment.
         t_min: transmittance before which a pixel stops.
-        rgb: [H * W * 3] out; [H * W] out are alpha, and depth, the sum of alpha T z.
+        rgb: [H * W * 3] out; [H * W] out are alpha, and depth, the sum of alpha T z, empty where it
+            is not wanted.
         final: [tiles * TILE_PIXELS] out, T at the end, patch by patch.
         last: [tiles * TILE_PIXELS] out, number of the last instance that contributed, from 1.
         met: [E] uint32 out, which patches each instance meets, as far as any were looked at.
@@ -195,6 +196,7 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
         evaluated: [1] pairs of an instance and a pixel are added.
     """
     tiles = len(tile_start) - 1
+    has_depth = len(depth) > 0
     batch = scratch[_BATCH:]
     patches = np.zeros(PATCHES, np.uint64)
     pairs = 0
@@ -255,7 +257,8 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                     red = fma(weight, broadcast(batch, i + RED), red)
                     green = fma(weight, broadcast(batch, i + GREEN), green)
                     blue = fma(weight, broadcast(batch, i + BLUE), blue)
-                    z = fma(weight, broadcast(batch, i + DEPTH), z)
+                    if has_depth:
+                        z = fma(weight, broadcast(batch, i + DEPTH), z)
                     final_T = select(live, T, final_T)
                     hit = weight > 0.0
                     latest = select(hit, fill(np.float32(first - begin + k + 1)), latest)
@@ -295,7 +298,8 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                 rgb[3 * p + 1] = scratch[_GREEN + at] + t * background[1]
                 rgb[3 * p + 2] = scratch[_BLUE + at] + t * background[2]
                 alpha[p] = _ONE - t
-                depth[p] = scratch[_DEPTH + at]
+                if has_depth:
+                    depth[p] = scratch[_DEPTH + at]
     fetch_add(evaluated, 0, pairs)
 
 

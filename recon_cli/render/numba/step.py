@@ -65,7 +65,7 @@ class PhotometricStep:
         settings = RenderSettings(
             self._black, options.sh_degree, options.scores,
             counting=target.mask if options.scores or options.loo else None)
-        image = ImageBuffers(rgb, view.take("alpha", pixels), view.take("depth", pixels))
+        image = ImageBuffers(rgb, view.take("alpha", pixels), view.take("nothing", 0))
         view.forward(packed, camera, settings, image, self.statistics)
         if target.gain is not None:
             # whole rows: ten times faster

@@ -57,7 +57,10 @@ class PackedSplats:
 
 @dataclass(frozen=True)
 class ImageBuffers:
-    """The images of a view, or the gradients by them, where alpha and depth may be empty: zeros."""
+    """The images of a view, or the gradients by them.
+
+    Depth may be empty: it is not wanted. So may gradients of alpha and depth: zeros.
+    """
 
     rgb: NDArray[np.float32]  # [H * W * 3]
     alpha: NDArray[np.float32]  # [H * W]
