@@ -1,14 +1,15 @@
-"""What lies far outside, behind windows: Gaussians on a sphere so large that it has no parallax.
+"""What the sparse points leave out: blank surfaces, and what lies far outside, behind windows.
 
-Structure from motion finds few points out there, so training would paint the view on the panes.
-Directions in which several views see no point of the scene get an ordinary Gaussian each, in the
-colour that these views show.
+Structure from motion finds few points there, so training would paint them on whatever is near.
+Parts of the pictures without points get Gaussians at the depth of the points around. Behind them,
+directions in which several views see no point get one each on a sphere so large that it has no
+parallax. All have the colour that the views show.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -40,6 +41,14 @@ _FACING = 5  # directions that must be free in a view that sees some of it; 50 s
 # degrees or more, on a walk down a corridor 5.
 _MISSED, _BEFORE, _SIDES_DEG = 0.25, 0.9, 10.0
 _FILL_DEGREES = 12.0  # directions this close to a far one become far: frames and trees hide some
+# Of gaps between points, in the reduced images. Chosen on views in the middle of stretches that
+# were taken away from five walks and rooms, see docs/training.md.
+_GAP_GRID = 4  # pixels from one place that is looked at to the next
+_NEIGHBOURS = 12  # points whose median depth a gap has
+_GAP_CELL = 0.06  # of the median depth of all gaps: places within are one
+_THROUGH = 1.15  # times the depth of a gap: a point beyond it, this many pixels away or less, shows
+_THROUGH_RANGE = 2  # that the gap is seen through
+_THROUGH_SHARE = 0.2  # of the views that look there; the points of some lie behind what hides them
 _OPACITY = 0.5
 _SPACING = 0.6  # of the distance between directions: the standard deviation
 
@@ -52,25 +61,34 @@ class FarContent:
     colors: NDArray[np.float64]  # [K, 3] float64 in [0, 1]
     scale: float  # standard deviation that closes the gaps between them, world units
     share: float  # of all looked-at pixels' directions that are far, 0 to 1
+    # points [G, 3] at the depth of those around, with uint8 colours, where views see none
+    gap_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    gap_colors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+
+    @staticmethod
+    def nothing() -> FarContent:
+        """Returns what is found where the points cover all."""
+        return FarContent(np.zeros((0, 3)), np.zeros((0, 3)), 1.0, 0.0)
 
 
 def far_content(
     views: Sequence[TrainView], points: NDArray[np.float64], extent: float
 ) -> FarContent:
-    """Returns the directions in which the views see no point [P, 3] of the scene."""
+    """Returns the directions in which the views see no point [P, 3] of the scene, and its gaps.
+
+    Around one thing, gaps are backgrounds at any depth, and stay empty.
+    """
     centers = np.stack([view.camera.center for view in views])
     directions = fibonacci_sphere(_DIRECTIONS)
     sphere = centers.mean(axis=0) + _RADIUS * extent * directions
     looked_at, empty = np.zeros(len(sphere)), np.zeros(len(sphere))
     total = np.zeros((len(sphere), 3))
-    for view in views[::max(1, -(-len(views) // _VIEWS))]:
-        small = _for_search(view)
-        covered = _cover_mask(small, points)
+    looks = [_look(view, points) for view in views[::max(1, -(-len(views) // _VIEWS))]]
+    for look in looks:
+        small = look.view
         rows, column, line = project_points(small.camera, sphere)
         looked_at[rows] += 1
-        free = ~covered[line, column]
-        if small.mask is not None:
-            free &= small.mask[line, column]
+        free = look.free[line, column]
         empty[rows[free]] += 1
         total[rows[free]] += small.image[line[free], column[free]] / 255
     far = (empty >= _AGREE) & (empty >= _SHARE * looked_at)
@@ -78,7 +96,90 @@ def far_content(
     colors = total / np.maximum(empty, 1)[:, None]
     far, colors = _fill_gaps(directions, far, colors)
     spacing = _RADIUS * extent * np.sqrt(4 * np.pi / _DIRECTIONS)
-    return FarContent(sphere[far], colors[far], float(_SPACING * spacing), share)
+    gaps = () if look_at_one_thing(views) else _find_gaps(looks)
+    return FarContent(sphere[far], colors[far], float(_SPACING * spacing), share, *gaps)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A reduced view, and the points that it shows, the nearest one of each pixel."""
+
+    view: TrainView
+    free: NDArray[np.bool_]  # [H, W] no point lies near, and the pixel counts
+    pixels: NDArray[np.int64]  # [P, 2] column and line
+    depths: NDArray[np.float64]  # [P] world units
+
+
+def _look(view: TrainView, points: NDArray[np.float64]) -> _Look:
+    """Returns what a view shows of the points."""
+    small = _for_search(view)
+    free = ~_cover_mask(small, points)
+    if small.mask is not None:
+        free &= small.mask
+    rows, column, line = project_points(small.camera, points)
+    depths = _depths(small.camera, points[rows])
+    nearest = np.argsort(depths, kind="stable")
+    _, first = np.unique((line * small.camera.width + column)[nearest], return_index=True)
+    kept = nearest[first]
+    return _Look(small, free, np.stack([column[kept], line[kept]], 1), depths[kept])
+
+
+def _depths(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    depths: NDArray[np.float64] = points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    return depths
+
+
+def _find_gaps(looks: Sequence[_Look]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Returns points [G, 3] on surfaces without points, and their colours.
+
+    Each view places them at the median depth of the points around in its image. What two views
+    place in the same cell counts, unless others see points through it.
+    """
+    looks = [look for look in looks if len(look.depths) >= _NEIGHBOURS]
+    found = [_place_gaps(look) for look in looks]
+    if not any(len(places) for places, _, _ in found):
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    places, colors, depths = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    by = np.repeat(np.arange(len(found)), [len(part[0]) for part in found])
+    cells = np.floor(places / (_GAP_CELL * np.median(depths))).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    count = np.bincount(cell)
+    views = np.bincount(np.unique(np.stack([cell, by], 1), axis=0)[:, 0])
+    places, colors = (
+        np.stack([np.bincount(cell, column) for column in values.T], 1) / count[:, None]
+        for values in (places, colors))
+    kept = (views >= _AGREE) & ~_seen_through(places, looks)
+    return places[kept], colors[kept].astype(np.uint8)
+
+
+def _place_gaps(
+    look: _Look,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Returns places [K, 3] of what one view shows without points, their colours and depths."""
+    camera = look.view.camera
+    line, column = np.mgrid[_GAP_GRID // 2:camera.height:_GAP_GRID,
+                            _GAP_GRID // 2:camera.width:_GAP_GRID]
+    free = look.free[line, column]
+    line, column = line[free], column[free]
+    _, near = cKDTree(look.pixels).query(np.stack([column, line], 1), k=_NEIGHBOURS)
+    depths = np.median(look.depths[near], axis=1)
+    rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (line + 0.5 - camera.cy) / camera.fy,
+                     np.ones(len(line))], 1)
+    places = (rays * depths[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    return places, look.view.image[line, column].astype(np.float64), depths
+
+
+def _seen_through(places: NDArray[np.float64], looks: Sequence[_Look]) -> NDArray[np.bool_]:
+    """Tells of which places [G, 3] too many views show points beyond."""
+    looked_at, through = np.zeros(len(places)), np.zeros(len(places))
+    for look in looks:
+        rows, column, line = project_points(look.view.camera, places)
+        distance, near = cKDTree(look.pixels).query(np.stack([column, line], 1))
+        beyond = look.depths[near] > _THROUGH * _depths(look.view.camera, places[rows])
+        looked_at[rows] += 1
+        through[rows[beyond & (distance <= _THROUGH_RANGE)]] += 1
+    return through > _THROUGH_SHARE * looked_at
 
 
 def faces(view: TrainView, content: FarContent, points: NDArray[np.float64]) -> bool:

@@ -203,7 +203,7 @@ class _Bench:
         self._scene, task = scene, scene.task
         needs_far = task.schedule.config.far != "off"
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
-                    else FarContent(np.zeros((0, 3)), np.zeros((0, 3)), 1.0, 0.0))
+                    else FarContent.nothing())
         drifting = task.schedule.config.exposure != "off"
         self.drift = (estimate_gains(task.train, scene.points) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))

@@ -67,9 +67,10 @@ def first_state(
     most: int,
     far: FarContent | None = None,
 ) -> TrainState:
-    """Returns the first state of a run: `most` Gaussians, some of them the background `far`.
+    """Returns the first state of a run: Gaussians at `most` points, and the background `far`.
 
     What lies far outside is told by the sparse points alone: walls have its colour behind them too.
+    Parts of the model may add points.
     """
     config = task.schedule.config
     if config.far != "on":
@@ -77,10 +78,16 @@ def first_state(
     elif far is None:
         far = far_content(task.train, points, task.extent)
     gains = estimate_gains(task.train, points).log_gains if config.exposure == "on" else None
+    sparse = len(points)
     if config.planes == "on" and task.blank is not None:
         surfaces = task.blank.found
         points = np.concatenate([points, surfaces.points])
         colors = np.concatenate([colors, surfaces.colors])
+    if far is not None:
+        points = np.concatenate([points, far.gap_points])
+        colors = np.concatenate([colors, far.gap_colors])
+    # what is added does not take the place of sparse points as long as there is room to grow
+    most = max(most, min(most + len(points) - sparse, config.max_gaussians // 2))
     splats = first_splats(config, points, colors, far, most=most)
     exposure, poses = new_parts(task, gains)
     return new_state(

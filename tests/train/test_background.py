@@ -7,11 +7,13 @@ import torch
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train import background
 from recon_cli.train.background import (
     faces,
     far_content,
     fibonacci_sphere,
     look_at_one_thing,
+    project_points,
     splats_of,
 )
 
@@ -135,3 +137,67 @@ AHEAD = [(x, 0.02 * x, 1.5) for x in np.linspace(0, 5, 20)]
 ], ids=["around", "before", "outwards", "across", "ahead", "turning"])
 def test_views_that_look_at_one_thing_are_told_from_others(centers, targets, one_thing):
     assert look_at_one_thing(views_from(centers, targets)) == one_thing
+
+
+def framed(behind=False):
+    """Nine views of a wall at z = 3 with points around a blank middle, and points of a far wall."""
+    x, y = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-3, 3, 61))
+    wall = np.stack([x, y, np.full_like(x, 3.0)], -1).reshape(-1, 3)
+    points = wall[(np.abs(wall[:, 0]) > 1) | (np.abs(wall[:, 1]) > 0.8)]
+    if behind:
+        x, y = np.meshgrid(np.linspace(-3, 3, 6), np.linspace(-2, 2, 4))
+        points = np.concatenate(
+            [points, np.stack([x, y, np.full_like(x, 8.0)], -1).reshape(-1, 3)])
+    views = []
+    for at in np.linspace(-0.4, 0.4, 9):
+        image = np.full((120, 160, 3), 128, np.uint8)
+        image[35:85, int(80 + 100 * (-1 - at) / 3):int(80 + 100 * (1 - at) / 3)] = SKY
+        views.append(looking(at, image))
+    return views, points
+
+
+def test_a_blank_part_of_a_wall_gets_points_at_the_depth_around_it_in_its_colour():
+    views, points = framed()
+    content = far_content(views, points, EXTENT)
+    gaps, colors = content.gap_points, content.gap_colors
+    assert np.allclose(gaps[:, 2], 3, atol=1e-9)
+    assert (np.abs(gaps[:, 0]) < 1.1).all()
+    assert (np.abs(gaps[:, 1]) < 0.9).all()
+    inner = (np.abs(gaps[:, 0]) < 0.8) & (np.abs(gaps[:, 1]) < 0.6)
+    # one a cell of .06 x 3: 8 x 6 cells of the inner part, or more
+    assert inner.sum() >= 40
+    assert np.abs(colors[inner].astype(int) - SKY).max() <= 1
+
+
+def test_a_gap_is_dropped_where_views_show_points_beyond(monkeypatch):
+    views, points = framed(behind=True)
+    kept = far_content(views, points, EXTENT).gap_points
+    monkeypatch.setattr(background, "_THROUGH_SHARE", 1.0)
+    found = far_content(views, points, EXTENT).gap_points
+    shown = np.zeros(len(found))
+    for view in views:
+        camera = view.camera.resized(150, 112)
+        near, beyond = (np.stack(project_points(camera, some)[1:], 1)
+                        for some in (found, points[points[:, 2] > 4]))
+        apart = np.linalg.norm(near[:, None] - beyond, axis=-1).min(1)
+        shown += (apart <= 2) & (found[:, 2] < 4)
+    open_ones = shown > 0.2 * len(views)
+    assert 5 < open_ones.sum() < len(found)
+    assert {tuple(place) for place in kept} == {tuple(place) for place in found[~open_ones]}
+
+
+def test_gaps_need_two_views_points_around_and_views_of_more_than_one_thing():
+    views, points = framed()
+    assert len(far_content(views[:1], points, EXTENT).gap_points) == 0
+    assert len(far_content(views, points[:5], EXTENT).gap_points) == 0
+    around = [TrainView(Camera(160, 120, 100.0, 100.0, 80.0, 60.0, looking_at(
+        np.array([np.sin(angle), 0, 3 - 3 * np.cos(angle)]), np.array([0.0, 0, 3]),
+        np.array([0.0, -1, 0]))), views[0].image) for angle in np.linspace(-0.6, 0.6, 5)]
+    assert look_at_one_thing(around)
+    assert len(far_content(around, points, EXTENT).gap_points) == 0
+
+
+def test_a_mask_hides_gaps():
+    views, points = framed()
+    hidden = [TrainView(view.camera, view.image, np.zeros((120, 160), bool)) for view in views]
+    assert len(far_content(hidden, points, EXTENT).gap_points) == 0
