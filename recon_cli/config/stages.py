@@ -184,7 +184,7 @@ class TrainConfig(StageConfig):
         "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
         choices=("auto", "denoised", "original"))
     far: str = option(
-        "auto", "Add distant background Gaussians; auto: by a trial of validation PSNR.",
+        "auto", "Add Gaussians where views show no points; auto: by a trial of validation PSNR.",
         choices=("auto", "on", "off"))
     planes: str = option(
         "auto", "Start with Gaussians on walls and ceilings without texture, where points around "
