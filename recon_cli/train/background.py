@@ -83,12 +83,12 @@ def far_content(
     sphere = centers.mean(axis=0) + _RADIUS * extent * directions
     looked_at, empty = np.zeros(len(sphere)), np.zeros(len(sphere))
     total = np.zeros((len(sphere), 3))
-    looks = [_look(view, points) for view in views[::max(1, -(-len(views) // _VIEWS))]]
-    for look in looks:
-        small = look.view
+    searched = [_search_view(view, points) for view in views[::max(1, -(-len(views) // _VIEWS))]]
+    for shown in searched:
+        small = shown.view
         rows, column, line = project_points(small.camera, sphere)
         looked_at[rows] += 1
-        free = look.free[line, column]
+        free = shown.free[line, column]
         empty[rows[free]] += 1
         total[rows[free]] += small.image[line[free], column[free]] / 255
     far = (empty >= _AGREE) & (empty >= _SHARE * looked_at)
@@ -96,12 +96,12 @@ def far_content(
     colors = total / np.maximum(empty, 1)[:, None]
     far, colors = _fill_gaps(directions, far, colors)
     spacing = _RADIUS * extent * np.sqrt(4 * np.pi / _DIRECTIONS)
-    gaps = () if look_at_one_thing(views) else _find_gaps(looks)
+    gaps = () if look_at_one_thing(views) else _find_gaps(searched)
     return FarContent(sphere[far], colors[far], float(_SPACING * spacing), share, *gaps)
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _SearchView:
     """A reduced view, and the points that it shows, the nearest one of each pixel."""
 
     view: TrainView
@@ -110,7 +110,7 @@ class _Look:
     depths: NDArray[np.float64]  # [P] world units
 
 
-def _look(view: TrainView, points: NDArray[np.float64]) -> _Look:
+def _search_view(view: TrainView, points: NDArray[np.float64]) -> _SearchView:
     """Returns what a view shows of the points."""
     small = _for_search(view)
     free = ~_cover_mask(small, points)
@@ -121,7 +121,7 @@ def _look(view: TrainView, points: NDArray[np.float64]) -> _Look:
     nearest = np.argsort(depths, kind="stable")
     _, first = np.unique((line * small.camera.width + column)[nearest], return_index=True)
     kept = nearest[first]
-    return _Look(small, free, np.stack([column[kept], line[kept]], 1), depths[kept])
+    return _SearchView(small, free, np.stack([column[kept], line[kept]], 1), depths[kept])
 
 
 def _depths(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,14 +129,14 @@ def _depths(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return depths
 
 
-def _find_gaps(looks: Sequence[_Look]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _find_gaps(searched: Sequence[_SearchView]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Returns points [G, 3] on surfaces without points, and their colours.
 
     Each view places them at the median depth of the points around in its image. What two views
     place in the same cell counts, unless others see points through it.
     """
-    looks = [look for look in looks if len(look.depths) >= _NEIGHBOURS]
-    found = [_place_gaps(look) for look in looks]
+    searched = [shown for shown in searched if len(shown.depths) >= _NEIGHBOURS]
+    found = [_place_gaps(shown) for shown in searched]
     if not any(len(places) for places, _, _ in found):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     places, colors, depths = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -149,34 +149,36 @@ def _find_gaps(looks: Sequence[_Look]) -> tuple[NDArray[np.float64], NDArray[np.
     places, colors = (
         np.stack([np.bincount(cell, column) for column in values.T], 1) / count[:, None]
         for values in (places, colors))
-    kept = (views >= _AGREE) & ~_seen_through(places, looks)
+    kept = (views >= _AGREE) & ~_seen_through(places, searched)
     return places[kept], colors[kept].astype(np.uint8)
 
 
 def _place_gaps(
-    look: _Look,
+    shown: _SearchView,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Returns places [K, 3] of what one view shows without points, their colours and depths."""
-    camera = look.view.camera
+    camera = shown.view.camera
     line, column = np.mgrid[_GAP_GRID // 2:camera.height:_GAP_GRID,
                             _GAP_GRID // 2:camera.width:_GAP_GRID]
-    free = look.free[line, column]
+    free = shown.free[line, column]
     line, column = line[free], column[free]
-    _, near = cKDTree(look.pixels).query(np.stack([column, line], 1), k=_NEIGHBOURS)
-    depths = np.median(look.depths[near], axis=1)
+    _, near = cKDTree(shown.pixels).query(np.stack([column, line], 1), k=_NEIGHBOURS)
+    depths = np.median(shown.depths[near], axis=1)
     rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (line + 0.5 - camera.cy) / camera.fy,
                      np.ones(len(line))], 1)
     places = (rays * depths[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    return places, look.view.image[line, column].astype(np.float64), depths
+    return places, shown.view.image[line, column].astype(np.float64), depths
 
 
-def _seen_through(places: NDArray[np.float64], looks: Sequence[_Look]) -> NDArray[np.bool_]:
+def _seen_through(
+    places: NDArray[np.float64], searched: Sequence[_SearchView]
+) -> NDArray[np.bool_]:
     """Tells of which places [G, 3] too many views show points beyond."""
     looked_at, through = np.zeros(len(places)), np.zeros(len(places))
-    for look in looks:
-        rows, column, line = project_points(look.view.camera, places)
-        distance, near = cKDTree(look.pixels).query(np.stack([column, line], 1))
-        beyond = look.depths[near] > _THROUGH * _depths(look.view.camera, places[rows])
+    for shown in searched:
+        rows, column, line = project_points(shown.view.camera, places)
+        distance, near = cKDTree(shown.pixels).query(np.stack([column, line], 1))
+        beyond = shown.depths[near] > _THROUGH * _depths(shown.view.camera, places[rows])
         looked_at[rows] += 1
         through[rows[beyond & (distance <= _THROUGH_RANGE)]] += 1
     return through > _THROUGH_SHARE * looked_at
