@@ -201,7 +201,7 @@ class TrainConfig(StageConfig):
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
         expert=True)
     means_rate: float = option(
-        1.6e-4, "Initial learning rate of the means in scene extents; with budget 10 times as high "
+        1.6e-4, "Initial learning rate of the means in scene extents; with budget 7 times as high "
         "and in median distances of the points from the nearest camera. Decays to a hundredth.",
         minimum=0.0, expert=True)
     quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)

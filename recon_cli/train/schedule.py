@@ -76,7 +76,7 @@ REFERENCE = Recipe(
 BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
     sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False,
-    replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=10.0, means_again=0.5,
+    replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=7.0, means_again=0.7,
     scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8, final_from=0.8, final_rate=0.1)
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 

@@ -92,10 +92,10 @@ def test_rounds_that_would_remove_nothing_are_left_out():
     assert plan[-1].count == 8
 
 
-def test_a_recovery_falls_as_a_run_does_and_moves_means_half_as_far():
+def test_a_recovery_falls_as_a_run_does_and_moves_means_less_far():
     run, recovery = Schedule(CONFIG), RecoverySchedule(CONFIG, first=100, until=150)
-    assert recovery.means_rate(100) == 0.5 * run.means_rate(0)
-    assert recovery.means_rate(150) == pytest.approx(0.5 * run.means_rate(100))
+    assert recovery.means_rate(100) == 0.7 * run.means_rate(0)
+    assert recovery.means_rate(150) == pytest.approx(0.7 * run.means_rate(100))
     assert recovery.rate_factor(101) == 1
     assert recovery.rate_factor(150) == pytest.approx(run.rate_factor(100))
 

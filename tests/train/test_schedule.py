@@ -78,7 +78,7 @@ def test_a_run_that_goes_on_is_one_of_its_own_in_full_size_and_degree():
     config = RunConfig(iterations=3000, max_gaussians=5000)
     plan, alone = ContinuedSchedule(config, first=2000), Schedule(RunConfig(iterations=1000))
     for i in range(1, 1001):
-        assert plan.means_rate(2000 + i) == 0.5 * alone.means_rate(i)  # nothing is far off
+        assert plan.means_rate(2000 + i) == 0.7 * alone.means_rate(i)  # nothing is far off
         assert plan.rate_factor(2000 + i) == alone.rate_factor(i)
         assert plan.densifies(2000 + i) == alone.densifies(i)
         assert (plan.level(2000 + i), plan.sh_degree(2000 + i)) == (1, 3)
