@@ -19,11 +19,11 @@ from recon_cli.io.ply import Element, format_header, read_header, read_tables
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
+    compact_order,
     decode_opacities,
     decode_smallest_three,
     encode_opacities,
     encode_smallest_three,
-    morton_order,
     refuse_above,
     splats_from_arrays,
     to_arrays,
@@ -48,11 +48,13 @@ Words = NDArray[np.uint32]
 def write_compressed_ply(path: Path, splats: Splats) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
 
+    What lies far outside comes last: in a chunk of the room it would leave the others no bits.
+
     Log scales below -20 become -20, coefficients are clipped to -4 to 4, and none stays 0.
     FormatError if there are no Gaussians, one is too large, or a parameter is not finite.
     """
     values = to_arrays(splats, path.name)
-    order = morton_order(values["means"])
+    order = compact_order(values["means"])
     means, log_scales, quats, logits, sh_dc, sh_rest = (values[name][order] for name in (
         "means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest"))
     refuse_above(path, log_scales, _SCALE_RANGE)

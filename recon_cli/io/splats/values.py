@@ -17,6 +17,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import Splats, with_rows
 
+_FAR = 10.0  # times the median distance of all from their middle
 _BITS = 21  # per axis; three make a word of 63
 _LARGEST = float(np.finfo(np.float32).max)
 Floats = NDArray[np.float32]
@@ -30,6 +31,14 @@ def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
     width = np.where(high > low, high - low, 1)
     cells = ((exact - low) / width * ((1 << _BITS) - 1)).astype(np.uint64)
     return np.argsort(morton_codes(cells), kind="stable")
+
+
+def compact_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Returns the Morton order of points [N, 3], with what lies far outside at the end."""
+    order, exact = morton_order(points), points.astype(np.float64)
+    away = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)[order]
+    far = away > _FAR * np.median(away)
+    return np.concatenate([order[~far], order[far]])
 
 
 def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -111,7 +120,7 @@ def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
     refuse_not_finite(path, plain)
     plain["sh_rest"] = trim_zero_rows(plain["sh_rest"]).copy()
-    return Splats(**{name: torch.from_numpy(value) for name, value in plain.items()})
+    return Splats.of({name: torch.from_numpy(value) for name, value in plain.items()})
 
 
 def refuse_above(path: Path, log_scales: Floats, most: float) -> None:

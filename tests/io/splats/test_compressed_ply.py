@@ -9,12 +9,13 @@ import torch
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import random_splats
 from splat_cases import N, damaged, edge_splats, greatest, read_or_refused, rotation_error
 
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.compressed_ply import read_compressed_ply, write_compressed_ply
-from recon_cli.io.splats.values import morton_order
-from recon_cli.scene.splats import SH_C0, with_rows
+from recon_cli.io.splats.values import compact_order, morton_order
+from recon_cli.scene.splats import SH_C0, joined, with_rows
 
 
 def few(count: int = 9, degree: int = 1):
@@ -23,7 +24,7 @@ def few(count: int = 9, degree: int = 1):
 
 def in_order(splats):
     """The Gaussians as the file has them, all with coefficients."""
-    rows = torch.from_numpy(morton_order(splats.means.numpy()))
+    rows = torch.from_numpy(compact_order(splats.means.numpy()))
     full = with_rows(splats.sh_rest, len(splats))
     whole = type(splats)(**(splats.parameters() | {"sh_rest": full}))
     return whole.map(lambda value: value[rows])
@@ -104,7 +105,7 @@ def test_the_layout_is_the_one_of_supersplat(tmp_path):
     assert np.frombuffer(data, "<f4", 6).tolist() == [0, 0, 0, 1, 1, 1]
     words = np.frombuffer(data, "<u4", 12, 72).reshape(3, 4)
     # Along the curve the first comes first; x has the highest bits of a position.
-    order = morton_order(splats.means.numpy()).tolist()
+    order = compact_order(splats.means.numpy()).tolist()
     places = {row: int(words[i, 0]) for i, row in enumerate(order)}
     assert places == {0: 0, 1: 2**32 - 1, 2: 2047 << 21 | 1024}
     rotations = {row: int(words[i, 1]) for i, row in enumerate(order)}
@@ -189,3 +190,15 @@ def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed
     path = tmp_path_factory.getbasetemp() / "fuzz.compressed.ply"
     write_compressed_ply(path, few(4, degree))
     read_or_refused(read_compressed_ply, path, damaged(path.read_bytes(), seed))
+
+
+def test_what_lies_far_outside_takes_no_bits_from_the_rest(tmp_path):
+    near = random_splats(1000, dtype=torch.float32)
+    far = random_splats(300, seed=1, dtype=torch.float32)
+    far.means *= 1000 / far.means.norm(dim=1, keepdim=True)
+    write_compressed_ply(tmp_path / "a.compressed.ply", joined([far, near])[0])
+    back = read_compressed_ply(tmp_path / "a.compressed.ply").means
+    rooms = back[back.norm(dim=1) < 100]
+    assert len(rooms) == 1000
+    apart = torch.cdist(near.means, rooms).amin(1)
+    assert (apart < 0.01).sum() >= 1000 - 256  # all but those of one chunk
