@@ -21,7 +21,11 @@ def _outputs(_ctx: click.Context, parameter: click.Parameter, text: str) -> tupl
     return tuple(output for output in OUTPUTS if output in asked)
 
 
-def _color(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[int, int, int]:
+def _color(
+    _ctx: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[int, int, int] | None:
+    if text is None:
+        return None
     try:
         red, green, blue = (int(word) for word in text.split(","))
     except ValueError as error:
@@ -61,8 +65,8 @@ def _color(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
 @click.option("--height", type=int, metavar="N",
               help="Height; alone it keeps the aspect ratio.  [pixels; default: see --size]")
 @click.option(
-    "--background", default="0,0,0", metavar="R,G,B", callback=_color, show_default=True,
-    help="Background colour, 0 to 255.")
+    "--background", metavar="R,G,B", callback=_color,
+    help="Background colour, 0 to 255.  [default: the scene's own]")
 @click.option("--codec", cls=options.Option, expert=True, type=click.Choice(CODECS),
               help="Video codec.  [default: h264]")
 @click.option(

@@ -350,13 +350,15 @@ class ExportConfig(StageConfig):
         "(COLMAP, most 3DGS viewers).", choices=("z", "y", "-y"),
         automatic="z if up is known, else as in training")
     crop: tuple[float, float, float, float, float, float] | None = option(
-        None, "Keep the box between two corners, in units of the exported scene.",
+        None, "Keep the box between two corners, in units of the exported scene, without backdrop.",
         metavar="X Y Z X Y Z", automatic="everything")
     drop_floaters: bool = option(
         False, "Remove Gaussians that no training view sees, or that at most two views see and "
         "that hide what is behind them or make these views worse.")
     drop_islands: bool = option(
         False, "Remove small groups of Gaussians far from all others, unless seen through windows.")
+    drop_backdrop: bool = option(
+        False, "Leave out the sphere of Gaussians that shows the grey backdrop of the training.")
     sh_degree: int | None = option(
         None, "Maximum degree of the spherical harmonics.", minimum=0, maximum=3,
         automatic="that of the scene")

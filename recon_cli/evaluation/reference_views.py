@@ -144,11 +144,10 @@ def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[
     return views
 
 
-def render_on_black(splats: Splats, camera: Camera, sh_degree: int, backend: str) -> RenderOutput:
-    """Returns a view of a model on black, without gradients, on the device of the model."""
+def render_view(splats: Splats, camera: Camera, sh_degree: int, backend: str) -> RenderOutput:
+    """Returns a view of a model on its backdrop, without gradients, on the model's device."""
     with torch.no_grad():
-        black = torch.zeros(3, device=splats.means.device)
-        return render(splats, camera, black, sh_degree, backend=backend)
+        return render(splats, camera, splats.background, sh_degree, backend=backend)
 
 
 def score_views(
@@ -218,7 +217,7 @@ def _measure(
             group, images = views[begin:begin + _AT_ONCE * threads], []
             for view in group:
                 start = time.perf_counter()
-                output = render_on_black(splats, view.camera, sh_degree, backend)
+                output = render_view(splats, view.camera, sh_degree, backend)
                 images.append(np.asarray(output.rgb.cpu().numpy(), np.float32))  # waits for it
                 if milliseconds is not None:
                     milliseconds.append(1e3 * (time.perf_counter() - start))
@@ -234,7 +233,7 @@ def mean_psnr_on_device(
     values = []
     with torch.no_grad():
         for view in views:
-            rgb = render_on_black(splats, view.camera, sh_degree, backend).rgb
+            rgb = render_view(splats, view.camera, sh_degree, backend).rgb
             errors = (rgb.clamp(0, 1) - view.pixels(device)).square()
             counting = view.counting(device)
             error = (errors if counting is None else errors[counting]).mean().item()

@@ -28,7 +28,7 @@ from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.images import fit_camera
-from recon_cli.io.ply import write_points
+from recon_cli.io.ply import write_ply, write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
 from recon_cli.io.splats.glb import nearest_axes, write_glb
 from recon_cli.io.splats.html import write_html
@@ -90,6 +90,8 @@ class Exporter:
             views = self._load_training_views() if self._has_views else None
             splats = step("drop_islands", drop_islands(
                 splats, self._scene, self._similarity, views, self._ctx))
+        if config.drop_backdrop:
+            splats = step("drop_backdrop", dataclasses.replace(splats, backdrop=None))
         if config.crop is not None:
             splats = step("crop", crop(splats, config.crop))
         if config.sh_degree is not None and config.sh_degree < splats.sh_degree:
@@ -138,8 +140,9 @@ class Exporter:
         if name not in ("sog", "lod"):
             self._write_file(name, path, splats)
             return gain()
-        write = partial(write_sog, path, splats) if name == "sog" else partial(
-            write_lod, path, make_levels(splats))
+        whole = splats.with_sphere()
+        write = partial(write_sog, path, whole) if name == "sog" else partial(
+            write_lod, path, make_levels(whole))
         limited = self._config.max_mb is not None and name == self._config.formats[0]
         found = -math.inf
         for sharing in SHARING:
@@ -152,17 +155,21 @@ class Exporter:
         return found
 
     def _write_file(self, name: str, path: Path, splats: Splats) -> None:
+        if name == "ply":
+            write_ply(path, splats)
+            return
+        whole = splats.with_sphere()
         if name == "glb":
-            write_glb(path, splats, axes=nearest_axes(self._up))
+            write_glb(path, whole, axes=nearest_axes(self._up))
         elif name == "spz":
-            write_spz(path, splats, version=self._config.spz_version)
+            write_spz(path, whole, version=self._config.spz_version)
         elif name == "html":
-            write_html(path, splats, title=self._title, up=self._up,
+            write_html(path, whole, title=self._title, up=self._up,
                        views=self._place(self._scene.train))
         elif name == "splat":
-            write_splat(path, self._at_degree(splats, 0))
+            write_splat(path, self._at_degree(splats, 0).with_sphere())
         else:
-            FORMATS[name].write(path, splats)
+            FORMATS[name].write(path, whole)
 
     def _size_of(self, name: str) -> Callable[[Splats], int]:
         """Returns the function that measures the size of a file of a format."""

@@ -42,7 +42,7 @@ def measure_change(
 
 
 def crop(splats: Splats, box: Box) -> Splats:
-    """Returns the Gaussians with their centres in a box or on it; ConfigError if none is."""
+    """Returns the Gaussians with their centres in a box or on it, alone; ConfigError if none is."""
     low, high = splats.means.new_tensor(box[:3]), splats.means.new_tensor(box[3:])
     inside = ((splats.means >= low) & (splats.means <= high)).all(dim=1)
     if not inside.any():
@@ -52,7 +52,7 @@ def crop(splats: Splats, box: Box) -> Splats:
             hint="Nine tenths of them are between "
             f"{' '.join(f'{value:.2f}' for value in least)} and "
             f"{' '.join(f'{value:.2f}' for value in most)}.")
-    return splats.select(inside)
+    return replace(splats.select(inside), backdrop=None)
 
 
 class LowerDegrees:

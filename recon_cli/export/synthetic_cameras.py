@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
-from recon_cli.evaluation.reference_views import render_on_black
+from recon_cli.evaluation.reference_views import render_view
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
@@ -119,7 +119,7 @@ def _render(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Returns an image [H, W, 3], and where it shows something [H, W]."""
     on_device = splats.map(lambda tensor: tensor.to(ctx.device))
-    output = render_on_black(on_device, camera, on_device.sh_degree, ctx.backend)
+    output = render_view(on_device, camera, on_device.sh_degree, ctx.backend)
     image: NDArray[np.float32] = output.rgb.clamp(0, 1).cpu().numpy()
     visible: NDArray[np.bool_] = (output.alpha > _VISIBLE).cpu().numpy()
     return image, visible

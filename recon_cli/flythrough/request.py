@@ -31,7 +31,7 @@ class RenderRequest:
     size: int | None = None  # longest side in pixels
     width: int | None = None  # without size, width and height: the size of training or the file
     height: int | None = None
-    background: tuple[int, int, int] = (0, 0, 0)  # RGB, 0 to 255
+    background: tuple[int, int, int] | None = None  # RGB, 0 to 255; None is the scene's own
     form: str | None = None  # png or mp4; None is mp4 if `out` ends in .mp4
     codec: str | None = None  # h264 or av1; None is h264
     crf: int | None = None  # quality of the video, smaller is better
@@ -88,7 +88,7 @@ class RenderRequest:
                 raise ConfigError(f"--{name} is {pixels}; it must be at least 1 pixel.")
         if self.size is not None and (self.width or self.height):
             raise ConfigError("--size and --width or --height exclude each other.")
-        if not all(0 <= value <= 255 for value in self.background):
+        if not all(0 <= value <= 255 for value in self.background or ()):
             raise ConfigError(f"--background is {self.background}; values must be 0 to 255.")
         if self.frames() > MAX_FRAMES:
             raise ConfigError(

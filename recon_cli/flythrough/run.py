@@ -207,7 +207,7 @@ def _frame_settings(
     cameras = plan.cameras
     return {
         "model": trained.model, "gaussians": trained.digest, "sh_degree": trained.sh_degree,
-        "outputs": list(request.outputs), "background": list(request.background),
+        "outputs": list(request.outputs), "background": list(request.background or ()) or "own",
         "sizes": [list(size) for size in sorted(
             {(camera.width, camera.height) for camera in cameras.values()})],
         "cameras": sha256_json({
@@ -222,7 +222,8 @@ def _render_missing(
     trained: TrainedScene, scale: DepthScale, trust: Trust | None, ctx: StageContext,
 ) -> None:
     splats = trained.splats.map(lambda tensor: tensor.to(ctx.device))
-    background = torch.tensor(request.background, device=ctx.device) / 255
+    background = splats.background if request.background is None else (
+        torch.tensor(request.background, device=ctx.device) / 255)
     surfaces = scale.select_surfaces(splats) if DEPTH in request.outputs else splats
     total = len(frames.names)
     with torch.no_grad(), ctx.progress.bar(

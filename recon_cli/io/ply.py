@@ -9,10 +9,14 @@ another have zeros there.
 The reader accepts ASCII and both byte orders, float and double, the properties in any order, and
 ignores unknown ones. Two infinities that other programs write are made finite: the logit of an
 opacity of exactly 0 or 1, and the logarithm of a scale of 0.
+
+A scene with a backdrop ends with the sphere of Gaussians that shows it in other programs; a comment
+in the header says what it is, and the reader makes a backdrop of it again.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import os
@@ -27,6 +31,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.splats.values import refuse_not_finite, sigmoid, splats_from_arrays, to_arrays
+from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
 from recon_cli.workspace.atomic import replacing, write_bytes
 
@@ -53,6 +58,9 @@ _TYPES = {
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+# the comment in the header: how many rows at the end show a backdrop, and its numbers
+_BACKDROP = re.compile(r"comment backdrop (\d{1,9})((?: \S+){7})")
+_ROUNDING = 1e-6  # of a value: what two machines may compute apart
 _DIGITS = 15  # of a count; larger ones fit on no disk
 _OF_MESHES = ("face", "tristrips", "edge")
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
@@ -66,10 +74,12 @@ def write_ply(
     """Writes `splats` to `path`, whole or not at all.
 
     `extra` are further properties [N] by name, after all others; readers that do not know them
-    skip them.
+    skip them. Those of the backdrop's sphere, which has none of its own, are the greatest.
     """
-    extra = extra or {}
+    backdrop, splats = splats.backdrop, splats.with_sphere()
     n = len(splats)
+    extra = {name: np.pad(values, (0, n - len(values)), constant_values=values.max(initial=0.0))
+             for name, values in (extra or {}).items()}
     if not len(splats.sh_rest):
         splats = splats.with_degree(0)
     rest = _REST[: 3 * TERMS[splats.sh_degree]]
@@ -82,7 +92,7 @@ def write_ply(
     table = np.column_stack([
         torch.cat([columns[name] for name in _GROUPS], dim=1).numpy(), *extra.values()])
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(n, splats.sh_degree, tuple(extra)))
+        file.write(_header(n, splats.sh_degree, tuple(extra), backdrop))
         file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
 
 
@@ -91,37 +101,49 @@ def _properties(sh_degree: int) -> list[str]:
     return [name for group in (_GROUPS | {"sh_rest": rest}).values() for name in group]
 
 
-def _header(n: int, sh_degree: int, extra: Sequence[str] = ()) -> bytes:
+def _header(
+    n: int, sh_degree: int, extra: Sequence[str] = (), backdrop: Backdrop | None = None
+) -> bytes:
     names = (*_properties(sh_degree), *extra)
-    return format_header({"vertex": (n, [f"float {name}" for name in names])})
+    comments = [] if backdrop is None else [
+        f"backdrop {SPHERE_GAUSSIANS} {' '.join(map(repr, backdrop.numbers))}"]
+    return format_header({"vertex": (n, [f"float {name}" for name in names])}, comments)
 
 
-def format_header(elements: Mapping[str, tuple[int, Sequence[str]]]) -> bytes:
+def format_header(
+    elements: Mapping[str, tuple[int, Sequence[str]]], comments: Sequence[str] = ()
+) -> bytes:
     """Returns the header of a binary .ply, by element its count and its properties with types."""
-    lines = ["ply", "format binary_little_endian 1.0"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     for name, (count, properties) in elements.items():
         lines += [f"element {name} {count}", *(f"property {text}" for text in properties)]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
-def max_gaussians(size: int, sh_degree: int) -> int:
-    """Returns how many Gaussians of a degree fit into a .ply of `size` bytes."""
-    each = 4 * len(_properties(sh_degree))
-    count = max(0, (size - len(_header(0, sh_degree))) // each)
-    while count and len(_header(count, sh_degree)) + each * count > size:  # the count has digits
+def max_gaussians(size: int, sh_degree: int, backdrop: Backdrop | None = None) -> int:
+    """Returns how many Gaussians of a degree fit into a .ply of `size` bytes with a backdrop."""
+    each, sphere = 4 * len(_properties(sh_degree)), 0 if backdrop is None else SPHERE_GAUSSIANS
+
+    def header(count: int) -> int:
+        return len(_header(count, sh_degree, backdrop=backdrop))
+
+    count = max(0, (size - header(0)) // each)
+    while count and header(count) + each * count > size:  # the count has digits
         count -= 1
-    return count
+    return max(0, count - sphere)
 
 
 def read_ply(path: Path) -> Splats:
     """Returns the Gaussians of a .ply as float32 tensors, in the file's order.
 
-    Those after the last one with a coefficient other than zero are of degree 0. Elements besides
+    Those after the last one with a coefficient other than zero are of degree 0. The sphere of a
+    backdrop, unless another program has changed it, becomes one again. Elements besides
     the vertices are ignored. Infinite logits of opacities, scales of 0 and a missing third scale
     become finite, and a warning counts them. FormatError if the file is missing, truncated, of
     another kind of .ply, or holds other values that are not finite.
     """
-    table = _vertices(read_header(path))
+    header = read_header(path)
+    table = _vertices(header)
     names = table.dtype.names or ()
     rest = [name for name in _REST if name in names]
     if len(rest) not in [3 * terms for terms in TERMS] or rest != _REST[: len(rest)]:
@@ -142,9 +164,23 @@ def read_ply(path: Path) -> Splats:
     values = {key: np.stack([columns[name] for name in group], axis=1) if group
               else np.zeros((len(table), 0), np.float32) for key, group in groups.items()}
     by_channel = values["sh_rest"].reshape(len(table), 3, len(rest) // 3)
-    return splats_from_arrays(path, values | {
+    splats = splats_from_arrays(path, values | {
         "logit_opacities": values["logit_opacities"][:, 0],
         "sh_rest": by_channel.transpose(0, 2, 1)})
+    return _without_sphere(splats, header.backdrop)
+
+
+def _without_sphere(splats: Splats, told: tuple[int, Backdrop] | None) -> Splats:
+    """Returns splats whose last rows show a backdrop with it in place of those rows."""
+    if told is None or told[0] > len(splats):
+        return splats
+    count, backdrop = told
+    near = splats.select(torch.arange(len(splats) - count))
+    found = dataclasses.replace(near, backdrop=backdrop)
+    ours = found.with_sphere().parameters()
+    same = all(ours[name].shape == value.shape and torch.allclose(ours[name], value, rtol=_ROUNDING)
+               for name, value in splats.parameters().items())
+    return found if same else splats
 
 
 def _make_finite(path: Path, columns: dict[str, NDArray[np.float32]]) -> None:
@@ -212,12 +248,13 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """The header: name of the format, elements, and offset of the data."""
+    """The header: name of the format, elements, offset of the data, and backdrop."""
 
     path: Path
     format: str
     elements: tuple[Element, ...]
     offset: int
+    backdrop: tuple[int, Backdrop] | None = None  # that a comment tells of, after its rows
 
 
 def read_header(path: Path) -> Header:
@@ -230,7 +267,8 @@ def read_header(path: Path) -> Header:
     end = _END.search(head)
     if not head.startswith((b"ply\n", b"ply\r\n")) or not end:
         raise FormatError(f"{path} is no .ply file.")
-    lines = [line.split() for line in head[:end.start()].decode("ascii", "replace").splitlines()]
+    texts = head[:end.start()].decode("ascii", "replace").splitlines()
+    lines = [text.split() for text in texts]
     lines = [line for line in lines[1:] if line and line[0] not in ("comment", "obj_info")]
     if not lines or len(lines[0]) != 3 or lines[0][0] != "format" or lines[0][1] not in _ORDERS:
         raise FormatError(
@@ -244,7 +282,17 @@ def read_header(path: Path) -> Header:
                      for start, stop in zip(starts, [*starts[1:], len(lines)], strict=True))
     if len({element.name for element in elements}) != len(elements):
         raise FormatError(f"{path} names an element twice.")
-    return Header(path, kind, elements, end.end())
+    return Header(path, kind, elements, end.end(), _told_backdrop(texts))
+
+
+def _told_backdrop(texts: Sequence[str]) -> tuple[int, Backdrop] | None:
+    """Returns the backdrop that a comment tells of; None where none does, or it cannot be read."""
+    for found in filter(None, map(_BACKDROP.fullmatch, texts)):
+        try:
+            return int(found[1]), Backdrop.of([float(text) for text in found[2].split()])
+        except ValueError:
+            return None
+    return None
 
 
 def _element(lines: list[list[str]], kind: str, path: Path) -> Element:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon_cli.scene.backdrop import SPHERE_OPACITY, Backdrop, enclosing
 from recon_cli.scene.harmonics import rotate_sh
 from recon_cli.scene.similarity import Similarity
 
@@ -35,6 +36,8 @@ class Splats:
     # [M, T, 3] coefficients of degrees 1 and up of the first M Gaussians, 0 <= M <= N and T one of
     # 0, 3, 8, 15
     sh_rest: Tensor
+    # behind all of them; None is black
+    backdrop: Backdrop | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -53,16 +56,22 @@ class Splats:
             if tensor.dtype != self.means.dtype or tensor.device != self.means.device:
                 raise ValueError(f"{name} differs from means in dtype or device")
 
+    @staticmethod
+    def of(parameters: Mapping[str, Tensor], backdrop: Backdrop | None = None) -> Splats:
+        """Returns splats of the raw parameters by name; ValueError where shapes disagree."""
+        return Splats(*(parameters[name] for name in PARAMETERS), backdrop=backdrop)
+
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
     def parameters(self) -> dict[str, Tensor]:
         """Returns the raw parameters by name, in declaration order; no copies."""
-        return {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: getattr(self, name) for name in PARAMETERS}
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Splats:
         """Returns splats whose every parameter went through `change`."""
-        return Splats(**{name: change(value) for name, value in self.parameters().items()})
+        changed = {name: change(value) for name, value in self.parameters().items()}
+        return Splats.of(changed, self.backdrop)
 
     def select(self, rows: Tensor) -> Splats:
         """Returns the Gaussians at `rows` ([K] indices or [N] mask), detached, in that order.
@@ -80,7 +89,7 @@ class Splats:
             raise ValueError("rows put Gaussians of degree 0 before some that have coefficients")
         taken = {name: value.detach()[rows[:count] if name == "sh_rest" else rows]
                  for name, value in self.parameters().items()}
-        return Splats(**taken)
+        return Splats.of(taken, self.backdrop)
 
     def within(self, center: Sequence[float], distance: float) -> Tensor:
         """Returns which centres lie within `distance` of `center` [3], [N] bool."""
@@ -90,6 +99,25 @@ class Splats:
     def with_degree(self, degree: int) -> Splats:
         """Returns the splats with coefficients of this degree: cut, or filled up with zeros."""
         return replace(self, sh_rest=with_terms(self.sh_rest, TERMS[degree]))
+
+    def with_sphere(self) -> Splats:
+        """Returns the splats with their backdrop as Gaussians, behind all others and last."""
+        if self.backdrop is None:
+            return self
+        positions, scale = self.backdrop.sphere(self.means.detach().cpu().numpy())
+        n, values = len(positions), self.means.new_tensor
+        sphere = Splats(
+            values(positions), values([[1.0, 0, 0, 0]]).repeat(n, 1),
+            values([[math.log(scale)] * 3]).repeat(n, 1),
+            torch.logit(values([SPHERE_OPACITY])).repeat(n),
+            ((values([self.backdrop.color]) - 0.5) / SH_C0).repeat(n, 1), self.sh_rest[:0])
+        return joined([replace(self, backdrop=None), sphere])[0]
+
+    @property
+    def background(self) -> Tensor:
+        """The colour behind all Gaussians, [3] in [0, 1]."""
+        return self.means.new_tensor(
+            (0.0, 0.0, 0.0) if self.backdrop is None else self.backdrop.color)
 
     @property
     def sh_degree(self) -> int:
@@ -105,6 +133,9 @@ class Splats:
     def opacities(self) -> Tensor:
         """Opacities in (0, 1), [N]."""
         return torch.sigmoid(self.logit_opacities)
+
+
+PARAMETERS = tuple(item.name for item in fields(Splats) if item.name != "backdrop")
 
 
 def with_terms(sh_rest: Tensor, terms: int) -> Tensor:
@@ -124,7 +155,8 @@ def with_rows(sh_rest: Tensor, rows: int) -> Tensor:
 def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
     """Returns the Gaussians of all parts, those with coefficients first, and their order.
 
-    The order is the row [N] of each in the plain concatenation of the parts.
+    The order is the row [N] of each in the plain concatenation of the parts. The backdrop is
+    that of the first which has one, for all cameras.
 
     Raises:
         ValueError: the parts are of different degrees.
@@ -137,7 +169,8 @@ def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
     together = {name: torch.cat([part.parameters()[name] for part in parts])
                 for name in parts[0].parameters()}
     rest = together.pop("sh_rest")  # in that order already
-    return Splats(**{name: value[order] for name, value in together.items()}, sh_rest=rest), order
+    rows = {name: value[order] for name, value in together.items()} | {"sh_rest": rest}
+    return Splats.of(rows, enclosing([part.backdrop for part in parts])), order
 
 
 def transformed(splats: Splats, similarity: Similarity) -> Splats:
@@ -158,7 +191,8 @@ def transformed(splats: Splats, similarity: Similarity) -> Splats:
         sh_rest = rotate_sh(sh_rest, similarity.rotation)
     return Splats(
         means.to(splats.means.dtype), quats, log_scales.to(splats.log_scales.dtype),
-        splats.logit_opacities, splats.sh_dc, sh_rest)
+        splats.logit_opacities, splats.sh_dc, sh_rest,
+        backdrop=None if splats.backdrop is None else splats.backdrop.moved(similarity))
 
 
 def _rotate_quats(quats: Tensor, rotation: NDArray[np.float64]) -> Tensor:

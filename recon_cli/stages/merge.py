@@ -20,7 +20,7 @@ from recon_cli.config.stages import MIN_GAUSSIANS, MergeConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, ReconstructionError, WorkspaceError
 from recon_cli.evaluation.metrics import psnr
-from recon_cli.evaluation.reference_views import load_reference_views, load_scene, render_on_black
+from recon_cli.evaluation.reference_views import load_reference_views, load_scene, render_view
 from recon_cli.io.colmap import read_pinholes
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.io.records import BLOCKS, BlockRecord, ImportRecord
@@ -199,7 +199,7 @@ def _seam_changes(
     with ctx.progress.bar("checking seams", len(shared), unit="view") as bar:
         for view in load_reference_views(shared, max_size, ctx, threads=ctx.threads):
             def score(model: Splats, view=view) -> float:  # type: ignore[no-untyped-def]
-                image = render_on_black(model, view.camera, model.sh_degree, ctx.backend).rgb
+                image = render_view(model, view.camera, model.sh_degree, ctx.backend).rgb
                 return psnr(image.cpu().numpy(), view.image, view.mask)
 
             best = max(score(model) for model, block in zip(alone, blocks, strict=True)

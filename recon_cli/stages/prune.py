@@ -64,7 +64,7 @@ def _target(config: PruneConfig, splats: Splats) -> int:
     if config.max_gaussians is not None:
         return min(n, config.max_gaussians)
     if config.max_mb is not None:
-        count = max_gaussians(int(1e6 * config.max_mb), splats.sh_degree)
+        count = max_gaussians(int(1e6 * config.max_mb), splats.sh_degree, splats.backdrop)
         if count == 0:
             raise ConfigError(
                 f"max_mb is {config.max_mb:g}, but a .ply of one Gaussian is larger.",

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.scene.train_view import TrainView
@@ -211,15 +212,6 @@ def look_at_one_thing(views: Sequence[TrainView]) -> bool:
     spread = np.degrees(np.arccos(np.clip(sides @ middle, -1, 1)))
     return bool(np.median(missed) < _MISSED and (ahead > 0).mean() > _BEFORE
                 and np.quantile(spread, _BEFORE) > _SIDES_DEG)
-
-
-def fibonacci_sphere(n: int) -> NDArray[np.float64]:
-    """Returns n unit vectors spread evenly, [n, 3] (Swinbank and Purser 2006)."""
-    i = np.arange(n) + 0.5
-    z = 1 - 2 * i / n
-    around = np.pi * (1 + 5**0.5) * i
-    flat = np.sqrt(1 - z * z)
-    return np.stack([flat * np.cos(around), flat * np.sin(around), z], axis=1)
 
 
 def project_points(

@@ -179,7 +179,7 @@ class _AutogradStep:
         splats = optimizer.splats
         device, counting = splats.means.device, view.counting(splats.means.device)
         output = render(
-            splats, view.camera, splats.means.new_zeros(3), options.sh_degree,
+            splats, view.camera, splats.background, options.sh_degree,
             backend=self._backend, scores=options.details or options.scores or options.loo,
             mask=counting)
         rgb = output.rgb

@@ -124,11 +124,10 @@ def add_views(
 ) -> None:
     """Adds what a pass over views with their masks finds; never give it held-out views."""
     device = splats.means.device
-    background = torch.zeros(3, dtype=splats.means.dtype, device=device)
     leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(found.leaves_out))
     for view in views:
-        output = render(leaves, view.camera, background, sh_degree, backend=backend, scores=True,
-                        mask=view.counting(device))
+        output = render(leaves, view.camera, leaves.background, sh_degree, backend=backend,
+                        scores=True, mask=view.counting(device))
         if output.rgb.requires_grad:
             output.rgb.sum().backward()  # type: ignore[no-untyped-call]
         found.add(output.statistics)

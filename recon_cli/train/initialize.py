@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import TrainingError
+from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
@@ -88,7 +90,11 @@ def first_state(
         colors = np.concatenate([colors, far.gap_colors])
     # what is added does not take the place of sparse points as long as there is room to grow
     most = max(most, min(most + len(points) - sparse, config.max_gaussians // 2))
-    splats = first_splats(config, points, colors, far, most=most)
+    grey = task.schedule.recipe.backdrop
+    centers = np.stack([view.camera.center for view in task.train])
+    splats = dataclasses.replace(
+        first_splats(config, points, colors, far, most=most),
+        backdrop=Backdrop.behind(grey, centers) if grey else None)
     exposure, poses = new_parts(task, gains)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,

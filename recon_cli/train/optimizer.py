@@ -87,10 +87,12 @@ class SplatOptimizer:
             held = self._buffers.get(name, {}).get("value")
             if held is None or held.shape != (room, *value.shape[1:]):
                 self._reserve(name, value, room)
-        self.splats = Splats(**{
-            name: self._view(name, "value").detach().requires_grad_() for name in self._buffers})
-        self.gradients = Splats(**{name: self._view(name, "gradient") for name in self._buffers}
-        ) if self.fused else self.splats
+        self.splats = Splats.of({
+            name: self._view(name, "value").detach().requires_grad_() for name in self._buffers
+        }, like.backdrop)
+        self.gradients = Splats.of({
+            name: self._view(name, "gradient") for name in self._buffers
+        }) if self.fused else self.splats
 
     def gradient(self, name: str) -> Tensor:
         """Returns the gradient of a parameter that the last backward pass left, to be changed."""

@@ -66,6 +66,7 @@ class Recipe:
     means_final: float = 0.01  # last rate of the means over the first; exponential between
     final_from: float = 1.0  # share from which all other rates fall
     final_rate: float = 1.0  # to which they fall at the end, of their own; exponential
+    backdrop: float = 0.0  # grey level behind all Gaussians, 0 to 1
 
 
 # Kerbl et al. 2023 and INRIA's defaults: 500, 15,000 and 1,000 of 30,000 iterations
@@ -77,7 +78,8 @@ BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
     sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False,
     replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=7.0, means_again=0.7,
-    scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8, final_from=0.8, final_rate=0.1)
+    scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8, final_from=0.8, final_rate=0.1,
+    backdrop=0.33)
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 

@@ -15,6 +15,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import ProcessGroup
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.render import Statistics
+from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import Splats
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.optimizer import SplatOptimizer
@@ -131,7 +132,8 @@ def save_state(path: Path, state: TrainState) -> None:
     check_finite(tensors, "Training diverged")
     scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue,
                "first_count": state.first_count, "skipped": state.skipped,
-               "looks": state.looks, "jump": state.jump}
+               "looks": state.looks, "jump": state.jump,
+               "backdrop": state.splats.backdrop and state.splats.backdrop.numbers}
     with replacing(path) as temporary:
         save_file({name: value.contiguous().cpu() for name, value in tensors.items()},
                   temporary, metadata={"state": json.dumps(scalars)})
@@ -167,7 +169,8 @@ def load_state(
         generator = torch.Generator()
         generator.set_state(tensors.pop("generator"))
         tensors = {name: value.to(device) for name, value in tensors.items()}
-        splats = Splats(**_under("splats.", tensors))
+        backdrop = scalars.get("backdrop")
+        splats = Splats.of(_under("splats.", tensors), backdrop and Backdrop.of(backdrop))
         state = TrainState(
             SplatOptimizer(splats, config, means_unit, backend=backend),
             DensificationStats(**_under("gathered.", tensors)), generator,

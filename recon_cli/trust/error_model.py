@@ -110,7 +110,7 @@ def _shape_terms(
 class Picture:
     """A view with what the expected error follows from."""
 
-    rgb: NDArray[np.float32]  # [H, W, 3] on black, not clamped
+    rgb: NDArray[np.float32]  # [H, W, 3] on the backdrop, not clamped
     alpha: NDArray[np.float32]  # [H, W]
     depth: NDArray[np.float32]  # [H, W] expected depth, in units of the scene's median depth
     terms: Mapping[str, NDArray[np.float32]]  # [H, W] by the names of TERMS
@@ -121,9 +121,8 @@ def picture_terms(
 ) -> Picture:
     """Renders a view and the terms of its pixels, by two more passes with values for colours."""
     device, dtype = splats.means.device, splats.means.dtype
-    black = torch.zeros(3, dtype=dtype, device=device)
     with torch.no_grad():
-        output = render(splats, camera, black, sh_degree, backend=backend)
+        output = render(splats, camera, splats.background, sh_degree, backend=backend)
         sight = support.seen_from(splats.means, camera.center)
         few = 1 / (1 + support.count.to(dtype))
         first = paint(splats, camera, [few, sight.angle, support.residual], backend)
@@ -137,7 +136,8 @@ def picture_terms(
     covered = alpha >= _COVERED
     share = np.where(covered, alpha, 1)
     mean_depth = output.depth.cpu().numpy() / share / scale
-    gray = rgb.mean(-1) / share
+    behind = float(splats.background.mean())
+    gray = (rgb.mean(-1) - (1 - alpha) * behind) / share  # of the Gaussians alone
     few_map, angle, residual = (np.where(covered, channel / share, empty) for channel, empty in zip(
         np.moveaxis(first, -1, 0), (1.0, np.pi, float(support.residual.max())), strict=True))
     square, nearer, brightness = (

@@ -161,7 +161,6 @@ def measure_support(
     `compare`, where cameras were refined and photos do not fit them, residuals are all alike.
     """
     device = splats.means.device
-    black = torch.zeros(3, dtype=splats.means.dtype, device=device)
     weights = torch.zeros(len(splats), dtype=torch.float64, device=device)
     errors = weights.clone()
     shown: list[Tensor] = []
@@ -169,7 +168,8 @@ def measure_support(
     for view in views:
         centers.append(view.camera.center)
         with torch.no_grad():
-            output = render(splats, view.camera, black, sh_degree, backend=backend, scores=True)
+            output = render(
+                splats, view.camera, splats.background, sh_degree, backend=backend, scores=True)
         statistics = output.statistics
         rows = torch.nonzero(statistics.blend_max >= CARRIES)[:, 0]
         shown.append(rows)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.metrics import leaves_enough, psnr
-from recon_cli.evaluation.reference_views import render_on_black
+from recon_cli.evaluation.reference_views import render_view
 from recon_cli.flythrough.paths import visible_depths
 from recon_cli.flythrough.trained_scene import open_trained_scene
 from recon_cli.io.images import fit_camera, fit_size, read_image, read_masked_image, to_uint8
@@ -231,7 +231,7 @@ class PhotoPairs:
         truth, mask = self.load_photo(view)
         camera, device = fit_camera(view.camera, self._max_size), self._ctx.device
         on_device = splats.map(lambda tensor: tensor.to(device))
-        rgb = render_on_black(on_device, camera, splats.sh_degree, self._ctx.backend).rgb
+        rgb = render_view(on_device, camera, splats.sh_degree, self._ctx.backend).rgb
         image: NDArray[np.float32] = rgb.cpu().numpy()
         return to_uint8(image), psnr(image, truth, mask) if leaves_enough(mask) else None
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import viser
 from numpy.typing import NDArray
 
 from recon_cli.render.torch.projection import colors_from_sh, rotation_matrices
@@ -60,6 +61,12 @@ def pack_splats(splats: Splats) -> PackedSplats:
         splats, scale, (splats.means.numpy() / scale).astype(np.float32),
         (factors @ factors.transpose(0, 2, 1)).astype(np.float16),
         _eight_bit(splats.opacities.numpy())[:, None])
+
+
+def show_backdrop(scene: viser.SceneApi, splats: Splats) -> None:
+    """Colours what browsers draw behind all Gaussians; black without a backdrop."""
+    pixel = _eight_bit(splats.background.detach().cpu().numpy())
+    scene.set_background_image(pixel.reshape(1, 1, 3), format="png")
 
 
 def _drop_non_finite(splats: Splats) -> Splats:

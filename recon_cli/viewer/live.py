@@ -23,7 +23,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.gravity import mean_up
 from recon_cli.scene.splats import Splats
 from recon_cli.viewer.content import FAR, browser_camera, move_browser, set_initial_camera
-from recon_cli.viewer.gaussians import pack_splats
+from recon_cli.viewer.gaussians import pack_splats, show_backdrop
 from recon_cli.viewer.server import Server
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import WorldSummary
@@ -62,6 +62,7 @@ class LiveView(TrainCallback):
             distance = float(np.median(depths)) if len(depths) else 1.0
             start = browser_camera(cameras[0], distance, FAR)
             self._server.scene.set_up_direction(up)
+            show_backdrop(self._server.scene, splats)
             set_initial_camera(self._server, start)
             for client in self._server.get_clients().values() if self._node is None else ():
                 move_browser(client, start, up, cameras[0])

@@ -25,7 +25,7 @@ from recon_cli.viewer.content import (
     move_browser,
     vertical_fov,
 )
-from recon_cli.viewer.gaussians import PackedSplats
+from recon_cli.viewer.gaussians import PackedSplats, show_backdrop
 from recon_cli.viewer.measure_panel import MeasurePanel
 from recon_cli.viewer.trust_tint import TrustTint
 
@@ -83,6 +83,7 @@ class Session:
     def _add_gaussians(self) -> viser.GaussianSplatHandle:
         packed = self._packed
         self._seen_from = np.asarray(self._client.camera.position)
+        show_backdrop(self._client.scene, packed.splats)
         return self._client.scene.add_gaussian_splats(
             "/gaussians", packed.centers, packed.covariances,
             self._colors(self._seen_from.tolist()), packed.opacities, scale=packed.scale)

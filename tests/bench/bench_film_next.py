@@ -33,7 +33,7 @@ from recon_cli.evaluation.reference_views import (
     load_reference_views,
     load_scene,
     mean_psnr,
-    render_on_black,
+    render_view,
 )
 from recon_cli.io.images import to_uint8, write_png
 from recon_cli.io.ply import read_ply
@@ -103,7 +103,7 @@ def film(
     views = []
     for number, camera in enumerate(cameras):
         path = folder / f"filmed_{number}.png"
-        write_png(path, to_uint8(render_on_black(
+        write_png(path, to_uint8(render_view(
             model, camera, model.sh_degree, ctx.backend).rgb.numpy()))
         views.append(View(path.name, camera, path, path))
     return views

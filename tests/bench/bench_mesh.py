@@ -25,7 +25,7 @@ from pose_errors import similarity
 from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene, load_views, render_on_black
+from recon_cli.evaluation.reference_views import load_scene, load_views, render_view
 from recon_cli.export.mesh import build
 from recon_cli.export.mesh.depth_maps import DepthMaps, render_depth_maps, weigh, weigh_by_agreement
 from recon_cli.export.mesh.volume import extract, fuse, pixel_rays
@@ -189,7 +189,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         return mesh.vertices, mesh.faces
 
     def expected(camera: Camera) -> NDArray[np.float32]:
-        output = render_on_black(splats, camera, 0, "numba")
+        output = render_view(splats, camera, 0, "numba")
         depth = output.depth / output.alpha.clamp_min(1e-3)
         return np.where(output.alpha > 0.5, depth, 0).astype(np.float32)
 

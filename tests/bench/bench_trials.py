@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.metrics import corrected_psnr, psnr
-from recon_cli.evaluation.reference_views import load_scene, render_on_black
+from recon_cli.evaluation.reference_views import load_scene, render_view
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.exposure import estimate_gains
@@ -86,7 +86,7 @@ class Capture:
             fit(state, task, config.iterations)
             rows = []
             for view in self.task.validation:
-                rgb = render_on_black(
+                rgb = render_view(
                     state.splats, view.camera, config.sh_degree, task.backend).rgb.numpy()
                 rows.append([score(rgb, view.image, view.mask) for score in (psnr, corrected_psnr)])
             self._scores[config] = np.array(rows)

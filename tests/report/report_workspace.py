@@ -26,7 +26,8 @@ from recon_cli.workspace.layout import Workspace
 TABLE = tuple(replace(row, module="report_workspace", renders=False) for row in STAGES)
 RUN = {"iterations": 60, "max_gaussians": 120, "sh_rate": 0.05, "densify_every": 10,
        "densify_gradient": 1e-5, "validation": 0.15}
-CONFIGS = {"train": TrainConfig(**RUN), "prune": PRUNE, "export": ExportConfig(format="spz")}
+CONFIGS = {"train": TrainConfig(**RUN), "prune": PRUNE,
+           "export": ExportConfig(format="spz", max_loss=3.0)}
 HELD_OUT = ("000000.png", "000004.png", "000008.png")
 INGEST = replace(records.INGEST, held_out=3, width=48, height=36)
 SFM = replace(

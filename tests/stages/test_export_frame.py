@@ -84,7 +84,7 @@ def of_transforms(path):
 def pictures(splats, cameras):
     """What the cameras see, by name."""
     with torch.no_grad():
-        return {name: render(splats, camera, torch.zeros(3), 3, backend="torch").rgb
+        return {name: render(splats, camera, splats.background, 3, backend="torch").rgb
                 for name, camera in cameras.items()}
 
 

@@ -49,6 +49,21 @@ def test_a_crop_keeps_the_centres_in_the_box_and_says_what_went(inputs, whole, t
     assert any(line.startswith(f"crop: {len(kept)} of {len(whole)}") for line in caplog.messages)
 
 
+def test_without_its_backdrop_a_scene_is_on_black_and_the_loss_is_said(inputs, whole, tmp_path):
+    assert whole.backdrop is not None
+    summary = exported(inputs, tmp_path, drop_backdrop=True, format="spz")
+    back = read_ply(tmp_path / "splats.ply")
+    assert back.backdrop is None
+    assert torch.equal(back.means, whole.means)
+    assert len(FORMATS["spz"].read(tmp_path / "splats.spz")) == len(whole)
+    (change,) = summary.changes
+    assert (change.option, change.gaussians) == ("drop_backdrop", len(whole))
+    scene = load_scene(inputs, validation=LEARNT.validation)
+    psnr = load_reference_psnr(scene, Similarity(), LEARNT.max_size, CONTEXT)
+    assert change.psnr_change_db == pytest.approx(
+        psnr.psnr_db(back) - psnr.psnr_db(whole), abs=1e-3)
+
+
 def test_a_crop_is_in_units_of_the_exported_scene(inputs, whole, tmp_path):
     scaled = exported(inputs, tmp_path, scale_between=("000000.png", "000006.png", 7.0))
     scale = scaled.transform["scale"]
@@ -79,7 +94,7 @@ def test_a_lower_degree_keeps_the_colours_that_the_views_see(inputs, whole, tmp_
 
 
 def test_a_file_without_harmonics_has_the_colours_that_the_views_see(inputs, whole, tmp_path):
-    exported(inputs, tmp_path, format="splat")
+    exported(inputs, tmp_path, format="splat", drop_backdrop=True)
     exported(inputs, tmp_path, format="ply", sh_degree=0)
     back = FORMATS["splat"].read(tmp_path / "splats.splat")
     fitted = read_ply(tmp_path / "splats.ply")
@@ -90,20 +105,22 @@ def test_a_file_without_harmonics_has_the_colours_that_the_views_see(inputs, who
 
 
 def test_a_palette_that_loses_too_much_gets_more_entries(inputs, tmp_path):
-    small = exported(inputs, tmp_path, format="sog", max_loss=9.0).files["sog"]
-    large = exported(inputs, tmp_path, format="sog").files["sog"]
-    assert small.psnr_change_db < -0.3 <= large.psnr_change_db
+    alone = {"format": "sog", "drop_backdrop": True}
+    small = exported(inputs, tmp_path, **alone, max_loss=9.0).files["sog"]
+    allowed = -0.7 * small.psnr_change_db
+    large = exported(inputs, tmp_path, **alone, max_loss=allowed).files["sog"]
+    assert small.psnr_change_db < -allowed <= large.psnr_change_db
     assert large.bytes > small.bytes
 
 
 @pytest.mark.parametrize("name", ["ply", "spz", "sog"])
 def test_a_file_is_no_larger_than_asked_for(inputs, whole, tmp_path, name):
-    exported(inputs, tmp_path, format=name)
+    exported(inputs, tmp_path, format=name, drop_backdrop=True)
     path = scene_file(tmp_path, name)
     most = 0.6 * path.stat().st_size / 1e6
-    summary = exported(inputs, tmp_path, format=name, max_mb=most)
+    summary = exported(inputs, tmp_path, format=name, max_mb=most, drop_backdrop=True)
     assert path.stat().st_size <= 1e6 * most
-    (change,) = summary.changes
+    _, change = summary.changes
     assert change.gaussians < len(whole) or change.degree < 3
     assert len(FORMATS[name].read(path)) == change.gaussians
     assert summary.gaussians == change.gaussians

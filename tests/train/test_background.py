@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from recon_cli.render import render
+from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import background
 from recon_cli.train.background import (
     faces,
     far_content,
-    fibonacci_sphere,
     look_at_one_thing,
     project_points,
     splats_of,

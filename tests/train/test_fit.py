@@ -122,7 +122,8 @@ def test_a_masked_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(
 def test_validation_scores_the_pixels_that_count():
     state, task = first_state(), masked_task("torch")
     view = task.validation[0]
-    rgb = render(state.splats, view.camera, torch.zeros(3), 0).rgb.detach().clamp(0, 1).numpy()
+    rgb = render(state.splats, view.camera, state.splats.background, 0).rgb.detach()
+    rgb = rgb.clamp(0, 1).numpy()
     error = np.mean((rgb - view.image / 255.0)[view.mask] ** 2)
     assert validation_psnr(state, task) == pytest.approx(-10 * np.log10(error), abs=1e-4)
 

@@ -1,5 +1,7 @@
 """Masks in a training step, on every backend: what they ignore moves nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.io.images import fill_masked
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
+from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.state import new_state
@@ -17,6 +20,7 @@ from recon_cli.train.state import new_state
 TOLERANCE = 1e-5
 CONFIG = RunConfig(iterations=10, max_gaussians=300)
 CAMERA = camera_at(60, 41)
+BACKDROP = Backdrop(0.9, 0.2, 0.5, 0.0, 0.0, 0.0, 1.0)
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 
 
@@ -47,8 +51,7 @@ def gradients_of(splats, view, backend, degree=3):
 def exact(splats, view, degree=3):
     """The same by autograd in float64, on the loss of an image that is the truth when ignored."""
     leaves = splats.map(lambda tensor: tensor.detach().double().requires_grad_())
-    rgb = render(leaves, view.camera, torch.zeros(3, dtype=torch.float64), degree,
-                 backend="torch").rgb
+    rgb = render(leaves, view.camera, leaves.background, degree, backend="torch").rgb
     truth = torch.from_numpy(view.image).double() / 255
     counts = torch.from_numpy(view.mask).double()[..., None]
     loss = photometric_loss(counts * rgb + (1 - counts) * truth, truth, 0.2)
@@ -56,9 +59,10 @@ def exact(splats, view, degree=3):
     return loss.item(), {name: leaf.grad for name, leaf in leaves.parameters().items()}
 
 
+@pytest.mark.parametrize("backdrop", [None, BACKDROP])
 @every_cpu_backend
-def test_a_masked_step_gives_the_gradients_of_the_masked_loss(backend):
-    splats = random_splats(200, seed=13, dtype=torch.float32)
+def test_a_masked_step_gives_the_gradients_of_the_masked_loss(backend, backdrop):
+    splats = replace(random_splats(200, seed=13, dtype=torch.float32), backdrop=backdrop)
     mask = blob_mask()
     view = TrainView(CAMERA, fill_masked(photograph(), mask), mask)
     loss, gradients, _ = gradients_of(splats, view, backend)

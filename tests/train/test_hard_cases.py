@@ -35,7 +35,8 @@ def psnr(state, views, mask=None):
     errors = []
     for view in views:
         with torch.no_grad():
-            rgb = render(state.splats, view.camera, torch.zeros(3), 0, backend="numba").rgb
+            rgb = render(
+                state.splats, view.camera, state.splats.background, 0, backend="numba").rgb
         error = (rgb.clamp(0, 1).numpy() - view.image / 255) ** 2
         errors.append(error[mask].mean() if mask is not None else error.mean())
     return -10 * np.log10(max(np.mean(errors), 1e-10))

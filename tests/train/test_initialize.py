@@ -11,7 +11,9 @@ from tiny_task import CONFIG, tiny_task
 from recon_cli.errors import TrainingError
 from recon_cli.scene.splats import SH_C0
 from recon_cli.train.blank_surfaces import SurfacePoints
-from recon_cli.train.initialize import first_state, splats_from_points
+from recon_cli.train.fit import fit
+from recon_cli.train.initialize import first_state, restore_state, splats_from_points
+from recon_cli.train.state import save_state
 
 GRID = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
 GREY = np.full((27, 3), 128, np.uint8)
@@ -61,3 +63,28 @@ def test_blank_surfaces_begin_with_gaussians_only_where_they_are_on(planes, more
     added = splats.means.detach().numpy()[27:]
     assert added.tolist() == surfaces.points[:more].tolist()
     assert torch.allclose(SH_C0 * splats.sh_dc[27:] + 0.5, torch.tensor(200 / 255), atol=1e-6)
+
+
+@pytest.mark.parametrize(("densify", "grey"), [("budget", 0.33), ("reference", None)])
+def test_behind_all_gaussians_is_a_grey_backdrop_except_in_the_reference(densify, grey):
+    config = replace(CONFIG, densify=densify)
+    task = tiny_task(config)
+    backdrop = first_state(task, GRID, GREY, most=100).splats.backdrop
+    if grey is None:
+        assert backdrop is None
+        return
+    assert backdrop.color == (grey,) * 3
+    for view in task.train:
+        away = view.camera.center - [backdrop.x, backdrop.y, backdrop.z]
+        assert np.linalg.norm(away) <= backdrop.reach
+
+
+def test_a_run_keeps_its_backdrop_from_one_checkpoint_to_the_next(tmp_path):
+    task = tiny_task(replace(CONFIG, densify="budget"))
+    state = first_state(task, GRID, GREY, most=100)
+    assert state.splats.backdrop is not None
+    save_state(tmp_path / "a.safetensors", state)
+    assert restore_state(tmp_path / "a.safetensors", task).splats.backdrop == state.splats.backdrop
+    begin = state.splats.backdrop
+    fit(state, task, 30)  # with densification
+    assert state.splats.backdrop == begin

@@ -138,6 +138,6 @@ def seen_db(splats, found, truth):
     values = []
     for camera, view in zip(found, truth, strict=True):
         with torch.no_grad():
-            rgb = render(splats, camera, torch.zeros(3), 3, backend="numba").rgb.numpy()
+            rgb = render(splats, camera, splats.background, 3, backend="numba").rgb.numpy()
         values.append(-10 * np.log10(np.mean((rgb.clip(0, 1) - view.image / 255) ** 2)))
     return np.mean(values)

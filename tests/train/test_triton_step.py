@@ -43,8 +43,8 @@ def exact(splats, view, gain=None):
     """Loss, leaves with their gradients, gradient of the log-gain and statistics in float64."""
     leaves = splats.map(lambda tensor: tensor.detach().double().requires_grad_())
     counting = view.counting(torch.device("cpu"))
-    out = render(leaves, view.camera, torch.zeros(3, dtype=torch.float64), DEGREE,
-                 backend="torch", scores=True, mask=counting)
+    out = render(leaves, view.camera, leaves.background, DEGREE, backend="torch", scores=True,
+                 mask=counting)
     log_gain = torch.zeros(3, dtype=torch.float64) if gain is None else (
         torch.from_numpy(gain).double().log())
     log_gain.requires_grad_()

@@ -5,10 +5,10 @@ import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.render import render
+from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.background import fibonacci_sphere
 from recon_cli.train.feature_trials import Candidate
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task

@@ -49,7 +49,8 @@ def test_the_page_draws_what_recon_renders_and_asks_nobody_else(shown, page, els
     camera = next(one.view.camera for one in shown.content.views if one.part == TRAINING)
     camera = camera.resized(192, 144)  # where the browser begins, and has its colours from
     with torch.no_grad():
-        ours = render(shown.content.models["pruned"].splats, camera, torch.zeros(3), 3).rgb
+        splats = shown.content.models["pruned"].splats
+        ours = render(splats, camera, splats.background, 3).rgb
     drawn = picture(elsewhere, page, client, camera)
     # viser cuts Gaussians off at two standard deviations and drops the faintest
     assert psnr(drawn.astype(np.float32), to_uint8(ours.numpy())) > 27
@@ -68,7 +69,7 @@ def test_a_jump_puts_the_camera_where_the_view_is_and_shows_its_photo_and_score(
     assert "000000.png (held-out), pruned: PSNR" in text
     with torch.no_grad():
         splats = shown.content.models["pruned"].splats
-        ours = render(splats, view.camera, torch.zeros(3), 3).rgb.numpy()
+        ours = render(splats, view.camera, splats.background, 3).rgb.numpy()
     expected = psnr(ours, read_image(view.original, 48, 36))
     assert float(text.split("PSNR ")[1].split(" dB")[0]) == pytest.approx(expected, abs=0.02)
     reported = until(page, lambda: np.allclose(

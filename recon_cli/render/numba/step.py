@@ -30,7 +30,6 @@ class PhotometricStep:
 
     def __init__(self) -> None:
         self._pass = ViewPass()
-        self._black = np.zeros(CHANNELS, np.float32)
         self.statistics = Statistics.zeros(torch.zeros(0, 3))  # of the last view; overwritten
         self.log_gain_gradient = np.zeros(CHANNELS)  # float64, of the last view that had a gain
 
@@ -63,7 +62,7 @@ class PhotometricStep:
         rgb = view.take("rgb", CHANNELS * pixels)
         packed = PackedSplats.of(splats.parameters().values())
         settings = RenderSettings(
-            self._black, options.sh_degree, options.scores,
+            flat(splats.background).copy(), options.sh_degree, options.scores,
             counting=target.mask if options.scores or options.loo else None)
         image = ImageBuffers(rgb, view.take("alpha", pixels), view.take("nothing", 0))
         view.forward(packed, camera, settings, image, self.statistics)

@@ -48,7 +48,7 @@ class _DeviceTarget:
 
 
 class PhotometricStep:
-    """Renders views over black, compares them with their photographs and runs the backward pass.
+    """Renders views over the backdrop, compares them with their photographs, and goes back.
 
     `graphs` None takes what suits the device, `room` None a likely number of instances at first.
     """
@@ -64,7 +64,7 @@ class PhotometricStep:
         # [1] 0 where the last view does not count: stopped, no Gaussian seen, or loss not finite
         self.counted, self._fits = (
             torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
-        self._background = torch.zeros(3, device=device)
+        self._background, self._shown = torch.zeros(3, device=device), (0.0, 0.0, 0.0)
         self._view = torch.zeros(25, dtype=torch.float64, device=device)
         self._pixels: dict[tuple[object, ...], Tensor] = {}
         # of the last view that had a gain
@@ -92,6 +92,10 @@ class PhotometricStep:
         if not self._room:
             self._room = max(_LEAST_ROOM, _FIRST_ROOM * len(splats))
         self._view.copy_(self._camera_buffer(camera))
+        color = (0.0, 0.0, 0.0) if splats.backdrop is None else splats.backdrop.color
+        if color != self._shown:  # in the same memory, which graphs read
+            self._background.copy_(torch.tensor(color))
+            self._shown = color
         photograph = self._upload(target)
         terms = TERMS[min(options.sh_degree, splats.sh_degree)]
         work = self._work(
