@@ -22,7 +22,7 @@ from recon_cli.scene.splats import Splats
 # that only grazes a Gaussian is densest far from it.
 _MOST_SIGMAS = 3.0
 # The median of what lies along a ray. Trained on a backdrop, surfaces let a seventh of it through
-# instead of a twentieth. Chosen on the room "living" and checked on "office", bench_mesh.py.
+# instead of a twentieth. Chosen on the room "living" alone, bench_mesh.py.
 _LEVEL, _LEVEL_ON_BACKDROP = 0.5, 0.6
 
 

@@ -1,5 +1,7 @@
 """The triton backend's whole step of a view, in an interpreter or on a GPU, against float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from scenes import camera_at, random_splats
 
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
+from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
@@ -76,6 +79,20 @@ def test_a_step_leaves_loss_gradients_and_statistics(mask, gain):
     assert np.linalg.norm(ours - turned) <= 1e-3 * np.linalg.norm(turned)
     if gain is not None:
         assert near(torch.from_numpy(compute.log_gain_gradient), true_gain)
+
+
+def test_a_step_on_a_backdrop_has_its_colour_and_one_after_it_is_on_black_again():
+    view = TrainView(CAMERA, photograph())
+    on_grey = replace(SEEN, backdrop=Backdrop(0.2, 0.9, 0.4, 0.0, 0.0, 0.0, 1.0))
+    compute = gradient_step("triton", DEVICE)
+    for splats in (on_grey, SEEN, on_grey):
+        optimizer = SplatOptimizer(
+            splats.map(lambda tensor: tensor.clone().to(DEVICE)), CONFIG, 1.0, backend="triton")
+        loss, _ = compute(optimizer, view, StepOptions(DEGREE, WEIGHT))
+        true_loss, leaves, _, _ = exact(splats, view)
+        assert loss == pytest.approx(true_loss, abs=LOSS_TOLERANCE)
+        for name, leaf in leaves.parameters().items():
+            assert near(optimizer.gradient(name), leaf.grad), name
 
 
 def test_a_view_that_sees_nothing_has_a_loss_and_no_gradient():
