@@ -1,14 +1,17 @@
 """The first Gaussians."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from tiny_task import CONFIG, tiny_task
 
-from recon_cli.errors import TrainingError
+from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import SH_C0
 from recon_cli.train.blank_surfaces import SurfacePoints
 from recon_cli.train.fit import fit
@@ -88,3 +91,21 @@ def test_a_run_keeps_its_backdrop_from_one_checkpoint_to_the_next(tmp_path):
     begin = state.splats.backdrop
     fit(state, task, 30)  # with densification
     assert state.splats.backdrop == begin
+
+
+@pytest.mark.parametrize("backdrop", ["absent", None, [1, 2], "grey"])
+def test_a_checkpoint_without_a_backdrop_is_on_black_and_a_damaged_one_is_refused(
+    tmp_path, backdrop
+):
+    task, path = tiny_task(replace(CONFIG, densify="budget")), tmp_path / "a.safetensors"
+    save_state(path, first_state(task, GRID, GREY, most=100))
+    with safe_open(path, framework="pt") as file:
+        scalars = json.loads(file.metadata()["state"]) | {"backdrop": backdrop}
+    if backdrop == "absent":  # as before there were any
+        del scalars["backdrop"]
+    save_file(load_file(path), path, metadata={"state": json.dumps(scalars)})
+    if backdrop in ("absent", None):
+        assert restore_state(path, task).splats.backdrop is None
+        return
+    with pytest.raises(FormatError, match="cannot be read"):
+        restore_state(path, task)
