@@ -75,11 +75,13 @@ def parts(
     ["kernels", "checks", "pictures", "gsplat", "steps", "floor", "room"]),
     help="Part to do; may be repeated.  [default: all]")
 @click.option("--minutes", default=9.0, show_default=True, help="What does not fit is left out.")
+@click.option("--cache", type=click.Path(file_okay=False, path_type=Path),
+              help="Folder of compiled kernels.  [default: a new one: compilation is timed]")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path),
               help="Write all figures as JSON.  [default: nowhere]")
 def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room: Path | None,
          steps: str, room_size: int | None, only: tuple[str, ...], minutes: float,
-         out: Path | None) -> None:
+         cache: Path | None, out: Path | None) -> None:
     """Check and measure the triton backend on DEVICE."""
     width, _, height = size.partition("x")
     whole, lengths = SceneSize(gaussians, int(width), int(height)), [
@@ -91,9 +93,9 @@ def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room
                     f"{torch.__version__}")
     figures.say(f"{gaussians:,} Gaussians of degree 3, {size}")
     clock = figures.watch(out)
-    with tempfile.TemporaryDirectory(prefix="recon-triton-") as cache:
-        # kernels of earlier runs are not found: their compilation is timed
-        os.environ["TRITON_CACHE_DIR"] = cache
+    with tempfile.TemporaryDirectory(prefix="recon-triton-") as empty:
+        # without --cache kernels of earlier runs are not found: their compilation is timed
+        os.environ["TRITON_CACHE_DIR"] = empty if cache is None else str(cache)
         for group, name, work in parts(figures, whole, rounds, stretch):
             if not only or group in only:
                 figures.part(name, lambda work=work: (clear(device), work()))

@@ -63,7 +63,9 @@ class _Render(torch.autograd.Function):
         statistics.radii = projected.radii
         lists = build_tile_lists(projected, projected.ends.int(), camera, view, instances)
         background = background.contiguous()
-        image = composite_tiles(lists, camera, background, counting, statistics if scores else None)
+        image = composite_tiles(
+            lists, camera, background, counting, statistics if scores else None,
+            keep=any(ctx.needs_input_grad))
         ctx.save_for_backward(*splats.parameters().values(), view, background)
         # the outputs themselves would hold their own graph, and with it everything here, for ever
         detached = replace(image, rgb=image.rgb.detach(), alpha=image.alpha.detach(),

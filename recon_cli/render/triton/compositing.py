@@ -8,6 +8,11 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
 
 s is zero where alpha was clamped. Every instance has a slot for its sums over the tile; slots of a
 Gaussian lie side by side and are added in order: no atomics, and the same bits every time.
+
+A long list would keep one warp busy when all others are done. So the way back goes by buckets of
+BUCKET instances, all at once: on the way forward the transmittance T and the colours C in front of
+each bucket's end are kept, and with the picture I the remainder there is R = g . (I - C) / T (Mallick
+et al. 2024, "Taming 3DGS", keep them likewise). Both passes load an instance before they need it.
 """
 
 from __future__ import annotations
@@ -36,11 +41,11 @@ T_MIN = tl.constexpr(TRANSMITTANCE_MIN)
 
 
 @triton.jit
-def log2_alpha(record, offset, column, row):
+def log2_alpha(u_x, u_y, v_y, log2_opacity, u_0, v_0, column, row):
     """Returns u, v and log2 alpha at pixels [256]: the same bits in both passes."""
-    u = tl.fma(tl.load(record), column, tl.fma(tl.load(record + 1), row, tl.load(offset)))
-    v = tl.fma(tl.load(record + 2), row, tl.load(offset + 1))
-    power = tl.fma(-v, v, tl.fma(-u, u, tl.load(record + 3)))
+    u = tl.fma(u_x, column, tl.fma(u_y, row, u_0))
+    v = tl.fma(v_y, row, v_0)
+    power = tl.fma(-v, v, tl.fma(-u, u, log2_opacity))
     return u, v, power
 
 
@@ -51,13 +56,37 @@ def alpha_of(power):
 
 
 CHUNK = 16  # instances between two looks at whether a pixel is alive
+BUCKET = 64  # instances; CHUNK divides it
+STATE = 5  # floats a pixel that are kept at the end of a bucket: T, red, green, blue, depth
+KEPT = tl.constexpr(STATE)
+
+
+@triton.jit
+def load_record(records, member, here):
+    """Returns the eight numbers of a Gaussian."""
+    record = records + member.to(tl.int64) * FLOATS
+    return (tl.load(record, mask=here, other=0.0), tl.load(record + 1, mask=here, other=0.0),
+            tl.load(record + 2, mask=here, other=0.0), tl.load(record + 3, mask=here, other=0.0),
+            tl.load(record + 4, mask=here, other=0.0), tl.load(record + 5, mask=here, other=0.0),
+            tl.load(record + 6, mask=here, other=0.0), tl.load(record + 7, mask=here, other=0.0))
+
+
+@triton.jit
+def load_offset(offsets, e, here):
+    """Returns u and v of instance e at its tile's first pixel."""
+    offset = offsets + 2 * e.to(tl.int64)
+    return tl.load(offset, mask=here, other=0.0), tl.load(offset + 1, mask=here, other=0.0)
 
 
 @triton.jit
 def composite(order, first, members, offsets, records, background, width, height, tiles_x,
-              rgb, alpha, depth, final, last, slots, counting, hits, weights, peaks,
-              SCORES: tl.constexpr, MASKED: tl.constexpr, CHUNK: tl.constexpr):
+              rgb, alpha, depth, final, last, states, bucket_tiles, slots, counting, hits, weights,
+              peaks, KEEP: tl.constexpr, SCORES: tl.constexpr, MASKED: tl.constexpr,
+              CHUNK: tl.constexpr, BUCKET: tl.constexpr):
     """Composites one tile.
+
+    Bucket k of tile t holds its instances from k BUCKET to (k + 1) BUCKET, in the numbers of all
+    instances, and has the number k + t.
 
     Args:
         order: [tiles] int32, longest list first, so that no long one is left over at the end.
@@ -66,8 +95,11 @@ def composite(order, first, members, offsets, records, background, width, height
         offsets: [E, 2] u and v at the tile's first pixel.
         records: [M, FLOATS].
         rgb: [H, W, 3] out; alpha and depth are [H, W].
-        final: [tiles, AREA] out, transmittance behind the last fragment.
-        last: [tiles, AREA] int32 out, number in the tile of the last fragment, from 1.
+        final: [tiles, AREA] out with KEEP, transmittance behind the last fragment.
+        last: [tiles, AREA] int32 out with KEEP, number in the tile of the last fragment, from 1.
+        states: [buckets, KEPT, AREA] out with KEEP, at the end of each bucket behind which the tile
+            goes on.
+        bucket_tiles: [buckets] int32 out with KEEP, the tile of each.
         slots: [E] int64, where the scores of an instance go.
         counting: [H, W] uint8, pixels that count in the scores, with MASKED.
         hits: [E] int32 out with SCORES; so are weights, the sum, and peaks, the maximum of alpha T.
@@ -79,6 +111,11 @@ def composite(order, first, members, offsets, records, background, width, height
     column, row = (pixel % SIDE).to(tl.float32), (pixel // SIDE).to(tl.float32)
     inside = (x < width) & (y < height)
     at = y * width + x
+    if KEEP:
+        bucket = begin // BUCKET + tile
+        while bucket <= end // BUCKET + tile:
+            tl.store(bucket_tiles + bucket, tile)
+            bucket += 1
     # a pixel beyond the image is stopped from the start
     T = tl.where(inside, 1.0, 0.0)
     final_T = T
@@ -88,21 +125,32 @@ def composite(order, first, members, offsets, records, background, width, height
     if MASKED:
         counts = inside & (tl.load(counting + at, mask=inside, other=0) != 0)
     e = begin
+    # the record of an instance is loaded one turn ahead, its number two
+    member = tl.load(members + e, mask=e < end, other=0)
+    n_ux, n_uy, n_vy, n_log2, n_red, n_green, n_blue, n_z = load_record(records, member, e < end)
+    n_u, n_v = load_offset(offsets, e, e < end)
+    member = tl.load(members + e + 1, mask=e + 1 < end, other=0)
     while (e < end) & (tl.max(T) >= T_MIN):
-        stop = tl.minimum(e + CHUNK, end)
+        stop = tl.minimum(e // CHUNK * CHUNK + CHUNK, end)
         while e < stop:
-            record = records + tl.load(members + e).to(tl.int64) * FLOATS
-            _, _, power = log2_alpha(record, offsets + 2 * e.to(tl.int64), column, row)
+            u_x, u_y, v_y, log2_o, u_0, v_0 = n_ux, n_uy, n_vy, n_log2, n_u, n_v
+            c_red, c_green, c_blue, c_z = n_red, n_green, n_blue, n_z
+            more = e + 1 < end
+            n_ux, n_uy, n_vy, n_log2, n_red, n_green, n_blue, n_z = load_record(
+                records, member, more)
+            n_u, n_v = load_offset(offsets, e + 1, more)
+            member = tl.load(members + e + 2, mask=e + 2 < end, other=0)
+            _, _, power = log2_alpha(u_x, u_y, v_y, log2_o, u_0, v_0, column, row)
             a = alpha_of(power)
             weight = T * a
             T = T * (1.0 - a)
             live = T >= T_MIN
             weight = tl.where(live, weight, 0.0)
             final_T = tl.where(live, T, final_T)
-            red = tl.fma(weight, tl.load(record + 4), red)
-            green = tl.fma(weight, tl.load(record + 5), green)
-            blue = tl.fma(weight, tl.load(record + 6), blue)
-            z = tl.fma(weight, tl.load(record + 7), z)
+            red = tl.fma(weight, c_red, red)
+            green = tl.fma(weight, c_green, green)
+            blue = tl.fma(weight, c_blue, blue)
+            z = tl.fma(weight, c_z, z)
             hit = weight > 0.0
             latest = tl.where(hit, e - begin + 1, latest)
             if SCORES:
@@ -112,8 +160,17 @@ def composite(order, first, members, offsets, records, background, width, height
                 tl.store(weights + slot, tl.sum(counted))
                 tl.store(peaks + slot, tl.max(counted))
             e += 1
-    tl.store(final + tile * AREA + pixel, final_T)
-    tl.store(last + tile * AREA + pixel, latest)
+        if KEEP:
+            if (e % BUCKET == 0) & (e < end):
+                state = states + (e // BUCKET - 1 + tile).to(tl.int64) * (KEPT * AREA) + pixel
+                tl.store(state, final_T)
+                tl.store(state + AREA, red)
+                tl.store(state + 2 * AREA, green)
+                tl.store(state + 3 * AREA, blue)
+                tl.store(state + 4 * AREA, z)
+    if KEEP:
+        tl.store(final + tile * AREA + pixel, final_T)
+        tl.store(last + tile * AREA + pixel, latest)
     tl.store(rgb + 3 * at, tl.fma(final_T, tl.load(background), red), mask=inside)
     tl.store(rgb + 3 * at + 1, tl.fma(final_T, tl.load(background + 1), green), mask=inside)
     tl.store(rgb + 3 * at + 2, tl.fma(final_T, tl.load(background + 2), blue), mask=inside)
@@ -145,61 +202,106 @@ def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
 
 
 @triton.jit
-def composite_backward(order, first, members, offsets, records, background, width, height, tiles_x,
-              final, last, grad_rgb, grad_alpha, grad_depth, slots, counting, sums,
-              PLAIN: tl.constexpr, DETAILS: tl.constexpr, SCORES: tl.constexpr,
-              MASKED: tl.constexpr):
-    """Sums the gradients of every instance of a tile over its pixels.
+def composite_backward(first, members, offsets, records, background, width, height, tiles_x, tiles,
+              rgb, depth, final, last, states, bucket_tiles, grad_rgb, grad_alpha, grad_depth,
+              slots, counting, sums, PLAIN: tl.constexpr, DETAILS: tl.constexpr,
+              SCORES: tl.constexpr, MASKED: tl.constexpr, BUCKET: tl.constexpr):
+    """Sums the gradients of every instance of a bucket over the pixels of its tile.
 
     The arguments are those of `composite`, and `grad_*`, dL/d(rgb, alpha, depth). With PLAIN the
     loss depends on colours alone, and the latter two are not read. Written are `sums` [E, SLOT] by
-    slot, zeros before: dL/d(red, green, blue, depth) and the sums of s times 1, u, v, uu, uv, vv;
-    with DETAILS that of s^2, and the fragments; with SCORES what leaving the instance out would
-    change, over the pixels in `counting`.
+    slot: dL/d(red, green, blue, depth) and the sums of s times 1, u, v, uu, uv, vv; with DETAILS
+    that of s^2, and the fragments; with SCORES what leaving the instance out would change, over the
+    pixels in `counting`. All are zero for an instance that no pixel reached.
     """
-    tile = tl.load(order + tl.program_id(0))
-    begin = tl.load(first + tile)
+    number = tl.program_id(0)
+    if number >= tl.load(first + tiles) // BUCKET + tiles:
+        return
+    tile = tl.load(bucket_tiles + number)
+    begin, end = tl.load(first + tile), tl.load(first + tile + 1)
+    low = tl.maximum(begin, (number - tile) * BUCKET)
+    high = tl.minimum(end, (number - tile + 1) * BUCKET)
+    if low >= high:
+        return
     pixel = tl.arange(0, AREA)
+    latest = tl.load(last + tile * AREA + pixel)
+    e = tl.minimum(high, begin + tl.max(latest))
+    if e < high:  # what no pixel reached
+        rest = tl.maximum(e, low) + tl.arange(0, BUCKET)
+        slot = tl.load(slots + rest, mask=rest < high, other=0)
+        to = sums + slot.to(tl.int64)[:, None] * SLOT + tl.arange(0, SLOT)[None, :]
+        tl.store(to, tl.zeros([BUCKET, SLOT], tl.float32), mask=(rest < high)[:, None])
+    if e <= low:
+        return
     x, y = tile % tiles_x * SIDE + pixel % SIDE, tile // tiles_x * SIDE + pixel // SIDE
     column, row = (pixel % SIDE).to(tl.float32), (pixel // SIDE).to(tl.float32)
     inside = (x < width) & (y < height)
     at = y * width + x
-    T = tl.load(final + tile * AREA + pixel)
-    latest = tl.load(last + tile * AREA + pixel)
     g_red = tl.load(grad_rgb + 3 * at, mask=inside, other=0.0)
     g_green = tl.load(grad_rgb + 3 * at + 1, mask=inside, other=0.0)
     g_blue = tl.load(grad_rgb + 3 * at + 2, mask=inside, other=0.0)
+    T = tl.load(final + tile * AREA + pixel)
+    # behind its last fragment a pixel shows the background
+    goes_on = latest > high - begin
+    behind_red, behind_green = T * 0.0 + tl.load(background), T * 0.0 + tl.load(background + 1)
+    behind_blue, behind_z = T * 0.0 + tl.load(background + 2), T * 0.0
+    absence = T * 0.0 + 1.0  # coverage is 1 - T at the end: a colour of -1 behind everything
+    if tl.max(goes_on.to(tl.int32)) > 0:
+        state = states + number.to(tl.int64) * (KEPT * AREA) + pixel
+        T_end = tl.load(state, mask=goes_on, other=1.0)
+        per_T = 1.0 / T_end
+        behind_red = tl.where(goes_on, per_T * (
+            tl.load(rgb + 3 * at, mask=goes_on, other=0.0)
+            - tl.load(state + AREA, mask=goes_on, other=0.0)), behind_red)
+        behind_green = tl.where(goes_on, per_T * (
+            tl.load(rgb + 3 * at + 1, mask=goes_on, other=0.0)
+            - tl.load(state + 2 * AREA, mask=goes_on, other=0.0)), behind_green)
+        behind_blue = tl.where(goes_on, per_T * (
+            tl.load(rgb + 3 * at + 2, mask=goes_on, other=0.0)
+            - tl.load(state + 3 * AREA, mask=goes_on, other=0.0)), behind_blue)
+        if PLAIN == 0:
+            behind_z = tl.where(goes_on, per_T * (
+                tl.load(depth + at, mask=goes_on, other=0.0)
+                - tl.load(state + 4 * AREA, mask=goes_on, other=0.0)), behind_z)
+            absence = tl.where(goes_on, per_T * T, absence)
+        T = tl.where(goes_on, T_end, T)
+    R = g_red * behind_red + g_green * behind_green + g_blue * behind_blue
     g_depth = T * 0.0
     if PLAIN == 0:
         g_depth = tl.load(grad_depth + at, mask=inside, other=0.0)
-    behind_red, behind_green = T * 0.0 + tl.load(background), T * 0.0 + tl.load(background + 1)
-    behind_blue = T * 0.0 + tl.load(background + 2)
-    # coverage is 1 - T at the end: a colour of -1 behind everything
-    R = g_red * behind_red + g_green * behind_green + g_blue * behind_blue
-    if PLAIN == 0:
-        R -= tl.load(grad_alpha + at, mask=inside, other=0.0)
+        R += g_depth * behind_z - tl.load(grad_alpha + at, mask=inside, other=0.0) * absence
     counts = inside
     if MASKED:
         counts = inside & (tl.load(counting + at, mask=inside, other=0) != 0)
-    e = begin + tl.max(latest)  # what no pixel reached stays zero
-    while e > begin:
+    # the record of an instance is loaded one turn ahead, its number two
+    member = tl.load(members + e - 1)
+    n_ux, n_uy, n_vy, n_log2, n_red, n_green, n_blue, n_z = load_record(records, member, e > low)
+    n_u, n_v = load_offset(offsets, e - 1, e > low)
+    n_slot = tl.load(slots + e - 1)
+    member = tl.load(members + e - 2, mask=e - 1 > low, other=0)
+    while e > low:
         e -= 1
-        record = records + tl.load(members + e).to(tl.int64) * FLOATS
-        u, v, power = log2_alpha(record, offsets + 2 * e.to(tl.int64), column, row)
+        u_x, u_y, v_y, log2_o, u_0, v_0 = n_ux, n_uy, n_vy, n_log2, n_u, n_v
+        red, green, blue, z, slot = n_red, n_green, n_blue, n_z, n_slot
+        more = e > low
+        n_ux, n_uy, n_vy, n_log2, n_red, n_green, n_blue, n_z = load_record(records, member, more)
+        n_u, n_v = load_offset(offsets, e - 1, more)
+        n_slot = tl.load(slots + e - 1, mask=more, other=0)
+        member = tl.load(members + e - 2, mask=e - 1 > low, other=0)
+        u, v, power = log2_alpha(u_x, u_y, v_y, log2_o, u_0, v_0, column, row)
         part = (power >= LOG2_ALPHA_MIN) & (latest > e - begin)
         a = tl.where(part, alpha_of(power), 0.0)
         T = T / (1.0 - a)
         weight = a * T
-        red, green, blue = tl.load(record + 4), tl.load(record + 5), tl.load(record + 6)
         shade = g_blue * blue
         if PLAIN == 0:
-            shade = tl.fma(g_blue, blue, g_depth * tl.load(record + 7))
+            shade = tl.fma(g_blue, blue, g_depth * z)
         shade = tl.fma(g_red, red, tl.fma(g_green, green, shade))
         slope = shade - R
         R = tl.fma(a, slope, R)
         s = tl.where(power <= LOG2_ALPHA_MAX, weight * slope, 0.0)
         su, sv = s * u, s * v
-        to = sums + tl.load(slots + e).to(tl.int64) * SLOT
+        to = sums + slot.to(tl.int64) * SLOT
         tl.store(to, tl.sum(weight * g_red))
         tl.store(to + 1, tl.sum(weight * g_green))
         tl.store(to + 2, tl.sum(weight * g_blue))

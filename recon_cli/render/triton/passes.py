@@ -14,22 +14,27 @@ from torch import Tensor
 from recon_cli.render.contract import Statistics
 from recon_cli.render.triton import projection as kernels
 from recon_cli.render.triton.compositing import (
+    BUCKET,
     CHUNK,
     PIXELS,
     RECORD,
     SIDE,
+    STATE,
     SUMS,
     composite,
     composite_backward,
     tally,
 )
-from recon_cli.render.triton.project_backward import project_backward
+from recon_cli.render.triton.project_backward import harmonics_backward, project_backward
 from recon_cli.render.triton.projection import BLOCK
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import TERMS, Splats
 
-_WARPS = 1  # a tile is one warp: no barrier in its sums
-_DEPTH_RANGE = 1 << 32  # a key is a tile times this, and the bits of a depth
+# one warp where there are sums over a tile's pixels: no barrier in them
+_SUMMING_WARPS, _WARPS = 1, 4
+# Gaussians a program that walks along their instances: the one with the most keeps all waiting
+NARROW = 32
+_NUMBERS = 512  # of sh_rest a program
 _LAST_KEY = (1 << 63) - 1  # sorts behind all others
 
 
@@ -76,8 +81,11 @@ class CompositedImage:
     rgb: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
     depth: Tensor  # [H, W]
-    final: Tensor  # [tiles, PIXELS] transmittance behind the last fragment
-    last: Tensor  # [tiles, PIXELS] int32, number in the tile of the last fragment, from 1
+    # what the way back needs, empty where none was wanted; see `compositing.composite`
+    final: Tensor  # [tiles, PIXELS]
+    last: Tensor  # [tiles, PIXELS] int32
+    states: Tensor  # [buckets, STATE, PIXELS]
+    bucket_tiles: Tensor  # [buckets] int32
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,7 @@ class BackwardOptions:
     plain: bool = False  # the loss depends on colours alone
     details: bool = True  # variance is wanted
     loo: bool = False
+    harmonics: bool = True  # without, the gradient of sh_rest is left as it is
 
 
 def project_splats(source: ViewInput) -> ProjectedSplats:
@@ -134,9 +143,9 @@ def list_instances(
     keys = torch.full((room,), _LAST_KEY, dtype=torch.int64, device=device)
     owners = torch.empty(room, dtype=torch.int32, device=device)
     if n and room:
-        kernels.list_tiles[(triton.cdiv(n, BLOCK),)](
+        kernels.list_tiles[(triton.cdiv(n, NARROW),)](
             projected.shapes, projected.centers, projected.depths, starts, view, n, tiles_x, keys,
-            owners, BLOCK=BLOCK)
+            owners, BLOCK=NARROW, num_warps=1)
     return keys, owners
 
 
@@ -163,38 +172,46 @@ def place_instances(
 
 def tile_ranges(keys: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
     """Returns first and order of `TileLists`, by keys in order."""
-    numbers = torch.arange(tiles + 1, device=keys.device)
-    first = torch.searchsorted(keys, numbers * _DEPTH_RANGE).int()
+    first = torch.empty(tiles + 1, dtype=torch.int32, device=keys.device)
+    kernels.tile_starts[(triton.cdiv(len(keys) + 1, BLOCK),)](
+        keys, len(keys), tiles, first, BLOCK=BLOCK)
     return first, torch.argsort(first[1:] - first[:-1], descending=True, stable=True).int()
 
 
 def composite_tiles(
     lists: TileLists, camera: Camera, background: Tensor, counting: Tensor | None,
-    scores: Statistics | None,
+    scores: Statistics | None, *, keep: bool,
 ) -> CompositedImage:
     """Composites all tiles, for the size of `camera`.
 
     `background` [3] is contiguous; `counting` [H, W] uint8 are the pixels that count in the scores,
-    None where all do; `scores` gets hits, blend_sum and blend_max.
+    None where all do; `scores` gets hits, blend_sum and blend_max. `keep` what
+    `composite_tiles_backward` needs.
     """
     like, height, width = lists.records, camera.height, camera.width
     rgb, alpha, depth = (like.new_empty(height, width, 3), like.new_empty(height, width),
                          like.new_empty(height, width))
-    final = like.new_empty(len(lists.order), PIXELS)
-    last = torch.empty(len(lists.order), PIXELS, dtype=torch.int32, device=like.device)
+    tiles = len(lists.order)
+    buckets = len(lists.members) // BUCKET + tiles if keep else 0
+    final = like.new_empty(tiles if keep else 0, PIXELS)
+    last = torch.empty(final.shape, dtype=torch.int32, device=like.device)
+    states = like.new_empty(buckets, STATE, PIXELS)
+    bucket_tiles = torch.empty(buckets, dtype=torch.int32, device=like.device)
     # zeros: an instance that a tile leaves out is never counted
     tallied = [like.new_zeros(len(lists.members) if scores else 0, dtype=kind)
                for kind in (torch.int32, torch.float32, torch.float32)]
-    composite[(len(lists.order),)](
+    composite[(tiles,)](
         lists.order, lists.first, lists.members, lists.offsets, lists.records, background,
-        width, height, lists.tiles_x, rgb, alpha, depth, final, last, lists.slots, counting,
-        *tallied, SCORES=scores is not None, MASKED=counting is not None, CHUNK=CHUNK,
-        num_warps=_WARPS)
+        width, height, lists.tiles_x, rgb, alpha, depth, final, last, states, bucket_tiles,
+        lists.slots, counting, *tallied, KEEP=keep, SCORES=scores is not None,
+        MASKED=counting is not None, CHUNK=CHUNK, BUCKET=BUCKET,
+        num_warps=_WARPS if scores is None else _SUMMING_WARPS)
     n = len(lists.records)
     if scores and n:
-        tally[(triton.cdiv(n, BLOCK),)](
-            lists.starts, *tallied, n, scores.hits, scores.blend_sum, scores.blend_max, BLOCK=BLOCK)
-    return CompositedImage(rgb, alpha, depth, final, last)
+        tally[(triton.cdiv(n, NARROW),)](
+            lists.starts, *tallied, n, scores.hits, scores.blend_sum, scores.blend_max,
+            BLOCK=NARROW, num_warps=1)
+    return CompositedImage(rgb, alpha, depth, final, last, states, bucket_tiles)
 
 
 def composite_tiles_backward(
@@ -208,12 +225,13 @@ def composite_tiles_backward(
     `options.plain`.
     """
     height, width = image.alpha.shape
-    sums = lists.records.new_zeros(len(lists.members), SUMS)
-    composite_backward[(len(lists.order),)](
-        lists.order, lists.first, lists.members, lists.offsets, lists.records, background,
-        width, height, lists.tiles_x, image.final, image.last, grad_rgb, grad_alpha,
-        grad_depth, lists.slots, counting, sums, PLAIN=options.plain, DETAILS=options.details,
-        SCORES=options.loo, MASKED=counting is not None, num_warps=_WARPS)
+    sums = lists.records.new_empty(len(lists.members), SUMS)
+    composite_backward[(len(image.bucket_tiles),)](
+        lists.first, lists.members, lists.offsets, lists.records, background, width, height,
+        lists.tiles_x, len(lists.order), image.rgb, image.depth, image.final, image.last,
+        image.states, image.bucket_tiles, grad_rgb, grad_alpha, grad_depth, lists.slots, counting,
+        sums, PLAIN=options.plain, DETAILS=options.details, SCORES=options.loo,
+        MASKED=counting is not None, BUCKET=BUCKET, num_warps=_SUMMING_WARPS)
     return sums
 
 
@@ -226,12 +244,18 @@ def project_splats_backward(
     The arguments are those of the passes before. sh_rest of `gradients` is left alone at degree 0.
     Where `counted` [1] int32 is zero, all is written as zero; None always counts.
     """
-    splats, n = source.splats, len(source.splats)
-    if n:
-        project_backward[(triton.cdiv(n, BLOCK),)](
-            splats.means, splats.quats, splats.log_scales, splats.logit_opacities, splats.sh_rest,
-            source.view, n, len(splats.sh_rest), lists.records, lists.starts, sums, counted,
-            *gradients.parameters().values(), statistics.means2d_grad,
-            statistics.variance, statistics.loo, STRIDE=3 * TERMS[splats.sh_degree],
-            TERMS=source.terms, GATED=counted is not None, PLAIN=options.plain,
-            DETAILS=options.details, SCORES=options.loo, BLOCK=BLOCK)
+    splats, n, stride = source.splats, len(source.splats), 3 * TERMS[source.splats.sh_degree]
+    if not n:
+        return
+    *others, sh_rest = gradients.parameters().values()
+    directions = splats.means.new_empty(n if source.terms else 0, 3)
+    project_backward[(triton.cdiv(n, NARROW),)](
+        splats.means, splats.quats, splats.log_scales, splats.logit_opacities, splats.sh_rest,
+        source.view, n, len(splats.sh_rest), lists.records, lists.starts, sums, counted,
+        *others, directions, statistics.means2d_grad, statistics.variance, statistics.loo,
+        STRIDE=stride, TERMS=source.terms, GATED=counted is not None, PLAIN=options.plain,
+        DETAILS=options.details, SCORES=options.loo, BLOCK=NARROW, num_warps=1)
+    if options.harmonics and source.terms and len(sh_rest):
+        harmonics_backward[(triton.cdiv(sh_rest.numel(), _NUMBERS),)](
+            directions, gradients.sh_dc, sh_rest.numel(), sh_rest, STRIDE=stride,
+            TERMS=source.terms, BLOCK=_NUMBERS)

@@ -40,14 +40,14 @@ WHITE = tl.constexpr(1.0 / UNIT.value)  # u and v hold sqrt(log2(e) / 2)
 @triton.jit(do_not_specialize=("count", "colored"))
 def project_backward(means, quats, log_scales, logits, sh_rest, view, count, colored, records,
                      starts, sums, counted, g_means, g_quats, g_log_scales, g_logits, g_sh_dc,
-                     g_sh_rest, means2d_grad, variance, loo, STRIDE: tl.constexpr,
+                     directions, means2d_grad, variance, loo, STRIDE: tl.constexpr,
                      TERMS: tl.constexpr, GATED: tl.constexpr, PLAIN: tl.constexpr,
                      DETAILS: tl.constexpr, SCORES: tl.constexpr, BLOCK: tl.constexpr):
-    """Writes the gradients of all Gaussians, zero for those that no pixel shows.
+    """Writes the gradients of all Gaussians but that of sh_rest, zero for those no pixel shows.
 
-    `sums` [E, SLOT] are of `compositing.composite_backward`. Written are the gradients `g_*`
-    (g_sh_rest not at degree 0) and the statistics, see `contract.Statistics`: variance
-    with DETAILS, loo with SCORES. With GATED all are zero where `counted` [1] int32 is.
+    `sums` [E, SLOT] are of `compositing.composite_backward`. Written are the gradients `g_*`, with
+    TERMS the directions [N, 3] from the camera, and the statistics, see `contract.Statistics`:
+    variance with DETAILS, loo with SCORES. With GATED all are zero where `counted` [1] int32 is.
     With PLAIN `sums` hold nothing of depths.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -91,12 +91,10 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
     if TERMS > 0:
         x, y, z, per_length = direction(means, view, i, drawn)
         has, row = drawn & (i < colored), STRIDE * i
-        writes = here & (i < colored)
+        tl.store(directions + 3 * i, x, mask=here)
+        tl.store(directions + 3 * i + 1, y, mask=here)
+        tl.store(directions + 3 * i + 2, z, mask=here)
         for k in tl.static_range(TERMS):
-            value = basis(k, x, y, z)
-            tl.store(g_sh_rest + row + 3 * k, value * red, mask=writes)
-            tl.store(g_sh_rest + row + 3 * k + 1, value * green, mask=writes)
-            tl.store(g_sh_rest + row + 3 * k + 2, value * blue, mask=writes)
             pull = (red * tl.load(sh_rest + row + 3 * k, mask=has, other=0.0)
                     + green * tl.load(sh_rest + row + 3 * k + 1, mask=has, other=0.0)
                     + blue * tl.load(sh_rest + row + 3 * k + 2, mask=has, other=0.0))
@@ -104,8 +102,6 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
             pull_x += pull * to_x
             pull_y += pull * to_y
             pull_z += pull * to_z
-        for k in tl.static_range(3 * TERMS, STRIDE):  # degrees that are not in use
-            tl.store(g_sh_rest + row + k, zero, mask=writes)
         along = pull_x * x + pull_y * y + pull_z * z  # the direction has length 1
         pull_x = (pull_x - along * x) * per_length
         pull_y = (pull_y - along * y) * per_length
@@ -191,3 +187,26 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
              pull_y + number(view, 1) * d_u + number(view, 4) * d_v + m21 * d_z, mask=here)
     tl.store(g_means + 3 * i + 2,
              pull_z + number(view, 2) * d_u + number(view, 5) * d_v + m22 * d_z, mask=here)
+
+
+@triton.jit(do_not_specialize=("count",))
+def harmonics_backward(directions, g_sh_dc, count, g_sh_rest, STRIDE: tl.constexpr,
+                       TERMS: tl.constexpr, BLOCK: tl.constexpr):
+    """Writes the gradient of sh_rest, `count` numbers in rows of STRIDE, one number a lane.
+
+    A lane for each Gaussian would write rows side by side, in 32 places of memory at once.
+    `directions` and `g_sh_dc` are of `project_backward`.
+    """
+    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = at < count
+    i, place = at // STRIDE, (at % STRIDE).to(tl.int32)
+    used = here & (place < 3 * TERMS)
+    term = place // 3
+    x = tl.load(directions + 3 * i, mask=used, other=0.0)
+    y = tl.load(directions + 3 * i + 1, mask=used, other=0.0)
+    z = tl.load(directions + 3 * i + 2, mask=used, other=0.0)
+    by_color = tl.load(g_sh_dc + 3 * i + place % 3, mask=used, other=0.0) * (1.0 / C0)
+    value = x * 0.0
+    for k in tl.static_range(TERMS):
+        value = tl.where(term == k, basis(k, x, y, z), value)
+    tl.store(g_sh_rest + at, value * by_color, mask=here)

@@ -243,3 +243,20 @@ def place(keys, slots, owners, centers, records, starts, count, tiles_x, members
     tl.store(members + e, owner, mask=here)
     tl.store(offsets + 2 * e, u.to(tl.float32), mask=here)
     tl.store(offsets + 2 * e + 1, (v_y.to(tl.float64) * dy).to(tl.float32), mask=here)
+
+
+@triton.jit(do_not_specialize=("count", "tiles"))
+def tile_starts(keys, count, tiles, first, BLOCK: tl.constexpr):
+    """Writes where the instances of each tile begin, `first` [tiles + 1] int32.
+
+    `keys` [count] int64 are sorted; behind those of the last tile may be greater ones.
+    """
+    e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    key = tl.load(keys + e, mask=e < count, other=0)
+    before = tl.load(keys + e - 1, mask=(e > 0) & (e <= count), other=0)
+    last = tl.where(e < count, tl.minimum((key >> 32).to(tl.int32), tiles), tiles)
+    tile = tl.where(e > 0, tl.minimum((before >> 32).to(tl.int32), tiles) + 1, 0)
+    last = tl.where(e <= count, last, tile - 1)
+    while tl.max(last - tile) >= 0:
+        tl.store(first + tile, e.to(tl.int32), mask=tile <= last)
+        tile += 1

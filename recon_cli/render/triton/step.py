@@ -10,8 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render.contract import Statistics, StepOptions, TargetImage
@@ -36,6 +39,7 @@ _LEAST_ROOM = 1 << 10
 _SPARE = 1.5  # times the most that was needed so far
 _FULL = 0.8  # of the room, from which more is made before it runs out
 _CAMERAS = 4096  # whose buffers stay on the device
+_PHOTOGRAPHS = 0.125  # of its memory, for photographs that stay there
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,9 @@ class PhotometricStep:
         self._background, self._shown = torch.zeros(3, device=device), (0.0, 0.0, 0.0)
         self._view = torch.zeros(25, dtype=torch.float64, device=device)
         self._pixels: dict[tuple[object, ...], Tensor] = {}
+        self._photographs: dict[int, tuple[NDArray[Any], Tensor]] = {}
+        self._room_for_photographs = 0 if device.type == "cpu" else int(
+            _PHOTOGRAPHS * torch.cuda.get_device_properties(device).total_memory)
         # of the last view that had a gain
         self.log_gain_gradient = torch.zeros(3, dtype=torch.float64, device=device)
 
@@ -81,7 +88,7 @@ class PhotometricStep:
 
         Args:
             splats: N Gaussians, float32, contiguous; in the same memory from call to call.
-            gradients: of the same shapes; sh_rest is left alone at degree 0.
+            gradients: of the same shapes; sh_rest is left alone at degree 0 and without `harmonics`.
             camera: of the view.
             target: the photograph, in memory from which the device can read.
             options: scores count even where the loss is not finite.
@@ -104,7 +111,7 @@ class PhotometricStep:
                   for tensor in parameters.parameters().values())
         key = (*places, len(splats), splats.sh_rest.shape, camera.width, camera.height,
                target.mask is None, options.sh_degree, options.ssim_weight, options.details,
-               self._room)
+               options.harmonics, self._room)
         if target.gain is None and not options.scores and not options.loo:
             self._graphs.run(key, work)
         else:
@@ -135,20 +142,34 @@ class PhotometricStep:
         return known[1]
 
     def _upload(self, target: TargetImage) -> _DeviceTarget:
-        mask = None if target.mask is None else torch.from_numpy(target.mask).view(torch.uint8)
+        mask = target.mask
         return _DeviceTarget(
-            self._copy_to_device("pixels", torch.from_numpy(target.pixels)),
+            self._copy_to_device("pixels", target.pixels),
             None if mask is None else self._copy_to_device("mask", mask),
             None if target.gain is None else torch.from_numpy(target.gain).to(self._view.device))
 
-    def _copy_to_device(self, name: str, source: Tensor) -> Tensor:
-        """Returns the device's own copy of a host tensor, in the same memory each time."""
+    def _copy_to_device(self, name: str, source: NDArray[Any]) -> Tensor:
+        """Returns the device's own copy of a host array, in the same memory each time."""
         key = (name, *source.shape)
         if key not in self._pixels:
             self._pixels[key] = torch.empty(
-                source.shape, dtype=source.dtype, device=self._view.device)
-        self._pixels[key].copy_(source, non_blocking=True)
+                source.shape, dtype=torch.uint8, device=self._view.device)
+        self._pixels[key].copy_(self._photograph(source), non_blocking=True)
         return self._pixels[key]
+
+    def _photograph(self, source: NDArray[Any]) -> Tensor:
+        """Returns an array on the device, where it stays, or on the host if there is no room."""
+        known = self._photographs.get(id(source))
+        if known is not None and known[0] is source:
+            return known[1]
+        tensor = torch.from_numpy(source.view(np.uint8))
+        if source.nbytes > self._room_for_photographs:
+            return tensor
+        self._room_for_photographs -= source.nbytes
+        tensor = tensor.to(self._view.device, non_blocking=True)
+        # with the array itself: its id is its own as long as it lives
+        self._photographs[id(source)] = source, tensor
+        return tensor
 
     def _work(
         self, source: ViewInput, gradients: Splats, camera: Camera, target: _DeviceTarget,
@@ -156,14 +177,16 @@ class PhotometricStep:
     ) -> Callable[[], None]:
         """Returns the work on a view of this size, which reads what differs from view to view."""
         room, statistics = self._room, self.statistics
-        backward = BackwardOptions(plain=True, details=options.details, loo=options.loo)
+        backward = BackwardOptions(
+            plain=True, details=options.details, loo=options.loo, harmonics=options.harmonics)
         scores = statistics if options.scores else None
 
         def work() -> None:
             projected = project_splats(source)
             starts = admit_step(projected.ends, room, self.status, self._fits)
             lists = build_tile_lists(projected, starts, camera, self._view, room)
-            image = composite_tiles(lists, camera, self._background, target.mask, scores)
+            image = composite_tiles(
+                lists, camera, self._background, target.mask, scores, keep=True)
             rgb = image.rgb if target.gain is None else image.rgb * target.gain
             loss, grad_rgb = loss_and_gradient(rgb, target.pixels, options.ssim_weight, target.mask)
             if target.gain is not None:
