@@ -68,11 +68,11 @@ class Statistics:
     def zeros(like: Tensor) -> Statistics:
         """Returns empty statistics for the N Gaussians whose means are `like`, [N, 3]."""
         n = like.shape[0]
+        zeros = like.new_zeros(7, n)  # at once: on a GPU each of them would be a launch
         return Statistics(
-            radii=like.new_zeros(n), hits=like.new_zeros(n, dtype=torch.int64),
-            blend_sum=like.new_zeros(n), blend_max=like.new_zeros(n),
-            means2d_grad=like.new_zeros(n, 2), variance=like.new_zeros(n),
-            loo=like.new_zeros(n))
+            radii=zeros[0], hits=like.new_zeros(n, dtype=torch.int64), blend_sum=zeros[1],
+            blend_max=zeros[2], means2d_grad=zeros[3:5].view(n, 2), variance=zeros[5],
+            loo=zeros[6])
 
 
 @dataclass(frozen=True, eq=False)

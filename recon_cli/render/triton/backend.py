@@ -54,6 +54,7 @@ class _Render(torch.autograd.Function):
         ctx: Any, background: Tensor, camera: Camera, terms: int, scores: bool,
         counting: Tensor | None, statistics: Statistics, *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.set_materialize_grads(False)  # a loss of colours alone takes less
         splats = Splats(*(tensor.contiguous() for tensor in tensors))
         view = camera_buffer(camera, background.device)
         projected = project_splats(ViewInput(splats, view, terms))
@@ -75,17 +76,23 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def backward(
-        ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor, grad_depth: Tensor
+        ctx: Any, grad_rgb: Tensor | None, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         *tensors, view, background = ctx.saved_tensors
         lists, image, statistics, terms, scores, counting = ctx.rest
-        splats, options = Splats(*tensors), BackwardOptions(loo=scores)
-        grad_rgb = grad_rgb.contiguous()
+        splats, plain = Splats(*tensors), grad_alpha is None and grad_depth is None
+        options = BackwardOptions(plain=plain, loo=scores)
+        grad_rgb = torch.zeros_like(image.rgb) if grad_rgb is None else grad_rgb.contiguous()
+        if not plain:
+            grad_alpha, grad_depth = (
+                torch.zeros_like(image.alpha) if gradient is None else gradient.contiguous()
+                for gradient in (grad_alpha, grad_depth))
         sums = composite_tiles_backward(
-            lists, image, background, counting, options, grad_rgb, grad_alpha.contiguous(),
-            grad_depth.contiguous())
+            lists, image, background, counting, options, grad_rgb, grad_alpha, grad_depth)
         gradients = splats.map(torch.empty_like)
         project_splats_backward(
             ViewInput(splats, view, terms), lists, sums, options, gradients, statistics)
-        grad_background = (grad_rgb * (1 - image.alpha)[..., None]).sum((0, 1))
+        grad_background = None
+        if ctx.needs_input_grad[0]:
+            grad_background = (grad_rgb * (1 - image.alpha)[..., None]).sum((0, 1))
         return (grad_background, None, None, None, None, None, *gradients.parameters().values())

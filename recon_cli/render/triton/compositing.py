@@ -57,7 +57,7 @@ def alpha_of(power):
 
 CHUNK = 16  # instances between two looks at whether a pixel is alive
 BUCKET = 64  # instances; CHUNK divides it
-STATE = 5  # floats a pixel that are kept at the end of a bucket: T, red, green, blue, depth
+STATE = 5  # floats a pixel kept at the end of a bucket: T, red, green, blue, depth
 KEPT = tl.constexpr(STATE)
 
 
@@ -81,8 +81,8 @@ def load_offset(offsets, e, here):
 @triton.jit
 def composite(order, first, members, offsets, records, background, width, height, tiles_x,
               rgb, alpha, depth, final, last, states, bucket_tiles, slots, counting, hits, weights,
-              peaks, KEEP: tl.constexpr, SCORES: tl.constexpr, MASKED: tl.constexpr,
-              CHUNK: tl.constexpr, BUCKET: tl.constexpr):
+              peaks, KEEP: tl.constexpr, PLAIN: tl.constexpr, SCORES: tl.constexpr,
+              MASKED: tl.constexpr, CHUNK: tl.constexpr, BUCKET: tl.constexpr):
     """Composites one tile.
 
     Bucket k of tile t holds its instances from k BUCKET to (k + 1) BUCKET, in the numbers of all
@@ -94,10 +94,10 @@ def composite(order, first, members, offsets, records, background, width, height
         members: [E] int32, Gaussian of each instance, by tile and depth.
         offsets: [E, 2] u and v at the tile's first pixel.
         records: [M, FLOATS].
-        rgb: [H, W, 3] out; alpha and depth are [H, W].
+        rgb: [H, W, 3] out; alpha and depth are [H, W], not written with PLAIN.
         final: [tiles, AREA] out with KEEP, transmittance behind the last fragment.
         last: [tiles, AREA] int32 out with KEEP, number in the tile of the last fragment, from 1.
-        states: [buckets, KEPT, AREA] out with KEEP, at the end of each bucket behind which the tile
+        states: [buckets, KEPT, AREA], with PLAIN one less, out with KEEP, at the end of each bucket behind which the tile
             goes on.
         bucket_tiles: [buckets] int32 out with KEEP, the tile of each.
         slots: [E] int64, where the scores of an instance go.
@@ -150,7 +150,8 @@ def composite(order, first, members, offsets, records, background, width, height
             red = tl.fma(weight, c_red, red)
             green = tl.fma(weight, c_green, green)
             blue = tl.fma(weight, c_blue, blue)
-            z = tl.fma(weight, c_z, z)
+            if PLAIN == 0:
+                z = tl.fma(weight, c_z, z)
             hit = weight > 0.0
             latest = tl.where(hit, e - begin + 1, latest)
             if SCORES:
@@ -162,20 +163,23 @@ def composite(order, first, members, offsets, records, background, width, height
             e += 1
         if KEEP:
             if (e % BUCKET == 0) & (e < end):
-                state = states + (e // BUCKET - 1 + tile).to(tl.int64) * (KEPT * AREA) + pixel
+                ended = (e // BUCKET - 1 + tile).to(tl.int64)
+                state = states + ended * ((KEPT - PLAIN) * AREA) + pixel
                 tl.store(state, final_T)
                 tl.store(state + AREA, red)
                 tl.store(state + 2 * AREA, green)
                 tl.store(state + 3 * AREA, blue)
-                tl.store(state + 4 * AREA, z)
+                if PLAIN == 0:
+                    tl.store(state + 4 * AREA, z)
     if KEEP:
         tl.store(final + tile * AREA + pixel, final_T)
         tl.store(last + tile * AREA + pixel, latest)
     tl.store(rgb + 3 * at, tl.fma(final_T, tl.load(background), red), mask=inside)
     tl.store(rgb + 3 * at + 1, tl.fma(final_T, tl.load(background + 1), green), mask=inside)
     tl.store(rgb + 3 * at + 2, tl.fma(final_T, tl.load(background + 2), blue), mask=inside)
-    tl.store(alpha + at, 1.0 - final_T, mask=inside)
-    tl.store(depth + at, z, mask=inside)
+    if PLAIN == 0:
+        tl.store(alpha + at, 1.0 - final_T, mask=inside)
+        tl.store(depth + at, z, mask=inside)
 
 
 @triton.jit(do_not_specialize=("count",))
@@ -204,12 +208,12 @@ def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
 @triton.jit
 def composite_backward(first, members, offsets, records, background, width, height, tiles_x, tiles,
               rgb, depth, final, last, states, bucket_tiles, grad_rgb, grad_alpha, grad_depth,
-              slots, counting, sums, PLAIN: tl.constexpr, DETAILS: tl.constexpr,
+              slots, counting, sums, PLANES: tl.constexpr, PLAIN: tl.constexpr, DETAILS: tl.constexpr,
               SCORES: tl.constexpr, MASKED: tl.constexpr, BUCKET: tl.constexpr):
     """Sums the gradients of every instance of a bucket over the pixels of its tile.
 
-    The arguments are those of `composite`, and `grad_*`, dL/d(rgb, alpha, depth). With PLAIN the
-    loss depends on colours alone, and the latter two are not read. Written are `sums` [E, SLOT] by
+    The arguments are those of `composite`, `states` with PLANES, and `grad_*`, dL/d(rgb, alpha,
+    depth). With PLAIN the loss depends on colours alone, and the latter two are not read. Written are `sums` [E, SLOT] by
     slot: dL/d(red, green, blue, depth) and the sums of s times 1, u, v, uu, uv, vv; with DETAILS
     that of s^2, and the fragments; with SCORES what leaving the instance out would change, over the
     pixels in `counting`. All are zero for an instance that no pixel reached.
@@ -247,7 +251,7 @@ def composite_backward(first, members, offsets, records, background, width, heig
     behind_blue, behind_z = T * 0.0 + tl.load(background + 2), T * 0.0
     absence = T * 0.0 + 1.0  # coverage is 1 - T at the end: a colour of -1 behind everything
     if tl.max(goes_on.to(tl.int32)) > 0:
-        state = states + number.to(tl.int64) * (KEPT * AREA) + pixel
+        state = states + number.to(tl.int64) * (PLANES * AREA) + pixel
         T_end = tl.load(state, mask=goes_on, other=1.0)
         per_T = 1.0 / T_end
         behind_red = tl.where(goes_on, per_T * (

@@ -10,6 +10,7 @@ comes from the cache.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
@@ -37,12 +38,12 @@ C30, C31, C32, C33, C34 = (tl.constexpr(c) for c in (
 def camera_buffer(camera: Camera, device: torch.device) -> Tensor:
     """Returns a camera as the numbers [25] that kernels read; the copy waits for nothing."""
     margin_x, margin_y = _MARGIN * camera.width / camera.fx, _MARGIN * camera.height / camera.fy
-    numbers = torch.tensor([
-        *camera.viewmat[:3, :3].ravel(), *camera.viewmat[:3, 3],
-        camera.fx, camera.fy, camera.cx, camera.cy,
-        -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x,
-        -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y,
-        *camera.center, camera.width, camera.height], dtype=torch.float64)
+    numbers = torch.from_numpy(np.concatenate([
+        camera.viewmat[:3, :3].ravel(), camera.viewmat[:3, 3],
+        [camera.fx, camera.fy, camera.cx, camera.cy,
+         -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x,
+         -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y],
+        camera.center, [camera.width, camera.height]]).astype(np.float64))
     if device.type == "cuda":
         numbers = numbers.pin_memory()
     return numbers.to(device, non_blocking=True)

@@ -1,8 +1,8 @@
-"""(1 - w) L1 + w (1 - SSIM) and its gradient in four kernels (Kerbl et al. 2023, eq. 7).
+"""(1 - w) L1 + w (1 - SSIM) and its gradient in five kernels (Kerbl et al. 2023, eq. 7).
 
 SSIM as in `train.gradient`: 11 taps, sigma 1.5, zeros beyond the border, mean over pixels and
 channels (Wang et al. 2004, eq. 13). The window is separable: two kernels go along rows, two down
-columns. Each program sums its own part, and torch adds the parts.
+columns. Each program sums its own part, and one adds the parts.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ _SIGMA, _RADIUS = 1.5, 5
 _WINDOW = [math.exp(-0.5 * (shift / _SIGMA) ** 2) for shift in range(_RADIUS + 1)]
 _TOTAL = _WINDOW[0] + 2 * sum(_WINDOW[1:])
 _BLOCK = 256  # numbers a program
+_PARTS = 1024  # sums that one program adds at once
 RADIUS = tl.constexpr(_RADIUS)
 W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight / _TOTAL) for weight in _WINDOW)
 C1, C2 = tl.constexpr(0.01**2), tl.constexpr(0.03**2)  # for images in [0, 1]
@@ -152,6 +153,29 @@ def gradient_of(image, truth, mask, maps, width, count, by_error, by_ssim, gradi
     tl.store(parts + tl.program_id(0), tl.sum(tl.where(here, tl.abs(error), 0.0)))
 
 
+@triton.jit(do_not_specialize=("programs", "count"))
+def total_loss(similar, wrong, programs, count, ssim_weight, loss, SSIM: tl.constexpr,
+               BLOCK: tl.constexpr):
+    """Writes the loss, float64, from the sums of `programs` parts of an image of `count` numbers.
+
+    `similar` and `wrong` [programs] are those of `similarity` and `gradient_of`.
+    """
+    lane = tl.arange(0, BLOCK)
+    error, alike = lane.to(tl.float64) * 0, lane.to(tl.float64) * 0
+    start = 0
+    while start < programs:
+        here = start + lane < programs
+        error += tl.load(wrong + start + lane, mask=here, other=0.0).to(tl.float64)
+        if SSIM:
+            alike += tl.load(similar + start + lane, mask=here, other=0.0).to(tl.float64)
+        start += BLOCK
+    value = tl.sum(error) / count
+    if SSIM:
+        weight = tl.full([], ssim_weight, tl.float64)
+        value = (1.0 - weight) * value + weight * (1.0 - tl.sum(alike) / count)
+    tl.store(loss, value)
+
+
 def loss_and_gradient(
     image: Tensor, truth: Tensor, ssim_weight: float, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
@@ -163,7 +187,7 @@ def loss_and_gradient(
     count, width = image.numel(), image.shape[1]
     grid = (triton.cdiv(count, _BLOCK),)
     maps, slopes = image.new_empty(5 * count), image.new_empty(3 * count)
-    similar, wrong = image.new_zeros(grid), image.new_empty(grid)
+    similar, wrong = image.new_empty(grid), image.new_empty(grid)
     gradient, masked = torch.empty_like(image), mask is not None
     if ssim_weight > 0:
         blur_products[grid](image, truth, mask, width, count, maps, MASKED=masked, BLOCK=_BLOCK)
@@ -172,8 +196,7 @@ def loss_and_gradient(
     gradient_of[grid](
         image, truth, mask, maps, width, count, (1 - ssim_weight) / count, -ssim_weight / count,
         gradient, wrong, MASKED=masked, SSIM=ssim_weight > 0, BLOCK=_BLOCK)
-    error = wrong.double().sum() / count
-    if ssim_weight == 0:
-        return error, gradient
-    similarity_mean = similar.double().sum() / count
-    return (1 - ssim_weight) * error + ssim_weight * (1 - similarity_mean), gradient
+    loss = torch.empty((), dtype=torch.float64, device=image.device)
+    total_loss[(1,)](
+        similar, wrong, grid[0], count, ssim_weight, loss, SSIM=ssim_weight > 0, BLOCK=_PARTS)
+    return loss, gradient

@@ -34,7 +34,7 @@ from recon_cli.scene.splats import TERMS, Splats
 _SUMMING_WARPS, _WARPS = 1, 4
 # Gaussians a program that walks along their instances: the one with the most keeps all waiting
 NARROW = 32
-_NUMBERS = 512  # of sh_rest a program
+_COEFFICIENTS = 256  # of sh_rest a program
 _LAST_KEY = (1 << 63) - 1  # sorts behind all others
 
 
@@ -180,22 +180,22 @@ def tile_ranges(keys: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
 
 def composite_tiles(
     lists: TileLists, camera: Camera, background: Tensor, counting: Tensor | None,
-    scores: Statistics | None, *, keep: bool,
+    scores: Statistics | None, *, keep: bool, plain: bool = False,
 ) -> CompositedImage:
     """Composites all tiles, for the size of `camera`.
 
     `background` [3] is contiguous; `counting` [H, W] uint8 are the pixels that count in the scores,
     None where all do; `scores` gets hits, blend_sum and blend_max. `keep` what
-    `composite_tiles_backward` needs.
+    `composite_tiles_backward` needs; with `plain` colours are all that is composited.
     """
     like, height, width = lists.records, camera.height, camera.width
-    rgb, alpha, depth = (like.new_empty(height, width, 3), like.new_empty(height, width),
-                         like.new_empty(height, width))
+    rgb = like.new_empty(height, width, 3)
+    alpha, depth = (like.new_empty(0 if plain else height, width) for _ in range(2))
     tiles = len(lists.order)
     buckets = len(lists.members) // BUCKET + tiles if keep else 0
     final = like.new_empty(tiles if keep else 0, PIXELS)
     last = torch.empty(final.shape, dtype=torch.int32, device=like.device)
-    states = like.new_empty(buckets, STATE, PIXELS)
+    states = like.new_empty(buckets, STATE - plain, PIXELS)
     bucket_tiles = torch.empty(buckets, dtype=torch.int32, device=like.device)
     # zeros: an instance that a tile leaves out is never counted
     tallied = [like.new_zeros(len(lists.members) if scores else 0, dtype=kind)
@@ -203,7 +203,7 @@ def composite_tiles(
     composite[(tiles,)](
         lists.order, lists.first, lists.members, lists.offsets, lists.records, background,
         width, height, lists.tiles_x, rgb, alpha, depth, final, last, states, bucket_tiles,
-        lists.slots, counting, *tallied, KEEP=keep, SCORES=scores is not None,
+        lists.slots, counting, *tallied, KEEP=keep, PLAIN=plain, SCORES=scores is not None,
         MASKED=counting is not None, CHUNK=CHUNK, BUCKET=BUCKET,
         num_warps=_WARPS if scores is None else _SUMMING_WARPS)
     n = len(lists.records)
@@ -222,15 +222,16 @@ def composite_tiles_backward(
     """Returns the sums [E, SUMS] of every instance, see `compositing.composite_backward`.
 
     The gradients [H, W, 3] and [H, W] are contiguous; the last two may be None with
-    `options.plain`.
+    `options.plain`, which `image` need not be.
     """
-    height, width = image.alpha.shape
+    height, width, _ = image.rgb.shape
     sums = lists.records.new_empty(len(lists.members), SUMS)
     composite_backward[(len(image.bucket_tiles),)](
         lists.first, lists.members, lists.offsets, lists.records, background, width, height,
         lists.tiles_x, len(lists.order), image.rgb, image.depth, image.final, image.last,
         image.states, image.bucket_tiles, grad_rgb, grad_alpha, grad_depth, lists.slots, counting,
-        sums, PLAIN=options.plain, DETAILS=options.details, SCORES=options.loo,
+        sums, PLANES=image.states.shape[1],
+        PLAIN=options.plain, DETAILS=options.details, SCORES=options.loo,
         MASKED=counting is not None, BUCKET=BUCKET, num_warps=_SUMMING_WARPS)
     return sums
 
@@ -256,6 +257,7 @@ def project_splats_backward(
         STRIDE=stride, TERMS=source.terms, GATED=counted is not None, PLAIN=options.plain,
         DETAILS=options.details, SCORES=options.loo, BLOCK=NARROW, num_warps=1)
     if options.harmonics and source.terms and len(sh_rest):
-        harmonics_backward[(triton.cdiv(sh_rest.numel(), _NUMBERS),)](
-            directions, gradients.sh_dc, sh_rest.numel(), sh_rest, STRIDE=stride,
-            TERMS=source.terms, BLOCK=_NUMBERS)
+        coefficients = sh_rest.numel() // 3
+        harmonics_backward[(triton.cdiv(coefficients, _COEFFICIENTS),)](
+            directions, gradients.sh_dc, coefficients, sh_rest, STRIDE=stride, TERMS=source.terms,
+            BLOCK=_COEFFICIENTS)

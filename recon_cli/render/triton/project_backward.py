@@ -37,6 +37,42 @@ AT_ONCE = tl.constexpr(4)  # slots; a Gaussian as large as the image has thousan
 WHITE = tl.constexpr(1.0 / UNIT.value)  # u and v hold sqrt(log2(e) / 2)
 
 
+@triton.jit
+def sums_of(starts, sums, count, counted, GATED: tl.constexpr, PLAIN: tl.constexpr,
+            DETAILS: tl.constexpr, SCORES: tl.constexpr, BLOCK: tl.constexpr):
+    """Returns the sums [BLOCK, SLOT] over the slots of each Gaussian, in order.
+
+    Four lanes read a slot, side by side: one lane would go to memory once for each number.
+    """
+    i = (tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK))[:, None]
+    slot = tl.load(starts + i, mask=i < count, other=0)
+    end = tl.load(starts + i + 1, mask=i < count, other=0)
+    if GATED:
+        end = tl.where(tl.load(counted) != 0, end, slot)
+    column = tl.arange(0, SLOT)[None, :]
+    used = column < 10
+    if PLAIN:
+        used = used & (column != 3)
+    if DETAILS:
+        used = used | (column == 10) | (column == 11)
+    if SCORES:
+        used = used | (column == 12)
+    total = tl.zeros([BLOCK, SLOT], tl.float32)
+    while tl.max(end - slot) > 0:
+        # several at once: their loads wait together
+        for _ in tl.static_range(AT_ONCE):
+            total += tl.load(sums + slot.to(tl.int64) * SLOT + column, mask=(slot < end) & used,
+                             other=0.0)
+            slot += 1
+    return total
+
+
+@triton.jit
+def part(total, place: tl.constexpr):
+    """Returns a column [BLOCK] of [BLOCK, SLOT]."""
+    return tl.sum(tl.where(tl.arange(0, SLOT)[None, :] == place, total, 0.0), 1)
+
+
 @triton.jit(do_not_specialize=("count", "colored"))
 def project_backward(means, quats, log_scales, logits, sh_rest, view, count, colored, records,
                      starts, sums, counted, g_means, g_quats, g_log_scales, g_logits, g_sh_dc,
@@ -56,30 +92,11 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
     if GATED:
         end = tl.where(tl.load(counted) != 0, end, slot)
     drawn = slot < end
-    zero = slot.to(tl.float32) * 0.0
-    red, green, blue, depth, s, s_u, s_v = zero, zero, zero, zero, zero, zero, zero
-    s_uu, s_uv, s_vv, squared, hits, left_out = zero, zero, zero, zero, zero, zero
-    while tl.max(end - slot) > 0:
-        # several at once: their loads wait together, and the order of the sums stays
-        for _ in tl.static_range(AT_ONCE):
-            more, at = slot < end, sums + slot.to(tl.int64) * SLOT
-            red += tl.load(at, mask=more, other=0.0)
-            green += tl.load(at + 1, mask=more, other=0.0)
-            blue += tl.load(at + 2, mask=more, other=0.0)
-            if PLAIN == 0:
-                depth += tl.load(at + 3, mask=more, other=0.0)
-            s += tl.load(at + 4, mask=more, other=0.0)
-            s_u += tl.load(at + 5, mask=more, other=0.0)
-            s_v += tl.load(at + 6, mask=more, other=0.0)
-            s_uu += tl.load(at + 7, mask=more, other=0.0)
-            s_uv += tl.load(at + 8, mask=more, other=0.0)
-            s_vv += tl.load(at + 9, mask=more, other=0.0)
-            if DETAILS:
-                squared += tl.load(at + 10, mask=more, other=0.0)
-                hits += tl.load(at + 11, mask=more, other=0.0)
-            if SCORES:
-                left_out += tl.load(at + 12, mask=more, other=0.0)
-            slot += 1
+    total = sums_of(starts, sums, count, counted, GATED, PLAIN, DETAILS, SCORES, BLOCK)
+    red, green, blue, depth = part(total, 0), part(total, 1), part(total, 2), part(total, 3)
+    s, s_u, s_v = part(total, 4), part(total, 5), part(total, 6)
+    s_uu, s_uv, s_vv = part(total, 7), part(total, 8), part(total, 9)
+    zero = s * 0.0
     record = records + i * FLOATS
     red = tl.where(tl.load(record + 4, mask=drawn, other=0.0) > 0.0, red, 0.0)
     green = tl.where(tl.load(record + 5, mask=drawn, other=0.0) > 0.0, green, 0.0)
@@ -117,10 +134,11 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
     tl.store(means2d_grad + 2 * i, d_x, mask=here)
     tl.store(means2d_grad + 2 * i + 1, d_y, mask=here)
     if DETAILS:
-        total = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
-        tl.store(variance + i, tl.maximum(total, 0.0).to(tl.float32), mask=here)
+        squared, hits = part(total, 10), part(total, 11)
+        spread = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
+        tl.store(variance + i, tl.maximum(spread, 0.0).to(tl.float32), mask=here)
     if SCORES:
-        tl.store(loo + i, left_out, mask=here)
+        tl.store(loo + i, part(total, 12), mask=here)
     odds = tl.exp2(tl.minimum(-tl.load(logits + i, mask=drawn, other=0.0) * LOG2E, 126.0))
     tl.store(g_logits + i, s * (odds / (1.0 + odds)), mask=here)  # o dL/do (1 - o)
 
@@ -192,21 +210,23 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
 @triton.jit(do_not_specialize=("count",))
 def harmonics_backward(directions, g_sh_dc, count, g_sh_rest, STRIDE: tl.constexpr,
                        TERMS: tl.constexpr, BLOCK: tl.constexpr):
-    """Writes the gradient of sh_rest, `count` numbers in rows of STRIDE, one number a lane.
+    """Writes the gradient of sh_rest, a coefficient of the three channels a lane.
 
-    A lane for each Gaussian would write rows side by side, in 32 places of memory at once.
-    `directions` and `g_sh_dc` are of `project_backward`.
+    There are `count` of them, STRIDE / 3 in a row. A lane for each Gaussian would write rows side
+    by side, in 32 places of memory at once. `directions` and `g_sh_dc` are of `project_backward`.
     """
-    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = at < count
-    i, place = at // STRIDE, (at % STRIDE).to(tl.int32)
-    used = here & (place < 3 * TERMS)
-    term = place // 3
+    i, term = at // (STRIDE // 3), at % (STRIDE // 3)
+    used = here & (term < TERMS)
     x = tl.load(directions + 3 * i, mask=used, other=0.0)
     y = tl.load(directions + 3 * i + 1, mask=used, other=0.0)
     z = tl.load(directions + 3 * i + 2, mask=used, other=0.0)
-    by_color = tl.load(g_sh_dc + 3 * i + place % 3, mask=used, other=0.0) * (1.0 / C0)
     value = x * 0.0
     for k in tl.static_range(TERMS):
         value = tl.where(term == k, basis(k, x, y, z), value)
-    tl.store(g_sh_rest + at, value * by_color, mask=here)
+    value *= 1.0 / C0
+    to = g_sh_rest + 3 * at.to(tl.int64)
+    tl.store(to, value * tl.load(g_sh_dc + 3 * i, mask=used, other=0.0), mask=here)
+    tl.store(to + 1, value * tl.load(g_sh_dc + 3 * i + 1, mask=used, other=0.0), mask=here)
+    tl.store(to + 2, value * tl.load(g_sh_dc + 3 * i + 2, mask=used, other=0.0), mask=here)

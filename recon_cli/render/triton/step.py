@@ -186,7 +186,8 @@ class PhotometricStep:
             starts = admit_step(projected.ends, room, self.status, self._fits)
             lists = build_tile_lists(projected, starts, camera, self._view, room)
             image = composite_tiles(
-                lists, camera, self._background, target.mask, scores, keep=True)
+                lists, camera, self._background, target.mask, scores, keep=True,
+                plain=True)
             rgb = image.rgb if target.gain is None else image.rgb * target.gain
             loss, grad_rgb = loss_and_gradient(rgb, target.pixels, options.ssim_weight, target.mask)
             if target.gain is not None:
