@@ -82,8 +82,7 @@ class RenderOutput:
     rgb: Tensor  # [H, W, 3] over the background, not clamped
     alpha: Tensor  # [H, W] coverage, 1 minus the final transmittance
     depth: Tensor  # [H, W] sum of alpha T z, world units; over alpha it is the expected depth
-    # Without `scores=True` hits, blend weights and loo stay zero, and with the torch backend
-    # variance too.
+    # Without `scores=True` hits, blend weights and loo stay zero, and but with numba variance too.
     statistics: Statistics
 
 

@@ -81,7 +81,7 @@ class _Render(torch.autograd.Function):
         *tensors, view, background = ctx.saved_tensors
         lists, image, statistics, terms, scores, counting = ctx.rest
         splats, plain = Splats(*tensors), grad_alpha is None and grad_depth is None
-        options = BackwardOptions(plain=plain, loo=scores)
+        options = BackwardOptions(plain=plain, details=scores, loo=scores)
         grad_rgb = torch.zeros_like(image.rgb) if grad_rgb is None else grad_rgb.contiguous()
         if not plain:
             grad_alpha, grad_depth = (

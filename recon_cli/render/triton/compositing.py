@@ -11,8 +11,9 @@ Gaussian lie side by side and are added in order: no atomics, and the same bits 
 
 A long list would keep one warp busy when all others are done. So the way back goes by buckets of
 BUCKET instances, all at once: on the way forward the transmittance T and the colours C in front of
-each bucket's end are kept, and with the picture I the remainder there is R = g . (I - C) / T (Mallick
-et al. 2024, "Taming 3DGS", keep them likewise). Both passes load an instance before they need it.
+each bucket's end are kept, and with the picture I the remainder there is R = g . (I - C) / T
+(Mallick et al. 2024, "Taming 3DGS", keep them likewise). Both passes load an instance before they
+need it.
 """
 
 from __future__ import annotations
@@ -79,10 +80,12 @@ def load_offset(offsets, e, here):
 
 
 @triton.jit
-def composite(order, first, members, offsets, records, background, width, height, tiles_x,
-              rgb, alpha, depth, final, last, states, bucket_tiles, slots, counting, hits, weights,
-              peaks, KEEP: tl.constexpr, PLAIN: tl.constexpr, SCORES: tl.constexpr,
-              MASKED: tl.constexpr, CHUNK: tl.constexpr, BUCKET: tl.constexpr):
+def composite(
+    order, first, members, offsets, records, background, width, height, tiles_x, rgb, alpha, depth,
+    final, last, states, bucket_tiles, slots, counting, hits, weights, peaks, KEEP: tl.constexpr,
+    PLAIN: tl.constexpr, SCORES: tl.constexpr, MASKED: tl.constexpr, CHUNK: tl.constexpr,
+    BUCKET: tl.constexpr,
+):
     """Composites one tile.
 
     Bucket k of tile t holds its instances from k BUCKET to (k + 1) BUCKET, in the numbers of all
@@ -161,7 +164,7 @@ def composite(order, first, members, offsets, records, background, width, height
                 tl.store(weights + slot, tl.sum(counted))
                 tl.store(peaks + slot, tl.max(counted))
             e += 1
-        if KEEP:
+        if KEEP:  # noqa: SIM102  # known when it is compiled, the next one is not
             if (e % BUCKET == 0) & (e < end):
                 ended = (e // BUCKET - 1 + tile).to(tl.int64)
                 state = states + ended * ((KEPT - PLAIN) * AREA) + pixel
@@ -206,10 +209,12 @@ def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
 
 
 @triton.jit
-def composite_backward(first, members, offsets, records, background, width, height, tiles_x, tiles,
-              rgb, depth, final, last, states, bucket_tiles, grad_rgb, grad_alpha, grad_depth,
-              slots, counting, sums, PLANES: tl.constexpr, PLAIN: tl.constexpr, DETAILS: tl.constexpr,
-              SCORES: tl.constexpr, MASKED: tl.constexpr, BUCKET: tl.constexpr):
+def composite_backward(
+    first, members, offsets, records, background, width, height, tiles_x, tiles, rgb, depth, final,
+    last, states, bucket_tiles, grad_rgb, grad_alpha, grad_depth, slots, counting, sums,
+    PLANES: tl.constexpr, PLAIN: tl.constexpr, DETAILS: tl.constexpr, SCORES: tl.constexpr,
+    MASKED: tl.constexpr, BUCKET: tl.constexpr,
+):
     """Sums the gradients of every instance of a bucket over the pixels of its tile.
 
     The arguments are those of `composite`, `states` with PLANES, and `grad_*`, dL/d(rgb, alpha,

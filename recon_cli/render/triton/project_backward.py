@@ -96,6 +96,10 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
     red, green, blue, depth = part(total, 0), part(total, 1), part(total, 2), part(total, 3)
     s, s_u, s_v = part(total, 4), part(total, 5), part(total, 6)
     s_uu, s_uv, s_vv = part(total, 7), part(total, 8), part(total, 9)
+    if DETAILS:
+        squared, hits = part(total, 10), part(total, 11)
+    if SCORES:
+        left_out = part(total, 12)
     zero = s * 0.0
     record = records + i * FLOATS
     red = tl.where(tl.load(record + 4, mask=drawn, other=0.0) > 0.0, red, 0.0)
@@ -134,11 +138,10 @@ def project_backward(means, quats, log_scales, logits, sh_rest, view, count, col
     tl.store(means2d_grad + 2 * i, d_x, mask=here)
     tl.store(means2d_grad + 2 * i + 1, d_y, mask=here)
     if DETAILS:
-        squared, hits = part(total, 10), part(total, 11)
         spread = squared.to(tl.float64) - s.to(tl.float64) * s / tl.maximum(hits, 1.0)
         tl.store(variance + i, tl.maximum(spread, 0.0).to(tl.float32), mask=here)
     if SCORES:
-        tl.store(loo + i, part(total, 12), mask=here)
+        tl.store(loo + i, left_out, mask=here)
     odds = tl.exp2(tl.minimum(-tl.load(logits + i, mask=drawn, other=0.0) * LOG2E, 126.0))
     tl.store(g_logits + i, s * (odds / (1.0 + odds)), mask=here)  # o dL/do (1 - o)
 

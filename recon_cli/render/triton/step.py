@@ -88,7 +88,8 @@ class PhotometricStep:
 
         Args:
             splats: N Gaussians, float32, contiguous; in the same memory from call to call.
-            gradients: of the same shapes; sh_rest is left alone at degree 0 and without `harmonics`.
+            gradients: of the same shapes; sh_rest is left alone at degree 0 and without
+                `harmonics`.
             camera: of the view.
             target: the photograph, in memory from which the device can read.
             options: scores count even where the loss is not finite.
