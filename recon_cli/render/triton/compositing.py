@@ -100,8 +100,8 @@ def composite(
         rgb: [H, W, 3] out; alpha and depth are [H, W], not written with PLAIN.
         final: [tiles, AREA] out with KEEP, transmittance behind the last fragment.
         last: [tiles, AREA] int32 out with KEEP, number in the tile of the last fragment, from 1.
-        states: [buckets, KEPT, AREA], with PLAIN one less, out with KEEP, at the end of each bucket behind which the tile
-            goes on.
+        states: [buckets, KEPT, AREA], with PLAIN one less, out with KEEP, at the end of each bucket
+            behind which the tile goes on.
         bucket_tiles: [buckets] int32 out with KEEP, the tile of each.
         slots: [E] int64, where the scores of an instance go.
         counting: [H, W] uint8, pixels that count in the scores, with MASKED.
@@ -218,10 +218,10 @@ def composite_backward(
     """Sums the gradients of every instance of a bucket over the pixels of its tile.
 
     The arguments are those of `composite`, `states` with PLANES, and `grad_*`, dL/d(rgb, alpha,
-    depth). With PLAIN the loss depends on colours alone, and the latter two are not read. Written are `sums` [E, SLOT] by
-    slot: dL/d(red, green, blue, depth) and the sums of s times 1, u, v, uu, uv, vv; with DETAILS
-    that of s^2, and the fragments; with SCORES what leaving the instance out would change, over the
-    pixels in `counting`. All are zero for an instance that no pixel reached.
+    depth). With PLAIN the loss depends on colours alone, and the latter two are not read. Written
+    are `sums` [E, SLOT] by slot: dL/d(red, green, blue, depth) and the sums of s times 1, u, v, uu,
+    uv, vv; with DETAILS that of s^2, and the fragments; with SCORES what leaving the instance out
+    would change, over the pixels in `counting`. All are zero where no pixel reached the instance.
     """
     number = tl.program_id(0)
     if number >= tl.load(first + tiles) // BUCKET + tiles:
