@@ -42,6 +42,9 @@ class Approximation:
 EXACT = Approximation()
 
 
+_ALIGNED = 64  # numbers: kernels are compiled anew for addresses that are aligned otherwise
+
+
 @dataclass(eq=False)
 class Statistics:
     """What densification and pruning need, gathered by the same passes that render.
@@ -68,11 +71,13 @@ class Statistics:
     def zeros(like: Tensor) -> Statistics:
         """Returns empty statistics for the N Gaussians whose means are `like`, [N, 3]."""
         n = like.shape[0]
-        zeros = like.new_zeros(7, n)  # at once: on a GPU each of them would be a launch
+        step = -(-n // _ALIGNED) * _ALIGNED
+        zeros = like.new_zeros(7 * step)  # at once: on a GPU each of them would be a launch
+        rows = [zeros[k * step:k * step + n] for k in range(7)]
         return Statistics(
-            radii=zeros[0], hits=like.new_zeros(n, dtype=torch.int64), blend_sum=zeros[1],
-            blend_max=zeros[2], means2d_grad=zeros[3:5].view(n, 2), variance=zeros[5],
-            loo=zeros[6])
+            radii=rows[0], hits=like.new_zeros(n, dtype=torch.int64), blend_sum=rows[1],
+            blend_max=rows[2], variance=rows[3], loo=rows[4],
+            means2d_grad=zeros[5 * step:5 * step + 2 * n].view(n, 2))
 
 
 @dataclass(frozen=True, eq=False)

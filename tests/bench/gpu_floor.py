@@ -12,16 +12,17 @@ E instances, T tiles, P pixels and Q pairs of a Gaussian and a pixel:
     sort                8 E read; key and slot (12 bytes) of E written
     place               16 E + 28 S read, 12 E written
     tile ranges         8 E read, 8 T written
-    composite           12 E + 32 S read; 20 bytes a pixel, 8 of each pixel of a tile written;
+    composite           12 E + 32 S read; 12 bytes a pixel, 8 of each pixel of a tile written;
                         31 operations a pair
     loss                15 P read, 12 P written; (216 + 144) operations a number of the picture
-    decompose           16 E + 32 S + 12 P + 8 of each pixel of a tile read; 36 E written, nine
+    composite backward  16 E + 32 S + 12 P + 8 of each pixel of a tile read; 36 E written, nine
                         sums; 49 operations a pair
-    unproject           36 E + 4 N + 268 S read, 244 N written
+    project backward    36 E + 4 N + 268 S read, 244 N written
     adam                28 bytes for each of 59 numbers: four are read, three written
 
 Q counts all 256 pixels of a tile for every instance up to the last one that any of them shows: what
-anybody must look at who composites by tiles. How many of these pairs contribute is told beside.
+anybody must look at who composites by tiles. What the forward pass keeps for the way back is no
+part of the floor. How many of these pairs contribute is told beside.
 Operations are counted as for CPUs (docs/bench.md, docs/rasterizer.md), a multiply-add as two; where
 only bytes stand above, operations are fewer. Three of four steps leave the harmonics as they are
 and take a fourth of adam's time.
@@ -96,13 +97,13 @@ STAGES = {
     "tile ranges": Stage(((passes, "tile_ranges"),), lambda c: 8 * c.E + 8 * c.T),
     "composite": Stage(
         ((triton_step, "composite_tiles"),),
-        lambda c: 12 * c.E + 32 * c.S + 20 * c.P + 8 * _AREA * c.T, lambda c: 31 * c.Q),
+        lambda c: 12 * c.E + 32 * c.S + 12 * c.P + 8 * _AREA * c.T, lambda c: 31 * c.Q),
     "loss": Stage(
         ((triton_step, "loss_and_gradient"),), lambda c: 27 * c.P, lambda c: 3 * 360 * c.P),
-    "decompose": Stage(
+    "composite backward": Stage(
         ((triton_step, "composite_tiles_backward"),),
         lambda c: 52 * c.E + 32 * c.S + 12 * c.P + 8 * _AREA * c.T, lambda c: 49 * c.Q),
-    "unproject": Stage(
+    "project backward": Stage(
         ((triton_step, "project_splats_backward"),), lambda c: 36 * c.E + 248 * c.N + 268 * c.S),
     "adam": Stage((), lambda c: 28 * 59 * c.N),
 }

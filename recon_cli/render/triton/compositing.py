@@ -79,7 +79,7 @@ def load_offset(offsets, e, here):
     return tl.load(offset, mask=here, other=0.0), tl.load(offset + 1, mask=here, other=0.0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("width", "height", "tiles_x"))
 def composite(
     order, first, members, offsets, records, background, width, height, tiles_x, rgb, alpha, depth,
     final, last, states, bucket_tiles, slots, counting, hits, weights, peaks, KEEP: tl.constexpr,
@@ -208,7 +208,7 @@ def tally(starts, hits, weights, peaks, count, total_hits, blend_sum, blend_max,
     tl.store(blend_max + j, peak, mask=here)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=("width", "height", "tiles_x", "tiles"))
 def composite_backward(
     first, members, offsets, records, background, width, height, tiles_x, tiles, rgb, depth, final,
     last, states, bucket_tiles, grad_rgb, grad_alpha, grad_depth, slots, counting, sums,

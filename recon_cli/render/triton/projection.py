@@ -180,7 +180,7 @@ def span(extent_x, extent_y, slope_y, slope_x, half, center_x, center_y, row, vi
     return first, tl.where(meets, last, first - 1)
 
 
-@triton.jit(do_not_specialize=("count",))
+@triton.jit(do_not_specialize=("count", "tiles_x"))
 def list_tiles(shapes, centers, depths, starts, view, count, tiles_x, keys, owners,
                BLOCK: tl.constexpr):
     """Writes the instances of each Gaussian into its slots.
@@ -218,7 +218,7 @@ def list_tiles(shapes, centers, depths, starts, view, count, tiles_x, keys, owne
         row += 1
 
 
-@triton.jit(do_not_specialize=("count",))
+@triton.jit(do_not_specialize=("count", "tiles_x"))
 def place(keys, slots, owners, centers, records, starts, count, tiles_x, members, offsets,
           BLOCK: tl.constexpr):
     """Writes what compositing reads of each instance, in the order of compositing.
