@@ -1,4 +1,4 @@
-"""Compiles the kernels for this CPU in a process beside the stages that come before training."""
+"""Compiles the kernels for this CPU or GPU in a process beside the stages before training."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from pathlib import Path
 from recon_cli import machine
 from recon_cli.pipeline.execute import Job
 
-_SOURCES = Path(__file__).parents[1] / "render" / "numba"
+_SOURCES = Path(__file__).parents[1] / "render"
+_DRIVER = Path("/proc/driver/nvidia/version")  # of an NVIDIA GPU
 _KILL_SECONDS = 10.0
 _LOG_TAIL = 2000  # characters
 
@@ -49,24 +50,32 @@ def compile_ahead(job: Job, stages: Sequence[str], *, again: bool) -> Iterator[N
                              log.read().decode(errors="replace")[-_LOG_TAIL:])
 
 
-def _compiled_since_installed() -> bool:
-    """Returns whether kernels were compiled after their sources and numba were installed.
+def _needs_kernels(backend: str, device: str) -> bool:
+    """Returns whether kernels were not compiled since their sources and compiler were installed.
 
-    A hint, for numba alone, whose import takes a second, knows what it is going to compile: where
-    it misleads, kernels are compiled when they are needed.
+    A hint: only torch, whose import takes a second, knows whether it can use the GPU. Where the
+    hint misleads, kernels are compiled when they are needed.
     """
-    numba = importlib.util.find_spec("numba")
-    sources = [*_SOURCES.glob("*.py"), *([Path(numba.origin)] if numba and numba.origin else [])]
-    installed = max(path.stat().st_ctime for path in sources)
-    return any(mark.stat().st_mtime > installed
-               for mark in (machine.cache_root() / "kernels").glob("*/ready"))
+    gpu = device != "cpu" and backend in ("auto", "triton") and _DRIVER.exists()
+    cpu = device != "cuda" and backend in ("auto", "numba")
+    if not gpu and not cpu:
+        return False
+    checked = gpu and _made_since_installed("self-check/triton-*.json", "triton")
+    return not (checked or (cpu and _made_since_installed("kernels/*/ready", "numba")))
+
+
+def _made_since_installed(marks: str, package: str) -> bool:
+    """Returns whether one of the marks in the cache is newer than a backend's package."""
+    found = importlib.util.find_spec(package)
+    sources = [*(_SOURCES / package).glob("*.py")]
+    sources += [Path(found.origin)] if found and found.origin else []
+    installed = max((path.stat().st_ctime for path in sources), default=0.0)
+    return any(mark.stat().st_mtime > installed for mark in machine.cache_root().glob(marks))
 
 
 def _waits(job: Job, stages: Sequence[str], *, again: bool) -> bool:
     """Returns whether the first stage that renders must wait for others."""
-    if job.compute.backend not in ("auto", "numba") or job.compute.device == "cuda":
-        return False
-    if _compiled_since_installed():
+    if not _needs_kernels(job.compute.backend, job.compute.device):
         return False
     first = next((row for row in job.table if row.renders and row.name in stages), None)
     if first is None:

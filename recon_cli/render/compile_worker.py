@@ -14,10 +14,16 @@ from recon_cli.render import registry
 
 
 def compile_kernels(backend: str, device: str) -> None:
-    """Compiles the kernels that these options, `auto` or a name, will take, if there are any."""
-    if registry.renders_on_cpu(backend, device) and registry.kernels_to_compile("numba"):
-        registry.use_threads("numba", 1)
-        registry.prepare("numba", lambda: None)
+    """Compiles the kernels that these options, `auto` or a name, will take, if there are any.
+
+    Those for a GPU are compiled by their self-check, whose verdict is kept.
+    """
+    if registry.renders_on_cpu(backend, device):
+        if registry.kernels_to_compile("numba"):
+            registry.use_threads("numba", 1)
+            registry.prepare("numba", lambda: None)
+    elif backend in ("auto", "triton") and device != "cpu":
+        registry.cuda_verdict()
 
 
 def main() -> None:

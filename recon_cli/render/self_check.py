@@ -208,17 +208,22 @@ def _compare(candidate: Candidate, splats: Splats, camera: Camera) -> Iterator[t
 def _compare_steps(
     candidate: Candidate, splats: Splats, camera: Camera
 ) -> Iterator[tuple[str, float]]:
-    """Yields the comparisons of a plain training step, and of one with a mask and a gain."""
+    """Yields the comparisons of plain training steps of each degree, and of one with all else.
+
+    A run begins at degree 0: kernels of all degrees are compiled by now.
+    """
     rng, shape = np.random.default_rng(2), (camera.height, camera.width)
     pixels = rng.integers(0, 256, (*shape, 3), np.uint8)
     masked = TargetImage(pixels, rng.random(shape) < 0.7, np.array([0.8, 1.1, 1.3], np.float32))
     scores = StepOptions(_DEGREE, _SSIM_WEIGHT, details=True, scores=True, loo=True)
     for label, target, options in (
         ("step", TargetImage(pixels), StepOptions(_DEGREE, _SSIM_WEIGHT)),
+        *((f"step of degree {degree}", TargetImage(pixels), StepOptions(degree, _SSIM_WEIGHT))
+          for degree in range(_DEGREE)),
         ("masked step", masked, scores),
     ):
         result = candidate.train_step(splats, camera, target, options)
-        loss, gradients = _reference_step(splats, camera, target)
+        loss, gradients = _reference_step(splats, camera, target, options.sh_degree)
         yield f"loss of a {label}", abs(result.loss - loss) / _LOSS
         for name, value in result.gradients.parameters().items():
             yield (f"gradient of {name} in a {label}",
@@ -249,11 +254,13 @@ def _render_backward(render: Renderer, splats: Splats, camera: Camera) -> dict[s
         "broken": output.statistics.radii.new_tensor([float(output.statistics.broken > 0)])}
 
 
-def _reference_step(splats: Splats, camera: Camera, target: TargetImage) -> tuple[float, Splats]:
+def _reference_step(
+    splats: Splats, camera: Camera, target: TargetImage, degree: int
+) -> tuple[float, Splats]:
     """Returns the loss (1 - w) L1 + w (1 - SSIM) and its gradients in float64, by autograd."""
     leaves = splats.map(lambda tensor: tensor.double().requires_grad_())
     device = splats.means.device
-    rgb = torch_render(leaves, camera, leaves.means.new_zeros(3), _DEGREE, False).rgb
+    rgb = torch_render(leaves, camera, leaves.means.new_zeros(3), degree, False).rgb
     truth = torch.from_numpy(target.pixels).to(device).double() / 255
     if target.gain is not None:
         rgb = rgb * torch.from_numpy(target.gain).to(device).double()
@@ -272,7 +279,8 @@ def _reference_step(splats: Splats, camera: Camera, target: TargetImage) -> tupl
     ssim = ((2 * x * y + 1e-4) * (2 * (product - x * y) + 9e-4)
             / ((x * x + y * y + 1e-4) * (square - x * x - y * y + 9e-4)))
     loss = (1 - _SSIM_WEIGHT) * (rgb - truth).abs().mean() + _SSIM_WEIGHT * (1 - ssim.mean())
-    gradients = torch.autograd.grad(loss, list(leaves.parameters().values()))
+    gradients = torch.autograd.grad(
+        loss, list(leaves.parameters().values()), materialize_grads=True)
     return float(loss.detach()), Splats(*gradients)
 
 

@@ -96,7 +96,8 @@ def test_a_failure_goes_to_the_log_and_not_to_the_terminal(tmp_path, worker, cap
     (["ingest", "denoise", "sfm"], [], False, {}, False),
     (["ingest", "train"], [], False, {"backend": "numba", "device": "cpu"}, True),
     (["ingest", "train"], [], False, {"backend": "torch"}, False),
-    (["ingest", "train"], [], False, {"device": "cuda"}, False)])
+    (["ingest", "train"], [], False, {"device": "cuda"}, False),  # no driver of a GPU
+    (["ingest", "train"], [], False, {"backend": "triton"}, False)])
 def test_a_process_starts_only_where_stages_that_render_wait_for_others(
         tmp_path, stages, finished, again, compute, beside):
     for name in finished:
@@ -106,19 +107,34 @@ def test_a_process_starts_only_where_stages_that_render_wait_for_others(
                          compute.get("device", "auto")]] * beside
 
 
+@pytest.mark.parametrize(("backend", "device", "beside"), [
+    ("auto", "auto", True), ("auto", "cuda", True), ("triton", "auto", True),
+    ("auto", "cpu", True), ("numba", "cuda", False), ("torch", "cuda", False)])
+def test_with_a_driver_of_a_gpu_its_kernels_are_compiled_too(
+        tmp_path, monkeypatch, backend, device, beside):
+    driver = tmp_path / "version"
+    driver.touch()
+    monkeypatch.setattr(compile_ahead, "_DRIVER", driver)
+    assert bool(starts(tmp_path, ["ingest", "train"], backend=backend, device=device)) is beside
+
+
+@pytest.mark.parametrize(("mark", "package"), [
+    ("kernels/0123/ready", "numba"), ("self-check/triton-0123.json", "triton")])
 @pytest.mark.parametrize(("age", "beside"), [(-100, False), (100, True)])
-def test_kernels_of_an_earlier_installation_do_not_count(tmp_path, monkeypatch, age, beside):
-    sources = tmp_path / "sources"
-    sources.mkdir()
-    (sources / "kernel.py").touch()
-    monkeypatch.setattr(compile_ahead, "_SOURCES", sources)
+def test_kernels_of_an_earlier_installation_do_not_count(
+        tmp_path, monkeypatch, mark, package, age, beside):
+    source = tmp_path / "sources" / package / "kernel.py"
+    source.parent.mkdir(parents=True)
+    source.touch()
+    monkeypatch.setattr(compile_ahead, "_SOURCES", tmp_path / "sources")
+    monkeypatch.setattr(compile_ahead, "_DRIVER", source)
     monkeypatch.setattr(compile_ahead.importlib.util, "find_spec", lambda _: None)
-    mark = tmp_path / "cache" / "kernels" / "0123" / "ready"
+    mark = tmp_path / "cache" / mark
     mark.parent.mkdir(parents=True)
     mark.touch()
-    installed = (sources / "kernel.py").stat().st_ctime
+    installed = source.stat().st_ctime
     os.utime(mark, (installed - age, installed - age))
-    assert bool(starts(tmp_path, ["ingest", "train"])) is beside
+    assert bool(starts(tmp_path, ["ingest", "train"], backend=package)) is beside
 
 
 def starts(folder, stages, *, again=False, **compute):
@@ -151,9 +167,10 @@ def starts(folder, stages, *, again=False, **compute):
 
 
 @pytest.mark.parametrize(("backend", "device", "cuda", "compiles"), [
-    ("auto", "auto", False, True), ("auto", "auto", True, False), ("auto", "cpu", True, True),
-    ("numba", "cpu", True, True), ("torch", "cpu", False, False),
-    ("triton", "auto", False, False), ("auto", "cuda", True, False)])
+    ("auto", "auto", False, "numba"), ("auto", "auto", True, "triton"),
+    ("auto", "cpu", True, "numba"), ("numba", "cpu", True, "numba"), ("torch", "cpu", False, None),
+    ("torch", "cuda", True, None), ("triton", "auto", True, "triton"),
+    ("auto", "cuda", True, "triton")])
 def test_the_process_compiles_what_the_options_come_to(
         monkeypatch, backend, device, cuda, compiles):
     prepared = []
@@ -161,8 +178,9 @@ def test_the_process_compiles_what_the_options_come_to(
     monkeypatch.setattr(registry, "kernels_to_compile", lambda name: 12 * (name == "numba"))
     monkeypatch.setattr(registry, "use_threads", lambda *_: None)
     monkeypatch.setattr(registry, "prepare", lambda name, _: prepared.append(name) or 0.0)
+    monkeypatch.setattr(registry, "cuda_verdict", lambda: prepared.append("triton"))
     compile_worker.compile_kernels(backend, device)
-    assert prepared == ["numba"] * compiles
+    assert prepared == ([compiles] if compiles else [])
 
 
 @pytest.mark.compile
