@@ -10,6 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -46,6 +47,7 @@ def option_info(item: dataclasses.Field[Any]) -> OptionInfo:
     return info
 
 
+@cache  # the hints of a class are read anew each time, for 5 ms a config
 def field_type(config: type[StageConfig], name: str) -> tuple[type, bool]:
     """Returns the scalar type of a field and whether None is allowed."""
     hint = get_type_hints(config)[name]
