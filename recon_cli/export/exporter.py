@@ -36,7 +36,7 @@ from recon_cli.io.splats.lod import LOD_META, make_levels, write_lod
 from recon_cli.io.splats.registry import FORMATS, scene_file
 from recon_cli.io.splats.sog import SHARING, write_sog
 from recon_cli.io.splats.splat import write_splat
-from recon_cli.io.splats.spz import write_spz
+from recon_cli.io.splats.spz import LARGEST_SCALE, write_spz
 from recon_cli.io.transforms import write_transforms
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
@@ -158,7 +158,7 @@ class Exporter:
         if name == "ply":
             write_ply(path, splats)
             return
-        whole = splats.with_sphere()
+        whole = splats.with_sphere(LARGEST_SCALE if name in ("spz", "html") else math.inf)
         if name == "glb":
             write_glb(path, whole, axes=nearest_axes(self._up))
         elif name == "spz":

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.similarity import Similarity
 
-SPHERE_GAUSSIANS = 600  # 8 degrees apart
+SPHERE_GAUSSIANS = 1024  # 6 degrees apart; more where they would be too large for a format
 SPHERE_OPACITY = 0.99  # the rasterizers clamp alpha there
+_MOST = 1 << 15
+_AT_ONCE = 256  # more of them: .compressed.ply has chunks of so many, of which they fill their own
 # of the distance of what is farthest: depth is along the axis of a camera, so that Gaussians aside,
 # which reach into the middle, would hide what is not much nearer
-_BEHIND = 3.0
+_BEHIND = 2.0
 _SPREAD = 0.8  # of the distance between neighbours: the standard deviation
 
 
@@ -69,18 +71,23 @@ class Backdrop:
         return Backdrop.of(
             [*self.color, *middle.tolist(), float(similarity.scale * self.reach)])
 
-    def sphere(self, means: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
+    def sphere(
+        self, means: NDArray[np.floating], largest: float = np.inf
+    ) -> tuple[NDArray[np.float64], float]:
         """Returns a sphere behind the cameras and all centres [N, 3] that are finite.
 
         The first are the centres [K, 3] of its Gaussians, float64, the second their standard
-        deviation, which leaves no gaps.
+        deviation, which leaves no gaps. K is SPHERE_GAUSSIANS, or so many more, up to a limit,
+        that the second is at most `largest`.
         """
         middle = np.array([self.x, self.y, self.z])
         finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
         farthest = np.linalg.norm(finite - middle, axis=1).max(initial=self.reach)
         radius = float(_BEHIND * farthest) or 1.0
-        scale = float(_SPREAD * radius * np.sqrt(4 * np.pi / SPHERE_GAUSSIANS))
-        return middle + radius * fibonacci_sphere(SPHERE_GAUSSIANS), scale
+        enough = 4 * np.pi * (_SPREAD * radius / largest) ** 2
+        count = int(np.clip(_AT_ONCE * np.ceil(enough / _AT_ONCE), SPHERE_GAUSSIANS, _MOST))
+        scale = float(_SPREAD * radius * np.sqrt(4 * np.pi / count))
+        return middle + radius * fibonacci_sphere(count), scale
 
 
 def enclosing(parts: Sequence[Backdrop | None]) -> Backdrop | None:

@@ -100,11 +100,14 @@ class Splats:
         """Returns the splats with coefficients of this degree: cut, or filled up with zeros."""
         return replace(self, sh_rest=with_terms(self.sh_rest, TERMS[degree]))
 
-    def with_sphere(self) -> Splats:
-        """Returns the splats with their backdrop as Gaussians, behind all others and last."""
+    def with_sphere(self, largest: float = math.inf) -> Splats:
+        """Returns the splats with their backdrop as Gaussians, behind all others and last.
+
+        Where a file holds scales up to `largest` only, there are more of them.
+        """
         if self.backdrop is None:
             return self
-        positions, scale = self.backdrop.sphere(self.means.detach().cpu().numpy())
+        positions, scale = self.backdrop.sphere(self.means.detach().cpu().numpy(), largest)
         n, values = len(positions), self.means.new_tensor
         sphere = Splats(
             values(positions), values([[1.0, 0, 0, 0]]).repeat(n, 1),

@@ -48,6 +48,17 @@ def test_the_sphere_lies_behind_all_gaussians_and_cameras():
         assert 0.05 * radius[0] < scale < 0.2 * radius[0]
 
 
+def test_a_format_of_small_gaussians_gets_more_of_them():
+    means = np.array([[5000.0, 0, 0]])
+    few, large = BACKDROP.sphere(means)
+    many, small = BACKDROP.sphere(means, 379.0)
+    assert large > 379 >= small > 300
+    assert len(many) > len(few)
+    assert len(many) % 256 == 0
+    assert small**2 * len(many) == pytest.approx(large**2 * len(few))  # as little gap
+    assert len(BACKDROP.sphere(means, 1e-3)[0]) == 1 << 15
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_a_scene_of_next_to_nothing_has_a_sphere(n):
     splats = scene(n).with_sphere()

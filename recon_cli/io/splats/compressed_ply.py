@@ -48,13 +48,16 @@ Words = NDArray[np.uint32]
 def write_compressed_ply(path: Path, splats: Splats) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
 
-    What lies far outside comes last: in a chunk of the room it would leave the others no bits.
+    What lies far outside comes first: in a chunk of the room it would leave the others no bits.
 
     Log scales below -20 become -20, coefficients are clipped to -4 to 4, and none stays 0.
     FormatError if there are no Gaussians, one is too large, or a parameter is not finite.
     """
     values = to_arrays(splats, path.name)
-    order = compact_order(values["means"])
+    # the logarithm of opacity x volume, whose products overflow
+    weights = values["log_scales"].sum(axis=1, dtype=np.float64) - np.logaddexp(
+        0, -values["logit_opacities"])
+    order = compact_order(values["means"], weights, _CHUNK)
     means, log_scales, quats, logits, sh_dc, sh_rest = (values[name][order] for name in (
         "means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest"))
     refuse_above(path, log_scales, _SCALE_RANGE)

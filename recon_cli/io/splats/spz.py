@@ -14,6 +14,8 @@ never released and is not supported. Never more is unpacked than the header's co
 from __future__ import annotations
 
 import gzip
+import logging
+import math
 import struct
 import zlib
 from dataclasses import dataclass
@@ -34,7 +36,6 @@ from recon_cli.io.splats.values import (
     encode_smallest_three,
     flip_yz,
     read_contents,
-    refuse_above,
     round_to_bytes,
     splats_from_arrays,
     to_arrays,
@@ -42,10 +43,13 @@ from recon_cli.io.splats.values import (
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.workspace.atomic import write_bytes
 
+logger = logging.getLogger("recon")
+
 _FRACTIONAL_BITS = (8, 12)  # fewest and most that are written; 12 is Niantic's
 _MOST = (1 << 23) - 1  # of a position, in fractions
 _SCALE_STEPS, _SCALE_OFFSET = 16, 10  # byte = (log scale + 10) * 16
 _LARGEST_SCALE = 255 / _SCALE_STEPS - _SCALE_OFFSET
+LARGEST_SCALE = math.exp(_LARGEST_SCALE)  # that an SPZ file holds, in units of the scene
 _COLOR = 0.15  # byte = (0.15 * dc + 0.5) * 255, so that dc of -3.33 to 3.33 fit
 _HARMONIC = 128
 # In steps of 2 of the 256 a trained scene of degree 3 packs to 1/8.2 of its .ply instead of 1/7.0
@@ -78,12 +82,12 @@ def spz_bytes(
 ) -> bytes:
     """Returns the bytes of an SPZ file of `splats`.
 
-    Log scales below -10 become -10, coefficients outside -1 to 127/128 and dc outside -3.33 to 3.33
-    are clipped. Positions get the 12 fractional bits of Niantic's program, fewer in a scene that is
-    wider than 2048 units, and never fewer than 8. `version` is 3, which all current readers
-    support, 2, with coarser rotations, or 4. `harmonic_step` is in 1/128; 1 is the finest. `path`
-    is for messages. FormatError if there are no Gaussians, one is too large or too far away, or a
-    parameter is not finite.
+    Log scales below -10 become -10, and above 5.9375, with a warning, 5.9375; coefficients outside
+    -1 to 127/128 and dc outside -3.33 to 3.33 are clipped. Positions get the 12 fractional bits of
+    Niantic's program, fewer in a scene that is wider than 2048 units, and never fewer than 8.
+    `version` is 3, which all current readers support, 2, with coarser rotations, or 4.
+    `harmonic_step` is in 1/128; 1 is the finest. `path` is for messages. FormatError if there are
+    no Gaussians, one is too far away, or a parameter is not finite.
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is none of {VERSIONS}")
@@ -91,7 +95,11 @@ def spz_bytes(
         name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()}))
     means, quats = values.means.numpy(), values.quats.numpy()
     log_scales = values.log_scales.numpy()
-    refuse_above(path, log_scales, _LARGEST_SCALE)
+    large = int((log_scales.max(axis=1) > _LARGEST_SCALE).sum())
+    if large:
+        logger.warning(
+            "%s: %s Gaussians are made smaller: SPZ holds e^%g units, the largest has e^%.1f",
+            path.name, f"{large:,}", _LARGEST_SCALE, log_scales.max())
     bits = _fractional_bits(path, means)
     return pack(SpzHeader(version, len(splats), values.sh_degree, bits), [
         _position_bytes(means, bits),

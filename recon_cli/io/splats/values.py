@@ -18,6 +18,7 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import Splats, with_rows
 
 _FAR = 10.0  # times the median distance of all from their middle
+_SHELL = 1.5  # outer distance over the inner one
 _BITS = 21  # per axis; three make a word of 63
 _LARGEST = float(np.finfo(np.float32).max)
 Floats = NDArray[np.float32]
@@ -33,12 +34,24 @@ def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.argsort(morton_codes(cells), kind="stable")
 
 
-def compact_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Returns the Morton order of points [N, 3], with what lies far outside at the end."""
-    order, exact = morton_order(points), points.astype(np.float64)
-    away = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)[order]
+def compact_order(
+    points: NDArray[np.float32], weights: NDArray[np.floating], chunk: int
+) -> NDArray[np.int64]:
+    """Returns the Morton order of points [N, 3], with what lies far outside before all others.
+
+    It comes by shells, the farthest one first: what shares a chunk with points far away is left
+    few bits for its place. The last such chunk is filled with the points of the least weights [N].
+    """
+    exact = points.astype(np.float64)
+    away = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)
     far = away > _FAR * np.median(away)
-    return np.concatenate([order[~far], order[far]])
+    near = np.flatnonzero(~far)
+    spare = near[np.argsort(weights[near], kind="stable")[: -far.sum() % chunk]]
+    shell = np.full(len(points), np.inf)
+    shell[far] = np.floor(np.log(away.max(initial=0.0) / away[far]) / np.log(_SHELL))
+    shell[spare] = len(points)  # behind all shells, before the rest
+    order = morton_order(points)
+    return order[np.argsort(shell[order], kind="stable")]
 
 
 def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:

@@ -22,9 +22,16 @@ def few(count: int = 9, degree: int = 1):
     return edge_splats(degree).select(torch.arange(count))
 
 
+def order_of(splats):
+    """As the file has them: what fills the chunk of those far away is the least visible."""
+    weights = splats.log_scales.double().sum(1) + torch.nn.functional.logsigmoid(
+        splats.logit_opacities.double())
+    return compact_order(splats.means.numpy(), weights.numpy(), 256)
+
+
 def in_order(splats):
     """The Gaussians as the file has them, all with coefficients."""
-    rows = torch.from_numpy(compact_order(splats.means.numpy()))
+    rows = torch.from_numpy(order_of(splats))
     full = with_rows(splats.sh_rest, len(splats))
     whole = type(splats)(**(splats.parameters() | {"sh_rest": full}))
     return whole.map(lambda value: value[rows])
@@ -105,7 +112,7 @@ def test_the_layout_is_the_one_of_supersplat(tmp_path):
     assert np.frombuffer(data, "<f4", 6).tolist() == [0, 0, 0, 1, 1, 1]
     words = np.frombuffer(data, "<u4", 12, 72).reshape(3, 4)
     # Along the curve the first comes first; x has the highest bits of a position.
-    order = compact_order(splats.means.numpy()).tolist()
+    order = order_of(splats).tolist()
     places = {row: int(words[i, 0]) for i, row in enumerate(order)}
     assert places == {0: 0, 1: 2**32 - 1, 2: 2047 << 21 | 1024}
     rotations = {row: int(words[i, 1]) for i, row in enumerate(order)}
@@ -202,3 +209,18 @@ def test_what_lies_far_outside_takes_no_bits_from_the_rest(tmp_path):
     assert len(rooms) == 1000
     apart = torch.cdist(near.means, rooms).amin(1)
     assert (apart < 0.01).sum() >= 1000 - 256  # all but those of one chunk
+
+
+def test_shells_far_away_share_no_chunk_and_the_last_is_filled_with_the_lightest():
+    near = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+    shells = [radius * point / np.linalg.norm(point, axis=1, keepdims=True)
+              for radius, point in ((1e3, near[:256]), (1e4, near[256:768]))]
+    points = np.concatenate([near, shells[0][:200], shells[1]]).astype(np.float32)
+    weights = np.random.default_rng(1).permutation(len(points)).astype(float)
+    order = compact_order(points, weights, 256)
+    away = np.linalg.norm(points, axis=1)[order]
+    assert (away[:512] > 9000).all()
+    assert (away[512:712] > 900).all()
+    lightest = np.argsort(weights[:1000])[:56]
+    assert set(order[712:768]) == set(lightest)
+    assert (np.sort(order) == np.arange(len(points))).all()

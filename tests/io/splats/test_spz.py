@@ -125,14 +125,18 @@ def test_positions_get_the_bits_that_the_extent_leaves(tmp_path, far, bits):
     assert greatest(read_spz(tmp_path / "a.spz").means, splats.means) <= 0.5 / 2**bits + 1e-9
 
 
+def test_what_is_too_large_is_made_smaller_with_a_warning(tmp_path, caplog):
+    splats = few()
+    splats.log_scales[2, 1] = 6.1
+    write_spz(tmp_path / "a.spz", splats)
+    assert "1 Gaussians are made smaller" in caplog.text
+    assert read_spz(tmp_path / "a.spz").log_scales[2, 1] == 5.9375
+
+
 def test_what_does_not_fit_is_refused_and_nothing_written(tmp_path):
     path = tmp_path / "a.spz"
     with pytest.raises(FormatError, match="40000 units from the origin"):
         write_spz(path, edge_splats(far=40000.0))
-    splats = few()
-    splats.log_scales[2, 1] = 6.1
-    with pytest.raises(FormatError, match="1 Gaussians are too large"):
-        write_spz(path, splats)
     splats = few()
     splats.sh_rest[0, 3, 1], splats.sh_rest[1, 0, 0] = np.inf, np.nan
     with pytest.raises(FormatError, match=r"sh_rest \(2\)"):
