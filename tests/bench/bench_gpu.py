@@ -71,6 +71,8 @@ def parts(
 @click.option("--steps", default="1000,2000,4000,8000,30000", metavar="N,...", show_default=True,
               help="Lengths of the runs in the room.")
 @click.option("--room-size", type=int, help="Longest side there.  [default: that of recon train]")
+@click.option("--reach", type=float, help="PSNR there that one of the runs must have, the shortest "
+              "first.  [default: within .1 dB of the longest]")
 @click.option("--only", multiple=True, type=click.Choice(
     ["kernels", "checks", "pictures", "gsplat", "steps", "floor", "room"]),
     help="Part to do; may be repeated.  [default: all]")
@@ -80,8 +82,8 @@ def parts(
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path),
               help="Write all figures as JSON.  [default: nowhere]")
 def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room: Path | None,
-         steps: str, room_size: int | None, only: tuple[str, ...], minutes: float,
-         cache: Path | None, out: Path | None) -> None:
+         steps: str, room_size: int | None, reach: float | None, only: tuple[str, ...],
+         minutes: float, cache: Path | None, out: Path | None) -> None:
     """Check and measure the triton backend on DEVICE."""
     width, _, height = size.partition("x")
     whole, lengths = SceneSize(gaussians, int(width), int(height)), [
@@ -100,7 +102,8 @@ def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room
             if not only or group in only:
                 figures.part(name, lambda work=work: (clear(device), work()))
         if room is not None and (not only or "room" in only):
-            figures.part("room", lambda: gpu_room.run(figures, room, lengths, room_size))
+            figures.part("room", lambda: gpu_room.run(
+                figures, room, lengths, room_size, reach))
     clock.cancel()
     click.echo(f"\n{figures.table()}")
     if out is not None:
