@@ -28,6 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.restoration import estimate_sigma
 
+from recon_cli.errors import ConfigError
+
 # 64 tiles leave 800 wavelet coefficients each in a frame of 600x340: known to 3%.
 GRID, SMALLEST_TILE = 8, 16
 # The 10th percentile finds tiles without texture as long as a tenth of the frame is plain.
@@ -96,8 +98,18 @@ def joint(
     The weights come from a guide instead of the frame (Petschnigg et al. 2004, Eisemann and Durand
     2004): first the frame slightly blurred, then the result of that (Zhang et al. 2014, rolling
     guidance). Less noise in the weights lets the range be half as wide, which keeps edges.
+
+    Raises:
+        ConfigError: OpenCV lacks its contributed modules.
     """
     # Share of white noise that the separable blur leaves: the sum of squares along one axis.
+    if not hasattr(cv2, "ximgproc"):
+        raise ConfigError(
+            "This OpenCV has no joint bilateral filter: another package of OpenCV was installed "
+            "over opencv-contrib-python-headless.",
+            hint="Type `pip uninstall opencv-python opencv-python-headless`, then `pip install "
+            "--force-reinstall opencv-contrib-python-headless`; or take "
+            "`recon denoise --filter bilateral`.")
     left = float(np.sum(cv2.getGaussianKernel(GUIDE_BLUR_SIZE, GUIDE_BLUR) ** 2))
     reach = strength * left * noise
     blurred = cv2.GaussianBlur(rgb, (GUIDE_BLUR_SIZE, GUIDE_BLUR_SIZE), GUIDE_BLUR)

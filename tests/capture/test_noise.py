@@ -8,6 +8,7 @@ from noisy_room import noisy, plain_room, psnr
 from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.fields import option_info
 from recon_cli.config.stages import DenoiseConfig
+from recon_cli.errors import ConfigError
 from recon_cli.experiments.filter_comparison import edges_kept
 
 
@@ -100,3 +101,11 @@ def test_the_number_of_threads_changes_no_pixel(denoised):
 def test_a_frame_of_a_few_pixels_can_be_filtered(denoised):
     assert denoised(np.full((3, 2, 3), 90, np.uint8), 5, STRENGTH).tolist() == [
         [[90] * 3] * 2] * 3
+
+
+def test_an_opencv_without_its_contributed_modules_is_named(monkeypatch):
+    monkeypatch.delattr(cv2, "ximgproc")
+    with pytest.raises(ConfigError, match="installed over opencv-contrib") as caught:
+        FILTERS["joint"](plain_room(), 8.0, 4.0)
+    assert "--filter bilateral" in caught.value.hint
+    assert FILTERS["bilateral"](plain_room(), 8.0, 4.0).shape == plain_room().shape
