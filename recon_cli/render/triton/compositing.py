@@ -9,11 +9,10 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
 s is zero where alpha was clamped. Every instance has a slot for its sums over the tile; slots of a
 Gaussian lie side by side and are added in order: no atomics, and the same bits every time.
 
-A long list would keep one warp busy when all others are done. So the way back goes by buckets of
-BUCKET instances, all at once: on the way forward the transmittance T and the colours C in front of
-each bucket's end are kept, and with the picture I the remainder there is R = g . (I - C) / T
-(Mallick et al. 2024, "Taming 3DGS", keep them likewise). Both passes load an instance before they
-need it.
+A long list would keep one warp busy when all others are done. So the backward pass goes by buckets
+of BUCKET instances, all at once: the forward pass keeps the transmittance T and the colours C at
+the end of each bucket, and with the image I the remainder there is R = g . (I - C) / T (Mallick et
+al. 2024, "Taming 3DGS", keep them likewise). Both passes load an instance before they need it.
 """
 
 from __future__ import annotations

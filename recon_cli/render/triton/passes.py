@@ -81,7 +81,7 @@ class CompositedImage:
     rgb: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
     depth: Tensor  # [H, W]
-    # what the way back needs, empty where none was wanted; see `compositing.composite`
+    # what the backward pass needs, empty where none follows; see `compositing.composite`
     final: Tensor  # [tiles, PIXELS]
     last: Tensor  # [tiles, PIXELS] int32
     states: Tensor  # [buckets, STATE, PIXELS]
