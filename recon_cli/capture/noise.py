@@ -102,7 +102,6 @@ def joint(
     Raises:
         ConfigError: OpenCV lacks its contributed modules.
     """
-    # Share of white noise that the separable blur leaves: the sum of squares along one axis.
     if not hasattr(cv2, "ximgproc"):
         raise ConfigError(
             "This OpenCV has no joint bilateral filter: another package of OpenCV was installed "
@@ -110,6 +109,7 @@ def joint(
             hint="Type `pip uninstall opencv-python opencv-python-headless`, then `pip install "
             "--force-reinstall opencv-contrib-python-headless`; or take "
             "`recon denoise --filter bilateral`.")
+    # Share of white noise that the separable blur leaves: the sum of squares along one axis.
     left = float(np.sum(cv2.getGaussianKernel(GUIDE_BLUR_SIZE, GUIDE_BLUR) ** 2))
     reach = strength * left * noise
     blurred = cv2.GaussianBlur(rgb, (GUIDE_BLUR_SIZE, GUIDE_BLUR_SIZE), GUIDE_BLUR)

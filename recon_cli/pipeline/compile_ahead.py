@@ -26,8 +26,9 @@ logger = logging.getLogger("recon")
 def compile_ahead(job: Job, stages: Sequence[str], *, again: bool) -> Iterator[None]:
     """Compiles while `stages` run, if others come before the first one that renders.
 
-    A stage that needs the kernels waits for the process by the lock of their folder, and compiles
-    them itself where that one failed. A failure is logged, for it costs nothing but time.
+    A stage that needs the kernels for this CPU waits for the process by the lock of their folder,
+    and compiles them itself where that one failed. One that needs those for a GPU compiles what is
+    not there yet. A failure is logged, for it costs nothing but time.
     """
     if not _waits(job, stages, again=again):
         yield
