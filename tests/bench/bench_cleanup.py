@@ -57,7 +57,7 @@ def before_views(
     for _ in range(PLANTED):
         camera = views[draw.integers(len(views))].camera
         with torch.no_grad():
-            shown = render(splats, camera, torch.zeros(3), splats.sh_degree, backend=ctx.backend)
+            shown = render(splats, camera, splats.background, splats.sh_degree, backend=ctx.backend)
         line, column = draw.integers(camera.height), draw.integers(camera.width)
         depth = float(shown.depth[line, column] / shown.alpha[line, column].clamp_min(1e-3))
         z = depth * draw.uniform(0.15, 0.6)

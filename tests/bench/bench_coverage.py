@@ -35,7 +35,7 @@ SHOWN = 30  # training views that are scored, at most
 def picture(splats: Splats, camera: Camera, degree: int) -> tuple[NDArray, NDArray]:
     """Returns colours [H, W, 3] and depth [H, W], world units."""
     with torch.no_grad():
-        out = render(splats, camera, torch.zeros(3), degree, backend="numba")
+        out = render(splats, camera, splats.background, degree, backend="numba")
     return out.rgb.clamp(0, 1).numpy(), (out.depth / out.alpha.clamp(min=1e-3)).numpy()
 
 

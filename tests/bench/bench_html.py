@@ -110,7 +110,7 @@ def measured(folder: Path, views: int, keep: Path | None) -> str:
             view = value["views"][number - 1]
             camera = in_window(view, value["lenses"][view["lens"]], width, height)
             with torch.no_grad():
-                rgb = render(splats, camera, torch.zeros(3), splats.sh_degree).rgb
+                rgb = render(splats, camera, splats.background, splats.sh_degree).rgb
             seen, want = picture(page, number), rgb.clamp(0, 1).double().numpy()
             scores.append(-10 * np.log10(((seen - want) ** 2).mean()))
             if keep:

@@ -120,8 +120,8 @@ def views(splats: Splats) -> list[Camera]:
 
 def psnr(splats: Splats, other: Splats) -> float:
     squares = [
-        (render(splats, camera, torch.zeros(3), splats.sh_degree, backend="numba").rgb
-         - render(other, camera, torch.zeros(3), other.sh_degree, backend="numba").rgb).square()
+        (render(splats, camera, splats.background, splats.sh_degree, backend="numba").rgb
+         - render(other, camera, other.background, other.sh_degree, backend="numba").rgb).square()
         for camera in views(splats)]
     return float(-10 * torch.log10(torch.stack(squares).mean()))
 

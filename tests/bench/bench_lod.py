@@ -35,7 +35,7 @@ def image(splats: Splats, camera: Camera) -> torch.Tensor:
     """Returns what a camera sees."""
     with torch.no_grad():
         rgb: torch.Tensor = render(
-            splats, camera, torch.zeros(3), splats.sh_degree, backend="numba").rgb.clamp(0, 1)
+            splats, camera, splats.background, splats.sh_degree, backend="numba").rgb.clamp(0, 1)
     return rgb
 
 

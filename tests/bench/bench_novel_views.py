@@ -64,7 +64,7 @@ def main(workspace: Path, room: Path) -> None:
                 config.max_size)
             truth = read_image(image, camera.width, camera.height)
             with torch.no_grad():
-                rgb = render(splats, camera, torch.zeros(3), config.sh_degree).rgb.numpy()
+                rgb = render(splats, camera, splats.background, config.sh_degree).rgb.numpy()
             values.append((psnr(rgb, truth), ssim(rgb, truth)))
         mean = np.mean(values, axis=0)
         click.echo(f"{stage}: {len(values)} novel views, {mean[0]:.2f} dB, SSIM {mean[1]:.4f}, "

@@ -144,7 +144,7 @@ def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
             if one.part == HELD_OUT:
                 camera = fit_camera(one.view.camera, content.max_size)
                 with torch.no_grad():
-                    ours = render(splats, camera, torch.zeros(3), 0, backend=ctx.backend).rgb
+                    ours = render(splats, camera, splats.background, 0, backend=ctx.backend).rgb
                 page.page.set_viewport_size({"width": camera.width, "height": camera.height})
                 asked = elsewhere.submit(drawn, client, content, camera)
                 while not asked.done():
