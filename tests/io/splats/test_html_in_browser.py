@@ -11,14 +11,15 @@ import torch
 from archive_splats import room
 from browser import WatchedPage
 from PIL import Image
-from scenes import camera_at
+from scenes import camera_at, one_splat
+from torch import Tensor
 
 from recon_cli.io.splats import html
 from recon_cli.io.splats.html import read_html, write_html
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.splats import transformed
+from recon_cli.scene.splats import joined, transformed
 
 WIDTH, HEIGHT = 240, 180
 Y_DOWN = np.array([0.0, -1, 0])
@@ -91,6 +92,19 @@ def test_the_page_shows_what_recon_renders_and_asks_for_nothing(page, tmp_path, 
             assert psnr_db(seen, rendered(path, camera, degree - 1)) < AGREE_DB - 8, number
     page.assert_silent()
     page.assert_offline()
+
+
+def test_the_page_shows_a_large_gaussian_whose_middle_is_beside_the_window(page, tmp_path):
+    # a wall of one colour is few large Gaussians; its middle is at 1.6 times the window here
+    path, camera = tmp_path / "a.html", cameras()[0]
+    beside = 1.6 * camera.cx / camera.fx
+    wall = one_splat((3 * beside, 0.0, 3.0), scale=1.0, opacity=0.9, color=(0.9, 0.8, 0.6))
+    both, _ = joined([room(1000, degree=0), wall.with_degree(0).map(Tensor.float)])
+    write_html(path, both, up=Y_DOWN, views=[("", camera)])
+    opened(page, path)
+    # Spark by itself leaves the wall out, which makes 19 dB
+    assert psnr_db(picture(page), rendered(path, camera, 0)) > AGREE_DB
+    page.assert_silent()
 
 
 def test_a_page_with_levels_of_detail_shows_the_scene(page, tmp_path, monkeypatch):

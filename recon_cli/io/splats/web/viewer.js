@@ -16,6 +16,18 @@ const CUTOFF = 2 * Math.log(255); // squared deviations at which an opaque Gauss
 // Gaussians of a frame where the scene has levels of detail and the browser draws on the CPU; for a
 // graphics card Spark chooses.
 const FEW = 200_000;
+// Times the window beyond which a Gaussian is left out by its middle: none is. Spark's 1.4 leaves out
+// large ones that show in the window.
+const CLIP = 1e6;
+// Times the window within which slopes are held in the projection of a Gaussian, as in training:
+// Spark, which leaves out what is beside the window, holds none, and makes a fog of it.
+const HELD = 1.3;
+const SPARK_SLOPES = "vec2 J2 = -(J1 * viewCenter.xy) * invZ;";
+const HELD_SLOPES = `
+  vec2 shift = vec2(projectionMatrix[2][0], projectionMatrix[2][1]);
+  vec2 lens = vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
+  vec2 J2 = -J1 * clamp(viewCenter.xy * invZ,
+                        (-${HELD} - shift) / lens, (${HELD} - shift) / lens);`;
 const MOST_PIXELS = 2; // device pixels a CSS pixel; more cost time and show nothing
 
 const { bytes, scene } = window.reconPage;
@@ -40,12 +52,15 @@ const spark = new SparkRenderer({
   blurAmount: 0,
   sortRadial: false, // by depth, as it was trained
   accumExtSplats: true, // positions of 32 bits; those of 16 can be seen
+  clipXY: CLIP,
   maxStdDev: Math.sqrt(CUTOFF),
   minAlpha: 1 / 255,
-  maxPixelRadius: 4096,
+  maxPixelRadius: 1e7,
   enableLod: scene.lod,
   lodSplatCount: drawsOnCpu() ? FEW : undefined,
 });
+if (!spark.material.vertexShader.includes(SPARK_SLOPES)) throw new Error("another Spark");
+spark.material.vertexShader = spark.material.vertexShader.replace(SPARK_SLOPES, HELD_SLOPES);
 const camera = new THREE.PerspectiveCamera();
 const world = new THREE.Group();
 const root = new THREE.Scene();

@@ -1,0 +1,66 @@
+"""What views lose in viewers that leave out Gaussians beside the window.
+
+`python tests/bench/bench_viewers.py WORKSPACE...` with a trained model each. A wall without texture
+is few large Gaussians, and one whose middle lies beside an image still shows in it. Viewers in
+browsers often leave out those whose middle is beyond 1.2 to 1.4 times the window (Spark's default
+is 1.4, that of recon's own pages 2). Held-out views are scored by recon's renderer with all
+Gaussians, and without those beyond each limit.
+"""
+
+from __future__ import annotations
+
+import statistics
+from pathlib import Path
+
+import click
+import torch
+
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_reference_views, load_scene
+from recon_cli.experiments.runner import score_as_ply
+from recon_cli.io.ply import read_ply
+from recon_cli.render.registry import use_threads
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+from recon_cli.train.train_data import read_config
+
+LIMITS = (2.0, 1.4, 1.2)  # times the window
+
+
+def within(splats: Splats, camera: Camera, limit: float) -> Splats:
+    """Returns the Gaussians before the camera whose middle is within `limit` times the image."""
+    rotation, shift = torch.from_numpy(camera.viewmat).float()[:3].split([3, 1], dim=1)
+    x, y, z = (splats.means @ rotation.T + shift[:, 0]).unbind(-1)
+    across = (camera.fx * x / z + camera.cx) / camera.width
+    down = (camera.fy * y / z + camera.cy) / camera.height
+    inside = (z > 0) & ((2 * across - 1).abs() < limit) & ((2 * down - 1).abs() < limit)
+    return splats.select(torch.nonzero(inside)[:, 0])
+
+
+@click.command()
+@click.argument("workspaces", nargs=-1, required=True,
+                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--threads", default=2, show_default=True)
+def main(workspaces: tuple[Path, ...], threads: int) -> None:
+    """Print the PSNR of held-out views in dB, with all Gaussians and within each limit."""
+    use_threads("numba", threads)
+    ctx = StageContext(backend="numba")
+    click.echo("| scene | Gaussians | views | all | "
+               + " | ".join(f"within {limit:g}" for limit in LIMITS) + " |\n"
+               "|---|---:|---:|---:|" + "---:|" * len(LIMITS))
+    for workspace in workspaces:
+        scene = load_scene(
+            StageInputs({name: workspace / name for name in ("ingest", "sfm")}), validation=0)
+        config = read_config(workspace / "train")
+        splats = read_ply(workspace / "train" / "splats.ply")
+        views = load_reference_views(scene.test, config.max_size, ctx)
+        scores = [statistics.mean(
+            score_as_ply(splats if limit is None else within(splats, view.camera, limit),
+                         [view], splats.sh_degree, ctx)[0].psnr_db for view in views)
+            for limit in (None, *LIMITS)]
+        click.echo(f"| {workspace.name} | {len(splats):,} | {len(views)} | "
+                   + " | ".join(f"{value:.2f}" for value in scores) + " |")
+
+
+if __name__ == "__main__":
+    main()
