@@ -5,7 +5,8 @@ optional parts of the model; then runs of full length differ from the chosen one
 Both are scored on the validation views, a fifth of the training views, each after its best gain;
 exposure by the mean of the PSNR without and with it, as the .ply has no gains; how far views of the
 same place differ stands behind its trial. `gain` is what a part is worth in the full run, `lost`
-what the choice gives away: never more than .1 dB is the aim.
+what the choice gives away: never more than .1 dB is the aim. With `--seeds` the full runs are
+repeated, and the error holds what seeds differ by as well: one seed of a walk can be 1 dB off.
 
     python tests/bench/bench_trials.py living fox --iterations 3000 --iterations 10000
 """
@@ -47,13 +48,16 @@ SWITCHED = {  # the other value of a part
 class Capture:
     """A workspace whose cameras are known, and the runs made of it."""
 
-    def __init__(self, workspace: Path, asked: TrainConfig, ctx: StageContext) -> None:
+    def __init__(
+        self, workspace: Path, asked: TrainConfig, ctx: StageContext, seeds: int
+    ) -> None:
         self.name, self.asked, self.ctx = workspace.name, asked, ctx
         inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
         self.scene: Scene = load_scene(inputs, validation=VALIDATION)
         self.task: Task = load_task(self.scene, first_config(asked), ctx)
         self.needs = choose_parts(self.task, self.scene, ctx, harmonics=True)
         self._scores: dict[RunConfig, NDArray[np.float64]] = {}
+        self.seeds = seeds
 
     def config(self, iterations: int) -> RunConfig:
         """Returns the options of a run with the chosen parts."""
@@ -99,14 +103,16 @@ class Capture:
         if other is None:
             return None
         start = time.process_time()
-        chosen, changed = self.scores(config), self.scores(other)
+        runs = [[self.scores(dataclasses.replace(one, seed=seed)) for seed in range(self.seeds)]
+                for one in (config, other)]
+        chosen, changed = np.array(runs)  # [S, V, 2] each
         seconds = time.process_time() - start
         on = (config.sh_degree > 0 if part == DEGREE
               else getattr(config, part) == SWITCHED[part][1])
-        both = (chosen - changed) * (1 if on else -1)  # [V, 2]
-        gains = both.mean(axis=1) if part == "exposure" else both[:, 1]
-        mean, error = gains.mean(), gains.std(ddof=1) / math.sqrt(len(gains))
-        as_is, corrected = both.mean(axis=0)
+        both = (chosen - changed) * (1 if on else -1)  # [S, V, 2]
+        gains = both.mean(axis=2) if part == "exposure" else both[..., 1]
+        mean, error = gains.mean(), standard_error(gains)
+        as_is, corrected = both.mean(axis=(0, 1))
         trial = next((d for d in self.needs.decisions if d.name.startswith(
             "harmonics above degree 0" if part == DEGREE else part)), None)
         tried = ("no sign" if trial is None or trial.mean_db is None
@@ -117,8 +123,16 @@ class Capture:
         choice = str(config.sh_degree) if part == DEGREE else ("on" if on else "off")
         lost = max(0.0, -mean if on else mean)
         return (f"| {self.name} | {part} | {tried} | {choice} | {iterations:,} "
-                f"| {chosen[:, 1].mean():.2f} | {as_is:+.2f} | {corrected:+.2f} "
+                f"| {chosen[..., 1].mean():.2f} | {as_is:+.2f} | {corrected:+.2f} "
                 f"| {mean:+.2f} ± {error:.2f} | {lost:.2f} | {seconds:.0f} |")
+
+
+def standard_error(gains: NDArray[np.float64]) -> float:
+    """Returns the standard error of the mean of gains [S, V], over the views and the seeds."""
+    by_view, by_seed = gains.mean(axis=0), gains.mean(axis=1)
+    views = float(by_view.var(ddof=1)) / len(by_view)
+    seeds = float(by_seed.var(ddof=1)) / len(by_seed) if len(by_seed) > 1 else 0.0
+    return math.sqrt(views + seeds)
 
 
 @click.command()
@@ -130,8 +144,9 @@ class Capture:
               show_default=True)
 @click.option("--max-size", default=400, show_default=True)
 @click.option("--threads", default=1, show_default=True)
+@click.option("--seeds", default=1, show_default=True, help="Of the full runs.")
 def main(workspaces: tuple[Path, ...], lengths: tuple[int, ...], parts: tuple[str, ...],
-         max_size: int, threads: int) -> None:
+         max_size: int, threads: int, seeds: int) -> None:
     """Print what each part is worth in the trial and in runs of full length, in dB."""
     use_threads("numba", threads)
     ctx = StageContext(backend="numba")
@@ -140,7 +155,7 @@ def main(workspaces: tuple[Path, ...], lengths: tuple[int, ...], parts: tuple[st
                "|---|---|---:|---|---:|---:|---:|---:|---:|---:|---:|")
     for workspace in workspaces:
         capture = Capture(workspace, TrainConfig(
-            max_size=max_size, validation=VALIDATION), ctx)
+            max_size=max_size, validation=VALIDATION), ctx, seeds)
         for iterations in lengths:
             for part in parts:
                 line = capture.row(part, iterations)
