@@ -11,8 +11,10 @@ import binascii
 import gzip
 import html
 import json
+import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.spz import spz_bytes, spz_splats
+from recon_cli.io.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_splats
 from recon_cli.io.splats.values import read_contents
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -46,6 +48,9 @@ LICENCES = ("LICENSE-three.txt", "LICENSE-spark.txt", "LICENSE-fflate.txt")
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
 _LEVELS_FROM = 500_000  # Gaussians, of which Spark makes levels of detail
 _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is measured on
+# At five, e^-10 units, the least scale, are .0015 units of the scene: in one of COLMAP, where some
+# ten are a room, less than a millimetre.
+_MOST_HALVINGS = 5
 _DEFAULT_LENS = (1200, 900, 1000.0)  # width, height and focal length in pixels
 
 
@@ -128,7 +133,8 @@ def _text(name: str) -> str:
 
 
 _OPENED = re.compile(rb'<script id="scene" type="application/octet-stream" '
-                     rb'data-format="([a-z]{1,9})" data-bytes="([0-9]{1,12})">')
+                     rb'data-format="([a-z]{1,9})" data-bytes="([0-9]{1,12})"'
+                     rb'(?: data-halvings="([0-9]{1,2})")?>')
 _CLOSED = b"</script>"
 
 
@@ -142,10 +148,30 @@ def write_html(
     visitor can step through the cameras of `views`; the page opens at the first of them, or in
     front of the scene. The errors are those of `spz_bytes`.
     """
-    packed = spz_bytes(path, splats, harmonic_step=1)  # beside the scripts size hardly counts
+    halvings = _halvings(splats)
+    # beside the scripts size hardly counts
+    packed = spz_bytes(path, _enlarged(splats, -halvings), harmonic_step=1,
+                       most_bits=POSITION_BITS + halvings)
+    tag = f' data-halvings="{halvings}"' if halvings else ""
     scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '
-             f'data-bytes="{len(packed)}">{base64.b64encode(packed).decode("ascii")}</script>')
+             f'data-bytes="{len(packed)}"{tag}>{base64.b64encode(packed).decode("ascii")}</script>')
     write_bytes(path, build_page(title, scene, views or [default_view(splats, up)], splats, up))
+
+
+def _halvings(splats: Splats) -> int:
+    """Returns how often the scene is halved until SPZ holds its largest Gaussian."""
+    largest = float(splats.scales.detach().max()) if len(splats) else 0.0
+    if not LARGEST_SCALE < largest < math.inf:
+        return 0
+    return min(_MOST_HALVINGS, math.ceil(math.log2(largest / LARGEST_SCALE)))
+
+
+def _enlarged(splats: Splats, doublings: int) -> Splats:
+    """Returns the scene in another unit: all lengths times two to the power of `doublings`."""
+    if doublings == 0:
+        return splats
+    return replace(splats, means=splats.means * 2.0**doublings,
+                   log_scales=splats.log_scales + doublings * math.log(2))
 
 
 def read_html(path: Path) -> Splats:
@@ -170,4 +196,4 @@ def read_html(path: Path) -> Splats:
     if len(packed) != promised:
         raise FormatError(
             f"{path} promises a scene of {promised} bytes, but holds {len(packed)}: it is damaged.")
-    return spz_splats(path, packed)
+    return _enlarged(spz_splats(path, packed), int(matches[0][3] or 0))

@@ -46,6 +46,7 @@ from recon_cli.workspace.atomic import write_bytes
 logger = logging.getLogger("recon")
 
 _FRACTIONAL_BITS = (8, 12)  # fewest and most that are written; 12 is Niantic's
+POSITION_BITS = _FRACTIONAL_BITS[1]
 _MOST = (1 << 23) - 1  # of a position, in fractions
 _SCALE_STEPS, _SCALE_OFFSET = 16, 10  # byte = (log scale + 10) * 16
 _LARGEST_SCALE = 255 / _SCALE_STEPS - _SCALE_OFFSET
@@ -78,13 +79,14 @@ def write_spz(path: Path, splats: Splats, *, version: int = 3) -> None:
 
 
 def spz_bytes(
-    path: Path, splats: Splats, *, version: int = 3, harmonic_step: int = _HARMONIC_STEP
+    path: Path, splats: Splats, *, version: int = 3, harmonic_step: int = _HARMONIC_STEP,
+    most_bits: int = _FRACTIONAL_BITS[1],
 ) -> bytes:
     """Returns the bytes of an SPZ file of `splats`.
 
     Log scales below -10 become -10, and above 5.9375, with a warning, 5.9375; coefficients outside
-    -1 to 127/128 and dc outside -3.33 to 3.33 are clipped. Positions get the 12 fractional bits of
-    Niantic's program, fewer in a scene that is wider than 2048 units, and never fewer than 8.
+    -1 to 127/128 and dc outside -3.33 to 3.33 are clipped. Positions get `most_bits` fractional
+    bits, 12 in Niantic's program, fewer where they do not fit, and never fewer than 8.
     `version` is 3, which all current readers support, 2, with coarser rotations, or 4.
     `harmonic_step` is in 1/128; 1 is the finest. `path` is for messages. FormatError if there are
     no Gaussians, one is too far away, or a parameter is not finite.
@@ -100,7 +102,7 @@ def spz_bytes(
         logger.warning(
             "%s: %s Gaussians are made smaller: SPZ holds e^%g units, the largest has e^%.1f",
             path.name, f"{large:,}", _LARGEST_SCALE, log_scales.max())
-    bits = _fractional_bits(path, means)
+    bits = _fractional_bits(path, means, most_bits)
     return pack(SpzHeader(version, len(splats), values.sh_degree, bits), [
         _position_bytes(means, bits),
         encode_opacities(values.logit_opacities.numpy()),
@@ -135,10 +137,10 @@ def spz_splats(path: Path, data: bytes) -> Splats:
     }))
 
 
-def _fractional_bits(path: Path, means: Floats) -> int:
-    """Returns the most fractional bits with which every position fits."""
+def _fractional_bits(path: Path, means: Floats, most: int) -> int:
+    """Returns the most fractional bits, at most `most`, with which every position fits."""
     farthest = float(np.abs(means).max())
-    fewest, most = _FRACTIONAL_BITS
+    fewest, _ = _FRACTIONAL_BITS
     for bits in range(most, fewest - 1, -1):
         if np.rint(farthest * 2.0**bits) <= _MOST:
             return bits

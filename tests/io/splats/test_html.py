@@ -78,6 +78,22 @@ def test_a_page_reads_back_as_the_spz_of_the_same_scene(tmp_path, degree):
         assert torch.equal(getattr(page, name), value), name
 
 
+@pytest.mark.parametrize(("log_scale", "halvings"), [(5.9, 0), (6.1, 1), (8.8, 5)])
+def test_a_scene_with_gaussians_too_large_for_spz_is_halved_and_read_back_as_it_was(
+        tmp_path, log_scale, halvings, caplog):
+    splats = room(200, degree=0)
+    splats.log_scales[3] = log_scale
+    splats.means[3] = torch.tensor([1500.0, -900.0, 40.0])
+    write_html(tmp_path / "a.html", splats)
+    text = (tmp_path / "a.html").read_text("utf-8")
+    assert (f'data-halvings="{halvings}"' in text) == (halvings > 0)
+    assert "smaller" not in caplog.text
+    back = read_html(tmp_path / "a.html")
+    assert (back.log_scales - splats.log_scales).abs().max() <= 0.5 / 16 + 1e-5
+    assert (back.means - splats.means).abs().max() <= 0.5 / 2**11
+    assert (back.means[:3] - splats.means[:3]).abs().max() <= 0.5 / 2**11
+
+
 def test_the_same_scene_gives_the_same_bytes(tmp_path):
     for name in ("a.html", "b.html"):
         write_html(tmp_path / name, room(40), title="x", views=[("v", camera())])

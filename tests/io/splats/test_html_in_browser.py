@@ -107,6 +107,17 @@ def test_the_page_shows_a_large_gaussian_whose_middle_is_beside_the_window(page,
     page.assert_silent()
 
 
+def test_the_page_shows_a_scene_that_was_halved_to_fit_into_spz(page, tmp_path):
+    path, camera = tmp_path / "a.html", cameras()[0]
+    far = one_splat((1200.0, 300.0, 2500.0), scale=900.0, opacity=0.9, color=(0.9, 0.8, 0.6))
+    both, _ = joined([room(1000, degree=0), far.with_degree(0).map(Tensor.float)])
+    write_html(path, both, up=Y_DOWN, views=[("", camera)])
+    assert 'data-halvings="2"' in path.read_text("utf-8")
+    opened(page, path)
+    assert psnr_db(picture(page), rendered(path, camera, 0)) > AGREE_DB
+    page.assert_silent()
+
+
 def test_a_page_with_levels_of_detail_shows_the_scene(page, tmp_path, monkeypatch):
     monkeypatch.setattr(html, "_LEVELS_FROM", 3000)
     path = made(tmp_path / "a.html", 0)

@@ -30,7 +30,7 @@ const HELD_SLOPES = `
                         (-${HELD} - shift) / lens, (${HELD} - shift) / lens);`;
 const MOST_PIXELS = 2; // device pixels a CSS pixel; more cost time and show nothing
 
-const { bytes, scene } = window.reconPage;
+const { bytes, halvings, scene } = window.reconPage; // the scene is halved to fit into .spz
 const canvas = document.querySelector("canvas");
 const button = (name) => document.getElementById(name);
 
@@ -204,5 +204,6 @@ const mesh = new SplatMesh({ fileBytes: bytes, fileType: "spz", extSplats: true,
 await mesh.initialized;
 if (!scene.lod) await restoreHarmonics(bytes, mesh.extSplats.extra);
 mesh.quaternion.set(1, 0, 0, 0); // y and z of an SPZ file are those of the scene, negated
+mesh.scale.setScalar(2 ** halvings);
 world.add(mesh);
 loaded = needed = true;
