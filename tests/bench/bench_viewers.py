@@ -2,8 +2,8 @@
 
 `python tests/bench/bench_viewers.py WORKSPACE...` with a trained model each. A wall without texture
 is few large Gaussians, and one whose middle lies beside an image still shows in it. Viewers in
-browsers often leave out those whose middle is beyond 1.2 to 1.4 times the window (Spark's default
-is 1.4, that of recon's own pages 2). Held-out views are scored by recon's renderer with all
+browsers often leave out those whose middle is beyond 1.2 to 1.4 times the window (1.4 is Spark's
+default; recon's own pages leave out none). Held-out views are scored by recon's renderer with all
 Gaussians, and without those beyond each limit.
 """
 
