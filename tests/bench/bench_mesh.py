@@ -193,16 +193,18 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         depth = output.depth / output.alpha.clamp_min(1e-3)
         return np.where(output.alpha > 0.5, depth, 0).astype(np.float32)
 
-    row("whole export, with rendering", lambda: built(views))
+    row("whole export, with rendering and stereo", lambda: built(views))
     row("expected, fused", lambda: fused(with_depths(maps, expected), agreement=False))
     row("median along the ray, fused", lambda: fused(copy(maps), agreement=False))
     row("and weighed by agreement", lambda: fused(copy(maps), agreement=True))
 
-    def without_planes() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        mesh = build.mesh_of(copy(maps), np.empty((0, 3)), ctx, max_triangles=triangles).mesh
+    def without_stereo(confirming: NDArray[np.float64]) -> tuple[
+            NDArray[np.float64], NDArray[np.int64]]:
+        mesh = build.mesh_of(copy(maps), confirming, ctx, max_triangles=triangles).mesh
         return mesh.vertices, mesh.faces
 
-    row("and only what views show", without_planes)
+    row("and only what views show", lambda: without_stereo(np.empty((0, 3))))
+    row("and with planes: all but stereo", lambda: without_stereo(scene.points))
 
     if video:
         return

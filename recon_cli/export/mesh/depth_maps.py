@@ -84,7 +84,7 @@ def weigh_by_agreement(maps: DepthMaps) -> None:
         return
     flat = np.concatenate([depth.reshape(-1) for depth in maps.depths])
     starts = np.concatenate([[0], np.cumsum([depth.size for depth in maps.depths])])[:-1]
-    table = np.stack([_row(camera) for camera in maps.cameras])
+    table = np.stack([camera_row(camera) for camera in maps.cameras])
     neighbours = find_neighbours(maps.cameras, maps.median)
     for own, (gain, others) in enumerate(zip(maps.gains, neighbours, strict=True)):
         agree, through = np.zeros((2, gain.size), np.int32)
@@ -110,7 +110,8 @@ def find_neighbours(cameras: Sequence[Camera], median: float) -> list[NDArray[np
     return rows
 
 
-def _row(camera: Camera) -> NDArray[np.float64]:
+def camera_row(camera: Camera) -> NDArray[np.float64]:
+    """Returns a camera as the kernels read it, [18]."""
     return np.concatenate([
         camera.viewmat[:3, :3].reshape(-1), camera.viewmat[:3, 3],
         [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]])

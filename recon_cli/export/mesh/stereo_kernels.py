@@ -1,0 +1,324 @@
+"""The loops over pixels, hypotheses and neighbours of dense stereo (`stereo.py`).
+
+What is computed for a view does not depend on the thread that takes it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from recon_cli.render.numba.kernel import inlined, kernel
+from recon_cli.render.numba.simd_functions import fetch_add
+
+# Chosen on the room "living" and checked on "office" (docs/mesh.md); all are flat around:
+_NOISE = np.float32(2.0)  # squared grey levels added to variances: blank windows correlate little
+_MOST_DIFFERENCE = np.float32(4.0)  # grey levels from which on two pixels differ altogether
+_LEAST_SCORE = np.float32(-0.4)  # of a window and another view's; what hides a surface counts so
+_LEAST_Z = np.float32(1e-6)
+_SMALL_STEP, _LARGE_STEP = 0.1, 0.8  # penalties of a step by one hypothesis, and by more
+_EDGE = 8.0  # gradient in grey levels a pixel at which the larger penalty has fallen to 1/e
+_LEAST_PENALTY = 0.15  # of the larger one, across any edge
+
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+_SUMS = 4  # of a window: values, squares, products with the view's own, absolute differences
+
+
+@kernel
+def match(
+    counter, rows, images, starts, cameras, others, radius, lowest, steps, hypotheses, inverse,
+):
+    """Finds the inverse depth of every pixel of some views by semi-global matching.
+
+    A hypothesis is an inverse depth; its cost is one minus the normalized correlation of a window
+    with those where it falls in other views, plus their mean difference, so that smooth shading
+    counts where there is no texture. A view in which something hides the surface costs no more than
+    `_LEAST_SCORE` says. Costs are made smooth along eight directions
+    (Hirschmueller 2008), less so across edges of the image.
+
+    Args:
+        counter: [1] shared; views already taken.
+        rows: [R] int64 the views.
+        images: [P] float32 grey images in 0 to 255, one after the other; starts: [V] of each.
+        cameras: [V, 18] rotation, translation, fx, fy, cx, cy, width and height of each.
+        others: [V, K] int64 views that each is compared with, -1 for none.
+        radius: of the windows, pixels.
+        lowest: [P] float32, the first hypothesis of each pixel; steps: [V] between two.
+        hypotheses: how many each pixel has, at least 3.
+        inverse: [P] float32 out, inverse depth in world units; 0 where the best hypothesis is the
+            first or last one, or no other view shows any.
+    """
+    while True:
+        taken = fetch_add(counter, 0, 1)
+        if taken >= len(rows):
+            break
+        own = rows[taken]
+        width, height = int(cameras[own, 16]), int(cameras[own, 17])
+        at, size = starts[own], width * height
+        image = images[at:at + size].reshape(height, width)
+        count = 0
+        while count < others.shape[1] and others[own, count] >= 0:
+            count += 1
+        if count == 0:
+            inverse[at:at + size] = 0
+            continue
+        base = lowest[at:at + size].reshape(height, width)
+        costs = np.empty((height, width, hypotheses), np.float32)
+        _fill_costs(costs, images, starts, cameras, own, others[own, :count], radius, image, base,
+                    steps[own])
+        total = np.zeros((height, width, hypotheses), np.float32)
+        penalty = _penalties(image)
+        _add_along_rows(total, costs, penalty)
+        _add_along_columns(total, costs, penalty)
+        _choose(inverse[at:at + size].reshape(height, width), total, base, steps[own])
+
+
+@kernel
+def _fill_costs(costs, images, starts, cameras, own, others, radius, image, base, step):
+    """Writes the cost of every hypothesis, [H, W, D].
+
+    Windows are summed row by row: a ring of rows holds the sums along x of what is needed.
+    """
+    height, width, hypotheses = costs.shape
+    rows = 2 * radius + 1
+    padded = np.empty((_SUMS, width + 2 * radius), np.float32)
+    ring = np.empty((rows, _SUMS, width), np.float32)
+    inside = np.empty((rows, width), np.float32)
+    place = np.empty((3, width), np.float32)
+    sums = np.empty((_SUMS, width), np.float32)
+    mean, spread = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    scale = np.float32(1 / rows**2)
+    for y in range(height + radius):
+        if y < height:
+            _push_row(ring[y % rows], padded, image[y], image[y], radius)
+        if y >= radius:
+            _sum_rows(sums, ring, y - radius, radius, height)
+            for x in range(width):
+                a = sums[0, x] * scale
+                mean[y - radius, x] = a
+                spread[y - radius, x] = max(sums[1, x] * scale - a * a, _ZERO) + _NOISE
+    score, seen = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    for d in range(hypotheses):
+        score[:] = 0
+        seen[:] = 0
+        for other in others:
+            Q = cameras[other]
+            R, t = _relative(cameras[own], Q)
+            for y in range(height + radius):
+                if y < height:
+                    _warp_row(padded[0, radius:radius + width], inside[y % rows], place,
+                              images[starts[other]:], cameras[own], Q, R, t, y, base[y], step * d)
+                    _push_row(ring[y % rows], padded, padded[0, radius:radius + width], image[y],
+                              radius)
+                if y >= radius:
+                    _sum_rows(sums, ring, y - radius, radius, height)
+                    row = y - radius
+                    _add_scores(score[row], seen[row], sums, inside[row % rows], mean[row],
+                                spread[row], scale)
+        for y in range(height):
+            for x in range(width):
+                costs[y, x, d] = _ONE - score[y, x] / max(seen[y, x], _ONE)
+
+
+@kernel
+def _relative(P, Q):
+    """Returns rotation [3, 3] and translation [3] from the axes of camera P to those of Q."""
+    R, t = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        t[i] = Q[9 + i]
+        for j in range(3):
+            R[i, j] = (Q[3 * i] * P[3 * j] + Q[3 * i + 1] * P[3 * j + 1]
+                       + Q[3 * i + 2] * P[3 * j + 2])
+            t[i] -= R[i, j] * P[9 + j]
+    return R, t
+
+
+@inlined
+def _warp_row(warped, inside, place, other, P, Q, R, t, y, base, shift):
+    """Reads another image where a row of a view falls at the inverse depths base + shift."""
+    width = len(warped)
+    wide, tall = int(Q[16]), int(Q[17])
+    b, first, slope = (y + 0.5 - P[15]) / P[13], (0.5 - P[14]) / P[12], 1 / P[12]
+    # u = (a line in x + inverse depth * a constant) / z + cx - .5, in pixels
+    u0, u1, u2 = (np.float32(Q[12] * (R[0, 0] * first + R[0, 1] * b + R[0, 2])),
+                  np.float32(Q[12] * R[0, 0] * slope), np.float32(Q[12] * t[0]))
+    v0, v1, v2 = (np.float32(Q[13] * (R[1, 0] * first + R[1, 1] * b + R[1, 2])),
+                  np.float32(Q[13] * R[1, 0] * slope), np.float32(Q[13] * t[1]))
+    z0, z1, z2 = (np.float32(R[2, 0] * first + R[2, 1] * b + R[2, 2]), np.float32(R[2, 0] * slope),
+                  np.float32(t[2]))
+    cx, cy, moved = np.float32(Q[14] - 0.5), np.float32(Q[15] - 0.5), np.float32(shift)
+    right, bottom = np.float32(wide - 1), np.float32(tall - 1)
+    us, vs, xs = place[0], place[1], place[2]
+    for x in range(width):
+        xs[x] = np.float32(x)
+    for x in range(width):
+        inverse = base[x] + moved
+        z = z0 + z1 * xs[x] + z2 * inverse
+        u = (u0 + u1 * xs[x] + u2 * inverse) / z + cx
+        v = (v0 + v1 * xs[x] + v2 * inverse) / z + cy
+        shown = z > _LEAST_Z and inverse > 0 and u >= 0 and v >= 0 and u <= right and v <= bottom
+        inside[x] = _ONE if shown else _ZERO
+        us[x] = min(max(u, _ZERO), right) if shown else _ZERO
+        vs[x] = min(max(v, _ZERO), bottom) if shown else _ZERO
+    for x in range(width):
+        i, j = min(int(us[x]), wide - 2), min(int(vs[x]), tall - 2)
+        du, dv = us[x] - np.float32(i), vs[x] - np.float32(j)
+        at = np.uintp(j * wide + i)
+        low = np.uintp(j * wide + i + wide)
+        one = np.uintp(1)
+        top = other[at] + du * (other[at + one] - other[at])
+        down = other[low] + du * (other[low + one] - other[low])
+        warped[x] = top + dv * (down - top)
+
+
+@inlined
+def _push_row(slot, padded, warped, image, radius):
+    """Writes sums along x of values, squares, products and differences of a row, [4, W].
+
+    Beyond its ends a row goes on with its last value. `warped` may be a part of `padded`.
+    """
+    width = len(image)
+    here = slice(radius, radius + width)
+    values, squares, products, differences = (
+        padded[0, here], padded[1, here], padded[2, here], padded[3, here])
+    for x in range(width):
+        value = warped[x]
+        values[x] = value
+        squares[x] = value * value
+        products[x] = value * image[x]
+        differences[x] = min(abs(value - image[x]), _MOST_DIFFERENCE)
+    for row in range(_SUMS):
+        for x in range(radius):
+            padded[row, x] = padded[row, radius]
+            padded[row, radius + width + x] = padded[row, radius + width - 1]
+        result = slot[row]
+        part = padded[row, :width]
+        for x in range(width):
+            result[x] = part[x]
+        for shift in range(1, 2 * radius + 1):
+            part = padded[row, shift:shift + width]
+            for x in range(width):
+                result[x] += part[x]
+
+
+@inlined
+def _sum_rows(sums, ring, y, radius, height):
+    """Writes the sums [4, W] of the windows about a row."""
+    width = sums.shape[1]
+    rows = 2 * radius + 1
+    for row in range(_SUMS):
+        result = sums[row]
+        result[:] = 0
+        for shift in range(-radius, radius + 1):
+            part = ring[min(max(y + shift, 0), height - 1) % rows, row]
+            for x in range(width):
+                result[x] += part[x]
+
+
+@inlined
+def _add_scores(score, seen, sums, inside, mean, spread, scale):
+    """Adds the scores of a row: correlation less mean difference, at least `_LEAST_SCORE`."""
+    values, squares, products, differences = sums[0], sums[1], sums[2], sums[3]
+    weight = scale / _MOST_DIFFERENCE
+    for x in range(len(score)):
+        b = values[x] * scale
+        other = max(squares[x] * scale - b * b, _ZERO) + _NOISE
+        value = ((products[x] * scale - mean[x] * b) / np.sqrt(spread[x] * other)
+                 - differences[x] * weight)
+        score[x] += inside[x] * max(value, _LEAST_SCORE)
+        seen[x] += inside[x]
+
+
+@kernel
+def _penalties(image):
+    """Returns the share [H, W] of the larger penalty that counts at each pixel."""
+    height, width = image.shape
+    shares = np.empty((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            across = image[y, min(x + 1, width - 1)] - image[y, max(x - 1, 0)]
+            down = image[min(y + 1, height - 1), x] - image[max(y - 1, 0), x]
+            gradient = 0.5 * math.sqrt(across * across + down * down)
+            shares[y, x] = max(math.exp(-gradient / _EDGE), _LEAST_PENALTY)
+    return shares
+
+
+@inlined
+def _extend(now, before, costs, large):
+    """Writes the least costs of paths that end at a pixel, from those of the one before."""
+    count = len(now)
+    least = before[0]
+    for d in range(1, count):
+        least = min(least, before[d])
+    most, small = np.float32(large), np.float32(_SMALL_STEP)
+    for d in range(count):
+        path = min(before[d] - least, most)
+        if d > 0:
+            path = min(path, before[d - 1] - least + small)
+        if d < count - 1:
+            path = min(path, before[d + 1] - least + small)
+        now[d] = costs[d] + path
+
+
+@kernel
+def _add_along_rows(total, costs, penalty):
+    """Adds the least costs of paths from the left and from the right."""
+    height, width, hypotheses = costs.shape
+    before, now = np.empty(hypotheses, np.float32), np.empty(hypotheses, np.float32)
+    for y in range(height):
+        for way in range(2):
+            for i in range(width):
+                x = i if way == 0 else width - 1 - i
+                if i == 0:
+                    now[:] = costs[y, x]
+                else:
+                    last = x - 1 if way == 0 else x + 1
+                    _extend(now, before, costs[y, x],
+                            _LARGE_STEP * min(penalty[y, x], penalty[y, last]))
+                for d in range(hypotheses):
+                    total[y, x, d] += now[d]
+                before, now = now, before
+
+
+@kernel
+def _add_along_columns(total, costs, penalty):
+    """Adds the least costs of paths from above and below, straight and diagonal."""
+    height, width, hypotheses = costs.shape
+    before = np.empty((width, hypotheses), np.float32)
+    now = np.empty((width, hypotheses), np.float32)
+    for way in range(2):
+        for slope in range(-1, 2):
+            for i in range(height):
+                y = i if way == 0 else height - 1 - i
+                last = y - 1 if way == 0 else y + 1
+                for x in range(width):
+                    beside = x - slope
+                    if i == 0 or beside < 0 or beside >= width:
+                        now[x] = costs[y, x]
+                    else:
+                        _extend(now[x], before[beside], costs[y, x],
+                                _LARGE_STEP * min(penalty[y, x], penalty[last, beside]))
+                    for d in range(hypotheses):
+                        total[y, x, d] += now[x, d]
+                before, now = now, before
+
+
+@kernel
+def _choose(inverse, total, base, step):
+    """Writes the hypothesis of least cost, between its neighbours by a parabola."""
+    height, width, hypotheses = total.shape
+    for y in range(height):
+        for x in range(width):
+            best = 0
+            for d in range(1, hypotheses):
+                if total[y, x, d] < total[y, x, best]:
+                    best = d
+            inverse[y, x] = 0
+            if best == 0 or best == hypotheses - 1:
+                continue
+            left, middle, right = total[y, x, best - 1], total[y, x, best], total[y, x, best + 1]
+            bend = left - 2 * middle + right
+            offset = 0.5 * (left - right) / bend if bend > 1e-6 else 0.0
+            inverse[y, x] = max(base[y, x] + step * (best + offset), 0.0)
