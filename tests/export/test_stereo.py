@@ -126,7 +126,8 @@ def test_masked_pixels_have_no_depth():
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[:, :60] = False
     views = [TrainView(view.camera, view.image, mask) for view in maps.views]
-    found = with_stereo(weigh(views, maps.cameras, maps.depths, maps.gains), EVERYWHERE, NullProgress())
+    masked = weigh(views, maps.cameras, maps.depths, maps.gains)
+    found = with_stereo(masked, EVERYWHERE, NullProgress())
     own = np.stack(found.depths[len(AROUND):])
     assert not own[:, :, :60].any()
     assert (own[:, :, 60:] > 0).mean() > 0.7
