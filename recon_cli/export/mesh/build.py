@@ -20,7 +20,7 @@ from recon_cli.errors import ReconstructionError
 from recon_cli.export.mesh.depth_maps import DepthMaps, render_depth_maps, weigh_by_agreement
 from recon_cli.export.mesh.kernels import SEEN_THROUGH, SHOWN, observe
 from recon_cli.export.mesh.plane_prior import pull_onto_planes, surface_planes
-from recon_cli.export.mesh.stereo import surface_points, with_stereo
+from recon_cli.export.mesh.stereo import with_stereo
 from recon_cli.export.mesh.volume import BYTES, extract, find_blocks, fuse
 from recon_cli.io.meshes import Mesh, simplify
 from recon_cli.machine import free_memory_bytes
@@ -39,7 +39,6 @@ _COARSER = 1.26  # of the voxel, for half the blocks to the area
 _MOST_COARSER = 8.0  # times; a mesh of a room in voxels of 16 cm is none
 _MOST_BYTES = 1_000_000_000  # of the volume
 _SHARE = 0.3  # of the free memory that the volume may take
-_CONFIRMING = 20_000  # places of each depth map by stereo that confirm planes
 _TOLERANCE = 0.025  # of a depth, within which a view shows a vertex
 _LEAST_ISLAND = 50.0  # voxel faces; 2 dm^2 in rooms
 
@@ -70,7 +69,7 @@ def build_mesh(
     Args:
         splats: on the device of `ctx`.
         views: at least one, with cameras in the world of the splats.
-        points: [P, 3] triangulated points, which confirm planes, as what stereo finds does.
+        points: [P, 3] triangulated points, which confirm planes.
         ctx: backend, threads, progress, and notices.
         max_triangles: that are left.
         voxel: side of a voxel in world units; None for 1/128 of the median depth.
@@ -86,9 +85,6 @@ def build_mesh(
     if len(views) > 1:
         means = splats.means.detach().cpu().numpy().astype(np.float64)
         maps = with_stereo(maps, (means.min(axis=0), means.max(axis=0)), ctx.progress)
-        stereo = slice(len(views), None)
-        points = np.concatenate([points, surface_points(
-            maps.cameras[stereo], maps.depths[stereo], _CONFIRMING)])
     with ctx.progress.bar("mesh", len(maps.views), unit="view") as bar:
         return mesh_of(maps, points, ctx, max_triangles=max_triangles, voxel=voxel,
                        on_view=bar.advance)
