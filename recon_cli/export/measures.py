@@ -6,7 +6,7 @@ and the scale. What is not found is said, not guessed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +20,7 @@ from recon_cli.scene.planes import Plane
 _LEVEL = 0.98  # cosine to up from which on a plane is level; 11 degrees
 _UPRIGHT = 0.10  # cosine to up up to which it is upright
 _SAME = 0.96  # cosine within which two walls face the same way
+_SCATTER = 1.05  # times the distance of a wall; a cupboard is deeper, fog is not
 _LEAST_WALL = 0.25  # of the area of the largest wall that faces the same way
 _MOST_OUTSIDE = 0.1  # share of the floor outside the footprint, else the room is no convex one
 _SIGMAS = 1.96  # of an interval of 95%, for a normal distribution
@@ -95,7 +96,8 @@ def measure_room(
         value = float(floor.heights(middle[None])[0] + ceiling.heights(middle[None])[0])
         height = _measure(value, np.hypot(doubts[id(floor)], doubts[id(ceiling)]), scale_error)
     base = middle @ up - (floor.heights(middle[None])[0] if floor is not None else 0.0)
-    walls = _outer_walls(best, centers, up)
+    sure = {id(confirmed) for _, confirmed in planes if confirmed is not None}
+    walls = _outer_walls(best, centers, up, sure)
     axes = _plan_axes(walls, up)
     footprint, lengths, area = _footprint(walls, axes, middle, doubts, scale_error)
     if footprint is None:
@@ -133,9 +135,14 @@ def _measure(value: float, error: float, scale_error: float) -> Measure:
 
 
 def _outer_walls(
-    planes: Sequence[Plane], centers: NDArray[np.float64], up: NDArray[np.float64]
+    planes: Sequence[Plane], centers: NDArray[np.float64], up: NDArray[np.float64],
+    sure: Set[int],
 ) -> list[Plane]:
-    """Returns upright planes that all cameras see from inside, the outermost of each direction."""
+    """Returns upright planes that all cameras see from inside, the outermost of each direction.
+
+    `sure` are the ids of those that points confirm. A plane without points that is a little
+    further out than one of these is the scatter of the same wall.
+    """
     upright = [plane for plane in planes if abs(plane.normal @ up) < _UPRIGHT
                and (plane.heights(centers) > 0).mean() > 0.95]
     middle = centers.mean(axis=0)
@@ -144,6 +151,9 @@ def _outer_walls(
         alike = [other for other in upright if other.normal @ plane.normal > _SAME]
         large = [other for other in alike
                  if other.area >= _LEAST_WALL * max(one.area for one in alike)]
+        known = [other.heights(middle[None])[0] for other in large if id(other) in sure]
+        large = [other for other in large if id(other) in sure or not any(
+            height < other.heights(middle[None])[0] < _SCATTER * height for height in known)]
         outermost = max(large, key=lambda other: other.heights(middle[None])[0])
         if outermost is plane:
             walls.append(plane)

@@ -56,6 +56,22 @@ def test_furniture_parallel_to_a_wall_is_no_wall():
     assert room.floor_area.value == pytest.approx(20.0)
 
 
+def test_fog_a_little_behind_a_confirmed_wall_is_that_wall():
+    walls = {name: plane(*side) for name, side in SIDES.items()}
+    south = walls["south"][0]
+    fog = plane((0.04, 1, 0), -0.05)
+    sure = [*walls.values()]
+    sure[list(SIDES).index("south")] = south, south
+    room = measure_room(box(), [*sure, fog], CENTERS, UP, 0.0)
+    assert sorted(wall.value for wall in room.walls) == pytest.approx([4, 4, 5, 5])
+    assert room.floor_area.value == pytest.approx(20.0)
+    # a wall that no point confirms, behind a cupboard that they do, is the wall
+    cupboard = plane((0, 1, 0), 0.4)[0]
+    walls["cupboard"] = cupboard, cupboard
+    room = measure_room(box(), [*walls.values()], CENTERS, UP, 0.0)
+    assert room.floor_area.value == pytest.approx(20.0)
+
+
 @pytest.mark.parametrize(("left_out", "words"), [
     ("ceiling", "No ceiling"), ("floor", "No floor"), ("east", "do not enclose")])
 def test_what_is_not_found_is_said(left_out, words):
