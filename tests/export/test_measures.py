@@ -59,7 +59,7 @@ def test_furniture_parallel_to_a_wall_is_no_wall():
 def test_fog_a_little_behind_a_confirmed_wall_is_that_wall():
     walls = {name: plane(*side) for name, side in SIDES.items()}
     south = walls["south"][0]
-    fog = plane((0.04, 1, 0), -0.05)
+    fog = plane((0.04, 1, 0), 0.0)
     sure = [*walls.values()]
     sure[list(SIDES).index("south")] = south, south
     room = measure_room(box(), [*sure, fog], CENTERS, UP, 0.0)
