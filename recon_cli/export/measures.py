@@ -78,13 +78,18 @@ def measure_room(
 ) -> RoomMeasures:
     """Returns the measures of a room whose unit is the metre and whose up is known."""
     best = [confirmed or plane for plane, confirmed in planes]
+    middle = centers.mean(axis=0)
     doubts = {id(row): _SHARE_OF_SPREAD * row.spread for row in best}
+    reach = max((abs(row.heights(middle[None])[0]) for row in best), default=0.0)
+    for plane, confirmed in planes:
+        if confirmed is None:
+            doubts[id(plane)] = float(np.hypot(
+                doubts[id(plane)], _lean(plane, planes) * reach))
     notes: list[str] = []
     floors = [plane for plane in best
               if plane.normal @ up > _LEVEL and (plane.heights(centers) > 0).mean() > 0.9]
     ceilings = [plane for plane in best
                 if plane.normal @ up < -_LEVEL and (plane.heights(centers) > 0).mean() > 0.9]
-    middle = centers.mean(axis=0)
     floor = max(floors, key=lambda plane: plane.heights(middle[None])[0], default=None)
     ceiling = max(ceilings, key=lambda plane: plane.heights(middle[None])[0], default=None)
     if floor is None:
@@ -109,6 +114,18 @@ def measure_room(
         footprint, lengths, area = None, (), None
     cut = cut_mesh(mesh, up, float(base) + 1.0)
     return RoomMeasures(height, area, lengths, footprint, tuple(notes), cut @ axes.T, axes)
+
+
+def _lean(plane: Plane, planes: Sequence[tuple[Plane, Plane | None]]) -> float:
+    """Returns by how much an unconfirmed wall leans against a confirmed one; 0 if against none.
+
+    Walls in front of each other are parallel, most often: where points confirm one and the other,
+    of surface alone, is not parallel, its surface is not the wall everywhere.
+    """
+    cosines = [abs(float(plane.normal @ confirmed.normal))
+               for _, confirmed in planes if confirmed is not None]
+    close = max((cosine for cosine in cosines if cosine > _SAME), default=1.0)
+    return float(np.sqrt(max(0.0, 1 - close**2)))
 
 
 def cut_mesh(mesh: Mesh, up: NDArray[np.float64], height: float) -> NDArray[np.float64]:

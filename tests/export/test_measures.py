@@ -72,6 +72,20 @@ def test_fog_a_little_behind_a_confirmed_wall_is_that_wall():
     assert room.floor_area.value == pytest.approx(20.0)
 
 
+def test_a_wall_of_surface_alone_that_leans_is_uncertain_by_as_much():
+    planes = {name: plane(*side) for name, side in SIDES.items()}
+    straight = measure_room(box(), [*planes.values()], CENTERS, UP, 0.0)
+    north = planes["north"][0]
+    planes["north"] = north, north
+    planes["south"] = plane((0.04, (1 - 0.04**2) ** 0.5, 0), 0.1)
+    room = measure_room(box(), [*planes.values()], CENTERS, UP, 0.0)
+    short = [wall for wall in room.walls if wall.value < 4.5]
+    assert len(short) == 2
+    assert all(0.02 < abs(wall.value - 4) < wall.error for wall in short)
+    assert abs(room.floor_area.value - 20) < room.floor_area.error
+    assert room.floor_area.error > 5 * straight.floor_area.error
+
+
 @pytest.mark.parametrize(("left_out", "words"), [
     ("ceiling", "No ceiling"), ("floor", "No floor"), ("east", "do not enclose")])
 def test_what_is_not_found_is_said(left_out, words):
