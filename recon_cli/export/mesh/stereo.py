@@ -107,13 +107,13 @@ def stereo_depths(
               for (image, _), low in zip(half, ranges[:, 0], strict=True)]
     coarse = _search(half, others, lowest, steps, _HYPOTHESES, _RADIUS, on_view)
     fine = steps / _FINER
-    lowest = []
-    for (image, _), found, step in zip(full, coarse, fine, strict=True):
-        prior = _enlarged(_smoothed(found), image.shape)
-        lowest.append((prior - step * (_REFINED // 2)).astype(np.float32))
-    depths = [np.where(inverse > 0, 1 / np.maximum(inverse, 1e-12), 0).astype(np.float32)
-              for inverse in _search(
-                  full, others, lowest, fine, _REFINED, _REFINED_RADIUS, on_view)]
+    priors = [_enlarged(_smoothed(found), image.shape)
+              for (image, _), found in zip(full, coarse, strict=True)]
+    lowest = [(prior - step * (_REFINED // 2)).astype(np.float32)
+              for prior, step in zip(priors, fine, strict=True)]
+    refined = _search(full, others, lowest, fine, _REFINED, _REFINED_RADIUS, on_view)
+    depths = [np.where((prior > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-12), 0).astype(
+        np.float32) for prior, inverse in zip(priors, refined, strict=True)]
     return _confirmed(depths, [camera for _, camera in full], others, maps.near)
 
 
