@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.export.mesh.plane_prior import face_geometry
+from recon_cli.export.mesh.planes import face_geometry
 from recon_cli.io.meshes import Mesh
 from recon_cli.scene.planes import Plane
 

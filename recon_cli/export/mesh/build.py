@@ -19,7 +19,7 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
 from recon_cli.export.mesh.depth_maps import DepthMaps, render_depth_maps, weigh_by_agreement
 from recon_cli.export.mesh.kernels import SEEN_THROUGH, SHOWN, observe
-from recon_cli.export.mesh.plane_prior import pull_onto_planes, surface_planes
+from recon_cli.export.mesh.planes import surface_planes
 from recon_cli.export.mesh.stereo import with_stereo
 from recon_cli.export.mesh.volume import BYTES, extract, find_blocks, fuse
 from recon_cli.io.meshes import Mesh, simplify
@@ -69,7 +69,7 @@ def build_mesh(
     Args:
         splats: on the device of `ctx`.
         views: at least one, with cameras in the world of the splats.
-        points: [P, 3] triangulated points, which confirm planes.
+        points: [P, 3] triangulated points, which confirm the planes that a room is measured by.
         ctx: backend, threads, progress, and notices.
         max_triangles: that are left.
         voxel: side of a voxel in world units; None for 1/128 of the median depth.
@@ -98,7 +98,6 @@ def mesh_of(
     weigh_by_agreement(maps)
     voxel, farthest = _fit_voxel(maps, voxel, ctx)
     planes = surface_planes(maps, voxel, farthest, points)
-    pull_onto_planes(maps, planes, voxel)
     vertices, faces = extract(fuse(maps, voxel, farthest, on_view))
     counts, _ = observe_all(maps, vertices, faces)
     shown = (counts[:, SHOWN] > 0) & (counts[:, SHOWN] >= 0.5 * counts[:, SEEN_THROUGH])
