@@ -16,7 +16,7 @@ MAX_LINES = 500
 BASE = {"errors", "lazy", "progress", "machine"}
 RECORDS = BASE | {"workspace", "config"}
 READ = RECORDS | {"scene", "io"}
-DRAW = READ | {"context", "render", "evaluation"}
+DRAW = READ | {"context", "render", "evaluation", "stereo"}
 MAKE = DRAW | {"capture", "executors", "sfm", "train", "export", "trust", "stages"}
 RUN = MAKE | {"pipeline"}
 ALLOWED: dict[str, set[str]] = {
@@ -33,6 +33,7 @@ ALLOWED: dict[str, set[str]] = {
     "executors": BASE | {"workspace"},
     "capture": READ,
     "sfm": READ | {"executors"},
+    "stereo": {"render", "scene"},
     "evaluation": READ | {"context", "render"},
     "train": DRAW,
     "export": DRAW | {"sfm", "train"},

@@ -25,7 +25,7 @@ from pose_errors import similarity
 from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene, load_views, render_view
+from recon_cli.evaluation.reference_views import load_scene, load_views
 from recon_cli.export.mesh import build
 from recon_cli.export.mesh.depth_maps import DepthMaps, render_depth_maps, weigh, weigh_by_agreement
 from recon_cli.export.mesh.volume import extract, fuse, pixel_rays
@@ -119,13 +119,6 @@ def f_scores(
     return " | ".join(cells)
 
 
-def with_depths(maps: DepthMaps, depth_of: Callable[[Camera], NDArray[np.float32]]) -> DepthMaps:
-    """Returns maps with other depths and the cosines of `maps`."""
-    depths = [depth_of(camera) for camera in maps.cameras]
-    ones = [(gain > 0).astype(np.float32) for gain in maps.gains]
-    return weigh(maps.views, maps.cameras, depths, ones)
-
-
 def true_scene(
     scene: Scene, room: Path
 ) -> tuple[Scene, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
@@ -188,13 +181,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         mesh = build.build_mesh(splats, some, scene.points, ctx, max_triangles=triangles).mesh
         return mesh.vertices, mesh.faces
 
-    def expected(camera: Camera) -> NDArray[np.float32]:
-        output = render_view(splats, camera, 0, "numba")
-        depth = output.depth / output.alpha.clamp_min(1e-3)
-        return np.where(output.alpha > 0.5, depth, 0).astype(np.float32)
-
     row("whole export, with rendering and stereo", lambda: built(views))
-    row("expected, fused", lambda: fused(with_depths(maps, expected), agreement=False))
     row("median along the ray, fused", lambda: fused(copy(maps), agreement=False))
     row("and weighed by agreement", lambda: fused(copy(maps), agreement=True))
 

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.export.mesh.kernels import compare
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.stereo.depths import camera_row
+from recon_cli.stereo.kernels import compare
 
 # Chosen on the room "living" and checked on "office", tests/bench/bench_mesh.py:
 NEAR = 0.02  # of the median depth; nothing nearer to a camera is a surface
@@ -108,10 +109,3 @@ def find_neighbours(cameras: Sequence[Camera], median: float) -> list[NDArray[np
         nearest = nearest[np.isfinite(apart[nearest])]
         rows.append(nearest[::max(1, len(nearest) // _NEIGHBOURS)][:_NEIGHBOURS])
     return rows
-
-
-def camera_row(camera: Camera) -> NDArray[np.float64]:
-    """Returns a camera as the kernels read it, [18]."""
-    return np.concatenate([
-        camera.viewmat[:3, :3].reshape(-1), camera.viewmat[:3, 3],
-        [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]])

@@ -84,54 +84,6 @@ def integrate(counter, blocks, values, weights, depth, gain, view, voxel, band, 
 
 
 @kernel
-def compare(counter, maps, starts, cameras, own, others, tolerance, near, agree, through):
-    """Counts, for each pixel of a depth map, the other maps that agree and that see through it.
-
-    Args:
-        counter: [1] shared; rows already taken.
-        maps: [P] float32, all depth maps one after the other, 0 for none; starts: [C] of each.
-        cameras: [C, 18] rotation, translation, fx, fy, cx, cy, width and height of each.
-        own: number of the map; others: [K] int64 numbers of those that it is compared with.
-        tolerance: of the depth, within which surfaces agree; near: least depth, world units.
-        agree: [H * W] int32 out; so is through.
-    """
-    P, start = cameras[own], starts[own]
-    width, height = int(P[16]), int(P[17])
-    while True:
-        y = fetch_add(counter, 0, 1)
-        if y >= height:
-            break
-        for x in range(width):
-            at = y * width + x
-            agree[at] = through[at] = 0
-            d = maps[start + at]
-            if d <= near:
-                continue
-            cx = (x + 0.5 - P[14]) / P[12] * d - P[9]
-            cy = (y + 0.5 - P[15]) / P[13] * d - P[10]
-            cz = d - P[11]
-            wx = P[0] * cx + P[3] * cy + P[6] * cz
-            wy = P[1] * cx + P[4] * cy + P[7] * cz
-            wz = P[2] * cx + P[5] * cy + P[8] * cz
-            for other in others:
-                Q = cameras[other]
-                z = Q[6] * wx + Q[7] * wy + Q[8] * wz + Q[11]
-                if z <= near:
-                    continue
-                u = Q[12] * (Q[0] * wx + Q[1] * wy + Q[2] * wz + Q[9]) / z + Q[14]
-                v = Q[13] * (Q[3] * wx + Q[4] * wy + Q[5] * wz + Q[10]) / z + Q[15]
-                if u < 0 or v < 0 or u >= Q[16] or v >= Q[17]:
-                    continue
-                seen = maps[starts[other] + int(v) * int(Q[16]) + int(u)]
-                if seen <= 0:
-                    continue
-                if z < seen - tolerance * z:
-                    through[at] += 1
-                elif z <= seen + tolerance * z:
-                    agree[at] += 1
-
-
-@kernel
 def observe(counter, points, normals, view, depth, image, tolerance, near, counts, colors):
     """Adds to each vertex whether a view shows it or sees through it, and its colour there.
 

@@ -1,0 +1,1 @@
+"""Dense stereo: depth from the images themselves, for training and for meshes."""

@@ -1,0 +1,186 @@
+"""Depth maps of photos by dense stereo, where another photo finds the same surface.
+
+Training fits colours. Where a wall has little texture, Gaussians at many depths give the same
+images, and structure from motion finds no points. Images of neighbours still differ there by their
+shading: summed over windows and made smooth along paths of pixels, that tells the depth
+(`kernels.match`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.render.numba.thread_pool import pool
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.train_view import TrainView
+from recon_cli.stereo.kernels import compare, match
+
+_LEAST_SIDE = 8  # pixels of any side; windows have 5
+# Weight of a neighbour: the points seen by both, each by the angle between the rays to it. Below
+# the best angle depth is uncertain, far beyond it surfaces look different.
+_ANGLE, _NARROWER, _WIDER = 5.0, 1.5, 8.0  # degrees: the best, and standard deviations
+_LEAST_ANGLE = 1.0  # degrees; below it all depths look alike
+_LEAST_SHARED = 10  # points that two views must both see
+# The first search, at half the size: inverse depths evenly spread, over more than the surface spans
+_HYPOTHESES, _RADIUS = 64, 1
+_NEARER, _FARTHER = 0.7, 1.4
+# The second one, about what the first found: a window then follows slanted surfaces.
+_REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
+_EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
+_TOLERANCE = 0.015  # of a depth, within which another view confirms it
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A view that is searched, and between which depths."""
+
+    view: TrainView
+    nearest: float  # world units
+    farthest: float
+    gain: float = 1.0  # of its exposure
+
+    @property
+    def grey(self) -> NDArray[np.float32]:
+        """Grey levels [H, W] as they were at the mean exposure."""
+        grey = cv2.cvtColor(np.ascontiguousarray(self.view.image), cv2.COLOR_RGB2GRAY)
+        return np.asarray(grey, np.float32) / np.float32(self.gain)
+
+
+def find_depths(
+    photos: Sequence[Photo], partners: NDArray[np.int64], near: float,
+    on_photo: Callable[[], None] = lambda: None,
+) -> list[NDArray[np.float32]]:
+    """Returns a depth map [H, W] in world units of each photo, 0 where there is none.
+
+    Args:
+        photos: at the size that is searched.
+        partners: [V, K] photos that each is compared with, -1 for none.
+        near: least depth of a surface, world units.
+        on_photo: called twice for each photo.
+    """
+    full = [(photo.grey, photo.view.camera) for photo in photos]
+    half = [_halved(*image) for image in full]
+    ranges = np.array([(1 / (_FARTHER * photo.farthest), 1 / max(_NEARER * photo.nearest, near))
+                       for photo in photos])
+    steps = (ranges[:, 1] - ranges[:, 0]) / (_HYPOTHESES - 1)
+    lowest = [np.full(image.shape, low, np.float32)
+              for (image, _), low in zip(half, ranges[:, 0], strict=True)]
+    coarse = _search(half, partners, lowest, steps, _HYPOTHESES, _RADIUS, on_photo)
+    fine = steps / _FINER
+    priors = [_enlarged(_smoothed(found), image.shape)
+              for (image, _), found in zip(full, coarse, strict=True)]
+    lowest = [(prior - step * (_REFINED // 2)).astype(np.float32)
+              for prior, step in zip(priors, fine, strict=True)]
+    refined = _search(full, partners, lowest, fine, _REFINED, _REFINED_RADIUS, on_photo)
+    depths = [np.where((prior > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-12), 0).astype(
+        np.float32) for prior, inverse in zip(priors, refined, strict=True)]
+    return _confirmed(depths, photos, partners, near)
+
+
+def find_partners(
+    cameras: Sequence[Camera], points: NDArray[np.float64], seen: NDArray[np.bool_], most: int
+) -> NDArray[np.int64]:
+    """Returns the views [V, most] that each view is compared with, best first, -1 for none.
+
+    `seen` [V, P] tells which view sees which of the points [P, 3].
+    """
+    rays = points - np.stack([camera.center for camera in cameras])[:, None]
+    rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12)
+    partners = np.full((len(cameras), most), -1, np.int64)
+    for own in range(len(cameras)):
+        mine = np.flatnonzero(seen[own])
+        angles = np.degrees(np.arccos(np.clip((rays[:, mine] * rays[own, mine]).sum(2), -1, 1)))
+        spread = np.where(angles < _ANGLE, _NARROWER, _WIDER)
+        both = seen[:, mine] & (angles >= _LEAST_ANGLE)
+        worth = (both * np.exp(-0.5 * ((angles - _ANGLE) / spread) ** 2)).sum(axis=1)
+        worth[both.sum(axis=1) < _LEAST_SHARED] = 0
+        worth[own] = 0
+        best = np.argsort(-worth, kind="stable")[:most]
+        best = best[worth[best] > 0]
+        partners[own, :len(best)] = best
+    return partners
+
+
+def places(
+    camera: Camera, depth: NDArray[np.float32], pixels: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Returns where some pixels of a depth map [H, W] lie, [N, 3] in world units."""
+    line, column = np.divmod(pixels, depth.shape[1])
+    rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (line + 0.5 - camera.cy) / camera.fy,
+                     np.ones(len(pixels))], axis=1)
+    local = rays * depth.reshape(-1)[pixels, None] - camera.viewmat[:3, 3]
+    return np.asarray(local @ camera.viewmat[:3, :3])
+
+
+def camera_row(camera: Camera) -> NDArray[np.float64]:
+    """Returns a camera as the kernels read it, [18]."""
+    return np.concatenate([
+        camera.viewmat[:3, :3].reshape(-1), camera.viewmat[:3, 3],
+        [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]])
+
+
+def _halved(image: NDArray[np.float32], camera: Camera) -> tuple[NDArray[np.float32], Camera]:
+    width, height = (max(_LEAST_SIDE, round(side / 2)) for side in (camera.width, camera.height))
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32), camera.resized(width, height)
+
+
+def _search(
+    images: Sequence[tuple[NDArray[np.float32], Camera]], partners: NDArray[np.int64],
+    lowest: Sequence[NDArray[np.float32]], steps: NDArray[np.float64], hypotheses: int, radius: int,
+    on_photo: Callable[[], None],
+) -> list[NDArray[np.float32]]:
+    """Returns the inverse depths [H, W] that `match` finds, 0 where it finds none."""
+    sizes = [image.size for image, _ in images]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    inverse = np.zeros(starts[-1], np.float32)
+    arguments = (
+        np.concatenate([image.reshape(-1) for image, _ in images]), starts[:-1],
+        np.stack([camera_row(camera) for _, camera in images]), partners, radius,
+        np.concatenate([part.reshape(-1) for part in lowest]), steps, hypotheses, inverse)
+    for first in range(0, len(images), pool.size):
+        rows = np.arange(first, min(first + pool.size, len(images)))
+        pool.run(match, rows, *arguments, scratch=False)
+        for _ in rows:
+            on_photo()
+    return [inverse[start:start + size].reshape(image.shape)
+            for start, size, (image, _) in zip(starts, sizes, images, strict=False)]
+
+
+def _smoothed(inverse: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns inverse depths without the bumps of walls, which the second search would keep."""
+    return np.asarray(cv2.medianBlur(cv2.medianBlur(np.ascontiguousarray(inverse), 5), 5))
+
+
+def _enlarged(inverse: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Returns inverse depths in another size; edges stay sharp."""
+    size = shape[1], shape[0]
+    nearest, linear = (cv2.resize(inverse, size, interpolation=way)
+                       for way in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
+    return np.asarray(np.where(np.abs(linear - nearest) < _EDGE * nearest, linear, nearest))
+
+
+def _confirmed(
+    depths: Sequence[NDArray[np.float32]], photos: Sequence[Photo], partners: NDArray[np.int64],
+    near: float,
+) -> list[NDArray[np.float32]]:
+    """Returns the depths without those that no other view agrees with, and without masked ones."""
+    flat = np.concatenate([depth.reshape(-1) for depth in depths])
+    starts = np.concatenate([[0], np.cumsum([depth.size for depth in depths])])[:-1]
+    table = np.stack([camera_row(photo.view.camera) for photo in photos])
+    kept = []
+    for own, (depth, photo) in enumerate(zip(depths, photos, strict=True)):
+        agree, through = np.zeros((2, depth.size), np.int32)
+        others = partners[own][partners[own] >= 0]
+        pool.run(compare, flat, starts, table, own, others, _TOLERANCE, near, agree, through,
+                 scratch=False)
+        there = agree.reshape(depth.shape) > 0
+        if photo.view.mask is not None:
+            there &= photo.view.mask
+        kept.append(np.where(there, depth, 0).astype(np.float32))
+    return kept
