@@ -186,9 +186,9 @@ class TrainConfig(StageConfig):
     far: str = option(
         "auto", "Add Gaussians where views show no points; auto: by a trial of validation PSNR.",
         choices=("auto", "on", "off"))
-    planes: str = option(
-        "auto", "Start with Gaussians on walls and ceilings without texture, where points around "
-        "them lie in a plane; auto: unless a trial lowers validation PSNR.",
+    stereo: str = option(
+        "auto", "Start with Gaussians on surfaces that dense stereo finds and sparse points leave "
+        "out; auto: on.",
         choices=("auto", "on", "off"), expert=True)
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",

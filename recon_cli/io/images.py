@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError
 from recon_cli.io.records import AGAIN
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import write_bytes
 
 _COUNTS = 255  # in a mask file; anything less is ignored, half-covered edges included
+_SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 
 
 def fit_size(width: int, height: int, max_size: int) -> tuple[int, int]:
@@ -111,3 +113,17 @@ def fit_image(rgb: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
         return rgb
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
+
+def reduce_view(view: TrainView, factor: float) -> TrainView:
+    """Returns a view and its camera reduced by area; unchanged where it would be too small."""
+    camera = view.camera
+    width, height = round(camera.width / factor), round(camera.height / factor)
+    if factor == 1 or min(width, height) < _SMALLEST:
+        return view
+    image = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
+    mask = None
+    if view.mask is not None:
+        hidden = (~view.mask).astype(np.float32)
+        # a reduced pixel counts only where all that it covers counts
+        mask = np.asarray(cv2.resize(hidden, (width, height), interpolation=cv2.INTER_AREA) == 0)
+    return TrainView(camera.resized(width, height), np.ascontiguousarray(image), mask)

@@ -33,7 +33,7 @@ def compile_ahead(job: Job, stages: Sequence[str], *, again: bool) -> Iterator[N
     if not _waits(job, stages, again=again):
         yield
         return
-    command = [sys.executable, "-m", "recon_cli.render.compile_worker", job.compute.backend,
+    command = [sys.executable, "-m", "recon_cli.train.compile_worker", job.compute.backend,
                job.compute.device]
     # In the workspace: `python -m` looks for modules in the current folder first.
     with tempfile.TemporaryFile() as log, subprocess.Popen(

@@ -62,7 +62,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 3, True,
           "recon_cli.stages.sfm",
           ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json", "model/*")),
-    Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 4, False,
+    Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 5, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),

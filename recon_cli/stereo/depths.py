@@ -33,6 +33,7 @@ _NEARER, _FARTHER = 0.7, 1.4
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 _EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
 _TOLERANCE = 0.015  # of a depth, within which another view confirms it
+_SMALL = 16  # pixels a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +116,15 @@ def places(
                      np.ones(len(pixels))], axis=1)
     local = rays * depth.reshape(-1)[pixels, None] - camera.viewmat[:3, 3]
     return np.asarray(local @ camera.viewmat[:3, :3])
+
+
+def compile_kernels() -> None:
+    """Compiles the kernels, or loads them from the cache, by a search of two small photos."""
+    cameras = [Camera(_SMALL, _SMALL, _SMALL, _SMALL, _SMALL / 2, _SMALL / 2, viewmat)
+               for viewmat in (np.eye(4), np.eye(4))]
+    image = np.zeros((_SMALL, _SMALL, 3), np.uint8)
+    find_depths([Photo(TrainView(camera, image), 1.0, 2.0) for camera in cameras],
+                np.array([[1], [0]]), near=0.1)
 
 
 def camera_row(camera: Camera) -> NDArray[np.float64]:

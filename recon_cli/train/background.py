@@ -17,11 +17,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from recon_cli.io.images import reduce_view
 from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.task import reduce_view
 
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart

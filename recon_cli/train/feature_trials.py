@@ -2,8 +2,8 @@
 
 A part has a cheap sign that must speak for it first, then two short runs at a reduced size that
 differ in this part alone are scored on views that neither trained on. A part is off unless the
-trial shows a gain; planes and, in rooms, far content are on unless it shows a loss. What was
-switched on is part of the trials that follow. `tests/bench/bench_trials.py` holds the choices
+trial shows a gain; far content in rooms is on unless it shows a loss. What was switched on is part
+of the trials that follow. `tests/bench/bench_trials.py` holds the choices
 against runs of full length.
 """
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
+from recon_cli.io.images import reduce_view
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.background import FarContent, faces, far_content, look_at_one_thing
 from recon_cli.train.exposure import Estimate, estimate_gains
@@ -29,7 +30,7 @@ from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.poses import worth_a_trial
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.task import Task, reduce_view
+from recon_cli.train.task import Task
 from recon_cli.workspace.summaries import TrialDecision
 
 # A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
@@ -113,8 +114,7 @@ _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
-LEAST_BLANK = 20  # points, a fifth of a square metre in a room
-PARTS = ("far", "planes", "exposure", "poses", "images")
+PARTS = ("far", "stereo", "exposure", "poses", "images")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
@@ -150,6 +150,8 @@ class Candidate:
 def examine(scene: Candidate) -> Needs:
     """Returns what a scene needs; parts that the options switch on or off are not tried."""
     config = scene.task.schedule.config
+    if config.stereo == "auto":
+        config = replace(config, stereo="on")
     bench = _Bench(scene)
     decisions: list[TrialDecision] = []
 
@@ -168,10 +170,6 @@ def examine(scene: Candidate) -> Needs:
     elif config.images == "auto":
         settle("images", "denoised", "")
     settle("far", "on" if bench.far.share > 0 else None, "points cover all that the views see")
-    blank = scene.task.blank
-    found = 0 if config.planes != "auto" or blank is None else len(blank.found.points)
-    settle("planes", "on" if found >= LEAST_BLANK else None,
-           f"{found} points lie on surfaces without texture")
     drift = bench.drift
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
@@ -224,10 +222,8 @@ class _Bench:
             return [values[i] for i in telling]
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
-        # and the errors are large, but loses up to .5 dB on all five of things. Planes gain off the
-        # path, where no view can be scored.
-        lenient = part == "planes" or (
-            part == "far" and not look_at_one_thing(self._scene.task.train))
+        # and the errors are large, but loses up to .5 dB on all five of things.
+        lenient = part == "far" and not look_at_one_thing(self._scene.task.train)
         return decide(part, (lambda: scores(without), lambda: scores(with_it)),
                       unless_worse=lenient)
 
@@ -287,7 +283,7 @@ class _Bench:
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
                      task.backend, task.device, nearness=task.nearness,
-                     camera_error=task.camera_error, blank=task.blank)
+                     camera_error=task.camera_error, stereo=task.stereo)
         # reduced views would be reduced once more in the search for what lies far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)

@@ -77,7 +77,7 @@ class FinishedModel:
         """
         if self.trained:
             return model_parts(self.config)
-        for name in ("far", "planes"):
+        for name in ("far", "stereo"):
             if getattr(asked, name) == "on":
                 raise ConfigError(
                     f"{name} is on, but an imported scene has the Gaussians that it has: others "

@@ -18,6 +18,7 @@ from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
 from recon_cli.train.poses import WORTH_PX, Poses
 from recon_cli.train.state import TrainState, load_state, new_state
+from recon_cli.train.stereo_points import SurfacePoints
 from recon_cli.train.task import Task
 
 _OPACITY = 0.1  # initial opacity of the reference implementation
@@ -81,10 +82,9 @@ def first_state(
         far = far_content(task.train, points, task.extent)
     gains = estimate_gains(task.train, points).log_gains if config.exposure == "on" else None
     sparse = len(points)
-    if config.planes == "on" and task.blank is not None:
-        surfaces = task.blank.found
-        points = np.concatenate([points, surfaces.points])
-        colors = np.concatenate([colors, surfaces.colors])
+    surfaces = surfaces_of(task, sparse)
+    points = np.concatenate([points, surfaces.points])
+    colors = np.concatenate([colors, surfaces.colors])
     if far is not None:
         points = np.concatenate([points, far.gap_points])
         colors = np.concatenate([colors, far.gap_colors])
@@ -99,6 +99,18 @@ def first_state(
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
         backend=task.backend, exposure=exposure, poses=poses)
+
+
+def surfaces_of(task: Task, sparse: int) -> SurfacePoints:
+    """Returns the points by stereo that a run begins with, besides those of structure from motion.
+
+    They fill what `sparse` points leave of half of the cap: the rest goes where the error is.
+    """
+    config = task.schedule.config
+    room = config.max_gaussians // 2 - sparse
+    if config.stereo != "on" or task.stereo is None or room <= 0:
+        return SurfacePoints.nothing()
+    return task.stereo.found.at_most(room, config.seed)
 
 
 def restore_state(path: Path, task: Task) -> TrainState:

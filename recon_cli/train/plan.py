@@ -10,6 +10,7 @@ import dataclasses
 import filecmp
 import logging
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate, with_exchange
 from recon_cli.train.feature_trials import Candidate, Needs, examine, model_parts
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.initialize import first_state, restore_state
+from recon_cli.train.initialize import first_state, restore_state, surfaces_of
 from recon_cli.train.schedule import RECIPES, Schedule, make_schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
@@ -213,9 +214,9 @@ def plan_task(
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = Facts(count_detail(task.train), len(task.train), len(scene.points), fit_memory)
+    spent = 0.0 if model is not None else needs.seconds + _search_surfaces(asked, facts, task)
     cost = _measure_cost(asked, facts, task, scene, out, ctx)
-    plan = make_plan(
-        asked, facts, cost, spent=0.0 if model is not None else needs.seconds, model=model)
+    plan = make_plan(asked, facts, cost, spent=spent, model=model)
     _report_plan(plan, asked, facts, ctx)
     config = run_config(asked, plan)
     write_config(out, config)
@@ -240,6 +241,16 @@ def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool
     for decision in needs.decisions:
         logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
     return needs
+
+
+def _search_surfaces(config: TrainConfig, facts: Facts, task: Task) -> float:
+    """Searches the surfaces that a run of about this length begins with; returns the seconds."""
+    start = time.perf_counter()
+    likely = dataclasses.replace(task, schedule=Schedule(probe_config(config, facts)))
+    found = surfaces_of(likely, facts.points)
+    logger.info("%s points on surfaces besides %s of sfm", f"{len(found.points):,}",
+                f"{facts.points:,}")
+    return time.perf_counter() - start
 
 
 def _measure_cost(

@@ -6,17 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
+from recon_cli.io.images import reduce_view
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.blank_surfaces import BlankSurfaces
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.stereo_points import StereoPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +32,7 @@ class Task:
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
-    blank: BlankSurfaces | None = None  # of the training views; None where they are not known
+    stereo: StereoPoints | None = None  # of the training views; None where they are not known
     ranks: ProcessGroup = SINGLE_PROCESS  # this process among those that take the steps together
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
@@ -57,24 +56,6 @@ class Task:
     def pyramid(self) -> Pyramid:
         """The training views at every size."""
         return Pyramid(self.train, page_locked=self.device.type == "cuda")
-
-
-_SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
-
-
-def reduce_view(view: TrainView, factor: float) -> TrainView:
-    """Returns a view and its camera reduced by area; unchanged where it would be too small."""
-    camera = view.camera
-    width, height = round(camera.width / factor), round(camera.height / factor)
-    if factor == 1 or min(width, height) < _SMALLEST:
-        return view
-    image = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
-    mask = None
-    if view.mask is not None:
-        hidden = (~view.mask).astype(np.float32)
-        # a reduced pixel counts only where all that it covers counts
-        mask = np.asarray(cv2.resize(hidden, (width, height), interpolation=cv2.INTER_AREA) == 0)
-    return TrainView(camera.resized(width, height), np.ascontiguousarray(image), mask)
 
 
 def _in_file(view: TrainView, file: ImageFile | None) -> TrainView:

@@ -24,8 +24,8 @@ from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.blank_surfaces import BlankSurfaces, SparseModel
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.stereo_points import SparseModel, StereoPoints
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import read_json, write_bytes
 
@@ -68,14 +68,15 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         train, [*load_views(scene.validation, config, ctx, file)], Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), nearness=nearness, camera_error=error,
         cell=scene.cell,
-        blank=BlankSurfaces(train, lambda: _sparse_model(scene, [view.name for view in views])))
+        stereo=StereoPoints(
+            train, lambda: _sparse_model(scene, [view.name for view in views]), ctx.progress))
 
 
 def _sparse_model(scene: Scene, names: Sequence[str]) -> SparseModel:
-    """Returns what is known of the views of these names; nothing where points have no tracks."""
+    """Returns what is known of the views of these names."""
     seen = {} if scene.sparse is None else read_visibility(scene.sparse)
     nothing = np.empty(0, np.int64)
-    return SparseModel(scene.points, [seen.get(name, nothing) for name in names], scene.up)
+    return SparseModel(scene.points, [seen.get(name, nothing) for name in names])
 
 
 def _refuse_tiny_units(scene: Scene) -> None:

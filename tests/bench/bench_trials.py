@@ -41,7 +41,7 @@ VALIDATION = 0.2  # share of the training views: as many views as trials hold ou
 DEGREE = "sh-degree"
 ALL = (*PARTS, DEGREE)
 SWITCHED = {  # the other value of a part
-    "far": ("off", "on"), "planes": ("off", "on"), "exposure": ("off", "on"),
+    "far": ("off", "on"), "stereo": ("off", "on"), "exposure": ("off", "on"),
     "poses": ("off", "on"), "images": ("original", "denoised")}
 
 

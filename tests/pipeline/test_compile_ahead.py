@@ -13,7 +13,8 @@ from fake_stages import TABLE
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.pipeline import compile_ahead
 from recon_cli.pipeline.plan import Job
-from recon_cli.render import compile_worker, registry
+from recon_cli.render import registry
+from recon_cli.train import compile_worker
 from recon_cli.workspace.layout import Workspace
 
 SECONDS = 20.0  # for a process to start or end on a busy machine
@@ -103,7 +104,7 @@ def test_a_process_starts_only_where_stages_that_render_wait_for_others(
     for name in finished:
         (tmp_path / name).mkdir()
     commands = starts(tmp_path, stages, again=again, **compute)
-    assert commands == [["recon_cli.render.compile_worker", compute.get("backend", "auto"),
+    assert commands == [["recon_cli.train.compile_worker", compute.get("backend", "auto"),
                          compute.get("device", "auto")]] * beside
 
 
@@ -179,8 +180,9 @@ def test_the_process_compiles_what_the_options_come_to(
     monkeypatch.setattr(registry, "use_threads", lambda *_: None)
     monkeypatch.setattr(registry, "prepare", lambda name, _: prepared.append(name) or 0.0)
     monkeypatch.setattr(registry, "cuda_verdict", lambda: prepared.append("triton"))
+    monkeypatch.setattr(compile_worker.depths, "compile_kernels", lambda: prepared.append("stereo"))
     compile_worker.compile_kernels(backend, device)
-    assert prepared == ([compiles] if compiles else [])
+    assert prepared == [*([compiles] if compiles else []), "stereo"]
 
 
 @pytest.mark.compile

@@ -1,14 +1,11 @@
 """Parts of the model are on where a sign speaks for them and a trial does."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from wall_scene import CONFIG, scene
 
-from recon_cli.train.blank_surfaces import SurfacePoints
-from recon_cli.train.feature_trials import LEAST_BLANK, examine
+from recon_cli.train.feature_trials import examine
 
 pytestmark = pytest.mark.integration
 
@@ -40,31 +37,14 @@ def test_a_camera_that_sets_its_exposure_is_found_and_helped():
     assert needs.config.exposure == "on"
 
 
-def with_blank(points):
-    """A plain scene in which blank surfaces were found at these points."""
-    plain = scene()
-    surfaces = SurfacePoints(points, np.full((len(points), 3), 128, np.uint8))
-    # the wall's Gaussians are small: at the rates of its real distance, 2, gains are lost in noise
-    task = replace(plain.task, blank=SimpleNamespace(found=surfaces), nearness=0.3)
-    return replace(plain, task=task)
-
-
-def test_points_on_blank_surfaces_are_used_unless_they_do_harm():
-    x, y = np.meshgrid(np.linspace(-1, 1, 12), np.linspace(-1, 1, 12))
-    on_the_wall = np.stack([x, y, np.full_like(x, 2.0)], -1).reshape(-1, 3)
-    needs = examine(with_blank(on_the_wall))
-    assert needs.config.planes == "on"
-    assert next(one for one in needs.decisions if one.name == "planes").mean_db is not None
-
-
-def test_few_points_on_blank_surfaces_are_not_tried():
-    needs = examine(with_blank(np.full((LEAST_BLANK - 1, 3), 2.0)))
-    assert needs.config.planes == "off"
-    assert f"{LEAST_BLANK - 1} points lie on" in reasons(needs)["planes"]
+def test_surfaces_by_stereo_are_used_without_a_trial():
+    needs = examine(scene())
+    assert needs.config.stereo == "on"
+    assert "stereo" not in reasons(needs)
 
 
 def test_what_the_options_say_is_not_tried():
-    config = replace(CONFIG, far="off", planes="on", exposure="on", poses="off")
+    config = replace(CONFIG, far="off", stereo="on", exposure="on", poses="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config

@@ -13,10 +13,10 @@ from tiny_task import CONFIG, tiny_task
 
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import SH_C0
-from recon_cli.train.blank_surfaces import SurfacePoints
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state, restore_state, splats_from_points
 from recon_cli.train.state import save_state
+from recon_cli.train.stereo_points import SurfacePoints
 
 GRID = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
 GREY = np.full((27, 3), 128, np.uint8)
@@ -56,16 +56,30 @@ def test_too_few_points_are_refused():
         splats_from_points(GRID[:3], GREY[:3], most=10, seed=0, sh_degree=3)
 
 
-@pytest.mark.parametrize(("planes", "more"), [("on", 3), ("off", 0), ("auto", 0)])
-def test_blank_surfaces_begin_with_gaussians_only_where_they_are_on(planes, more):
-    surfaces = SurfacePoints(GRID[:3] + 20, np.full((3, 3), 200, np.uint8))
-    config = replace(CONFIG, planes=planes)
-    task = replace(tiny_task(config), blank=SimpleNamespace(found=surfaces))
+@pytest.mark.parametrize(("stereo", "cap", "more"), [
+    ("on", 1000, 3), ("off", 1000, 0), ("on", 58, 2), ("on", 54, 0)])
+def test_surfaces_by_stereo_begin_with_gaussians_where_sparse_points_leave_room(
+        stereo, cap, more):
+    surfaces = SurfacePoints(GRID[:3] + 20.0, np.full((3, 3), 200, np.uint8))
+    task = tiny_task(replace(CONFIG, stereo=stereo, max_gaussians=cap))
+    task = replace(task, stereo=SimpleNamespace(found=surfaces))
     splats = first_state(task, GRID, GREY, most=100).splats
     assert len(splats) == 27 + more
     added = splats.means.detach().numpy()[27:]
-    assert added.tolist() == surfaces.points[:more].tolist()
+    assert {*map(tuple, added)} <= {*map(tuple, surfaces.points)}
     assert torch.allclose(SH_C0 * splats.sh_dc[27:] + 0.5, torch.tensor(200 / 255), atol=1e-6)
+
+
+def test_without_room_no_surface_is_searched():
+    class Unsearched:
+        @property
+        def found(self):
+            raise AssertionError("searched")
+
+    task = tiny_task(replace(CONFIG, stereo="on", max_gaussians=1000))
+    task = replace(task, stereo=Unsearched())
+    points = np.random.default_rng(0).normal(size=(600, 3))
+    first_state(task, points, np.full((600, 3), 90, np.uint8), most=500)
 
 
 @pytest.mark.parametrize(("densify", "grey"), [("budget", 0.33), ("reference", None)])

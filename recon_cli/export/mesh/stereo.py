@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from recon_cli.export.mesh.depth_maps import DepthMaps, weigh
 from recon_cli.export.mesh.volume import pixel_rays
+from recon_cli.io.images import reduce_view
 from recon_cli.progress import Progress
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.stereo.depths import Photo, find_depths, find_partners, places
-from recon_cli.train.task import reduce_view
 
 _SIDE = 600  # pixels of the longer side at most
 _MOST_VIEWS = 150  # that get a depth map, evenly spread; 1.6 CPU seconds each

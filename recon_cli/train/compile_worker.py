@@ -1,4 +1,4 @@
-"""The compiling process: `python -m recon_cli.render.compile_worker BACKEND DEVICE`.
+"""The compiling process: `python -m recon_cli.train.compile_worker BACKEND DEVICE`.
 
 `pipeline.compile_ahead` starts it. It takes what other work leaves of the cores, writes on its
 standard error alone, and does not outlive its parent.
@@ -11,10 +11,11 @@ import sys
 
 from recon_cli import machine
 from recon_cli.render import registry
+from recon_cli.stereo import depths
 
 
 def compile_kernels(backend: str, device: str) -> None:
-    """Compiles the kernels that these options, `auto` or a name, will take, if there are any.
+    """Compiles the kernels that these options, `auto` or a name, will take, and those of stereo.
 
     Those for a GPU are compiled by their self-check, whose verdict is kept.
     """
@@ -24,6 +25,7 @@ def compile_kernels(backend: str, device: str) -> None:
             registry.prepare("numba", lambda: None)
     elif backend in ("auto", "triton") and device != "cpu":
         registry.cuda_verdict()
+    depths.compile_kernels()
 
 
 def main() -> None:
