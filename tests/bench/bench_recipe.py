@@ -17,6 +17,7 @@ import dataclasses
 import statistics
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -28,6 +29,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_reference_views, load_scene
 from recon_cli.experiments.runner import score_as_ply
+from recon_cli.io.colmap import read_visibility
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene
@@ -36,6 +38,7 @@ from recon_cli.train.initialize import first_state
 from recon_cli.train.plan import Facts, count_detail, first_count, useful_cap
 from recon_cli.train.schedule import RECIPES, Recipe, Schedule
 from recon_cli.train.state import TrainState
+from recon_cli.train.stereo_points import SparseModel, StereoPoints
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task
 
@@ -108,17 +111,24 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
             f"| {middle[4]:,.0f} | {middle[3]:.0f} |")
 
 
-def without_stretches(scene: Scene) -> Scene:
-    """Returns the scene without stretches of its training views, whose middle is validated."""
+def without_stretches(scene: Scene) -> tuple[Scene, SparseModel]:
+    """Returns the scene without stretches of its training views, whose middle is validated.
+
+    The rows of a sparse model change with the points that go.
+    """
     views = sorted(scene.train, key=lambda view: view.name)
     place = np.arange(len(views)) % EVERY - (EVERY // 2 - 1)
     away, scored = (np.abs(place) <= count // 2 for count in (GAP, MIDDLE))
     train = tuple(view for view, gone in zip(views, away, strict=True) if not gone)
     sees = observe_points(scene.points, [view.camera for view in train])
     kept = np.bincount(sees.point, minlength=len(scene.points)) >= SEES
-    return dataclasses.replace(
+    tracks = {} if scene.sparse is None else read_visibility(scene.sparse)
+    rows = [tracks.get(view.name, np.empty(0, np.int64)) for view in train]
+    seen = [np.cumsum(kept)[mine[kept[mine]]] - 1 for mine in rows]
+    rest = dataclasses.replace(
         scene, train=train, points=scene.points[kept], colors=scene.colors[kept],
         validation=tuple(view for view, own in zip(views, scored, strict=True) if own))
+    return rest, SparseModel(rest.points, seen)
 
 
 @click.command()
@@ -152,8 +162,12 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
     for workspace in workspaces:
         inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
         scene = load_scene(inputs, validation=base.validation)
-        scene = without_stretches(scene) if stretches else scene
+        if stretches:
+            scene, sparse = without_stretches(scene)
         task = load_task(scene, base, ctx)
+        if stretches:
+            stereo = StereoPoints(task.train, partial(lambda model: model, sparse), ctx.progress)
+            task = dataclasses.replace(task, stereo=stereo)
         if max_gaussians == 0:
             facts = Facts(count_detail(task.train), len(task.train), len(scene.points), 0)
             task = planned(task, {"max_gaussians": useful_cap(facts, iterations)}, 0)
