@@ -142,7 +142,7 @@ def test_the_shortest_time_gives_the_smallest_run_and_says_so(inputs, tmp_path, 
 
 
 def test_one_step_is_a_run(inputs, tmp_path):
-    summary = run(TrainConfig(iterations=1), inputs, tmp_path / "out")
+    summary = run(TrainConfig(iterations=1, stereo="off"), inputs, tmp_path / "out")
     assert summary.iterations == 1
     assert len(read_ply(tmp_path / "out" / "splats.ply")) == summary.gaussians == 60
 
