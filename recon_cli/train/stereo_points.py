@@ -27,8 +27,8 @@ _SAMPLES = 4000  # sparse points looked at to find them
 _LEAST_SEEN = 10  # sparse points that tell between which depths a view is searched
 _TAIL = 0.01  # of them, which do not count
 _NEAR = 0.02  # of the median depth; nothing nearer to a camera is a surface
-# Side of the cells that get one point each, in median depths: 10 cm in a room. At a third of it
-# two of three walks lost .2 to .5 dB: finer Gaussians go where the error is, in the run.
+# Side of the cells that get one point each, in median depths: 10 cm in a room. Finer Gaussians go
+# where the error is, in the run.
 _CELL = 1 / 25
 _AGREE = 2  # views that find a surface in a cell
 _HALF = 1 << 20  # cells on each side of the origin
