@@ -214,9 +214,13 @@ def plan_task(
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = Facts(count_detail(task.train), len(task.train), len(scene.points), fit_memory)
-    spent = 0.0 if model is not None else needs.seconds + _search_surfaces(asked, facts, task)
+    spent = 0.0 if model is not None else needs.seconds + _search_surfaces(
+        probe_config(asked, facts), facts, task)
     cost = _measure_cost(asked, facts, task, scene, out, ctx)
     plan = make_plan(asked, facts, cost, spent=spent, model=model)
+    if model is None and asked.minutes is not None:  # longer than the likely run, with more room
+        spent += _search_surfaces(run_config(asked, plan), facts, task)
+        plan = make_plan(asked, facts, cost, spent=spent)
     _report_plan(plan, asked, facts, ctx)
     config = run_config(asked, plan)
     write_config(out, config)
@@ -243,11 +247,10 @@ def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool
     return needs
 
 
-def _search_surfaces(config: TrainConfig, facts: Facts, task: Task) -> float:
-    """Searches the surfaces that a run of about this length begins with; returns the seconds."""
+def _search_surfaces(config: RunConfig, facts: Facts, task: Task) -> float:
+    """Searches the surfaces that a run begins with, once at most; returns the seconds."""
     start = time.perf_counter()
-    likely = dataclasses.replace(task, schedule=Schedule(probe_config(config, facts)))
-    found = surfaces_of(likely, facts.points)
+    found = surfaces_of(dataclasses.replace(task, schedule=Schedule(config)), facts.points)
     logger.info("%s points on surfaces besides %s of sfm", f"{len(found.points):,}",
                 f"{facts.points:,}")
     return time.perf_counter() - start

@@ -1,17 +1,23 @@
 """What is decided where the user left it open: in closed form, on a model of known cost."""
 
 from dataclasses import replace
+from functools import cached_property
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scenes import camera_at
+from tiny_task import tiny_task
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.errors import ConfigError
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import plan
 from recon_cli.train.cost import CostModel, LevelCost
+from recon_cli.train.feature_trials import Needs
 from recon_cli.train.plan import QUALITIES, Facts, make_plan
+from recon_cli.train.stereo_points import SurfacePoints
+from recon_cli.workspace.summaries import TrainPlan
 
 FACTS = Facts(detail=60_000, views=40, points=9000, room=10**9)
 FREE = LevelCost(1, 0.0, 0.0)
@@ -45,6 +51,32 @@ def test_minutes_are_filled_calibration_included(minutes):
     made = make_plan(TrainConfig(minutes=minutes), FACTS, COST)
     assert made.iterations == pytest.approx((60 * minutes - 0.5) / (0.01 * plan._LONGER), abs=2)
     assert made.seconds + COST.seconds <= 60 * minutes
+
+
+def test_minutes_include_a_search_for_surfaces_that_only_the_longer_run_has_room_for(
+        tmp_path, monkeypatch):
+    now = [0.0]
+
+    class Slow:
+        @cached_property
+        def found(self):
+            now[0] += 20.0
+            return SurfacePoints.nothing()
+
+    task = tiny_task(RunConfig(stereo="on"))
+    task = replace(task, train=20 * task.train, stereo=Slow())
+    scene = SimpleNamespace(points=np.zeros((9000, 3)), colors=np.zeros((9000, 3), np.uint8))
+    for name, value in {
+            "gaussians_that_fit": 10**9, "load_task": task, "count_detail": 16_000,
+            "choose_parts": Needs(RunConfig(stereo="on"), ()), "_measure_cost": COST}.items():
+        monkeypatch.setattr(plan, name, lambda *_, value=value, **__: value)
+    monkeypatch.setattr(plan, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    ctx = SimpleNamespace(notice=lambda _: None)
+    likely = plan.probe_config(TrainConfig(minutes=5.0), Facts(16_000, 80, 9000, 10**9))
+    assert likely.max_gaussians // 2 < 9000  # all of it sparse points
+    plan.plan_task(TrainConfig(minutes=5.0), scene, tmp_path, ctx)
+    assert now[0] == 20
+    assert 270 < TrainPlan.read(tmp_path).seconds <= 300 - COST.seconds - 20
 
 
 def test_a_hundredth_of_a_minute_gives_the_smallest_run():
