@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.kernels import compare, match
+from recon_cli.stereo.kernels import compare, lay_planes, match
 
 _LEAST_SIDE = 8  # pixels of any side; windows have 5
 # Weight of a neighbour: the points seen by both, each by the angle between the rays to it. Below
@@ -33,6 +33,7 @@ _NEARER, _FARTHER = 0.7, 1.4
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 _EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
 _TOLERANCE = 0.015  # of a depth, within which another view confirms it
+_WINDOW, _TEXTURE = 5, 6.0  # pixels a side; standard deviation of grey levels that is no texture
 _SMALL = 16  # pixels a side
 
 
@@ -72,15 +73,19 @@ def find_depths(
     lowest = [np.full(image.shape, low, np.float32)
               for (image, _), low in zip(half, ranges[:, 0], strict=True)]
     coarse = _search(half, partners, lowest, steps, _HYPOTHESES, _RADIUS, on_photo)
+    coarse = _laid_on_planes(half, coarse, partners, near, steps)
     fine = steps / _FINER
-    priors = [_enlarged(_smoothed(found), image.shape)
+    priors = [_enlarged(found, image.shape)
               for (image, _), found in zip(full, coarse, strict=True)]
     lowest = [(prior - step * (_REFINED // 2)).astype(np.float32)
               for prior, step in zip(priors, fine, strict=True)]
     refined = _search(full, partners, lowest, fine, _REFINED, _REFINED_RADIUS, on_photo)
-    depths = [np.where((prior > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-12), 0).astype(
-        np.float32) for prior, inverse in zip(priors, refined, strict=True)]
-    return _confirmed(depths, photos, partners, near)
+    depths = [np.where(prior > 0, _depth(inverse), np.float32(0))
+              for prior, inverse in zip(priors, refined, strict=True)]
+    masks = [photo.view.mask for photo in photos]
+    sure = _confirmed(depths, [camera for _, camera in full], partners, near)
+    return [np.where(there if mask is None else there & mask, depth, np.float32(0))
+            for depth, there, mask in zip(depths, sure, masks, strict=True)]
 
 
 def find_partners(
@@ -162,11 +167,6 @@ def _search(
             for start, size, (image, _) in zip(starts, sizes, images, strict=False)]
 
 
-def _smoothed(inverse: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns inverse depths without the bumps of walls, which the second search would keep."""
-    return np.asarray(cv2.medianBlur(cv2.medianBlur(np.ascontiguousarray(inverse), 5), 5))
-
-
 def _enlarged(inverse: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
     """Returns inverse depths in another size; edges stay sharp."""
     size = shape[1], shape[0]
@@ -175,22 +175,48 @@ def _enlarged(inverse: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[n
     return np.asarray(np.where(np.abs(linear - nearest) < _EDGE * nearest, linear, nearest))
 
 
-def _confirmed(
-    depths: Sequence[NDArray[np.float32]], photos: Sequence[Photo], partners: NDArray[np.int64],
-    near: float,
+def _laid_on_planes(
+    images: Sequence[tuple[NDArray[np.float32], Camera]], inverse: Sequence[NDArray[np.float32]],
+    partners: NDArray[np.int64], near: float, steps: NDArray[np.float64],
 ) -> list[NDArray[np.float32]]:
-    """Returns the depths without those that no other view agrees with, and without masked ones."""
+    """Returns inverse depths [H, W] that lie on planes where the images are blank.
+
+    Matching goes by steps there, and by noise: the second search would only follow them.
+    """
+    sure = _confirmed([_depth(one) for one in inverse], [camera for _, camera in images], partners,
+                      near)
+    laid = [np.zeros_like(one) for one in inverse]
+    for (image, _), found, agreed, step, result in zip(
+            images, inverse, sure, steps, laid, strict=True):
+        pool.run(lay_planes, found, image, agreed, _blankness(image), float(step), result,
+                 scratch=False)
+    return laid
+
+
+def _blankness(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns 1 where windows about a pixel have one brightness, 0 where they have texture."""
+    mean, square = (cv2.blur(one, (_WINDOW, _WINDOW)) for one in (image, image * image))
+    return np.asarray(np.exp(-np.maximum(square - mean * mean, 0) / _TEXTURE**2), np.float32)
+
+
+def _depth(inverse: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns depths, 0 where there is none."""
+    return np.where(inverse > 0, 1 / np.maximum(inverse, 1e-12), 0).astype(np.float32)
+
+
+def _confirmed(
+    depths: Sequence[NDArray[np.float32]], cameras: Sequence[Camera],
+    partners: NDArray[np.int64], near: float,
+) -> list[NDArray[np.bool_]]:
+    """Returns where another view agrees with each depth map."""
     flat = np.concatenate([depth.reshape(-1) for depth in depths])
     starts = np.concatenate([[0], np.cumsum([depth.size for depth in depths])])[:-1]
-    table = np.stack([camera_row(photo.view.camera) for photo in photos])
-    kept = []
-    for own, (depth, photo) in enumerate(zip(depths, photos, strict=True)):
+    table = np.stack([camera_row(camera) for camera in cameras])
+    sure = []
+    for own, depth in enumerate(depths):
         agree, through = np.zeros((2, depth.size), np.int32)
         others = partners[own][partners[own] >= 0]
         pool.run(compare, flat, starts, table, own, others, _TOLERANCE, near, agree, through,
                  scratch=False)
-        there = agree.reshape(depth.shape) > 0
-        if photo.view.mask is not None:
-            there &= photo.view.mask
-        kept.append(np.where(there, depth, 0).astype(np.float32))
-    return kept
+        sure.append(agree.reshape(depth.shape) > 0)
+    return sure

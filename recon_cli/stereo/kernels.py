@@ -20,6 +20,14 @@ _LEAST_Z = np.float32(1e-6)
 _SMALL_STEP, _LARGE_STEP = 0.1, 0.8  # penalties of a step by one hypothesis, and by more
 _EDGE = 8.0  # gradient in grey levels a pixel at which the larger penalty has fallen to 1/e
 _LEAST_PENALTY = 0.15  # of the larger one, across any edge
+# Of planes through blank regions:
+_REACH, _STRIDE = 12, 2  # pixels; every second one is looked at
+_GREY = 5.0  # standard deviation of grey levels that belong to a region
+_FIRST_SPREAD, _SPREAD, _ROUNDS = 1.0, 0.6, 3  # hypotheses off a plane, at first and then
+_UNSURE = 0.01  # weight of a depth that no other view agrees with
+_CUT = 8.0  # squared deviations from which on a pixel counts nothing
+_SLOPE = 0.5  # squared pixels added to the spread of places: few of them tell no slope
+_LEAST_BLANK = 0.05  # of a pixel, for a plane to be looked for
 
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
@@ -322,6 +330,70 @@ def _choose(inverse, total, base, step):
             bend = left - 2 * middle + right
             offset = 0.5 * (left - right) / bend if bend > 1e-6 else 0.0
             inverse[y, x] = max(base[y, x] + step * (best + offset), 0.0)
+
+
+@kernel
+def lay_planes(counter, inverse, image, sure, blank, step, laid):
+    """Lays a plane through the inverse depths about each blank pixel.
+
+    An inverse depth that is linear in the place in the image is a plane in the room. Each is fitted
+    to what is as bright and near the plane so far, by weights that fall off like a Gaussian.
+
+    Args:
+        counter: [1] shared; rows already taken.
+        inverse: [H, W] float32, 0 for none; image: [H, W] float32 grey levels.
+        sure: [H, W] whether another view agrees; blank: [H, W] float32, share of the plane.
+        step: between two hypotheses.
+        laid: [H, W] float32 out.
+    """
+    height, width = inverse.shape
+    while True:
+        y = fetch_add(counter, 0, 1)
+        if y >= height:
+            break
+        for x in range(width):
+            at, across, down = float(inverse[y, x]), 0.0, 0.0
+            laid[y, x] = inverse[y, x]
+            if blank[y, x] < _LEAST_BLANK or at <= 0:
+                continue
+            grey = 1 / (_GREY * _GREY)
+            for turn in range(_ROUNDS):
+                spread = step * (_FIRST_SPREAD if turn == 0 else _SPREAD)
+                depth = 1 / (spread * spread)
+                n = sx = sy = sv = xx = xy = yy = xv = yv = 0.0
+                for j in range(-_REACH, _REACH + 1, _STRIDE):
+                    if y + j < 0 or y + j >= height:
+                        continue
+                    for i in range(-_REACH, _REACH + 1, _STRIDE):
+                        if x + i < 0 or x + i >= width:
+                            continue
+                        v = float(inverse[y + j, x + i])
+                        off = v - (at + across * i + down * j)
+                        other = image[y + j, x + i] - image[y, x]
+                        off = off * off * depth + other * other * grey
+                        if v <= 0 or off >= _CUT:
+                            continue
+                        w = 1 - off / _CUT  # to the fourth about exp(-off / 2)
+                        w *= w
+                        w *= w
+                        if not sure[y + j, x + i]:
+                            w *= _UNSURE
+                        n += w
+                        sx += w * i
+                        sy += w * j
+                        sv += w * v
+                        xx += w * i * i
+                        xy += w * i * j
+                        yy += w * j * j
+                        xv += w * i * v
+                        yv += w * j * v
+                mx, my, mv = sx / n, sy / n, sv / n  # the pixel itself counts: n > 0
+                xx, yy, xy = xx / n - mx * mx + _SLOPE, yy / n - my * my + _SLOPE, xy / n - mx * my
+                xv, yv = xv / n - mx * mv, yv / n - my * mv
+                divisor = xx * yy - xy * xy
+                across, down = (xv * yy - yv * xy) / divisor, (yv * xx - xv * xy) / divisor
+                at = mv - across * mx - down * my
+            laid[y, x] += blank[y, x] * (max(at, 0.0) - inverse[y, x])
 
 
 @kernel

@@ -215,3 +215,103 @@ def test_depth_in_columns_is_that_in_rows_of_the_turned_volume():
         along, costs.transpose(1, 0, 2).copy(), penalty.T.copy())
     # in one column diagonal paths begin anew at every pixel: four times the cost itself
     np.testing.assert_allclose(down[:, 0] - 4 * costs[:, 0], along[0], atol=1e-5)
+
+
+# --- planes through blank regions ---------------------------------------------------------------
+
+STEP = 0.02
+
+
+def laid(inverse, image=None, sure=None, blank=None):
+    shape = inverse.shape
+    image = np.full(shape, 90.0) if image is None else image
+    out = np.zeros(shape, np.float32)
+    pool.run(
+        kernels.lay_planes, inverse.astype(np.float32), image.astype(np.float32),
+        np.ones(shape, bool) if sure is None else sure,
+        np.ones(shape, np.float32) if blank is None else blank.astype(np.float32), STEP, out,
+        scratch=False)
+    return out
+
+
+def slope(height=40, width=60):
+    y, x = np.mgrid[:height, :width]
+    return 0.5 + 0.006 * x - 0.004 * y
+
+
+def by_plain_float64(inverse, image, sure, y, x):
+    """The plane about one pixel, by weighted least squares with a ridge on its slopes."""
+    rows, columns = np.mgrid[-kernels._REACH:kernels._REACH + 1:kernels._STRIDE,
+                             -kernels._REACH:kernels._REACH + 1:kernels._STRIDE].reshape(2, -1)
+    inside = ((rows + y >= 0) & (rows + y < len(inverse)) & (columns + x >= 0)
+              & (columns + x < inverse.shape[1]))
+    rows, columns = rows[inside], columns[inside]
+    values, greys = inverse[rows + y, columns + x], image[rows + y, columns + x] - image[y, x]
+    plane = np.array([inverse[y, x], 0.0, 0.0])
+    for turn in range(kernels._ROUNDS):
+        spread = STEP * (kernels._SPREAD if turn else kernels._FIRST_SPREAD)
+        off = values - plane @ [np.ones(len(rows)), columns, rows]
+        off = (off / spread) ** 2 + (greys / kernels._GREY) ** 2
+        weights = np.maximum(1 - off / kernels._CUT, 0) ** 4 * (values > 0)
+        weights *= np.where(sure[rows + y, columns + x], 1, kernels._UNSURE)
+        A = np.stack([columns, rows], axis=1) - np.average(
+            np.stack([columns, rows], axis=1), axis=0, weights=weights)
+        b = values - np.average(values, weights=weights)
+        total = weights.sum()
+        slopes = np.linalg.solve(A.T @ (A * weights[:, None]) / total + kernels._SLOPE * np.eye(2),
+                                 A.T @ (b * weights) / total)
+        plane = np.array([np.average(values - columns * slopes[0] - rows * slopes[1],
+                                     weights=weights), *slopes])
+    return plane[0]
+
+
+def test_planes_agree_with_plain_float64():
+    generator = np.random.default_rng(0)
+    inverse = slope(24, 30) + generator.normal(0, 0.5 * STEP, (24, 30))
+    inverse[generator.random(inverse.shape) < 0.1] = 0
+    inverse = inverse.astype(np.float32).astype(float)
+    image, sure = generator.normal(90, 3, inverse.shape), generator.random(inverse.shape) < 0.7
+    image = image.astype(np.float32).astype(float)
+    result = laid(inverse, image, sure)
+    for y, x in [(0, 0), (3, 20), (12, 15), (23, 29), (14, 2)]:
+        expected = by_plain_float64(inverse, image, sure, y, x) if inverse[y, x] > 0 else 0
+        assert result[y, x] == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_steps_of_a_slanted_wall_become_a_plane():
+    steps = np.round(slope() / STEP) * STEP
+    error = np.abs(laid(steps) - slope())
+    assert error.max() < 0.4 * STEP
+    assert error.mean() < 0.1 * np.abs(steps - slope()).mean()
+
+
+def test_what_stands_before_a_wall_and_is_brighter_stays_before_it():
+    inverse, image = np.full((40, 60), 0.5), np.full((40, 60), 90.0)
+    inverse[:, 30:] += STEP
+    image[:, 30:] += 30
+    np.testing.assert_allclose(laid(inverse, image), inverse, atol=1e-6)
+
+
+def test_far_from_the_plane_so_far_nothing_counts():
+    inverse = np.full((40, 60), 0.5)
+    inverse[:, 30:] += 4 * STEP
+    np.testing.assert_allclose(laid(inverse), inverse, atol=1e-6)
+
+
+def test_depths_that_another_view_agrees_with_outweigh_others():
+    inverse, sure = np.full((40, 60), 0.5), np.ones((40, 60), bool)
+    inverse[13:27, 23:37] += 0.7 * STEP
+    sure[13:27, 23:37] = False
+    assert np.abs(laid(inverse, sure=sure)[20, 30] - 0.5) < 0.02 * STEP
+    assert np.abs(laid(inverse)[20, 30] - 0.5) > 0.04 * STEP
+
+
+def test_texture_and_missing_depths_stay_as_they_are():
+    steps = np.round(slope() / STEP) * STEP
+    steps[:5] = 0
+    blank = np.ones(steps.shape)
+    blank[:, :30] = 0
+    result = laid(steps, blank=blank)
+    np.testing.assert_array_equal(result[:, :30], steps[:, :30].astype(np.float32))
+    assert not result[:5].any()
+    assert (result[5:, 30:] != steps[5:, 30:].astype(np.float32)).any()
