@@ -33,7 +33,7 @@ _NEARER, _FARTHER = 0.7, 1.4
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 _EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
 _TOLERANCE = 0.015  # of a depth, within which another view confirms it
-_WINDOW, _TEXTURE = 5, 6.0  # pixels a side; standard deviation of grey levels that is no texture
+_WINDOW, _TEXTURE = 5, 6.0  # pixels a side; deviation of grey levels at which a plane counts 1/e
 _SMALL = 16  # pixels a side
 
 
