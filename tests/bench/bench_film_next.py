@@ -5,8 +5,8 @@
 A third of the training views is taken away in one stretch, the middle third by name, and with it
 the points that fewer than two of the others see. The rest is trained and suggestions are made; of
 the views taken away the one nearest to each suggestion is given back, and then as many at random,
-in several draws; last those that the score of the suggestions would choose among them, and as many
-evenly spread over the stretch. Scores are
+in several draws; last those that the score of the suggestions would choose among them, as many evenly
+spread over the stretch, and all of the stretch, which bounds what any choice can bring. Scores are
 those of the held-out views; with --removed, where these lie on the path, of every third view taken
 away, which is never given back. Prints one line a workspace.
 
@@ -183,7 +183,7 @@ def compare_filmed(
             len(capture.taken), len(suggestions), replace=False)]) for _ in range(draws)]
     click.echo(
         f"| {name} | {len(capture.scored)} | {without:.2f} | {there:.2f} | {np.mean(scores):.2f} | "
-        f"{' '.join(f'{score:.2f}' for score in scores)} | {there - np.mean(scores):+.2f} | | |")
+        f"{' '.join(f'{score:.2f}' for score in scores)} | {there - np.mean(scores):+.2f} | | | |")
 
 
 @click.command()
@@ -204,7 +204,8 @@ def main(
         raise click.UsageError("--everywhere needs a --model that its views are rendered from.")
     whole = None if model is None else read_ply(model)
     click.echo("| workspace | scored views | with a third missing | + suggested | + random | draws "
-               "| gain | + by score | + evenly |\n|---|---:|---:|---:|---:|---|---:|---:|---:|")
+               "| gain | + by score | + evenly | + all |\n"
+               "|---|---:|---:|---:|---:|---|---:|---:|---:|---:|")
     details = []
     for workspace in workspaces:
         capture = open_capture(workspace, max_size, iterations, removed=removed)
@@ -213,7 +214,7 @@ def main(
         suggestions, why = film_next(
             splats, trust, scene, WorldSummary.read(workspace / "sfm"), capture.ctx)
         if not suggestions:
-            click.echo(f"| {workspace.name} | {why} | | | | | | | |")
+            click.echo(f"| {workspace.name} | {why} | | | | | | | | |")
             continue
         without = capture.psnr(splats)
         chosen = nearest(suggestions, capture.taken, scene)
@@ -233,6 +234,7 @@ def main(
         count = len(capture.taken)
         evenly = capture.psnr(capture.train([capture.taken[row] for row in np.linspace(
             0, count - 1, 2 * len(chosen) + 1).round().astype(int)[1::2]])[0])
+        everything = capture.psnr(capture.train(capture.taken)[0])
         rng, scores = np.random.default_rng(0), []
         for _ in range(draws):
             rows = rng.choice(len(capture.taken), len(chosen), replace=False)
@@ -240,7 +242,8 @@ def main(
         click.echo(
             f"| {workspace.name} | {len(capture.scored)} | {without:.2f} | {with_chosen:.2f} | "
             f"{np.mean(scores):.2f} | {' '.join(f'{score:.2f}' for score in scores)} | "
-            f"{with_chosen - np.mean(scores):+.2f} | {by_score:.2f} | {evenly:.2f} |")
+            f"{with_chosen - np.mean(scores):+.2f} | {by_score:.2f} | {evenly:.2f} | "
+            f"{everything:.2f} |")
     click.echo("\n".join(["", *details]))
 
 
