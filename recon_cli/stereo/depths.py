@@ -29,12 +29,39 @@ _LEAST_SHARED = 10  # points that two views must both see
 # The first search, at half the size: inverse depths evenly spread, over more than the surface spans
 _HYPOTHESES, _RADIUS = 64, 1
 _NEARER, _FARTHER = 0.7, 1.4
+# and along level planes, by their distance from the camera in median depths: in rooms from 65 cm,
+# which a table top lies below a standing person's eyes, to 3 m
+_LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
 # The second one, about what the first found: a window then follows slanted surfaces.
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 _EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
 _TOLERANCE = 0.015  # of a depth, within which another view confirms it
+_FRONTAL = np.zeros(3)  # planes parallel to each image
 _WINDOW, _TEXTURE = 5, 6.0  # pixels a side; deviation of grey levels at which a plane counts 1/e
 _SMALL = 16  # pixels a side
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """The level planes, floors and ceilings above all, that are searched as well.
+
+    Up has to be known: planes that lean find less than none.
+    """
+
+    up: NDArray[np.float64]  # [3] unit vector
+    median: float  # depth of all photos, world units
+
+
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """One search: see `match`."""
+
+    base: Sequence[NDArray[np.float32]]  # [H, W] of each photo
+    lowest: NDArray[np.float64]  # [V]
+    steps: NDArray[np.float64]  # [V]
+    hypotheses: int
+    radius: int
+    normal: NDArray[np.float64]  # [3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +82,7 @@ class Photo:
 
 def find_depths(
     photos: Sequence[Photo], partners: NDArray[np.int64], near: float,
-    on_photo: Callable[[], None] = lambda: None,
+    on_photo: Callable[[], None] = lambda: None, *, levels: Levels | None = None,
 ) -> list[NDArray[np.float32]]:
     """Returns a depth map [H, W] in world units of each photo, 0 where there is none.
 
@@ -63,23 +90,29 @@ def find_depths(
         photos: at the size that is searched.
         partners: [V, K] photos that each is compared with, -1 for none.
         near: least depth of a surface, world units.
-        on_photo: called twice for each photo.
+        on_photo: called for each photo twice, with `levels` three times.
+        levels: to be searched as well; a third more time for more of floors and ceilings.
     """
     full = [(photo.grey, photo.view.camera) for photo in photos]
     half = [_halved(*image) for image in full]
     ranges = np.array([(1 / (_FARTHER * photo.farthest), 1 / max(_NEARER * photo.nearest, near))
                        for photo in photos])
-    steps = (ranges[:, 1] - ranges[:, 0]) / (_HYPOTHESES - 1)
-    lowest = [np.full(image.shape, low, np.float32)
-              for (image, _), low in zip(half, ranges[:, 0], strict=True)]
-    coarse = _search(half, partners, lowest, steps, _HYPOTHESES, _RADIUS, on_photo)
+    lowest = np.ascontiguousarray(ranges[:, 0])
+    steps = (ranges[:, 1] - lowest) / (_HYPOTHESES - 1)
+    base = [np.zeros(image.shape, np.float32) for image, _ in half]
+    sweeps = [_Sweep(base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
+    if levels:
+        first, last = 1 / (_HIGHEST * levels.median), 1 / (_LOWEST * levels.median)
+        step = (last - first) / (_LEVELS - 1)
+        sweeps.append(_Sweep(base, np.full(len(photos), first), np.full(len(photos), step),
+                             _LEVELS, _RADIUS, levels.up))
+    coarse = _search(half, partners, sweeps, on_photo)
     coarse = _laid_on_planes(half, coarse, partners, near, steps)
     fine = steps / _FINER
     priors = [_enlarged(found, image.shape)
               for (image, _), found in zip(full, coarse, strict=True)]
-    lowest = [(prior - step * (_REFINED // 2)).astype(np.float32)
-              for prior, step in zip(priors, fine, strict=True)]
-    refined = _search(full, partners, lowest, fine, _REFINED, _REFINED_RADIUS, on_photo)
+    refined = _search(full, partners, [_Sweep(
+        priors, -fine * (_REFINED // 2), fine, _REFINED, _REFINED_RADIUS, _FRONTAL)], on_photo)
     depths = [np.where(prior > 0, _depth(inverse), np.float32(0))
               for prior, inverse in zip(priors, refined, strict=True)]
     masks = [photo.view.mask for photo in photos]
@@ -147,22 +180,24 @@ def _halved(image: NDArray[np.float32], camera: Camera) -> tuple[NDArray[np.floa
 
 def _search(
     images: Sequence[tuple[NDArray[np.float32], Camera]], partners: NDArray[np.int64],
-    lowest: Sequence[NDArray[np.float32]], steps: NDArray[np.float64], hypotheses: int, radius: int,
-    on_photo: Callable[[], None],
+    sweeps: Sequence[_Sweep], on_photo: Callable[[], None],
 ) -> list[NDArray[np.float32]]:
-    """Returns the inverse depths [H, W] that `match` finds, 0 where it finds none."""
+    """Returns the inverse depths [H, W] of least cost in any sweep, 0 where there are none."""
     sizes = [image.size for image, _ in images]
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    inverse = np.zeros(starts[-1], np.float32)
-    arguments = (
-        np.concatenate([image.reshape(-1) for image, _ in images]), starts[:-1],
-        np.stack([camera_row(camera) for _, camera in images]), partners, radius,
-        np.concatenate([part.reshape(-1) for part in lowest]), steps, hypotheses, inverse)
-    for first in range(0, len(images), pool.size):
-        rows = np.arange(first, min(first + pool.size, len(images)))
-        pool.run(match, rows, *arguments, scratch=False)
-        for _ in rows:
-            on_photo()
+    inverse, least = np.zeros(starts[-1], np.float32), np.full(starts[-1], np.inf, np.float32)
+    flat = np.concatenate([image.reshape(-1) for image, _ in images])
+    cameras = np.stack([camera_row(camera) for _, camera in images])
+    for sweep in sweeps:
+        arguments = (
+            flat, starts[:-1], cameras, partners, sweep.radius, sweep.normal,
+            np.concatenate([part.reshape(-1) for part in sweep.base]), sweep.lowest, sweep.steps,
+            sweep.hypotheses, inverse, least)
+        for first in range(0, len(images), pool.size):
+            rows = np.arange(first, min(first + pool.size, len(images)))
+            pool.run(match, rows, *arguments, scratch=False)
+            for _ in rows:
+                on_photo()
     return [inverse[start:start + size].reshape(image.shape)
             for start, size, (image, _) in zip(starts, sizes, images, strict=False)]
 

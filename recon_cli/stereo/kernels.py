@@ -36,11 +36,13 @@ _SUMS = 4  # of a window: values, squares, products with the view's own, absolut
 
 @kernel
 def match(
-    counter, rows, images, starts, cameras, others, radius, lowest, steps, hypotheses, inverse,
+    counter, rows, images, starts, cameras, others, radius, normal, base, lowest, steps, hypotheses,
+    inverse, least,
 ):
     """Finds the inverse depth of every pixel of some views by semi-global matching.
 
-    A hypothesis is an inverse depth; its cost is one minus the normalized correlation of a window
+    A hypothesis is a plane across the view: surfaces along the planes cost no steps, and windows
+    follow them (Gallup et al. 2007). Its cost is one minus the normalized correlation of a window
     with those where it falls in other views, plus their mean difference, so that smooth shading
     counts where there is no texture. A view in which something hides the surface costs no more than
     `_LEAST_SCORE` says. Costs are made smooth along eight directions
@@ -53,10 +55,13 @@ def match(
         cameras: [V, 18] rotation, translation, fx, fy, cx, cy, width and height of each.
         others: [V, K] int64 views that each is compared with, -1 for none.
         radius: of the windows, pixels.
-        lowest: [P] float32, the first hypothesis of each pixel; steps: [V] between two.
+        normal: [3] of the planes, world axes; zero for planes parallel to each image.
+        base: [P] float32, inverse depth that is added to that of the planes.
+        lowest: [V] inverse distance from the camera of the first plane; steps: [V] between two.
         hypotheses: how many each pixel has, at least 3.
-        inverse: [P] float32 out, inverse depth in world units; 0 where the best hypothesis is the
-            first or last one, or no other view shows any.
+        inverse: [P] float32 in and out, inverse depth in world units, 0 for none.
+        least: [P] float32 in and out, the cost of `inverse`, infinite at first. Both stay where no
+            hypothesis costs less, or the best one is the first or last.
     """
     while True:
         taken = fetch_add(counter, 0, 1)
@@ -70,21 +75,41 @@ def match(
         while count < others.shape[1] and others[own, count] >= 0:
             count += 1
         if count == 0:
-            inverse[at:at + size] = 0
             continue
-        base = lowest[at:at + size].reshape(height, width)
+        prior = base[at:at + size].reshape(height, width)
+        slants = _slants(cameras[own], normal, height, width)
         costs = np.empty((height, width, hypotheses), np.float32)
-        _fill_costs(costs, images, starts, cameras, own, others[own, :count], radius, image, base,
-                    steps[own])
+        _fill_costs(costs, images, starts, cameras, own, others[own, :count], radius, image, prior,
+                    slants, lowest[own], steps[own])
         total = np.zeros((height, width, hypotheses), np.float32)
         penalty = _penalties(image)
         _add_along_rows(total, costs, penalty)
         _add_along_columns(total, costs, penalty)
-        _choose(inverse[at:at + size].reshape(height, width), total, base, steps[own])
+        _choose(inverse[at:at + size].reshape(height, width),
+                least[at:at + size].reshape(height, width), total, prior, slants,
+                lowest[own], steps[own])
 
 
 @kernel
-def _fill_costs(costs, images, starts, cameras, own, others, radius, image, base, step):
+def _slants(P, normal, height, width):
+    """Returns the inverse depth [H, W] of a plane at a distance of 1 from camera P."""
+    x, y, z = (P[0] * normal[0] + P[1] * normal[1] + P[2] * normal[2],
+               P[3] * normal[0] + P[4] * normal[1] + P[5] * normal[2],
+               P[6] * normal[0] + P[7] * normal[1] + P[8] * normal[2])
+    if x == 0 and y == 0 and z == 0:
+        z = 1.0
+    slants = np.empty((height, width), np.float32)
+    for row in range(height):
+        for column in range(width):
+            slants[row, column] = abs(x * (column + 0.5 - P[14]) / P[12]
+                                      + y * (row + 0.5 - P[15]) / P[13] + z)
+    return slants
+
+
+@kernel
+def _fill_costs(
+    costs, images, starts, cameras, own, others, radius, image, base, slants, lowest, step,
+):
     """Writes the cost of every hypothesis, [H, W, D].
 
     Windows are summed row by row: a ring of rows holds the sums along x of what is needed.
@@ -117,7 +142,8 @@ def _fill_costs(costs, images, starts, cameras, own, others, radius, image, base
             for y in range(height + radius):
                 if y < height:
                     _warp_row(padded[0, radius:radius + width], inside[y % rows], place,
-                              images[starts[other]:], cameras[own], Q, R, t, y, base[y], step * d)
+                              images[starts[other]:], cameras[own], Q, R, t, y, base[y], slants[y],
+                              lowest + step * d)
                     _push_row(ring[y % rows], padded, padded[0, radius:radius + width], image[y],
                               radius)
                 if y >= radius:
@@ -144,8 +170,8 @@ def _relative(P, Q):
 
 
 @inlined
-def _warp_row(warped, inside, place, other, P, Q, R, t, y, base, shift):
-    """Reads another image where a row of a view falls at the inverse depths base + shift."""
+def _warp_row(warped, inside, place, other, P, Q, R, t, y, base, slant, shift):
+    """Reads another image where a row falls at the inverse depths base + slant * shift."""
     width = len(warped)
     wide, tall = int(Q[16]), int(Q[17])
     b, first, slope = (y + 0.5 - P[15]) / P[13], (0.5 - P[14]) / P[12], 1 / P[12]
@@ -162,7 +188,7 @@ def _warp_row(warped, inside, place, other, P, Q, R, t, y, base, shift):
     for x in range(width):
         xs[x] = np.float32(x)
     for x in range(width):
-        inverse = base[x] + moved
+        inverse = base[x] + slant[x] * moved
         z = z0 + z1 * xs[x] + z2 * inverse
         u = (u0 + u1 * xs[x] + u2 * inverse) / z + cx
         v = (v0 + v1 * xs[x] + v2 * inverse) / z + cy
@@ -314,7 +340,7 @@ def _add_along_columns(total, costs, penalty):
 
 
 @kernel
-def _choose(inverse, total, base, step):
+def _choose(inverse, least, total, base, slants, lowest, step):
     """Writes the hypothesis of least cost, between its neighbours by a parabola."""
     height, width, hypotheses = total.shape
     for y in range(height):
@@ -323,13 +349,14 @@ def _choose(inverse, total, base, step):
             for d in range(1, hypotheses):
                 if total[y, x, d] < total[y, x, best]:
                     best = d
-            inverse[y, x] = 0
-            if best == 0 or best == hypotheses - 1:
+            if best == 0 or best == hypotheses - 1 or total[y, x, best] >= least[y, x]:
                 continue
+            least[y, x] = total[y, x, best]
             left, middle, right = total[y, x, best - 1], total[y, x, best], total[y, x, best + 1]
             bend = left - 2 * middle + right
             offset = 0.5 * (left - right) / bend if bend > 1e-6 else 0.0
-            inverse[y, x] = max(base[y, x] + step * (best + offset), 0.0)
+            inverse[y, x] = max(
+                base[y, x] + slants[y, x] * (lowest + step * (best + offset)), 0.0)
 
 
 @kernel

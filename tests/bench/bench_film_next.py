@@ -5,10 +5,10 @@
 A third of the training views is taken away in one stretch, the middle third by name, and with it
 the points that fewer than two of the others see. The rest is trained and suggestions are made; of
 the views taken away the one nearest to each suggestion is given back, and then as many at random,
-in several draws; last those that the score of the suggestions would choose among them, as many evenly
-spread over the stretch, and all of the stretch, which bounds what any choice can bring. Scores are
-those of the held-out views; with --removed, where these lie on the path, of every third view taken
-away, which is never given back. Prints one line a workspace.
+in several draws; last those that the score of the suggestions would choose among them, as many
+evenly spread over the stretch, and all of the stretch, which bounds what any choice brings. Scores
+are those of the held-out views; with --removed, where these lie on the path, of every third view
+taken away, which is never given back. Prints one line a workspace.
 
 With --model, a model of the whole scene in the workspace's frame, the pictures that are added are
 rendered from it, those from the suggested places themselves and those of the random frames; so are

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 from walls import AROUND, HEIGHT, WIDTH, errors, grain, views_of, wall
@@ -11,6 +13,7 @@ from recon_cli.export.mesh.depth_maps import weigh
 from recon_cli.export.mesh.stereo import with_stereo
 from recon_cli.export.mesh.volume import pixel_rays
 from recon_cli.progress import NullProgress
+from recon_cli.scene.gravity import Gravity
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
@@ -30,6 +33,32 @@ def test_what_was_cut_off_stays_off():
         places = view.center + pixel_rays(view) @ view.viewmat[:3, :3] * depth[..., None]
         assert (depth > 0).any()
         assert (places[depth > 0, 1] >= -0.3).all()
+
+
+class Counted(NullProgress):
+    """Notes how much a bar was to show, and how much it showed."""
+
+    def __init__(self):
+        self.total = self.done = 0
+
+    @contextmanager
+    def bar(self, _label, total, **_):
+        self.total = total
+        yield self
+
+    def advance(self, steps=1):
+        self.done += steps
+
+
+@pytest.mark.parametrize(("up", "searches"), [(None, 2), (np.array([0.0, 0.0, 1.0]), 3)])
+def test_level_planes_are_searched_where_up_is_known(monkeypatch, up, searches):
+    monkeypatch.setattr(stereo, "find_gravity", lambda *_: Gravity(up, None, None))
+    progress = Counted()
+    found = with_stereo(maps_of(AROUND[:4], grain), EVERYWHERE, progress)
+    assert progress.total == progress.done == searches * 4
+    error, share = errors(AROUND[:4], found.depths[4:])
+    assert share > 0.6
+    assert np.median(error) < 0.0025
 
 
 def test_large_views_are_searched_at_600_pixels_and_compared_at_their_own(monkeypatch):

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from walls import AROUND, HEIGHT, camera, errors, grain, shading, views_of, wall
+from walls import AROUND, HEIGHT, UP, camera, errors, grain, shading, views_of, wall
 
 from recon_cli.export.mesh.volume import pixel_rays
 from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo import kernels
-from recon_cli.stereo.depths import Photo, camera_row, find_depths, find_partners, places
+from recon_cli.stereo.depths import (
+    Levels,
+    Photo,
+    camera_row,
+    find_depths,
+    find_partners,
+    places,
+)
 
 NEAR = 0.05
 
@@ -117,6 +124,56 @@ def test_places_of_pixels_are_where_their_rays_end():
         places(view, depth, pixels), expected.reshape(-1, 3)[pixels], atol=1e-6)
 
 
+# --- level planes -------------------------------------------------------------------------------
+
+CEILING = 1.2  # above the cameras
+BELOW = [camera((0.2 * x, y, 0.0), (0.2 * x + 2.0, 0.5 * y, 1.4))
+         for y in (-0.5, -0.25, 0.0, 0.25, 0.5) for x in (-1, 1)]
+
+
+def ceiling_views(noise=1.0):
+    """Views of a white ceiling, lit from one corner, and its depth in each."""
+    generator = np.random.default_rng(0)
+    views, truths = [], []
+    for view in BELOW:
+        rays = pixel_rays(view) @ view.viewmat[:3, :3]
+        depth = (CEILING - view.center[2]) / rays[..., 2]
+        places = view.center + rays * depth[..., None]
+        grey = 215 - 5 * np.sqrt((places[..., 0] + 1) ** 2 + (places[..., 1] - 1) ** 2)
+        image = np.rint(grey + noise * generator.normal(size=grey.shape)).astype(np.uint8)
+        views.append(TrainView(view, np.repeat(image[..., None], 3, axis=2)))
+        truths.append(depth)
+    return views, np.stack(truths)
+
+
+def ceiling_depths(views, truths, levels=None, on_photo=lambda: None):
+    photos = [Photo(view, truth.min(), truth.max())
+              for view, truth in zip(views, truths, strict=True)]
+    x, y = np.meshgrid(np.linspace(0, 5, 40), np.linspace(-2, 2, 30))
+    points = np.stack([x, y, np.full_like(x, CEILING)], axis=-1).reshape(-1, 3)
+    cameras = [view.camera for view in views]
+    seen = observe_points(points, cameras).matrix.toarray() > 0
+    partners = find_partners(cameras, points, seen, len(views) - 1)
+    return np.stack(find_depths(photos, partners, NEAR, on_photo, levels=levels))
+
+
+def test_level_planes_find_more_of_a_white_ceiling():
+    views, truths = ceiling_views()
+    right = []
+    for levels in (None, Levels(UP, float(np.median(truths)))):
+        found = ceiling_depths(views, truths, levels)
+        right.append((np.abs(found / truths - 1) < 0.02).mean())
+    assert right[1] > 1.5 * right[0]
+    assert right[1] > 0.2
+
+
+def test_each_photo_is_reported_once_a_search():
+    views, truths = ceiling_views()
+    calls = []
+    ceiling_depths(views[:2], truths[:2], Levels(UP, 2.0), lambda: calls.append(1))
+    assert len(calls) == 3 * 2
+
+
 # --- against plain float64 ---------------------------------------------------------------------
 
 
@@ -134,9 +191,9 @@ def windows(values: np.ndarray, radius: int) -> np.ndarray:
                     for y in range(2 * radius + 1) for x in range(2 * radius + 1)], axis=0)
 
 
-def warped(cameras, other: np.ndarray, inverse: float) -> tuple[np.ndarray, np.ndarray]:
+def warped(cameras, other: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     own, far = cameras
-    places = own.center + pixel_rays(own) @ own.viewmat[:3, :3] / inverse
+    places = own.center + pixel_rays(own) @ own.viewmat[:3, :3] / inverse[..., None]
     x, y, z = np.moveaxis(places @ far.viewmat[:3, :3].T + far.viewmat[:3, 3], -1, 0)
     u, v = far.fx * x / z + far.cx - 0.5, far.fy * y / z + far.cy - 0.5
     inside = (u >= 0) & (v >= 0) & (u <= far.width - 1) & (v <= far.height - 1)
@@ -147,18 +204,22 @@ def warped(cameras, other: np.ndarray, inverse: float) -> tuple[np.ndarray, np.n
     return top * (1 - v + j) + low * (v - j), inside
 
 
+@pytest.mark.parametrize("normal", [np.zeros(3), np.array([0.6, 0.0, 0.8])])
 @pytest.mark.parametrize("radius", [1, 2])
-def test_costs_are_those_of_their_definition(radius):
+def test_costs_are_those_of_their_definition(radius, normal):
     cameras, images = pair()
-    inverses = np.linspace(0.2, 0.5, 5)
+    rays = pixel_rays(cameras[0]) @ cameras[0].viewmat[:3, :3]
+    slants = np.abs(rays @ normal) if normal.any() else np.ones(images[0].shape)
+    planes = np.linspace(0.1, 0.4, 5)
     costs = np.empty((*images[0].shape, 5), np.float32)
     flat = np.concatenate([image.reshape(-1) for image in images])
     kernels._fill_costs(
         costs, flat, np.array([0, images[0].size]), np.stack([camera_row(c) for c in cameras]), 0,
-        np.array([1]), radius, images[0], np.full(images[0].shape, 0.2, np.float32), 0.075)
+        np.array([1]), radius, images[0], np.full(images[0].shape, 0.1, np.float32),
+        kernels._slants(camera_row(cameras[0]), normal, *images[0].shape), 0.1, 0.075)
     own, other = (image.astype(np.float64) for image in images)
-    for d, inverse in enumerate(inverses):
-        there, inside = warped(cameras, other, inverse)
+    for d, plane in enumerate(planes):
+        there, inside = warped(cameras, other, 0.1 + slants * plane)
         a, b = windows(own, radius), windows(there, radius)
         spread = ((windows(own * own, radius) - a * a + 2)
                   * (windows(there * there, radius) - b * b + 2))

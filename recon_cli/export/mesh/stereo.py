@@ -14,10 +14,11 @@ from recon_cli.io.images import reduce_view
 from recon_cli.progress import Progress
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import observe_points
-from recon_cli.stereo.depths import Photo, find_depths, find_partners, places
+from recon_cli.scene.gravity import find_gravity
+from recon_cli.stereo.depths import Levels, Photo, find_depths, find_partners, places
 
 _SIDE = 600  # pixels of the longer side at most
-_MOST_VIEWS = 150  # that get a depth map, evenly spread; 1.6 CPU seconds each
+_MOST_VIEWS = 150  # that get a depth map, evenly spread; 2 to 3 CPU seconds each
 _NEIGHBOURS = 20  # views that each is compared with; more of them find more of blank walls
 _SAMPLES = 3000  # points looked at to find them
 _LEAST_PIXELS = 20  # with depth, to tell how near and far is searched
@@ -44,8 +45,10 @@ def with_stereo(
     points = surface_points(cameras, depths, max(1, _SAMPLES // len(rows)))
     seen = observe_points(points, cameras).matrix.toarray() > 0
     partners = find_partners(cameras, points, seen, _NEIGHBOURS)
-    with progress.bar("stereo", 2 * len(photos), unit="view") as bar:
-        found = find_depths(photos, partners, maps.near, bar.advance)
+    up = find_gravity(points, np.stack([camera.viewmat for camera in cameras])).up
+    levels = None if up is None else Levels(up, maps.median)
+    with progress.bar("stereo", (3 if levels else 2) * len(photos), unit="view") as bar:
+        found = find_depths(photos, partners, maps.near, bar.advance, levels=levels)
     views = [photo.view for photo in photos]
     rendered, weights = list(maps.depths), [_RENDERED * gain for gain in maps.gains]
     used = []
