@@ -45,7 +45,7 @@ _SMALL = 16  # pixels a side
 class Levels:
     """The level planes, floors and ceilings above all, that are searched as well.
 
-    Up has to be known: planes that lean find less than none.
+    Up has to be known: tilted planes find less of a ceiling than no planes at all.
     """
 
     up: NDArray[np.float64]  # [3] unit vector
@@ -91,7 +91,7 @@ def find_depths(
         partners: [V, K] photos that each is compared with, -1 for none.
         near: least depth of a surface, world units.
         on_photo: called for each photo twice, with `levels` three times.
-        levels: to be searched as well; a third more time for more of floors and ceilings.
+        levels: to be searched as well; a quarter more time for more of floors and ceilings.
     """
     full = [(photo.grey, photo.view.camera) for photo in photos]
     half = [_halved(*image) for image in full]
