@@ -18,8 +18,8 @@ print("argument", what, flush=True)
 if what == "die-once" and count == 1 or what == "die":
     os.kill(os.getpid(), signal.SIGKILL)
 if what == "wait":
-    pathlib.Path("waiting").touch()
     try:
+        pathlib.Path("waiting").touch()
         time.sleep(600)
     except KeyboardInterrupt:
         pathlib.Path("saved").touch()
