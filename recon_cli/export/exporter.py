@@ -240,9 +240,11 @@ class Exporter:
     def _write_mesh(self, name: str, splats: Splats) -> Path:
         """Writes the mesh, made once for all formats, or the plan of its walls."""
         if self._mesh is None or self._mesh[0] is not splats:
+            measured = PLAN in self._config.formats
             self._mesh = splats, build_mesh(
                 splats.map(lambda tensor: tensor.to(self._ctx.device)),
-                self._load_training_views(), self._similarity.points(self._scene.points), self._ctx,
+                self._load_training_views(),
+                self._similarity.points(self._scene.points) if measured else None, self._ctx,
                 max_triangles=self._config.max_triangles, voxel=self._config.voxel)
         if name == PLAN:
             centers = np.stack([view.camera.center for view in self._scene.train])

@@ -190,7 +190,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         return extract(fuse(some, voxel, farthest))
 
     def built(some: list[TrainView]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        mesh = build.build_mesh(splats, some, scene.points, ctx, max_triangles=triangles).mesh
+        mesh = build.build_mesh(splats, some, None, ctx, max_triangles=triangles).mesh
         return mesh.vertices, mesh.faces
 
     row("whole export, with rendering and stereo", lambda: built(views))
@@ -198,7 +198,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
     row("and weighed by agreement", lambda: fused(copy(maps), agreement=True))
 
     def without_stereo() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        mesh = build.mesh_of(copy(maps), np.empty((0, 3)), ctx, max_triangles=triangles).mesh
+        mesh = build.mesh_of(copy(maps), None, ctx, max_triangles=triangles).mesh
         return mesh.vertices, mesh.faces
 
     row("and only what views show: all but stereo", without_stereo)
@@ -214,7 +214,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         blank = [TrainView(camera, np.zeros((camera.height, camera.width, 3), np.uint8))
                  for camera in cameras]
         whole = weigh(blank, cameras, depths, [np.ones_like(depth) for depth in depths])
-        mesh = build.mesh_of(whole, np.empty((0, 3)), ctx, max_triangles=triangles).mesh
+        mesh = build.mesh_of(whole, None, ctx, max_triangles=triangles).mesh
         return mesh.vertices, mesh.faces
 
     row("exact depth of a fifth of the views, the same way", exact)

@@ -17,7 +17,6 @@ from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.train_view import TrainView
 
 UP = np.array([0.0, 0.0, 1.0])
-NOWHERE = np.empty((0, 3))
 
 
 def camera(eye, target, size=96):
@@ -64,11 +63,21 @@ def test_a_ball_seen_from_all_around_is_closed_and_as_large_as_it_is():
     assert (outwards > 0).mean() > 0.99
 
 
+def test_a_room_to_be_measured_has_its_planes_and_what_points_say_of_them():
+    grid = np.linspace(-0.7, 0.7, 15)
+    points = np.stack(np.meshgrid([2.01], grid, grid), axis=-1).reshape(-1, 3)
+    result = mesh_of(maps_of(FRONT, wall_depth), points, CONTEXT, max_triangles=100, voxel=0.04)
+    [(plane, confirmed)] = result.planes
+    assert abs(plane.offset) == pytest.approx(2.0, abs=0.01)
+    assert abs(confirmed.offset) == pytest.approx(2.01, abs=1e-6)
+
+
 def test_one_wall_is_one_sheet_with_open_rims():
-    result = mesh_of(maps_of(FRONT, wall_depth), NOWHERE, CONTEXT, max_triangles=10**6, voxel=0.04)
+    result = mesh_of(maps_of(FRONT, wall_depth), None, CONTEXT, max_triangles=10**6, voxel=0.04)
     vertices, faces = result.mesh.vertices, result.mesh.faces
     assert np.abs(vertices[:, 0] - 2.0).max() < 0.01
     assert np.abs(vertices[:, 1:]).max() < 0.9
+    assert result.planes == []
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(
         corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
@@ -87,12 +96,12 @@ def test_what_one_view_alone_claims_is_no_surface():
         return depth
 
     result = mesh_of(
-        maps_of(FRONT, with_floater), NOWHERE, CONTEXT, max_triangles=10**6, voxel=0.04)
+        maps_of(FRONT, with_floater), None, CONTEXT, max_triangles=10**6, voxel=0.04)
     assert np.abs(result.mesh.vertices[:, 0] - 2.0).max() < 0.02
 
 
 def test_ten_triangles_are_enough_for_a_wall():
-    result = mesh_of(maps_of(FRONT, wall_depth), NOWHERE, CONTEXT, max_triangles=10, voxel=0.04)
+    result = mesh_of(maps_of(FRONT, wall_depth), None, CONTEXT, max_triangles=10, voxel=0.04)
     assert 0 < len(result.mesh.faces) <= 10 < result.triangles_before
     assert np.abs(result.mesh.vertices[:, 0] - 2.0).max() < 0.1
 
@@ -104,12 +113,12 @@ def test_a_mesh_that_does_not_fit_gets_coarser_voxels_with_a_notice(monkeypatch)
     maps = maps_of(FRONT, wall_depth)
     fine = len(fuse(maps, 0.02, 8.0).blocks) * build.BYTES
     monkeypatch.setattr(build, "_MOST_BYTES", fine / 3)
-    result = mesh_of(maps, NOWHERE, ctx, max_triangles=10**6, voxel=0.02)
+    result = mesh_of(maps, None, ctx, max_triangles=10**6, voxel=0.02)
     assert 0.02 < result.voxel < 0.08
     assert any("in place of 0.02" in text for text in notices)
     monkeypatch.setattr(build, "_MOST_BYTES", 10)
     with pytest.raises(ReconstructionError, match="memory"):
-        mesh_of(maps_of(FRONT, wall_depth), NOWHERE, ctx, max_triangles=100, voxel=0.02)
+        mesh_of(maps_of(FRONT, wall_depth), None, ctx, max_triangles=100, voxel=0.02)
 
 
 def test_views_that_do_not_agree_make_no_mesh():
@@ -118,4 +127,4 @@ def test_views_that_do_not_agree_make_no_mesh():
         return rng.uniform(0.5, 8.0, (view.height, view.width)).astype(np.float32)
 
     with pytest.raises(ReconstructionError, match="There is no surface"):
-        mesh_of(maps_of(FRONT[:2], random_depth), NOWHERE, CONTEXT, max_triangles=1000, voxel=0.04)
+        mesh_of(maps_of(FRONT[:2], random_depth), None, CONTEXT, max_triangles=1000, voxel=0.04)

@@ -50,7 +50,7 @@ class MeshResult:
     mesh: Mesh
     voxel: float  # world units
     triangles_before: int  # before they were simplified
-    planes: list[tuple[Plane, Plane | None]]  # its large planes, and what points make of them
+    planes: list[tuple[Plane, Plane | None]]  # if looked for: large ones, what points make of them
 
     def describe(self) -> str:
         """Returns triangles and voxels as part of a sentence."""
@@ -61,15 +61,16 @@ class MeshResult:
 
 
 def build_mesh(
-    splats: Splats, views: Sequence[TrainView], points: NDArray[np.float64], ctx: StageContext, *,
-    max_triangles: int, voxel: float | None = None,
+    splats: Splats, views: Sequence[TrainView], points: NDArray[np.float64] | None,
+    ctx: StageContext, *, max_triangles: int, voxel: float | None = None,
 ) -> MeshResult:
     """Returns the mesh of what the views show of a scene.
 
     Args:
         splats: on the device of `ctx`.
         views: at least one, with cameras in the world of the splats.
-        points: [P, 3] triangulated points, which confirm the planes that a room is measured by.
+        points: [P, 3] triangulated points, which confirm the planes that a room is measured by;
+            None if it is not measured.
         ctx: backend, threads, progress, and notices.
         max_triangles: that are left.
         voxel: side of a voxel in world units; None for 1/128 of the median depth.
@@ -91,13 +92,13 @@ def build_mesh(
 
 
 def mesh_of(
-    maps: DepthMaps, points: NDArray[np.float64], ctx: StageContext, *, max_triangles: int,
+    maps: DepthMaps, points: NDArray[np.float64] | None, ctx: StageContext, *, max_triangles: int,
     voxel: float | None = None, on_view: Callable[[], None] = lambda: None,
 ) -> MeshResult:
     """Returns the mesh of depth maps; see `build_mesh`."""
     weigh_by_agreement(maps)
     voxel, farthest = _fit_voxel(maps, voxel, ctx)
-    planes = surface_planes(maps, voxel, farthest, points)
+    planes = [] if points is None else surface_planes(maps, voxel, farthest, points)
     vertices, faces = extract(fuse(maps, voxel, farthest, on_view))
     counts, _ = observe_all(maps, vertices, faces)
     shown = (counts[:, SHOWN] > 0) & (counts[:, SHOWN] >= 0.5 * counts[:, SEEN_THROUGH])
