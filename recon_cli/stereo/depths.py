@@ -29,6 +29,7 @@ _LEAST_SHARED = 10  # points that two views must both see
 # The first search, at half the size: inverse depths evenly spread, over more than the surface spans
 _HYPOTHESES, _RADIUS = 64, 1
 _NEARER, _FARTHER = 0.7, 1.4
+_COMPARED = 14  # partners at most; what is level or refined is compared with all
 # and along level planes, by their distance from the camera in median depths: in rooms from 65 cm,
 # which a table top lies below a standing person's eyes, to 3 m
 _LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
@@ -56,6 +57,7 @@ class Levels:
 class _Sweep:
     """One search: see `match`."""
 
+    partners: NDArray[np.int64]  # [V, K]
     base: Sequence[NDArray[np.float32]]  # [H, W] of each photo
     lowest: NDArray[np.float64]  # [V]
     steps: NDArray[np.float64]  # [V]
@@ -100,19 +102,22 @@ def find_depths(
     lowest = np.ascontiguousarray(ranges[:, 0])
     steps = (ranges[:, 1] - lowest) / (_HYPOTHESES - 1)
     base = [np.zeros(image.shape, np.float32) for image, _ in half]
-    sweeps = [_Sweep(base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
+    sweeps = [_Sweep(
+        partners[:, :_COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
     if levels:
         first, last = 1 / (_HIGHEST * levels.median), 1 / (_LOWEST * levels.median)
         step = (last - first) / (_LEVELS - 1)
-        sweeps.append(_Sweep(base, np.full(len(photos), first), np.full(len(photos), step),
-                             _LEVELS, _RADIUS, levels.up))
-    coarse = _search(half, partners, sweeps, on_photo)
+        sweeps.append(_Sweep(
+            partners, base, np.full(len(photos), first), np.full(len(photos), step), _LEVELS,
+            _RADIUS, levels.up))
+    coarse = _search(half, sweeps, on_photo)
     coarse = _laid_on_planes(half, coarse, partners, near, steps)
     fine = steps / _FINER
     priors = [_enlarged(found, image.shape)
               for (image, _), found in zip(full, coarse, strict=True)]
-    refined = _search(full, partners, [_Sweep(
-        priors, -fine * (_REFINED // 2), fine, _REFINED, _REFINED_RADIUS, _FRONTAL)], on_photo)
+    refined = _search(full, [_Sweep(
+        partners, priors, -fine * (_REFINED // 2), fine, _REFINED, _REFINED_RADIUS, _FRONTAL)],
+        on_photo)
     depths = [np.where(prior > 0, _depth(inverse), np.float32(0))
               for prior, inverse in zip(priors, refined, strict=True)]
     masks = [photo.view.mask for photo in photos]
@@ -179,8 +184,8 @@ def _halved(image: NDArray[np.float32], camera: Camera) -> tuple[NDArray[np.floa
 
 
 def _search(
-    images: Sequence[tuple[NDArray[np.float32], Camera]], partners: NDArray[np.int64],
-    sweeps: Sequence[_Sweep], on_photo: Callable[[], None],
+    images: Sequence[tuple[NDArray[np.float32], Camera]], sweeps: Sequence[_Sweep],
+    on_photo: Callable[[], None],
 ) -> list[NDArray[np.float32]]:
     """Returns the inverse depths [H, W] of least cost in any sweep, 0 where there are none."""
     sizes = [image.size for image, _ in images]
@@ -190,7 +195,8 @@ def _search(
     cameras = np.stack([camera_row(camera) for _, camera in images])
     for sweep in sweeps:
         arguments = (
-            flat, starts[:-1], cameras, partners, sweep.radius, sweep.normal,
+            flat, starts[:-1], cameras, np.ascontiguousarray(sweep.partners), sweep.radius,
+            sweep.normal,
             np.concatenate([part.reshape(-1) for part in sweep.base]), sweep.lowest, sweep.steps,
             sweep.hypotheses, inverse, least)
         for first in range(0, len(images), pool.size):

@@ -54,7 +54,7 @@ def match(
         images: [P] float32 grey images in 0 to 255, one after the other; starts: [V] of each.
         cameras: [V, 18] rotation, translation, fx, fy, cx, cy, width and height of each.
         others: [V, K] int64 views that each is compared with, -1 for none.
-        radius: of the windows, pixels.
+        radius: of the windows, 1 or 2 pixels.
         normal: [3] of the planes, world axes; zero for planes parallel to each image.
         base: [P] float32, inverse depth that is added to that of the planes.
         lowest: [V] inverse distance from the camera of the first plane; steps: [V] between two.
@@ -190,8 +190,9 @@ def _warp_row(warped, inside, place, other, P, Q, R, t, y, base, slant, shift):
     for x in range(width):
         inverse = base[x] + slant[x] * moved
         z = z0 + z1 * xs[x] + z2 * inverse
-        u = (u0 + u1 * xs[x] + u2 * inverse) / z + cx
-        v = (v0 + v1 * xs[x] + v2 * inverse) / z + cy
+        one_over = _ONE / z
+        u = (u0 + u1 * xs[x] + u2 * inverse) * one_over + cx
+        v = (v0 + v1 * xs[x] + v2 * inverse) * one_over + cy
         shown = z > _LEAST_Z and inverse > 0 and u >= 0 and v >= 0 and u <= right and v <= bottom
         inside[x] = _ONE if shown else _ZERO
         us[x] = min(max(u, _ZERO), right) if shown else _ZERO
@@ -228,13 +229,14 @@ def _push_row(slot, padded, warped, image, radius):
             padded[row, x] = padded[row, radius]
             padded[row, radius + width + x] = padded[row, radius + width - 1]
         result = slot[row]
-        part = padded[row, :width]
+        first, second, third = (
+            padded[row, :width], padded[row, 1:width + 1], padded[row, 2:width + 2])
         for x in range(width):
-            result[x] = part[x]
-        for shift in range(1, 2 * radius + 1):
-            part = padded[row, shift:shift + width]
+            result[x] = first[x] + second[x] + third[x]
+        if radius == 2:
+            fourth, fifth = padded[row, 3:width + 3], padded[row, 4:width + 4]
             for x in range(width):
-                result[x] += part[x]
+                result[x] += fourth[x] + fifth[x]
 
 
 @inlined
@@ -242,13 +244,18 @@ def _sum_rows(sums, ring, y, radius, height):
     """Writes the sums [4, W] of the windows about a row."""
     width = sums.shape[1]
     rows = 2 * radius + 1
+    middle = y % rows
+    above, below = max(y - 1, 0) % rows, min(y + 1, height - 1) % rows
     for row in range(_SUMS):
         result = sums[row]
-        result[:] = 0
-        for shift in range(-radius, radius + 1):
-            part = ring[min(max(y + shift, 0), height - 1) % rows, row]
+        first, second, third = ring[above, row], ring[middle, row], ring[below, row]
+        for x in range(width):
+            result[x] = first[x] + second[x] + third[x]
+        if radius == 2:
+            fourth = ring[max(y - 2, 0) % rows, row]
+            fifth = ring[min(y + 2, height - 1) % rows, row]
             for x in range(width):
-                result[x] += part[x]
+                result[x] += fourth[x] + fifth[x]
 
 
 @inlined
