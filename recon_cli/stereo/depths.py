@@ -93,7 +93,7 @@ def find_depths(
         partners: [V, K] photos that each is compared with, -1 for none.
         near: least depth of a surface, world units.
         on_photo: called for each photo twice, with `levels` three times.
-        levels: to be searched as well; a quarter more time for more of floors and ceilings.
+        levels: to be searched as well; two fifths more time for more of floors and ceilings.
     """
     full = [(photo.grey, photo.view.camera) for photo in photos]
     half = [_halved(*image) for image in full]

@@ -18,7 +18,7 @@ from recon_cli.scene.gravity import find_gravity
 from recon_cli.stereo.depths import Levels, Photo, find_depths, find_partners, places
 
 _SIDE = 600  # pixels of the longer side at most
-_MOST_VIEWS = 150  # that get a depth map, evenly spread; 2 to 3 CPU seconds each
+_MOST_VIEWS = 150  # that get a depth map, evenly spread; about 2 CPU seconds each
 _NEIGHBOURS = 20  # views that each is compared with; more of them find more of blank walls
 _SAMPLES = 3000  # points looked at to find them
 _LEAST_PIXELS = 20  # with depth, to tell how near and far is searched
