@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections import UserDict
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import click
 
 from recon_cli import __version__
-from recon_cli.commands import console
+from recon_cli.commands import console, hints
 from recon_cli.commands.options import Call
 from recon_cli.errors import ReconError
 from recon_cli.lazy import load
@@ -78,10 +79,25 @@ def cli() -> None:
     """Turn a video or photos of a room into a 3D Gaussian Splatting scene."""
 
 
+def _default_workspace(verb: str) -> str | None:
+    """Returns the workspace that a verb takes where none is typed; None where it takes none."""
+    command = cli.commands.get(verb) if verb in VERBS else None
+    option = next((item for item in command.params if item.name == "workspace"), None) if (
+        command) else None
+    if not isinstance(option, click.Option):
+        return None
+    given = os.environ.get(str(option.envvar)) if option.envvar else None
+    return given or str(option.default)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit code."""
     call = Call()
-    handler = console.show_log(detailed=lambda: call.verbose)
+
+    def complete(text: str) -> str:
+        return hints.name_workspace(text, call.workspace, _default_workspace)
+
+    handler = console.show_log(detailed=lambda: call.verbose, complete=complete)
     try:
         if launch.follows():
             return launch.follow()
@@ -99,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     except ReconError as error:
         logger.debug("failed", exc_info=True)
-        console.print_error(error.message, error.hint)
+        console.print_error(error.message, complete(error.hint))
         return error.exit_code
     except Exception as error:
         logger.debug("failed", exc_info=True)

@@ -9,14 +9,15 @@ from collections.abc import Sequence
 
 
 class ReconError(Exception):
-    """A failure that the user can act on; `hint` says what to type or change next, or is empty."""
+    """A failure that the user can act on; `hint` says what to type or change next."""
 
     exit_code = 1
+    usual_hint = ""  # of a class whose members all call for the same; others give one each
 
     def __init__(self, message: str, *, hint: str = "") -> None:
         super().__init__(message)
         self.message = message
-        self.hint = hint
+        self.hint = hint or self.usual_hint
 
 
 class ConfigError(ReconError):
@@ -70,9 +71,13 @@ class WorkspaceError(ReconError):
 class ManifestError(WorkspaceError):
     """A manifest is truncated, edited by hand, or of an unknown version."""
 
+    usual_hint = "Run the stage again with --again; `recon status` names those that are damaged."
+
 
 class FormatError(InputError):
     """A file does not hold what its format promises."""
+
+    usual_hint = "Copy the file again, or write it anew with the program that made it."
 
 
 def list_names(names: Sequence[str], most: int = 5) -> str:

@@ -14,12 +14,16 @@ logger = logging.getLogger("recon")
 
 
 class _NoticeFormatter(logging.Formatter):
-    """Puts `notice:` before warnings; everything else is printed as it is."""
+    """Puts `notice:` before warnings and completes their commands; the rest stays as it is."""
+
+    def __init__(self, complete: Callable[[str], str]) -> None:
+        super().__init__()
+        self._complete = complete
 
     def format(self, record: logging.LogRecord) -> str:
         """Returns the message, after `notice:` where it is a warning."""
         text = super().format(record)
-        return f"notice: {text}" if record.levelno >= logging.WARNING else text
+        return f"notice: {self._complete(text)}" if record.levelno >= logging.WARNING else text
 
 
 class _BarAwareHandler(logging.StreamHandler[TextIO]):
@@ -31,10 +35,15 @@ class _BarAwareHandler(logging.StreamHandler[TextIO]):
             super().emit(record)
 
 
-def show_log(*, detailed: Callable[[], bool]) -> logging.Handler:
-    """Shows the log on stderr, debug messages where `detailed()`, and returns the handler."""
+def show_log(
+    *, detailed: Callable[[], bool], complete: Callable[[str], str] = str
+) -> logging.Handler:
+    """Shows the log on stderr, debug messages where `detailed()`, and returns the handler.
+
+    `complete` completes the commands in notices (see `hints.name_workspace`).
+    """
     handler = _BarAwareHandler()
-    handler.setFormatter(_NoticeFormatter())
+    handler.setFormatter(_NoticeFormatter(complete))
     handler.addFilter(lambda record: record.levelno >= logging.INFO or detailed())
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG)

@@ -107,7 +107,9 @@ def _no_such_view(
     if name in parts:
         return ConfigError(f"This capture has no {name} views.", hint="Give others with --views.")
     if name in unregistered:
-        return ConfigError(f"The frame {name} has no camera, so it has no view to render.")
+        return ConfigError(
+            f"The frame {name} has no camera, so it has no view to render.",
+            hint=f"Give {', '.join(parts)}, or the name of a frame such as {min(known)}.")
     close = difflib.get_close_matches(name, known, n=1)
     return ConfigError(
         f"There is no view {name!r} among the {len(known)} of this capture.",

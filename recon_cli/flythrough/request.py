@@ -40,7 +40,8 @@ class RenderRequest:
     def __post_init__(self) -> None:
         if self.file is None and self.path not in (TRAINING, ORBIT):
             raise ConfigError(
-                f"--path takes {TRAINING}, {ORBIT} or a FILE.json, but got {self.path!r}.")
+                f"--path takes {TRAINING}, {ORBIT} or a FILE.json, but got {self.path!r}.",
+                hint="Give one of these; a file of cameras must end in .json.")
         self._check_numbers()
         self._check_views()
         self._check_video()
@@ -81,15 +82,22 @@ class RenderRequest:
         for name, value, highest in (("fps", self.fps, 240), ("seconds", self.seconds, 86_400)):
             if value is not None and not (math.isfinite(value) and 0 < value <= highest):
                 raise ConfigError(
-                    f"--{name} is {value:g}; it must be above 0 and at most {highest}.")
+                    f"--{name} is {value:g}; it must be above 0 and at most {highest}.",
+                    hint=f"Give a number in that range with --{name}, or leave it out.")
         for name in ("size", "width", "height"):
             pixels = getattr(self, name)
             if pixels is not None and pixels < 1:
-                raise ConfigError(f"--{name} is {pixels}; it must be at least 1 pixel.")
+                raise ConfigError(
+                    f"--{name} is {pixels}; it must be at least 1 pixel.",
+                    hint=f"Give more pixels with --{name}, or leave it out.")
         if self.size is not None and (self.width or self.height):
-            raise ConfigError("--size and --width or --height exclude each other.")
+            raise ConfigError(
+                "--size and --width or --height exclude each other.",
+                hint="Leave --size out, or the others.")
         if not all(0 <= value <= 255 for value in self.background or ()):
-            raise ConfigError(f"--background is {self.background}; values must be 0 to 255.")
+            raise ConfigError(
+                f"--background is {self.background}; values must be 0 to 255.",
+                hint="Give red, green and blue, such as --background 255,255,255.")
         if self.frames() > MAX_FRAMES:
             raise ConfigError(
                 f"The path has {self.frames():,} frames; at most {MAX_FRAMES:,} are rendered.",
@@ -98,12 +106,15 @@ class RenderRequest:
     def _check_views(self) -> None:
         if self.file is not None and self.seconds is not None:
             raise ConfigError(
-                "--seconds has no effect on a path from a file, which lists its frames.")
+                "--seconds has no effect on a path from a file, which lists its frames.",
+                hint="Leave --seconds out; --fps makes the video longer or shorter.")
         if not self.views:
             return
         for name in ("fps", "seconds"):
             if getattr(self, name) is not None:
-                raise ConfigError(f"--{name} has no effect on single views.")
+                raise ConfigError(
+                    f"--{name} has no effect on single views.",
+                    hint=f"Leave --{name} out, or give --path instead of --views.")
         if self.video:
             raise ConfigError(
                 "Single views cannot become a video.",
@@ -116,11 +127,15 @@ class RenderRequest:
     def _check_video(self) -> None:
         codec = self.codec or CODECS[0]
         if self.crf is not None and not 0 <= self.crf <= _CRF_LIMITS[codec]:
-            raise ConfigError(f"--crf is {self.crf}; {codec} accepts 0 to {_CRF_LIMITS[codec]}.")
+            raise ConfigError(
+                f"--crf is {self.crf}; {codec} accepts 0 to {_CRF_LIMITS[codec]}.",
+                hint=f"Give a number in that range; {CRF[codec]} is the default.")
         if not self.video:
             for name in ("codec", "crf"):
                 if getattr(self, name) is not None:
-                    raise ConfigError(f"--{name} has no effect without --format mp4.")
+                    raise ConfigError(
+                        f"--{name} has no effect without --format mp4.",
+                        hint=f"Add --format mp4, or leave --{name} out.")
         file = self.out_file
         if file is not None and not self.video and DEPTH in self.outputs:
             raise ConfigError(

@@ -28,7 +28,7 @@ def test_without_a_trained_model_the_command_to_type_is_named(copied, capsys):
 
 def test_an_empty_workspace_names_the_first_command(tmp_path, capsys):
     assert render(tmp_path / "none") == 4
-    assert "Run `recon ingest VIDEO`" in capsys.readouterr().err
+    assert "Run `recon ingest VIDEO -w " in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
 
 
@@ -36,7 +36,7 @@ def test_a_pruned_model_that_is_not_there_is_an_error_and_a_stale_one_is_left_ou
     copied, before_a_wall, tmp_path, capsys, caplog
 ):
     assert render(before_a_wall, "--model", "pruned", "--out", tmp_path / "out") == 4
-    assert "Run `recon prune` first" in capsys.readouterr().err
+    assert "Run `recon prune -w " in capsys.readouterr().err
     (copied / "prune" / "splats.ply").write_bytes((copied / "train" / "splats.ply").read_bytes())
     assert render(copied, "--views", "000001", "--out", tmp_path / "out") == 0
     assert "the pruned model is not used: it is stale" in caplog.text
