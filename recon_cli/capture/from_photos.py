@@ -193,7 +193,7 @@ def _make_sheet(
     for candidate in record:
         if candidate.index in written and candidate.name is None:
             for folder in (store.FOLDER, store.MASKS):
-                (out / folder / source.names[candidate.index]).unlink(missing_ok=True)
+                atomic.delete(out / folder / source.names[candidate.index])
     return sheet
 
 

@@ -13,6 +13,7 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job, summary_text
 from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.errors import ManifestError
 from recon_cli.lazy import load
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, StageStatus, free_space
@@ -28,7 +29,7 @@ logger = logging.getLogger("recon")
 @click.option(
     "--json", "as_json", is_flag=True,
     help="Print JSON: workspace, and stages with name, state, reasons, done, total, seconds, "
-         "summary, notices.  [default: off]")
+         "summary, notices, hint.  [default: off]")
 @options.common()
 @pass_call
 def status(call: Call, as_json: bool) -> None:
@@ -39,6 +40,7 @@ def status(call: Call, as_json: bool) -> None:
         click.echo(json.dumps({
             "workspace": str(job.workspace.root),
             "stages": [dataclasses.asdict(stage) for stage in stages]}, indent=1))
+        _refuse_damaged(stages)
         return
     if not job.workspace.root.exists():
         logger.warning("there is no workspace at %s yet", job.workspace.root)
@@ -49,6 +51,14 @@ def status(call: Call, as_json: bool) -> None:
                 click.echo(line)
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)
+    _refuse_damaged(stages)
+
+
+def _refuse_damaged(stages: Sequence[StageStatus]) -> None:
+    """Raises ManifestError for the first stage whose manifest cannot be trusted."""
+    for stage in stages:
+        if stage.state == "damaged":
+            raise ManifestError(stage.reasons[0], hint=stage.hint)
 
 
 def status_table(stages: Sequence[StageStatus]) -> str:
@@ -84,7 +94,8 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
     job = Job(Workspace(call.workspace), table=STAGES)  # recon.toml may be damaged
     freed = free_space(job, stages, dry=dry_run)
     for item in freed:
-        click.echo(f"{item.path}: {format_megabytes(item.size)}")
+        link = " (a link; what it points to stays)" * item.is_link
+        click.echo(f"{item.path}: {format_megabytes(item.size)}{link}")
     outcome = "would be freed" if dry_run else "freed"
     click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
 
