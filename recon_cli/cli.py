@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     except ReconError as error:
         logger.debug("failed", exc_info=True)
-        console.print_error(error.message, error.hint)
+        console.print_error(error.message, console.name_workspace(error.hint, call.workspace))
         return error.exit_code
     except Exception as error:
         logger.debug("failed", exc_info=True)

@@ -203,7 +203,7 @@ def _plan_raw(photos: Sequence[Photo], record: Path, ctx: IngestContext) -> RawP
     if not paths:
         return RawPlan({}, {})
     if record.exists():
-        plan = RawPlan.from_json(atomic.read_json(record))
+        plan = RawPlan.from_json(atomic.read_json(record, dict))
         if plan.shots.keys() | plan.broken.keys() == {path.name for path in paths}:
             return plan
     with ctx.progress.bar("raw", len(paths), unit="photo") as bar:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import logging
+import re
+import shlex
 from collections.abc import Callable
+from pathlib import Path
 from typing import TextIO
 
 import click
 
 from recon_cli.progress import hide_bars
+
+DEFAULT_WORKSPACE = Path("workspace")
+_WITHOUT_WORKSPACE = ("batch", "bench", "study")
 
 logger = logging.getLogger("recon")
 
@@ -46,6 +52,20 @@ def print_error(message: str, hint: str) -> None:
     click.echo(f"error: {message}", err=True)
     if hint:
         click.echo(f"hint: {hint}", err=True)
+
+
+def name_workspace(hint: str, workspace: Path) -> str:
+    """Returns a hint whose commands name the workspace, where that is not the default one."""
+    if workspace == DEFAULT_WORKSPACE:
+        return hint
+
+    def complete(found: re.Match[str]) -> str:
+        command, verb = found[1], found[2]
+        if verb in _WITHOUT_WORKSPACE or re.search(r" (-w|--workspace)\b", command):
+            return found[0]
+        return f"`{command} -w {shlex.quote(str(workspace))}`"
+
+    return re.sub(r"`(recon ([a-z]+)[^`]*)`", complete, hint)
 
 
 def usage_hint(error: click.ClickException) -> str:

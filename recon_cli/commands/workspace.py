@@ -13,7 +13,6 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job, summary_text
 from recon_cli.commands.options import Call, pass_call, verb
-from recon_cli.errors import ManifestError
 from recon_cli.lazy import load
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, StageStatus, free_space
@@ -29,7 +28,7 @@ logger = logging.getLogger("recon")
 @click.option(
     "--json", "as_json", is_flag=True,
     help="Print JSON: workspace, and stages with name, state, reasons, done, total, seconds, "
-         "summary, notices, hint.  [default: off]")
+         "summary, notices.  [default: off]")
 @options.common()
 @pass_call
 def status(call: Call, as_json: bool) -> None:
@@ -40,7 +39,7 @@ def status(call: Call, as_json: bool) -> None:
         click.echo(json.dumps({
             "workspace": str(job.workspace.root),
             "stages": [dataclasses.asdict(stage) for stage in stages]}, indent=1))
-        _refuse_damaged(stages)
+        _refuse_damaged(job, stages)
         return
     if not job.workspace.root.exists():
         logger.warning("there is no workspace at %s yet", job.workspace.root)
@@ -51,14 +50,14 @@ def status(call: Call, as_json: bool) -> None:
                 click.echo(line)
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)
-    _refuse_damaged(stages)
+    _refuse_damaged(job, stages)
 
 
-def _refuse_damaged(stages: Sequence[StageStatus]) -> None:
+def _refuse_damaged(job: Job, stages: Sequence[StageStatus]) -> None:
     """Raises ManifestError for the first stage whose manifest cannot be trusted."""
     for stage in stages:
         if stage.state == "damaged":
-            raise ManifestError(stage.reasons[0], hint=stage.hint)
+            job.workspace.manifest(stage.name)
 
 
 def status_table(stages: Sequence[StageStatus]) -> str:

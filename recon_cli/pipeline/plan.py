@@ -61,7 +61,6 @@ class StageStatus:
     seconds: float | None  # that the finished result took; None where there is none
     summary: dict[str, Any]  # of the finished result
     notices: tuple[str, ...]  # what the user should know but makes nothing stale
-    hint: str = ""  # what to type where it is damaged
 
 
 def status(job: Job) -> tuple[StageStatus, ...]:
@@ -86,8 +85,7 @@ def _status(check: StageCheck) -> StageStatus:
         run.seconds if run else None,
         dict(run.summary) if run else {},
         (*(run.summary.get("notices", ()) if run else ()),
-         *(f"the input {path} is gone" for path in check.gone)),
-        check.damage.hint if check.damage else "")
+         *(f"the input {path} is gone" for path in check.gone)))
 
 
 def run(

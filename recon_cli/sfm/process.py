@@ -193,7 +193,7 @@ def _timeout_error(max_minutes: float, monitor: Monitor) -> SfmError:
         f"The cameras were not found within {max_minutes:g} minutes; the last step was "
         f"{monitor.doing}.",
         hint="Allow more time with --max-minutes (features and matches found so far are kept), or "
-        "use fewer frames (recon ingest --frames N) or --max-features 1024.")
+        "use fewer frames (`recon ingest --frames N`) or --max-features 1024.")
 
 
 def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
@@ -204,7 +204,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
     if code == -signal.SIGKILL:
         hint = (
             "The system may have run out of memory; try --max-features 1024 or fewer frames "
-            "(recon ingest --frames N).")
+            "(`recon ingest --frames N`).")
     return CrashError(
         f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
         f"{last_error(log)}", hint=hint)

@@ -162,7 +162,7 @@ def load_state(
     """
     try:
         with safe_open(path, framework="pt") as file:
-            scalars = parse_json((file.metadata() or {})["state"], dict)
+            scalars = parse_json((file.metadata() or {})["state"], dict, finite=False)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if scalars["version"] != _VERSION:
             raise KeyError("version")
@@ -197,7 +197,7 @@ def read_progress(path: Path) -> tuple[int, int]:
     """
     try:
         with safe_open(path, framework="pt") as file:
-            scalars = parse_json((file.metadata() or {})["state"], dict)
+            scalars = parse_json((file.metadata() or {})["state"], dict, finite=False)
             begin, end = scalars["jump"] or (0, 0)
             return (int(scalars["iteration"]) - (end - begin),
                     file.get_slice("splats.means").get_shape()[0])

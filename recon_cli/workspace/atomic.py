@@ -18,6 +18,7 @@ from recon_cli.errors import FormatError
 from recon_cli.workspace import journal
 
 MAX_TEXT_BYTES = 256 << 20  # of a JSON or TOML file; parsing takes some twenty times as much memory
+_MOST_DIGITS = 20  # of an integer of 64 bits, with its sign
 LEFTOVERS = ".*.tmp*"  # files that `replacing` had not finished when it was killed
 
 
@@ -91,15 +92,16 @@ def read_json(path: Path, kind: type | None = None, *, hint: str = "") -> Any:
         raise FormatError(f"{path} cannot be read as JSON: {reason}.", hint=hint) from error
 
 
-def parse_json(text: str | bytes, kind: type | None = None) -> Any:
+def parse_json(text: str | bytes, kind: type | None = None, *, finite: bool = True) -> Any:
     """Returns a JSON value of any origin: a value of a `kind` (dict or list), if that is given.
 
     Raises:
-        ValueError: it is not JSON or not of that kind, holds NaN, infinity or a number of thousands
-            of digits, or is nested thousands deep.
+        ValueError: it is not JSON or not of that kind, is nested thousands deep, or where `finite`
+            is asked for holds NaN, infinity, or a number that is too large for a float.
     """
+    number = _finite if finite else float
     try:
-        value = json.loads(text, parse_constant=_finite, parse_float=_finite)
+        value = json.loads(text, parse_constant=number, parse_float=number, parse_int=_integer)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if kind is not None and not isinstance(value, kind):
@@ -107,6 +109,11 @@ def parse_json(text: str | bytes, kind: type | None = None) -> Any:
             value, dict) else "a single value"
         raise ValueError(f"it holds {what}, not {'a list' if kind is list else 'an object'}")
     return value
+
+
+def _integer(text: str) -> float:
+    """Returns an integer, or the float next to one that no file of ours can mean."""
+    return int(text) if len(text) <= _MOST_DIGITS else _finite(text)
 
 
 def _finite(text: str) -> float:

@@ -168,7 +168,7 @@ def _read(journal: Path) -> dict[str, _History]:
         if event == "there":
             history.pending = False
             continue
-        state = _State(*values, grows=event == "grows") if values else _MISSING
+        state = _State(values[0], values[1], event == "grows") if values else _MISSING
         history.before, history.last, history.pending = history.last, state, event == "file"
     return histories
 
