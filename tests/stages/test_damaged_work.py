@@ -23,6 +23,7 @@ from recon_cli.config.stages import DenoiseConfig, EvaluateConfig, ExportConfig,
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.stages import denoise, evaluate, export, ingest, prune, train
 from recon_cli.workspace import journal
+from recon_cli.workspace.atomic import delete, write_bytes
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import PartialRun, ResultKey
 
@@ -183,7 +184,6 @@ def test_work_of_an_undamaged_run_is_kept(tmp_path: Path) -> None:
     workspace, key = Workspace(tmp_path), ResultKey("train", 1, {}, (), {})
     out, first = workspace.begin(key)
     assert isinstance(first, PartialRun)
-    from recon_cli.workspace.atomic import delete, write_bytes
     write_bytes(out / "kept.bin", b"1")
     write_bytes(out / "kept.bin", b"2")
     write_bytes(out / "gone.bin", b"3")
