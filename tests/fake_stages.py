@@ -22,6 +22,7 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import STAGES
+from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import JsonRecord
 
@@ -56,7 +57,7 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     for step in range(1, STEPS + 1):
         path = out / f"step{step}.txt"
         if not path.exists():
-            path.write_text(f"{step} of {name}")
+            write_bytes(path, f"{step} of {name}".encode())
             ctx.record(step, STEPS)
             time.sleep(float(os.environ.get(f"SLOW_{name.upper()}", "0")))
     options = {key: value for key, value in config.hashed_fields().items() if key != "seed"}

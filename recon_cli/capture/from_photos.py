@@ -193,7 +193,7 @@ def _make_sheet(
     for candidate in record:
         if candidate.index in written and candidate.name is None:
             for folder in (store.FOLDER, store.MASKS):
-                (out / folder / source.names[candidate.index]).unlink(missing_ok=True)
+                atomic.delete(out / folder / source.names[candidate.index])
     return sheet
 
 
@@ -203,7 +203,7 @@ def _plan_raw(photos: Sequence[Photo], record: Path, ctx: IngestContext) -> RawP
     if not paths:
         return RawPlan({}, {})
     if record.exists():
-        plan = RawPlan.from_json(atomic.read_json(record))
+        plan = RawPlan.from_json(atomic.read_json(record, dict))
         if plan.shots.keys() | plan.broken.keys() == {path.name for path in paths}:
             return plan
     with ctx.progress.bar("raw", len(paths), unit="photo") as bar:

@@ -89,7 +89,7 @@ def find_sequence(
     if len(photos) <= most or not looks_numbered(photos):
         return None
     if record.exists():
-        return PhotoSequence.from_json(atomic.read_json(record))
+        return PhotoSequence.from_json(atomic.read_json(record, dict))
     with ctx.progress.bar("scan", len(photos), unit="photo") as bar:
         def read() -> Iterator[NDArray[np.uint8] | InputError]:
             for photo in photos:

@@ -70,7 +70,7 @@ class Scan:
     @classmethod
     def read(cls, path: Path) -> Scan:
         """Returns the scan that `write` wrote."""
-        value: dict[str, Any] = atomic.read_json(path)
+        value: dict[str, Any] = atomic.read_json(path, dict)
         overlay = None
         if value["overlay"]:
             data = np.frombuffer(path.with_suffix(".png").read_bytes(), np.uint8)

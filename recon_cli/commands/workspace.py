@@ -39,6 +39,7 @@ def status(call: Call, as_json: bool) -> None:
         click.echo(json.dumps({
             "workspace": str(job.workspace.root),
             "stages": [dataclasses.asdict(stage) for stage in stages]}, indent=1))
+        _refuse_damaged(job, stages)
         return
     if not job.workspace.root.exists():
         logger.warning("there is no workspace at %s yet", job.workspace.root)
@@ -49,6 +50,14 @@ def status(call: Call, as_json: bool) -> None:
                 click.echo(line)
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)
+    _refuse_damaged(job, stages)
+
+
+def _refuse_damaged(job: Job, stages: Sequence[StageStatus]) -> None:
+    """Raises ManifestError for the first stage whose manifest cannot be trusted."""
+    for stage in stages:
+        if stage.state == "damaged":
+            job.workspace.manifest(stage.name)
 
 
 def status_table(stages: Sequence[StageStatus]) -> str:
@@ -84,7 +93,8 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
     job = Job(Workspace(call.workspace), table=STAGES)  # recon.toml may be damaged
     freed = free_space(job, stages, dry=dry_run)
     for item in freed:
-        click.echo(f"{item.path}: {format_megabytes(item.size)}")
+        link = " (a link; what it points to stays)" * item.is_link
+        click.echo(f"{item.path}: {format_megabytes(item.size)}{link}")
     outcome = "would be freed" if dry_run else "freed"
     click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
 

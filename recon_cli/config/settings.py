@@ -25,6 +25,7 @@ from recon_cli.config.stages import (
     TrainConfig,
 )
 from recon_cli.errors import ConfigError
+from recon_cli.workspace.atomic import read_text
 
 SECTIONS: dict[str, type[StageConfig]] = {
     "ingest": IngestConfig,
@@ -48,14 +49,15 @@ _TRUTH = {"true": True, "false": False}
 def read_settings(path: Path) -> Settings:
     """Returns the checked settings of a recon.toml; ConfigError if it is missing or wrong."""
     try:
-        with path.open("rb") as file:
-            settings = tomllib.load(file)
+        settings = tomllib.loads(read_text(path))
     except OSError as error:
         raise ConfigError(
             f"{path} cannot be read: {error.strerror}.",
             hint="Check the path after --config.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}.", hint="Fix that line.") from error
+    except (ValueError, RecursionError) as error:
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
+        raise ConfigError(
+            f"{path} is not valid TOML: {reason}.", hint=f"Fix {path.name}.") from error
     for section, values in settings.items():
         _check_names(section, (), where=str(path))
         if not isinstance(values, dict):
@@ -122,6 +124,10 @@ def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> Non
         SECTIONS[section](**values)
     except ConfigError as error:
         raise ConfigError(f"{where}{error.message}", hint=error.hint) from error
+    except OverflowError as error:  # a whole number for a float
+        raise ConfigError(
+            f"{where.rstrip('.')}: a number has too many digits.",
+            hint="Write a smaller one.") from error
 
 
 def _suggest(word: str, known: list[str], lead: str) -> str:

@@ -85,7 +85,7 @@ def _undo_export(splats: Splats, record: Path) -> Splats:
     if not record.is_file():
         return splats
     try:
-        similarity = Similarity.from_json(read_json(record)["similarity"])
+        similarity = Similarity.from_json(read_json(record, dict)["similarity"])
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
             f"{record} does not hold the frame of an export: {error!r}.",

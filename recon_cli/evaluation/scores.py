@@ -116,7 +116,8 @@ class Metrics(JsonRecord):
     @classmethod
     def read(cls, evaluate: Path) -> Self:
         """Returns a folder's scores; ManifestError for another version, FormatError if damaged."""
-        return cls.from_json(read_json(evaluate / cls.FILE))
+        return cls.from_json(read_json(
+            evaluate / cls.FILE, dict, hint="Run `recon eval --again`."))
 
 
 @dataclass(frozen=True)

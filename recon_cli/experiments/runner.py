@@ -43,7 +43,7 @@ from recon_cli.train.prune_loop import RATIO, PruneRun, prune_loop, remaining, r
 from recon_cli.train.schedule import RecoverySchedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
-from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.atomic import parse_json, write_bytes
 from recon_cli.workspace.digests import sha256_json
 
 RECORDS_FILE = "runs.jsonl"
@@ -197,7 +197,7 @@ class Records:
         self._values: dict[str, Mapping[str, Any]] = {}
         for number, line in enumerate(lines, start=1):
             try:
-                entry = json.loads(line)
+                entry = parse_json(line, dict)
                 if entry["version"] == _VERSION:
                     self._values[entry["key"]] = entry["value"]
             except (ValueError, KeyError, TypeError) as error:

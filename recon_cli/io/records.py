@@ -27,8 +27,7 @@ from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import JsonRecord
 
 FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
-AGAIN = "Delete the folder of ingest in the workspace and run recon ingest again."
-_RERUN = "Run `recon ingest --again`."
+AGAIN = "Run `recon ingest --again`."
 POSES, POINTS = "poses.json", "points.safetensors"
 BLOCK = "block.safetensors"
 _IMPORT = "import.json"
@@ -77,7 +76,7 @@ class FrameList:
 
 def read_frame_list(stage: Path) -> FrameList:
     """Returns the list of frames in ingest's folder; FormatError if it is missing or damaged."""
-    value = atomic.read_json(stage / LIST)
+    value = atomic.read_json(stage / LIST, dict, hint=AGAIN)
     try:
         frames = tuple(Frame(**frame) for frame in value.pop("frames"))
         groups = tuple(_group(group) for group in value.pop("groups"))
@@ -140,7 +139,7 @@ class KnownPoses:
 
 def read_poses(path: Path) -> KnownPoses:
     """Returns what `KnownPoses.write` wrote to poses.json; FormatError if a file is damaged."""
-    value = atomic.read_json(path)
+    value = atomic.read_json(path, dict, hint=AGAIN)
     try:
         viewmats = {
             name: np.array(matrix, np.float64).reshape(4, 4)
@@ -150,7 +149,7 @@ def read_poses(path: Path) -> KnownPoses:
         tensors = load_file(path.with_name(POINTS))
         return KnownPoses(viewmats, bool(value["metric"]), tensors["points"], tensors["colors"])
     except (AttributeError, KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
-        raise FormatError(f"{path} holds no poses.", hint=_RERUN) from error
+        raise FormatError(f"{path} holds no poses.", hint=AGAIN) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +175,7 @@ class BlockRecord:
             return None
         try:
             with safe_open(path, "numpy") as file:
-                names = json.loads(file.metadata()["validation"])
+                names = atomic.parse_json(file.metadata()["validation"], list)
                 cell = Cell(file.get_tensor("points"), file.get_tensor("owned").astype(np.bool_))
             return BlockRecord(cell, frozenset(names))
         except (KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
@@ -240,7 +239,7 @@ class ImportRecord(JsonRecord):
         FormatError if the file is damaged, ManifestError if it is of another version.
         """
         path = folder / _IMPORT
-        return ImportRecord.from_json(atomic.read_json(path)) if path.exists() else None
+        return ImportRecord.from_json(atomic.read_json(path, dict)) if path.exists() else None
 
 
 def has_views(folders: Mapping[str, Path]) -> bool:

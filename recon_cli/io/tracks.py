@@ -69,7 +69,7 @@ class Tracks:
         """Returns the tracks of a file; FormatError if it is damaged or holds none."""
         try:
             with safe_open(path, "numpy") as file:
-                names = json.loads(file.metadata()["names"])
+                names = atomic.parse_json(file.metadata()["names"], list)
                 image, track, xy = (file.get_tensor(name) for name in ("image", "track", "xy"))
         except (KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
             raise FormatError(

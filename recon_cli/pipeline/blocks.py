@@ -20,7 +20,7 @@ import numpy as np
 from recon_cli import machine
 from recon_cli.config import settings as layers
 from recon_cli.config.stages import DenoiseConfig, IngestConfig, SfmConfig, TrainConfig
-from recon_cli.errors import ConfigError, ReconstructionError, StageError
+from recon_cli.errors import ConfigError, FormatError, ReconstructionError, StageError
 from recon_cli.executors.executor import Command, Executor, find_reason, run_all, watching
 from recon_cli.io import records
 from recon_cli.io.colmap import read_observations, read_scene, write_part
@@ -100,7 +100,7 @@ def cut_blocks(job: Job, count: int, config: TrainConfig) -> tuple[Block, ...]:
         plan = {"version": _VERSION, "blocks": count, "validation": config.validation,
                 **{name: _manifest(job, name).digest for name in ("ingest", "denoise", "sfm")}}
         blocks = tuple(Block(str(index), root / str(index)) for index in range(count))
-        if not (root / LIST).exists() or read_json(root / LIST) != plan:
+        if _read_list(root) != plan:
             remove(root)
             _write_blocks(job, blocks, config)
             write_json(root / LIST, plan)  # the last: without it, all is cut again
@@ -111,11 +111,12 @@ def cut_blocks(job: Job, count: int, config: TrainConfig) -> tuple[Block, ...]:
 def list_blocks(workspace: Workspace) -> tuple[Block, ...]:
     """Returns the blocks of a workspace; StageError where it has none, or one is not trained."""
     root = workspace.root / BLOCKS
-    if not (root / LIST).exists():
+    found = _read_list(root)
+    if not found:
         raise StageError(f"{workspace.root} has no blocks to merge.",
                          hint="Run `recon train --blocks N` first.")
     blocks = tuple(Block(str(index), root / str(index))
-                   for index in range(int(read_json(root / LIST)["blocks"])))
+                   for index in range(int(found["blocks"])))
     for block in blocks:
         train = next(stage for stage in status(Job(Workspace(block.workspace)))
                      if stage.name == MERGE.name)
@@ -127,6 +128,15 @@ def list_blocks(workspace: Workspace) -> tuple[Block, ...]:
                 hint=f"Run `recon train --blocks {len(blocks)}` again, or `recon train -w "
                 f"{block.workspace}`.")
     return blocks
+
+
+def _read_list(root: Path) -> dict[str, Any]:
+    """Returns what was cut; empty where nothing was, or the list of it is damaged."""
+    try:
+        value: dict[str, Any] = read_json(root / LIST, dict)
+    except FormatError:
+        return {}
+    return value if type(value.get("blocks")) is int else {}
 
 
 def train_blocks(

@@ -65,9 +65,11 @@ class Job:
 
 def run_stage(
     job: Job, checks: WorkspaceCheck, row: Stage, config: StageConfig,
-    sources: tuple[Source, ...] | None = None, *, start: Start = Start.AUTO,
+    sources: tuple[Source, ...] | None = None, *, start: Start = Start.AUTO, again: bool = False,
 ) -> Manifest:
     """Runs a stage whose needs are fresh and returns its manifest; no `sources` are the last ones.
+
+    With `again` it does not go on from unfinished work.
 
     Raises:
         ReconError: whatever the stage raises; what it had finished is kept for the next run.
@@ -77,13 +79,15 @@ def run_stage(
         sources = _read_last_sources(job, row) if row.takes else ()
     key = ResultKey(row.name, row.version, config.hashed_fields(), sources, checks.upstream(row))
     _warn_of_stale_uses(checks, row)
+    if again:
+        workspace.discard(row.name)
     key = dataclasses.replace(key, continues=find_start(workspace, row, key, start))
     inputs = StageInputs(
         {name: workspace.folder(name) for name, digest in key.upstream.items() if digest},
         tuple(Path(source.path) for source in sources),
         workspace.folder(row.name) if key.continues else None)
     logger.debug("%s: running with %s", row.name, config)
-    out, earlier = workspace.begin(key)
+    out, earlier = workspace.begin(key, own_digests=row.own_digests)
     with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
         run_it = load(f"{row.module}.run")

@@ -41,6 +41,7 @@ class StageCheck:
     reasons: tuple[str, ...] = ()  # why the result is stale; empty where it is fresh or missing
     gone: tuple[str, ...] = ()  # inputs that no longer exist; that alone makes nothing stale
     partial_run: PartialRun | None = None  # an interrupted run that the next one would resume
+    damage: ManifestError | None = None  # why the manifest of a result cannot be trusted
 
     @property
     def fresh(self) -> bool:
@@ -49,7 +50,9 @@ class StageCheck:
 
     @property
     def state(self) -> str:
-        """One of fresh, partial, stale, missing."""
+        """One of damaged, fresh, partial, stale, missing."""
+        if self.damage:
+            return "damaged"
         if self.fresh:
             return "fresh"
         if self.partial_run:
@@ -68,9 +71,14 @@ class WorkspaceCheck:
     """The checks of a workspace as it is now, each made once. Nothing is changed.
 
     A stage behind a stale one is stale too; one behind a missing one is not, until that is made.
+    A damaged manifest is an error, or with `tolerant` a state of its own.
     """
 
-    def __init__(self, workspace: Workspace, settings: Settings, table: Sequence[Stage]) -> None:
+    def __init__(
+        self, workspace: Workspace, settings: Settings, table: Sequence[Stage], *,
+        tolerant: bool = False,
+    ) -> None:
+        self._tolerant = tolerant
         self._workspace = workspace
         self._settings = settings
         self._rows = {row.name: row for row in table}
@@ -101,12 +109,20 @@ class WorkspaceCheck:
             ConfigError: the settings hold a value that cannot be used.
         """
         if name not in self._checks:
-            row, manifest = self.row(name), self._workspace.manifest(name)
-            if manifest:
-                row = origin_row(row, manifest.key)
-            config = self.config(row, manifest.key if manifest else None)
-            self._checks[name] = self._compare(row, manifest, config)
+            self._checks[name] = self._check(name)
         return self._checks[name]
+
+    def _check(self, name: str) -> StageCheck:
+        row = self.row(name)
+        try:
+            manifest = self._workspace.manifest(name)
+        except ManifestError as error:
+            if not self._tolerant:
+                raise
+            return StageCheck(row, None, (error.message,), damage=error)
+        if manifest:
+            row = origin_row(row, manifest.key)
+        return self._compare(row, manifest, self.config(row, manifest.key if manifest else None))
 
     def check_against(
         self, name: str, config: StageConfig, sources: tuple[Source, ...] | None
@@ -146,7 +162,8 @@ class WorkspaceCheck:
             gone, sources = self._read_again(manifest.key.sources)
         needs = [self.check(need) for need in row.needs]
         reasons = [
-            f"{check.row.name} is stale" for check in needs if check.manifest and not check.fresh]
+            f"{check.row.name} is {'damaged' if check.damage else 'stale'}" for check in needs
+            if check.damage or (check.manifest and not check.fresh)]
         expected = self._current_key(row, config, manifest.key, sources)
         reasons += differences(manifest.key, expected, section=layers.section_of(row.config))
         reasons += find_changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)

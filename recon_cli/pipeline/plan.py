@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -20,14 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
-from recon_cli.errors import StageError
+from recon_cli.errors import ManifestError, StageError
 from recon_cli.pipeline.compile_ahead import compile_ahead
 from recon_cli.pipeline.continuation import Start, is_imported, is_merged, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
 from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, matches, read_source
-from recon_cli.workspace.layout import LOG, disk_errors, remove, size_of
+from recon_cli.workspace.layout import LOG, disk_errors, has_link, remove, size_of
 from recon_cli.workspace.manifest import Manifest
 
 __all__ = ["Job", "Outcome", "StageStatus", "Target", "plan", "run", "run_stage", "status"]
@@ -53,8 +54,8 @@ class StageStatus:
     """How a stage stands; `recon status --json` prints these fields under these names."""
 
     name: str  # of the stage and of its folder
-    state: str  # fresh, stale, partial or missing
-    reasons: tuple[str, ...]  # why it is stale, in words
+    state: str  # fresh, stale, partial, missing or damaged
+    reasons: tuple[str, ...]  # why it is stale or what is damaged, in words
     done: int  # how much of an interrupted run would be resumed; 0 where there is none
     total: int  # of how much; 0 where there is no interrupted run
     seconds: float | None  # that the finished result took; None where there is none
@@ -65,11 +66,12 @@ class StageStatus:
 def status(job: Job) -> tuple[StageStatus, ...]:
     """Returns how every stage stands. Takes no lock and changes nothing.
 
+    A stage whose manifest cannot be trusted is damaged; what needs it is stale.
+
     Raises:
-        ManifestError: a manifest cannot be trusted.
         ConfigError: the settings hold a value that cannot be used.
     """
-    checks = job.inspect()
+    checks = WorkspaceCheck(job.workspace, job.settings, job.table, tolerant=True)
     with disk_errors(job.workspace.root, "reading the workspace"):
         return tuple(_status(checks.check(row.name)) for row in job.table)
 
@@ -91,7 +93,8 @@ def run(
 ) -> tuple[Outcome, ...]:
     """Brings every target up to date, in order, and returns what was done for each.
 
-    Fresh targets run only with `again`. `verb` is shown to processes that want the workspace.
+    Fresh targets run only with `again`, which also discards their unfinished work. `verb` is shown
+    to processes that want the workspace.
 
     Raises:
         StageError: a need is not fresh and not automatic, or another verb's scene would be
@@ -224,7 +227,7 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         fresh = None if again else _find_fresh(job, checks, target, sources)
     if fresh is None:
         start = Start.ANEW if again and target.start is Start.AUTO else target.start
-        manifest = run_stage(job, checks, row, target.config, sources, start=start)
+        manifest = run_stage(job, checks, row, target.config, sources, start=start, again=again)
         yield Outcome(row.name, manifest, ran=True)
     else:
         yield Outcome(row.name, fresh, ran=False)
@@ -293,12 +296,14 @@ class Freed:
 
     path: Path
     size: int
+    is_link: bool  # which alone is removed, not what it points to
 
 
 def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:
     """Removes what can be spared and returns it; with `dry` nothing is removed.
 
     That is unfinished work, replaced results and large volatile files, or the results of `stages`.
+    Nothing is removed through a link.
 
     Raises:
         WorkspaceError: another process holds the workspace, or it cannot be written.
@@ -308,7 +313,8 @@ def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tu
         return ()
     with disk_errors(workspace.root, "cleaning"), workspace.writing("clean"):
         paths = [workspace.folder(stage) for stage in stages] or _spare(job)
-        freed = tuple(Freed(path, size_of(path)) for path in paths if path.exists())
+        freed = tuple(Freed(path, size_of(path), path.is_symlink()) for path in paths
+                      if os.path.lexists(path))
         if dry:
             return freed
         for stage in stages:
@@ -322,8 +328,13 @@ def _spare(job: Job) -> list[Path]:
     paths = job.workspace.scraps()
     for row in job.table:
         folder = job.workspace.folder(row.name)
-        manifest = job.workspace.manifest(row.name)
+        try:
+            manifest = job.workspace.manifest(row.name)
+        except ManifestError as error:
+            logger.warning("%s is left as it is: %s %s", row.name, error.message, error.hint)
+            continue
         paths += [
             folder / name for name, file in (manifest.outputs if manifest else {}).items()
-            if matches(name, row.volatile) and file.size >= _WORTH_BYTES]
+            if matches(name, row.volatile) and file.size >= _WORTH_BYTES
+            and not has_link(folder / name, job.workspace.root)]
     return paths

@@ -90,7 +90,8 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
     status = known[backend]
     if device not in status.devices or status.missing:
         reason = status.missing or f"it does not run on {device}"
-        raise BackendError(f"Backend {backend} cannot be used: {reason}.", hint="See recon doctor.")
+        raise BackendError(
+            f"Backend {backend} cannot be used: {reason}.", hint="See `recon doctor`.")
     verdict = cuda_verdict() if backend == "triton" else None
     if verdict is not None and not verdict.passed:
         logger.warning(
@@ -169,7 +170,7 @@ def renderer(backend: str) -> Renderer:
         from recon_cli.render.triton.backend import render as triton_render
 
         return triton_render
-    raise BackendError(f"There is no backend {backend!r}.", hint="See recon doctor.")
+    raise BackendError(f"There is no backend {backend!r}.", hint="See `recon doctor`.")
 
 
 def render(

@@ -347,7 +347,7 @@ def _read(path: Path, key: dict[str, str]) -> Verdict | None:
             return None
         verdict = Verdict(**content["verdict"])
         return verdict if isinstance(verdict.failure, str) else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

@@ -42,7 +42,7 @@ def read_log(path: Path) -> tuple[LogRow, ...]:
 def read_sweep(path: Path) -> Sweep:
     """Returns the content of a sweep.json; FormatError if it is damaged."""
     with _format_errors(path):
-        return Sweep.from_json(read_json(path))
+        return Sweep.from_json(read_json(path, dict))
 
 
 @contextmanager

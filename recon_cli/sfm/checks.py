@@ -46,7 +46,7 @@ def check_motion(pairs: int, matches: int, flat: int) -> None:
         raise SfmError(
             "No two frames match.",
             hint="Use more frames of one room, so that neighbours overlap by two thirds: "
-            "recon ingest --frames N.")
+            "`recon ingest --frames N`.")
     if flat > MAX_FLAT_SHARE * matches:
         raise SfmError(
             f"The camera did not move, or sees only one flat surface: {flat / matches:.0%} of the "
@@ -65,8 +65,8 @@ def check_registered(
     raise SfmError(
         f"Only {len(registered)} of {len(names)} frames have a camera, but at least {needed} are "
         f"needed. Missing: {list_names(missing)}.",
-        hint="Use more frames, so that neighbours overlap (recon ingest --frames N), match all of "
-        "them (--pairs exhaustive), or accept a part of the room with a lower --min-registered.")
+        hint="Use more frames, so that neighbours overlap (`recon ingest --frames N`), match all "
+        "of them (--pairs exhaustive), or accept a part of the room with a lower --min-registered.")
 
 
 def check_parallax(median_angle_deg: float) -> None:

@@ -7,12 +7,17 @@ may run in a process while pycolmap has the database open.
 from __future__ import annotations
 
 import sqlite3
+import zlib
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from recon_cli.errors import FormatError
+from recon_cli.workspace import atomic
 
 KEYPOINT_COLUMNS = 6  # x, y and the 2x2 matrix of its shape, which COLMAP writes for SIFT
 _TABLES = {"features": "descriptors", "matches": "two_view_geometries"}
@@ -32,6 +37,87 @@ def is_sound(path: Path, names: Sequence[str], cameras: int) -> bool:
     except sqlite3.DatabaseError:
         return False
     return verdict == "ok" and count == cameras and images == sorted(names)
+
+
+# Each table's column that numbers the image or pair of a row.
+_CONTENT = {"keypoints": "image_id", "descriptors": "image_id", "matches": "pair_id",
+            "two_view_geometries": "pair_id"}
+_FOUND = {"features": ("keypoints", "descriptors"), "matches": ("matches", "two_view_geometries")}
+
+
+def seal(path: Path) -> None:
+    """Writes the digests of all rows of a database beside it, for `keep_sealed`."""
+    try:
+        with closing(_connect(path)) as connection:
+            digests = _digest_rows(connection)
+    except sqlite3.DatabaseError:  # whoever reads it next finds no digest that fits
+        return
+    atomic.write_json(_digests_path(path), digests)
+
+
+def unseal(path: Path) -> None:
+    """Deletes the digests of a database that no later run will go on from."""
+    _digests_path(path).unlink(missing_ok=True)
+
+
+def keep_sealed(path: Path) -> str | None:
+    """Deletes what was written to a database since it was sealed, as in a step that was killed.
+
+    Returns the first step whose sealed rows were damaged since: "features", "matches", or None.
+    """
+    try:
+        sealed = atomic.read_json(_digests_path(path), dict)
+        with closing(_connect(path)) as connection, connection:
+            found = _digest_rows(connection)
+            for step, tables in _FOUND.items():
+                if step == "features" and found["rest"] != sealed["rest"]:
+                    return step
+                if any(found[step].get(row) != digest for row, digest in sealed[step].items()):
+                    return step
+                for row in found[step].keys() - sealed[step].keys():
+                    for table in tables:
+                        connection.execute(
+                            f"DELETE FROM {table} WHERE {_CONTENT[table]} = ?", (int(row),))
+    except (FormatError, sqlite3.DatabaseError, KeyError, TypeError, AttributeError, ValueError):
+        return "features"
+    return None
+
+
+def clear_matches(path: Path) -> None:
+    """Deletes all matches."""
+    with closing(_connect(path)) as connection, connection:
+        for table in _FOUND["matches"]:
+            connection.execute(f"DELETE FROM {table}")
+
+
+def _digest_rows(connection: sqlite3.Connection) -> dict[str, Any]:
+    """Returns the CRC-32 of what was found of each image and pair, by number, and of the rest."""
+    tables = [name for name, in connection.execute(
+        "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%' "
+        "ORDER BY name")]
+    digests: dict[str, Any] = {step: {} for step in _FOUND}
+    digests["rest"] = 0
+    for table in tables:
+        step = next((step for step, names in _FOUND.items() if table in names), None)
+        cursor = connection.execute(f"SELECT * FROM {table} ORDER BY 1")
+        columns = [column for column, *_ in cursor.description]
+        for row in cursor:
+            if step is None:
+                digests["rest"] = _crc(row, digests["rest"])
+            else:
+                number = str(row[columns.index(_CONTENT[table])])
+                digests[step][number] = _crc(row, digests[step].get(number, 0))
+    return digests
+
+
+def _crc(row: Sequence[Any], value: int) -> int:
+    for item in row:
+        value = zlib.crc32(item if isinstance(item, bytes) else repr(item).encode(), value)
+    return value
+
+
+def _digests_path(path: Path) -> Path:
+    return path.with_suffix(".digests.json")
 
 
 def progress(path: Path, step: str) -> int:
@@ -97,7 +183,8 @@ def matched_ids(path: Path) -> list[tuple[int, int]]:
 
 
 def remove(path: Path) -> None:
-    """Deletes a database together with SQLite's side files."""
+    """Deletes a database together with SQLite's side files and its digests."""
+    unseal(path)
     for suffix in ("", "-wal", "-shm", "-journal"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 

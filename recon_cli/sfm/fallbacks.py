@@ -225,6 +225,7 @@ def _try_fallback(
         return MapperAttempt(fallback.name, reason, skipped=skipped), None
     if wanted:
         matching.match_pairs(job, wanted, report)
+        database.seal(job.database)
     job = _linked_job(job, fallback.name)
     candidate = merge_models.best_model(
         job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS)

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,8 @@ from typing import Any, BinaryIO
 from recon_cli.errors import ConfigError, FormatError, ReconError, SfmError, WorkspaceError
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace import atomic
+from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.journal import crc32
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
@@ -28,6 +30,7 @@ CLIP_SECONDS = 1e6  # from the start of a clip to that of the next, in the times
 LOG_FILE = "steps.json"  # in the stage's folder: the finished steps
 STEPS = ("features", "matches", "model", "sparse", "undistorted")
 SPLIT = "split"  # a step after the matches where a view graph is cut into segments
+_SELF = "self"  # in the log, beside the steps: its own checksum
 _ORDER = (*STEPS[:2], SPLIT, *STEPS[2:])
 
 Result = dict[str, Any]  # JSON values only
@@ -122,7 +125,7 @@ class MappingJob:
     @classmethod
     def read(cls, path: Path) -> MappingJob:
         """Returns the job that `write` wrote; raises FormatError for any other file."""
-        value = atomic.read_json(path)
+        value = atomic.read_json(path, dict)
         try:
             if value.keys() != cls.__dataclass_fields__.keys():
                 raise KeyError("fields")
@@ -157,34 +160,75 @@ class StepLog:
         self._out = out
         self._steps: dict[str, dict[str, Any]] = {}
         try:
-            self._steps = dict(atomic.read_json(out / LOG_FILE))
+            steps = atomic.read_json(out / LOG_FILE, dict)
         except FormatError:
             return  # the first run, or a lost file: every step is done again
+        if steps.pop(_SELF, None) == sha256_json(steps):
+            self._steps = steps
 
     def result(self, step: str) -> Result | None:
         """Returns the recorded result of a step whose files are all there, else None."""
         entry = self._steps.get(step)
         if entry is None or any(
             not (self._out / name).is_file() or (self._out / name).stat().st_size != size
-            for name, size in entry["files"].items()
+            for name, (size, _) in entry["files"].items()
         ):
             return None
         result: Result = entry["result"]
         return result
 
-    def finish(self, step: str, result: Result, folder: Path | None = None) -> None:
-        """Records a step as finished, with its result and the files in the `folder` it wrote."""
-        files = {
-            path.relative_to(self._out).as_posix(): path.stat().st_size
-            for path in (() if folder is None else _files(folder))}
+    def finish(
+        self, step: str, result: Result, folder: Path | None = None, also: Sequence[str] = ()
+    ) -> None:
+        """Records a step as finished, with its result and the files in the `folder` it wrote.
+
+        `also` are names of files that it wrote besides, where they are there.
+        """
+        besides = [path for path in (self._out / name for name in also) if path.is_file()]
+        files = digest_files(self._out, [*(() if folder is None else _files(folder)), *besides])
         self._steps[step] = {"result": result, "files": files}
-        atomic.write_json(self._out / LOG_FILE, self._steps)
+        self._write()
+
+    def find_damage(self) -> str | None:
+        """Returns the first finished step with a file that was damaged since; None without one."""
+        for step, entry in self._steps.items():
+            names = [self._out / name for name in entry["files"]]
+            if self.result(step) is None or digest_files(self._out, names) != entry["files"]:
+                return step
+        return None
 
     def forget_from(self, step: str) -> None:
         """Removes a step and all that build on it."""
         for name in _ORDER[_ORDER.index(step):]:
             self._steps.pop(name, None)
-        atomic.write_json(self._out / LOG_FILE, self._steps)
+        self._write()
+
+    def _write(self) -> None:
+        atomic.write_json(
+            self._out / LOG_FILE, {**self._steps, _SELF: sha256_json(self._steps)})
+
+
+def digest_files(out: Path, paths: Iterable[Path]) -> dict[str, list[int]]:
+    """Returns the size and CRC-32 of files by their names relative to `out`."""
+    return {path.relative_to(out).as_posix(): [path.stat().st_size, crc32(path)] for path in paths}
+
+
+def vouch(folder: Path) -> None:
+    """Writes the digests of the files of a finished folder beside it."""
+    atomic.write_json(_vouchers(folder), digest_files(folder, _files(folder)))
+
+
+def is_vouched(folder: Path) -> bool:
+    """Returns whether a folder is as it was finished."""
+    try:
+        digests = atomic.read_json(_vouchers(folder), dict)
+    except FormatError:
+        return False
+    return folder.is_dir() and digests == digest_files(folder, _files(folder))
+
+
+def _vouchers(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.digests.json")
 
 
 def publish(folder: Path, target: Path) -> None:
@@ -277,7 +321,7 @@ class Reporter:
 
 def parse(line: bytes) -> Event:
     """Returns the event that `Reporter` wrote as one line."""
-    value = json.loads(line)
+    value = atomic.parse_json(line)
     if "phase" in value:
         return Phase(value["phase"], value["total"], value["done"])
     if "count" in value:

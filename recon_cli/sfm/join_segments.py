@@ -173,6 +173,7 @@ def _seed_database(job: MappingJob, index: int) -> None:
         for image in target.read_all_images():
             _copy_features(source, there[image.name], target, image.image_id)
     copy_matches(job.database, segment.database, names)
+    database.seal(segment.database)
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,6 +339,7 @@ def _join(job: MappingJob, report: Reporter) -> list[JoinedModel]:
     others = _overlapping(source, join_models(segments, groups[0]), known)
     if others - database.pair_names(source.database):
         matching.match_pairs(source, others, report)
+        database.seal(source.database)
         joins, groups = join_all(
             segments, find_shared_points(source, segments), seed=job.seed)
     report.phase("joining", len(job.segments))
@@ -397,7 +399,7 @@ def read_refused(job: MappingJob) -> list[str]:
     """Returns which joins of segments were not made, a sentence each; none without segments."""
     if not job.segments or not (job.out / REPORT).exists():
         return []
-    refused: list[str] = atomic.read_json(job.out / REPORT)["refused"]
+    refused: list[str] = atomic.read_json(job.out / REPORT, dict)["refused"]
     return [f"{text[:1].upper()}{text[1:]}." for text in refused]
 
 

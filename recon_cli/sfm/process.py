@@ -14,11 +14,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from recon_cli.errors import ReconError, SfmError
 from recon_cli.progress import Bar, Progress
+from recon_cli.sfm import database
 from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, parse
 
 _DOING = {
@@ -122,9 +123,9 @@ def run_job(
     deadline = time.monotonic() + 60 * max_minutes
     file = job.out / "job.json"
     job.write(file)
+    monitor = Monitor(job, progress, record, on_idle)
     try:
-        with _start(job, file) as child, Monitor(
-                job, progress, record, on_idle) as monitor:
+        with _start(job, file) as child, monitor:
             for event in _events(child):
                 if isinstance(event, (ReconError, OSError)):
                     raise event
@@ -138,6 +139,11 @@ def run_job(
                 raise _timeout_error(max_minutes, monitor) from error
             if code != 0:
                 raise _crash_error(job.out / LOG, code, monitor)
+    except BaseException:
+        if monitor.doing != "starting":  # what was found before has been checked
+            with suppress(OSError):  # the error that led here says more
+                database.seal(job.database)
+        raise
     finally:
         for leftover in (file, job.out / LOCK):
             leftover.unlink(missing_ok=True)
@@ -187,7 +193,7 @@ def _timeout_error(max_minutes: float, monitor: Monitor) -> SfmError:
         f"The cameras were not found within {max_minutes:g} minutes; the last step was "
         f"{monitor.doing}.",
         hint="Allow more time with --max-minutes (features and matches found so far are kept), or "
-        "use fewer frames (recon ingest --frames N) or --max-features 1024.")
+        "use fewer frames (`recon ingest --frames N`) or --max-features 1024.")
 
 
 def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
@@ -198,7 +204,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
     if code == -signal.SIGKILL:
         hint = (
             "The system may have run out of memory; try --max-features 1024 or fewer frames "
-            "(recon ingest --frames N).")
+            "(`recon ingest --frames N`).")
     return CrashError(
         f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
         f"{last_error(log)}", hint=hint)

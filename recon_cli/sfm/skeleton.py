@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
-from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, is_vouched, publish, vouch
 from recon_cli.sfm.matching import Pair, similar_pairs
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 
@@ -122,12 +122,13 @@ def _load_models(
 ) -> list[pycolmap.Reconstruction]:
     """Returns the models in a folder of the attempts, and builds them where it is missing."""
     folder = job.attempts / name
-    if not folder.is_dir():
+    if not is_vouched(folder):
         unfinished = fresh_folder(job.attempts / f"{name}.found")
         for index, model in enumerate(build()):
             (unfinished / str(index)).mkdir()
             model.write(unfinished / str(index))
         publish(unfinished, folder)
+        vouch(folder)
     return [pycolmap.Reconstruction(path) for path in sorted(
         folder.iterdir(), key=lambda path: int(path.name))]
 

@@ -47,7 +47,7 @@ def keep_trusted_part(
             f"{verdict.problems[0]} The largest part that can be trusted on its own has "
             f"{len(kept)} of {len(job.names)} frames, but --min-registered asks for "
             f"{job.min_registered:.0%}.",
-            hint="Use more frames between the two parts (recon ingest --frames N), match all of "
+            hint="Use more frames between the two parts (`recon ingest --frames N`), match all of "
             "them (--pairs exhaustive), accept the part with a lower --min-registered, or keep the "
             "whole as it is with --accept-weak.")
     left_out = tuple(sorted(set(mapper.list_registered(model)).difference(kept)))

@@ -206,7 +206,7 @@ def check_weak_link(verdict: ModelVerdict, accept: bool, *, given: bool = False)
         return
     raise SfmError(
         " ".join(problems),
-        hint="Use more frames between the two parts (recon ingest --frames N), match all of them "
+        hint="Use more frames between the two parts (`recon ingest --frames N`), match all of them "
         "(--pairs exhaustive), or keep the model as it is with --accept-weak.")
 
 

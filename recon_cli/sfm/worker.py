@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import shutil
 import signal
 import sys
 import time
@@ -28,11 +29,24 @@ from recon_cli.sfm import (
     matching,
     undistort,
 )
-from recon_cli.sfm.job import LOCK, LOG_FILE, SPLIT, MappingJob, Reporter, Result, StepLog
+from recon_cli.sfm.job import (
+    LOCK,
+    LOG_FILE,
+    SPLIT,
+    STEPS,
+    VERDICT,
+    MappingJob,
+    Reporter,
+    Result,
+    StepLog,
+)
+from recon_cli.workspace.summaries import WorldSummary
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
 _FOLDERS = ("model", "sparse", "undistorted")  # steps that write a folder of their name
+# Files that a step writes besides.
+_BESIDES = {"model": (VERDICT, join_segments.REPORT), "sparse": (WorldSummary.FILE,)}
 
 
 def work(job: MappingJob, report: Reporter) -> None:
@@ -49,7 +63,9 @@ def work(job: MappingJob, report: Reporter) -> None:
         "sparse": lambda: undistort.place_model(job),
         "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)
-    if "features" in job.steps:
+    _forget_damaged(job, log)
+    done = job.last == STEPS[-1] and all(log.result(step) is not None for step in job.steps)
+    if "features" in job.steps and not done:  # else nothing reads it any more
         _prepare_database(job, log)
     for step in job.steps:
         if log.result(step) is not None:
@@ -61,14 +77,42 @@ def work(job: MappingJob, report: Reporter) -> None:
         result = actions[step]()
         result["seconds"] = round(time.monotonic() - start, 2)
         result["cpu_seconds"] = round(time.process_time() - cpu, 2)
-        log.finish(step, result, job.out / step if step in _FOLDERS else None)
+        if step in ("features", "matches"):
+            database.seal(job.database)
+        log.finish(step, result, job.out / step if step in _FOLDERS else None,
+                   _BESIDES.get(step, ()))
+
+
+def _forget_damaged(job: MappingJob, log: StepLog) -> None:
+    """Forgets finished steps whose files were damaged since, and what builds on them."""
+    step = log.find_damage()
+    if step is not None:
+        _tell(f"files of the step {step} were damaged: it is taken again")
+        log.forget_from(step)
+    if StepLog(job.attempts).find_damage() is not None:
+        _tell("a model was damaged: frames are matched again")
+        shutil.rmtree(job.attempts)
+        if "features" in job.steps and job.database.exists():
+            # later attempts have added pairs, with which the earlier ones would find other models
+            database.clear_matches(job.database)
+            database.seal(job.database)
+        log.forget_from("matches")
+
+
+def _tell(text: str) -> None:
+    sys.stderr.write(f"{text}\n")  # into the log of the mapping process
 
 
 def _prepare_database(job: MappingJob, log: StepLog) -> None:
     """Keeps the database of an interrupted run where it is intact, else starts a new one."""
-    if not database.is_sound(job.database, job.names, len(job.groups)):
+    sound = database.is_sound(job.database, job.names, len(job.groups))
+    damaged = database.keep_sealed(job.database) if sound else "features"
+    if damaged == "features":
         log.forget_from("features")
         matching.create_database(job)
+    elif damaged:
+        log.forget_from("matches")
+        database.clear_matches(job.database)
     for step in ("features", "matches"):
         result = log.result(step)
         # Further attempts add pairs.

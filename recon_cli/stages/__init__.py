@@ -50,6 +50,7 @@ class Stage:
     # patterns of outputs (times, logs, for resuming) that later stages' fingerprints leave out
     volatile: tuple[str, ...] = ()
     renders: bool = False  # it needs a rasterizer, and so torch and a device
+    own_digests: bool = False  # it finds damage in its unfinished work by itself
     takes: str = ""  # input from the user, as in usage; empty for stages that only read others
     spares: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
 
@@ -61,7 +62,8 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 3, True,
           "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json", "model/*")),
+          ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json", "model/*"),
+          own_digests=True),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 5, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,

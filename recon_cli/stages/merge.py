@@ -32,6 +32,7 @@ from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.schedule import make_schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.train_data import gaussians_that_fit, load_task, read_config, write_config
+from recon_cli.workspace.atomic import delete
 from recon_cli.workspace.digests import digest_file, sha256_json
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.summaries import LogRow, MergeSummary
@@ -92,7 +93,7 @@ def run(config: MergeConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     steps = 0 if state is None else state.steps
     write_config(out, dataclasses.replace(run_config, iterations=before + steps))
     record.write(out)
-    (out / CHECKPOINT).unlink(missing_ok=True)
+    delete(out / CHECKPOINT)
     values = list(changes.values())
     last = LogRow.read_all(out / LOG)[-1] if steps else None
     return MergeSummary(

@@ -16,7 +16,7 @@ from recon_cli.executors.executor import Executor, start_executor
 from recon_cli.io import records as store
 from recon_cli.io.records import POSES, FrameList, describe_stretches, read_poses
 from recon_cli.io.tracks import TRACKS
-from recon_cli.sfm import process, segments
+from recon_cli.sfm import database, process, segments
 from recon_cli.sfm.align_world import parse_place
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
@@ -62,6 +62,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     summary = _summary(frames, runs)
     _report(summary, frames, ctx)
     segments.remove_segments(job)
+    database.unseal(job.database)
     return summary
 
 

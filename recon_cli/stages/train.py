@@ -22,6 +22,7 @@ from recon_cli.train.plan import first_or_saved, plan_task
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
+from recon_cli.workspace.atomic import delete
 from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
 
 
@@ -40,7 +41,7 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
         keep={task.schedule.mid: "mid.safetensors"}), ctx)
     save_state(out / "final.safetensors", state)
     write_ply(out / "splats.ply", state.splats)
-    (out / CHECKPOINT).unlink(missing_ok=True)
+    delete(out / CHECKPOINT)
     return _summarize(state, task, out, ctx)
 
 

@@ -30,6 +30,7 @@ from recon_cli.train.state import (
     save_state,
 )
 from recon_cli.train.task import Task
+from recon_cli.workspace.atomic import delete
 
 # Of Gaussians that stand for trained ones: with .3 a step takes what a real one does within 10%,
 # with the .1 that training begins with up to 25% less (room `living`, one thread).
@@ -224,7 +225,7 @@ class _Probe:
         state = self._state(self.small)
         begin = self._now()
         save_state(scratch, state)
-        scratch.unlink()
+        delete(scratch)
         return 1e3 * (self._now() - begin) / (len(self.small) / 1000)
 
     def _now(self) -> float:

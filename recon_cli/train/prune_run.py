@@ -32,7 +32,7 @@ from recon_cli.train.schedule import RecoverySchedule
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task, read_config
-from recon_cli.workspace.atomic import read_json, write_bytes
+from recon_cli.workspace.atomic import delete, read_json, write_bytes
 from recon_cli.workspace.summaries import JsonRecord, TrainPlan
 
 logger = logging.getLogger("recon")
@@ -173,7 +173,7 @@ class StoredPruneRun(PruneRun):
             self.state.iteration, n, left, 1 - left / n, before, self._psnr(), None, kept=True))
         logger.info("round %d removes %d of %d Gaussians", number + 1, n - left, n)
         self.write_rounds()
-        (self._out / _name(number)).unlink(missing_ok=True)
+        delete(self._out / _name(number))
 
     def end_round(self) -> float | None:
         """Returns the validation PSNR in dB, and records it as that of the round under way."""
@@ -201,7 +201,7 @@ class StoredPruneRun(PruneRun):
     def clear(self) -> None:
         """Deletes what only a resumed run would have needed."""
         for path in (*self._out.glob(_name("*")), self._out / GOOD):
-            path.unlink(missing_ok=True)
+            delete(path)
 
     def _psnr(self) -> float | None:
         return validation_psnr(self.state, self.source.task)
@@ -209,7 +209,7 @@ class StoredPruneRun(PruneRun):
     def _read_rounds(self) -> list[Round]:
         """Returns the list of rounds; empty where the state that it leads to is missing."""
         path = self._out / ROUNDS
-        rows = read_json(path) if path.exists() else []
+        rows = read_json(path, list) if path.exists() else []
         resumable = (self._out / _name(len(rows))).exists()
         return [Round.from_json(row) for row in rows] if resumable else []
 

@@ -19,6 +19,7 @@ from recon_cli.train.distributed.data_parallel import fit_together
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
 from recon_cli.train.task import Task
+from recon_cli.workspace import journal
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.summaries import LogRow
 
@@ -76,15 +77,16 @@ def run_fit(
     with _defer_interrupt() as interrupted, ctx.progress.bar(
         segment.label, total, unit="step", done=state.iteration - segment.first
     ) as bar:
+        log = TrainLog(out / LOG, state.iteration, segment.earlier_seconds)
         callbacks = (
-            TrainLog(out / LOG, state.iteration, segment.earlier_seconds),
+            log,
             *ctx.callbacks,
             ProgressCallback(bar, state.iteration),
             Checkpointer(
                 state, None if importance else out / segment.checkpoint,
                 task.schedule.config.checkpoint_every,
                 {iteration: out / name for iteration, name in segment.keep.items()}, interrupted,
-                lambda iteration: ctx.record(iteration - segment.first, total)))
+                log.keep, lambda iteration: ctx.record(iteration - segment.first, total)))
         for callback in ctx.callbacks:
             callback.on_begin(
                 segment.label, segment.until, [view.camera for view in task.train], state.splats)
@@ -112,11 +114,13 @@ class TrainLog(TrainCallback):
         lines = path.read_text(encoding="utf-8").splitlines(True) if path.exists() else []
         # a kill in mid-write leaves a last line without its end
         whole = [line for line in lines if line.endswith("\n")]
-        valid = [line for line in whole if json.loads(line)["iteration"] <= iteration]
+        valid = [line for line, row in zip(whole, LogRow.read_all(path), strict=True)
+                 if row.iteration <= iteration]
         if not valid:  # a branch starts where the other run stood
             first = {"iteration": iteration, "seconds": earlier_seconds, "cpu_seconds": 0.0}
             valid = [json.dumps(first) + "\n"]
         write_bytes(path, "".join(valid).encode())
+        self.keep()
         self._earlier = seconds_at(path, iteration)
         self._earlier_cpu = seconds_at(path, iteration, clock="cpu_seconds")
 
@@ -125,8 +129,13 @@ class TrainLog(TrainCallback):
         self._write(dataclasses.asdict(report), report.seconds, report.cpu_seconds)
 
     def add_idle(self, iteration: int, seconds: float, cpu_seconds: float) -> None:
-        """Counts time in which no step was taken."""
+        """Counts time in which no step was taken, and keeps what was logged for a later run."""
         self._write({"iteration": iteration}, seconds, cpu_seconds)
+        self.keep()
+
+    def keep(self) -> None:
+        """Records what a later run that goes on from here must find in the log."""
+        journal.expect_growth(self._path)
 
     def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
         row["seconds"] = round(self._earlier + seconds, 3)
@@ -179,15 +188,17 @@ class Checkpointer(TrainCallback):
     """Saves the state now and then, at certain steps for good, and when Ctrl-C was pressed.
 
     `keep` holds files by step, `every` is the least distance of checkpoints in steps. Without
-    `path` there are none, as while scores are gathered. `record` gets the steps done after each.
+    `path` there are none, as while scores are gathered. `prepare` is called before each, and
+    `record` gets the steps done after it.
     """
 
     def __init__(
         self, state: TrainState, path: Path | None, every: int, keep: Mapping[int, Path],
-        interrupted: Callable[[], bool], record: Callable[[int], None],
+        interrupted: Callable[[], bool], prepare: Callable[[], None],
+        record: Callable[[int], None],
     ) -> None:
         self._state, self._path, self._every, self._keep = state, path, every, keep
-        self._interrupted, self._record = interrupted, record
+        self._interrupted, self._prepare, self._record = interrupted, prepare, record
         self._throttle = CheckpointThrottle()
 
     def needs_step(self, iteration: int) -> bool:
@@ -202,6 +213,7 @@ class Checkpointer(TrainCallback):
         due = iteration % self._every == 0 and self._throttle.allows()
         if self._path is not None and (due or interrupted):
             with self._throttle.saving():
+                self._prepare()
                 save_state(self._path, self._state)
             self._record(iteration)
         if interrupted:

@@ -20,7 +20,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.poses import Poses
-from recon_cli.workspace.atomic import replacing
+from recon_cli.workspace.atomic import parse_json, replacing
 
 LONG_SAVE = 0.25  # seconds; a checkpoint that takes longer is written less often
 SAVE_SHARE = 0.1  # of the time, that such checkpoints may take
@@ -162,7 +162,7 @@ def load_state(
     """
     try:
         with safe_open(path, framework="pt") as file:
-            scalars = json.loads((file.metadata() or {})["state"])
+            scalars = parse_json((file.metadata() or {})["state"], dict, finite=False)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if scalars["version"] != _VERSION:
             raise KeyError("version")
@@ -197,7 +197,7 @@ def read_progress(path: Path) -> tuple[int, int]:
     """
     try:
         with safe_open(path, framework="pt") as file:
-            scalars = json.loads((file.metadata() or {})["state"])
+            scalars = parse_json((file.metadata() or {})["state"], dict, finite=False)
             begin, end = scalars["jump"] or (0, 0)
             return (int(scalars["iteration"]) - (end - begin),
                     file.get_slice("splats.means").get_shape()[0])
@@ -208,7 +208,7 @@ def read_progress(path: Path) -> tuple[int, int]:
 def _unreadable(path: Path, error: Exception) -> FormatError:
     return FormatError(
         f"The checkpoint {path} cannot be read: {error}.",
-        hint="Run the stage again with --again; it starts from the beginning.")
+        hint=f"Run `recon {path.parent.name} --again`; it starts from the beginning.")
 
 
 def check_finite(tensors: dict[str, Tensor], what: str) -> None:

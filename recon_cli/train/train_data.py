@@ -117,7 +117,7 @@ def read_config(folder: Path) -> RunConfig:
         FormatError: a version before this one wrote a value that is no longer known.
     """
     path = folder / "config.json"
-    values = read_json(path)
+    values = read_json(path, dict, hint="Run `recon train --again`.")
     names = {item.name for item in dataclasses.fields(RunConfig)}
     try:
         return RunConfig(**{name: value for name, value in values.items() if name in names})

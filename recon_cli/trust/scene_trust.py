@@ -77,7 +77,8 @@ class TrustRecord(JsonRecord):
         FormatError or ManifestError if it is damaged.
         """
         path = evaluate / FOLDER / RECORD
-        return TrustRecord.from_json(read_json(path)) if path.exists() else None
+        hint = "Run `recon eval --again`."
+        return TrustRecord.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
 
     def write(self, evaluate: Path) -> None:
         """Writes the record into evaluate's folder."""

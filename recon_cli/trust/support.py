@@ -22,7 +22,7 @@ from recon_cli.errors import FormatError
 from recon_cli.render import render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.workspace.atomic import replacing
+from recon_cli.workspace.atomic import parse_json, replacing
 
 CARRIES = 0.01  # of a pixel's colour, from which a view shows a Gaussian
 MAX_VIEWS = 300  # that are looked at, evenly spread; more show next to nothing new
@@ -129,7 +129,7 @@ class Support:
         """Returns what `save` wrote; FormatError if the file is missing, damaged or of another."""
         try:
             with safe_open(path, framework="pt") as file:
-                head = json.loads((file.metadata() or {})["support"])
+                head = parse_json((file.metadata() or {})["support"], dict)
                 shown, centers, residual = (
                     file.get_tensor(name) for name in ("shown", "centers", "residual"))
             count = int(head["gaussians"])

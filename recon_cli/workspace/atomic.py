@@ -1,16 +1,24 @@
-"""Files that are either whole or not there: written beside, flushed, then renamed into place."""
+"""Files that are either whole or not there: written beside, flushed, then renamed into place.
+
+Of unfinished work each gets a digest as well, see `journal`. Here is also the one reader of JSON.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import os
+import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import FormatError
+from recon_cli.workspace import journal
 
+MAX_TEXT_BYTES = 256 << 20  # of a JSON or TOML file; parsing takes some twenty times as much memory
+_MOST_DIGITS = 20  # of an integer of 64 bits, with its sign
 LEFTOVERS = ".*.tmp*"  # files that `replacing` had not finished when it was killed
 
 
@@ -23,12 +31,40 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.tmp{os.getpid()}{path.suffix}")
     try:
         yield temporary
+        _share(temporary)
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
+        journal.expect(path, temporary)
         temporary.replace(path)
+        journal.confirm(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _share(path: Path) -> None:
+    """Gives a file that only its owner may read the permissions of any new file.
+
+    Some libraries (safetensors) write private files whatever the umask says.
+    """
+    if stat.S_IMODE(path.stat().st_mode) & 0o077:
+        return
+    probe = path.with_name(f"{path.name}.mode")
+    descriptor = os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+    try:
+        mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
+    finally:
+        os.close(descriptor)
+        probe.unlink()
+    with suppress(OSError):  # of a file system without permissions
+        path.chmod(mode)
+
+
+def delete(path: Path) -> None:
+    """Deletes a file of unfinished work, if it is there, so that a next run does not miss it."""
+    if os.path.lexists(path):
+        journal.expect_removal(path)
+        path.unlink()
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -42,22 +78,75 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path) -> Any:
-    """Returns what a JSON file holds.
+def read_json(path: Path, kind: type | None = None, *, hint: str = "") -> Any:
+    """Returns what a JSON file holds: a value of a `kind` (dict or list), if that is given.
 
     Raises:
-        FormatError: the file is missing, truncated or no JSON.
+        FormatError: the file is missing, no plain file, too large, truncated, or not such JSON.
     """
+    hint = hint or f"Make {path.name} again, or restore it from a copy."
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(read_text(path), kind)
     except (OSError, ValueError) as error:
-        raise FormatError(f"{path} cannot be read as JSON: {error}.") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise FormatError(f"{path} cannot be read as JSON: {reason}.", hint=hint) from error
+
+
+def parse_json(text: str | bytes, kind: type | None = None, *, finite: bool = True) -> Any:
+    """Returns a JSON value of any origin: a value of a `kind` (dict or list), if that is given.
+
+    Raises:
+        ValueError: it is not JSON or not of that kind, is nested thousands deep, or where `finite`
+            is asked for holds NaN, infinity, or a number that is too large for a float.
+    """
+    number = _finite if finite else float
+    try:
+        value = json.loads(text, parse_constant=number, parse_float=number, parse_int=_integer)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if kind is not None and not isinstance(value, kind):
+        what = "a list" if isinstance(value, list) else "an object" if isinstance(
+            value, dict) else "a single value"
+        raise ValueError(f"it holds {what}, not {'a list' if kind is list else 'an object'}")
+    return value
+
+
+def _integer(text: str) -> float:
+    """Returns an integer, or the float next to one that no file of ours can mean."""
+    return int(text) if len(text) <= _MOST_DIGITS else _finite(text)
+
+
+def _finite(text: str) -> float:
+    """Returns a number; ValueError for NaN, Infinity, and one too large for a float."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"it holds {text[:20]}, which is not a finite number")
+    return number
+
+
+def read_text(path: Path) -> str:
+    """Returns the text of a file that a person may have written.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no plain file, too large, or not UTF-8.
+    """
+    found = path.stat()  # before it is opened: a FIFO would wait for its writer
+    if stat.S_ISDIR(found.st_mode):
+        raise ValueError("it is a folder")
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError("it is not a plain file")
+    if found.st_size > MAX_TEXT_BYTES:
+        raise ValueError(f"it has {found.st_size / 1e6:,.0f} MB, and "
+                         f"{MAX_TEXT_BYTES / 1e6:,.0f} MB are the most that is read")
+    return path.read_bytes().decode("utf-8")
 
 
 def clear_leftovers(folder: Path) -> None:
     """Deletes what was begun in a folder, and below it, when a process was killed."""
     for path in folder.rglob(LEFTOVERS):
-        path.unlink()
+        if path.is_symlink() or not path.is_dir():
+            path.unlink()
 
 
 def sync_folder(folder: Path) -> None:

@@ -4,6 +4,9 @@ A stage writes into `.partial/<stage>/`. When it is done, its files are flushed,
 written last, and two renames put it in place: the old result to `.old/`, the new one to where the
 old one was. Killed between any two of these steps, the next writer finds either the old or the new
 result and completes what was begun.
+
+Whatever is deleted here may have been replaced by a link, to a larger disk for example: the link is
+removed, never what it points to.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
-from recon_cli.workspace import manifest
+from recon_cli.workspace import journal, manifest
 from recon_cli.workspace.atomic import clear_leftovers, read_json, sync_folder, write_json
 from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, describe_progress
@@ -32,6 +35,7 @@ LOCK = ".lock"  # dropped by the system when its holder dies
 HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
 BLOCKS = "blocks"  # workspaces of `recon train --blocks`, by number
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
+_OLD = ".old"  # results that were replaced
 
 logger = logging.getLogger("recon")
 
@@ -53,10 +57,10 @@ class Workspace:
 
     def partial(self, stage: str) -> Path:
         """Returns where a stage writes before it is finished."""
-        return self.root / ".partial" / stage
+        return self.root / journal.PARTIAL / stage
 
     def _old(self, stage: str) -> Path:
-        return self.root / ".old" / stage
+        return self.root / _OLD / stage
 
     def _record(self, stage: str) -> Path:
         return self.partial(stage).with_suffix(".json")
@@ -89,30 +93,48 @@ class Workspace:
 
     def partial_run(self, stage: str) -> PartialRun | None:
         """Returns how far an interrupted run of a stage came, or None."""
-        return PartialRun.read(self._record(stage)) if self.partial(stage).is_dir() else None
+        folder = self.partial(stage)
+        if folder.is_symlink() or not folder.is_dir():
+            return None
+        partial_run = PartialRun.read(self._record(stage))
+        return partial_run if partial_run and partial_run.key.stage == stage else None
 
-    def begin(self, key: ResultKey) -> tuple[Path, PartialRun]:
+    def begin(self, key: ResultKey, *, own_digests: bool = False) -> tuple[Path, PartialRun]:
         """Returns the folder for a stage to write in, and how far an identical run came before.
 
-        Files of an interrupted run are kept only if it had the same key.
+        Files of an interrupted run are kept only if it had the same key, and none of them was
+        damaged since. A stage with `own_digests` finds that out by itself.
 
         Raises:
             WorkspaceError: a folder that is no result has the name of the stage.
         """
         self._refuse_foreign(key.stage)
         partial, earlier = self.partial(key.stage), self.partial_run(key.stage)
-        if earlier and earlier.key.fingerprint == key.fingerprint:
+        doubt = self._doubt(key, earlier, own_digests=own_digests)
+        if earlier and not doubt:
             progress = describe_progress(earlier.done, earlier.total)
             logger.info("%s: resuming (%s)", key.stage, progress)
             clear_leftovers(partial)
-        else:
-            if earlier:
-                logger.info("%s: unfinished work for other settings is discarded", key.stage)
-            self.discard(key.stage)
-            earlier = PartialRun(key)
-            partial.mkdir(parents=True)
-            earlier.write(self._record(key.stage))
-        return partial, earlier
+            return partial, earlier
+        if doubt:
+            logger.warning("%s: unfinished work is discarded: %s", key.stage, doubt)
+        self.discard(key.stage)
+        fresh = PartialRun(key)
+        partial.mkdir(parents=True)
+        if not own_digests:
+            journal.start(partial)
+        fresh.write(self._record(key.stage))
+        return partial, fresh
+
+    def _doubt(self, key: ResultKey, earlier: PartialRun | None, *, own_digests: bool) -> str:
+        """Returns why a run does not go on from unfinished work; empty if it does, or has none."""
+        partial = self.partial(key.stage)
+        if earlier is None:
+            return f"the record of it at {self._record(key.stage)} is missing or damaged" * (
+                os.path.lexists(partial))
+        if earlier.key.fingerprint != key.fingerprint:
+            return "it has other settings or inputs"
+        return "" if own_digests else journal.find_damage(partial)
 
     def record(self, partial_run: PartialRun) -> None:
         """Writes how much of a run would survive a crash."""
@@ -120,9 +142,14 @@ class Workspace:
 
     def discard(self, stage: str) -> None:
         """Removes unfinished work of a stage."""
+        holder = self.root / journal.PARTIAL
+        if holder.is_symlink() and not self.partial_run(stage):
+            holder.unlink()  # it may point to anything
+            return
         # The record goes first: without it the rest counts for nothing.
         remove(self._record(stage))
         remove(self.partial(stage))
+        remove(journal.journal_path(self.partial(stage)))
 
     def seal(self, stage: str) -> dict[str, FileDigest]:
         """Flushes what a stage wrote and returns the digest of every file, by relative path."""
@@ -145,32 +172,45 @@ class Workspace:
         """Renames the old result away and the new one into place; any prefix can be resumed."""
         self._retire(stage)
         partial = self.partial(stage)
-        partial.rename(self.folder(stage))
+        move(partial, self.folder(stage))
         sync_folder(self.root)
         sync_folder(partial.parent)
         remove(self._record(stage))
+        remove(journal.journal_path(partial))
         remove(self._old(stage))
 
     def _retire(self, stage: str) -> None:
         """Renames a stage's result to .old/, where it may be removed at any time."""
         self._refuse_foreign(stage)
         folder, old = self.folder(stage), self._old(stage)
-        if folder.exists():
-            old.parent.mkdir(exist_ok=True)
-            remove(old)
-            folder.rename(old)
-            sync_folder(old.parent)
+        if not os.path.lexists(folder):
+            return
+        old.parent.mkdir(exist_ok=True)
+        remove(old)
+        if folder.is_symlink():  # moved, a relative link would point elsewhere
+            target = folder.resolve()
+            old.symlink_to(target)
+            folder.unlink()
+            logger.warning("%s was a link to %s, which is left as it is", folder, target)
+        else:
+            move(folder, old)
+        sync_folder(old.parent)
 
     def recover(self) -> None:
         """Completes or undoes what a crash interrupted, stage by stage."""
-        for partial in _folders(self.root / ".partial"):
-            if _complete(partial):
+        for name in (journal.PARTIAL, _OLD):
+            path = self.root / name
+            if (path.is_symlink() and name == _OLD) or (
+                    os.path.lexists(path) and not path.is_dir()):
+                path.unlink()
+        for partial in _folders(self.root / journal.PARTIAL):
+            if self._record(partial.name).is_file() and _complete(partial):
                 logger.info("%s: finishing what a crash interrupted", partial.name)
                 self._swap(partial.name)
-        for old in _folders(self.root / ".old"):
+        for old in _folders(self.root / _OLD):
             if not self.folder(old.name).exists() and _complete(old):
                 logger.info("%s: restoring the result from before a crash", old.name)
-                old.rename(self.folder(old.name))
+                move(old, self.folder(old.name))
                 sync_folder(self.root)
             else:
                 remove(old)
@@ -181,9 +221,13 @@ class Workspace:
         remove(self._old(stage))
 
     def scraps(self) -> list[Path]:
-        """Returns what no finished result needs: unfinished work, old results, blocks, seeds."""
-        return [path for parent in (".partial", ".old", SEEDS, BLOCKS)
-                for path in sorted(self.root.glob(f"{parent}/*"))]
+        """Returns what no finished result needs: unfinished work, old results, blocks, seeds.
+
+        Where one of these folders is a link, that is the link, not what it leads to.
+        """
+        parents = [self.root / name for name in (journal.PARTIAL, _OLD, SEEDS, BLOCKS)]
+        return [path for parent in parents
+                for path in ([parent] if parent.is_symlink() else sorted(parent.glob("*")))]
 
     def _refuse_foreign(self, stage: str) -> None:
         """Refuses to replace a folder that is not ours: -w may point anywhere."""
@@ -195,9 +239,15 @@ class Workspace:
 
 
 def size_of(path: Path) -> int:
-    """Returns the bytes in a file or in all files below a folder."""
-    files = path.rglob("*") if path.is_dir() else [path]
-    return sum(file.lstat().st_size for file in files if not file.is_dir())
+    """Returns the bytes in a file or in all files below a folder; of a link its own."""
+    files = path.rglob("*") if path.is_dir() and not path.is_symlink() else [path]
+    return sum(file.lstat().st_size for file in files if file.is_symlink() or not file.is_dir())
+
+
+def has_link(path: Path, root: Path) -> bool:
+    """Returns whether a path below `root`, or a folder between them, is a link."""
+    between = [path, *path.parents]
+    return any(part.is_symlink() for part in between[:between.index(root)])
 
 
 @contextmanager
@@ -249,11 +299,29 @@ def _flush(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Removes a file or a folder, if it is there."""
-    if path.is_dir():
+    """Removes a file, a link, or a folder with all that is in it, if it is there."""
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def move(source: Path, target: Path) -> None:
+    """Renames a folder to where nothing is, also to another file system: whole or not at all."""
+    try:
+        source.rename(target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        copy = target.with_name(f".{target.name}.moving")
+        remove(copy)  # of a move that was killed
+        shutil.copytree(source, copy, symlinks=True)
+        for path in copy.rglob("*"):
+            if not path.is_symlink():
+                _flush(path)
+        copy.rename(target)
+        sync_folder(target.parent)
+        remove(source)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,11 +55,19 @@ class ResultKey:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ResultKey:
-        """Returns the key that `to_json` described."""
-        sources = tuple(Source(item["path"], _digests(item["files"])) for item in value["inputs"])
+        """Returns the key that `to_json` described.
+
+        Raises:
+            KeyError, TypeError, ValueError, AttributeError: it is of no such form.
+        """
+        sources = tuple(
+            Source(_typed(item["path"], str), _digests(item["files"])) for item in value["inputs"])
+        upstream = {name: _typed(digest, str, type(None))
+                    for name, digest in value["upstream"].items()}
         return cls(
-            value["stage"], value["version"], value["config"], sources, value["upstream"],
-            value.get("continues"))
+            _typed(value["stage"], str), _typed(value["version"], int),
+            _typed(value["config"], dict), sources, upstream,
+            _typed(value.get("continues"), str, type(None)))
 
 
 @dataclass(frozen=True)
@@ -98,25 +107,48 @@ class Manifest:
         """Returns the manifest in a stage's folder.
 
         Raises:
-            ManifestError: it is truncated, was edited, or has another schema.
+            ManifestError: it is truncated, was edited, has another schema, or names files that do
+                not lie in the folder.
         """
         path = folder / NAME
-        hint = f"Run the stage again with --again, or delete {folder}."
+        clean = shlex.join(["recon", "clean", folder.name, "-w", str(folder.parent)])
+        hint = f"Remove this result by `{clean}`, then make it again."
         try:
-            content = read_json(path)
+            content = read_json(path, dict)
+            if content.get("schema") != SCHEMA:
+                raise ManifestError(
+                    f"{path} has schema {str(content.get('schema'))[:20]}, but this recon reads "
+                    f"schema {SCHEMA}.", hint=hint)
+            if content.pop("self", None) != sha256_json(content):
+                raise ManifestError(
+                    f"{path} does not match its own checksum: it was edited or damaged.", hint=hint)
+            return cls._of(content)
         except FormatError as error:
             raise ManifestError(error.message, hint=hint) from error
-        schema = content.get("schema") if isinstance(content, dict) else None
-        if schema != SCHEMA:
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            reason = f"it lacks {error}" if isinstance(error, KeyError) else error
             raise ManifestError(
-                f"{path} has schema {schema}, but this recon reads schema {SCHEMA}.", hint=hint)
-        if content.pop("self", None) != sha256_json(content):
-            raise ManifestError(
-                f"{path} does not match its own checksum: it was edited or damaged.", hint=hint)
+                f"{path} is not a manifest of recon: {reason}.", hint=hint) from error
+
+    @classmethod
+    def _of(cls, content: Mapping[str, Any]) -> Manifest:
+        outputs = _digests(content["outputs"])
+        for name in outputs:
+            _check_output(name)
         run = {field.name: content[field.name] for field in dataclasses.fields(RunRecord)}
-        return cls(
-            ResultKey.from_json(content), _digests(content["outputs"]), content["digest"],
-            RunRecord(**run))
+        _typed(run["seconds"], int, float)
+        _typed(run["summary"], dict)
+        _typed(run["versions"], dict)
+        return cls(ResultKey.from_json(content), outputs, _typed(content["digest"], str),
+                   RunRecord(**run))
+
+
+def _check_output(name: str) -> None:
+    """Raises ValueError unless a name stays in the folder that it is relative to, on any system."""
+    parts = name.split("/")
+    if ("\0" in name or "\\" in name or ".." in parts or "" in parts or "." in parts
+            or ":" in parts[0]):
+        raise ValueError(f"it names the output {name[:100]!r}, which is no file of a stage")
 
 
 def describe_progress(done: int, total: int) -> str:
@@ -135,17 +167,22 @@ class PartialRun:
 
     def write(self, path: Path) -> None:
         """Writes the record, whole or not at all."""
-        write_json(path, {
+        content = {
             "fingerprint": self.key.fingerprint, **self.key.to_json(),
-            "done": self.done, "total": self.total, "seconds": self.seconds})
+            "done": self.done, "total": self.total, "seconds": self.seconds}
+        write_json(path, {**content, "self": sha256_json(content)})
 
     @classmethod
     def read(cls, path: Path) -> PartialRun | None:
-        """Returns the record, or None where there is none that can be read."""
+        """Returns the record, or None where there is none that can be trusted."""
         try:
-            value = read_json(path)
-            return cls(ResultKey.from_json(value), value["done"], value["total"], value["seconds"])
-        except (FormatError, KeyError, TypeError, AttributeError):
+            value = read_json(path, dict)
+            if value.pop("self", None) != sha256_json(value):
+                return None
+            return cls(
+                ResultKey.from_json(value), _typed(value["done"], int), _typed(value["total"], int),
+                _typed(value["seconds"], int, float))
+        except (FormatError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
             return None
 
 
@@ -224,4 +261,14 @@ def _value_text(value: object) -> str:
 
 
 def _digests(value: Mapping[str, Mapping[str, Any]]) -> dict[str, FileDigest]:
-    return {name: FileDigest(**file) for name, file in value.items()}
+    return {name: FileDigest(
+        _typed(file["sha256"], str), _typed(file["size"], int), _typed(file["mtime_ns"], int))
+        for name, file in value.items()}
+
+
+def _typed(value: Any, *kinds: type) -> Any:
+    """Returns a value, or raises TypeError unless it is of one of these types."""
+    if type(value) not in kinds:
+        raise TypeError(f"it holds {str(value)[:100]!r}, not a value of type "
+                        f"{' or '.join(kind.__name__ for kind in kinds)}")
+    return value

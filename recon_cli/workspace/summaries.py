@@ -8,7 +8,6 @@ None.
 from __future__ import annotations
 
 import dataclasses
-import json
 import types
 import typing
 from collections.abc import Mapping
@@ -16,9 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from recon_cli.errors import ManifestError
-from recon_cli.workspace.atomic import read_json
+from recon_cli.errors import FormatError, ManifestError
+from recon_cli.workspace.atomic import parse_json, read_json, read_text
 
+_HINT = "Run the stage that wrote it again with --again."
 _SCALARS: Mapping[Any, tuple[type, ...]] = {
     bool: (bool,), int: (int,), float: (float, int), str: (str,)}
 
@@ -48,7 +48,7 @@ class JsonRecord:
             ManifestError: it is no mapping, lacks a field, or holds one of another type.
         """
         if not isinstance(value, Mapping):
-            raise ManifestError("the record is not a JSON object")
+            raise ManifestError("the record is not a JSON object", hint=_HINT)
         kinds = typing.get_type_hints(cls)
         fields = dataclasses.fields(cls)
         missing = [
@@ -57,7 +57,8 @@ class JsonRecord:
             and field.default_factory is dataclasses.MISSING]
         if missing:
             raise ManifestError(
-                f"the record lacks {', '.join(missing)}: another version of recon wrote it")
+                f"the record lacks {', '.join(missing)}: another version of recon wrote it",
+                hint=_HINT)
         return cls(**{
             field.name: _decode(field.name, kinds[field.name], value[field.name])
             for field in fields if field.name in value})
@@ -86,7 +87,9 @@ def _decode(name: str, kind: Any, item: Any) -> Any:
         return kind.from_json(item)
     if kind is Any or isinstance(item, _SCALARS.get(kind, ())):
         return item
-    raise ManifestError(f"the record holds {item!r} as {name}: another version of recon wrote it")
+    raise ManifestError(
+        f"the record holds {repr(item)[:100]} as {name}: another version of recon wrote it",
+        hint=_HINT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +191,8 @@ class WorldSummary(JsonRecord):
             FormatError: it is damaged.
         """
         path = sfm / cls.FILE
-        return cls.from_json(read_json(path)) if path.exists() else None
+        hint = "Run `recon sfm --again`."
+        return cls.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,7 +277,7 @@ class TrainPlan(JsonRecord):
             ManifestError: the file is of another version.
             FormatError: it is missing or damaged.
         """
-        return cls.from_json(read_json(train / cls.FILE))
+        return cls.from_json(read_json(train / cls.FILE, dict, hint="Run `recon train --again`."))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,10 +298,17 @@ class LogRow(JsonRecord):
 
         Raises:
             ManifestError: a row is of another version.
-            ValueError: a row is damaged.
+            FormatError: a row is damaged.
         """
-        lines = log.read_text(encoding="utf-8").splitlines(True) if log.exists() else []
-        return tuple(cls.from_json(json.loads(line)) for line in lines if line.endswith("\n"))
+        try:
+            lines = read_text(log).splitlines(True) if log.exists() else []
+            # a loss may not be finite: such steps are skipped
+            values = [parse_json(line, dict, finite=False)
+                      for line in lines if line.endswith("\n")]
+        except (OSError, ValueError) as error:
+            raise FormatError(f"{log} is damaged: {error}.",
+                              hint=f"Run `recon {log.parent.name} --again`.") from error
+        return tuple(map(cls.from_json, values))
 
 
 @dataclass(frozen=True, kw_only=True)

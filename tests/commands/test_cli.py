@@ -213,7 +213,10 @@ def test_a_broken_manifest_is_7(capsys: Said) -> None:
     main(["ingest", "room.mp4"])
     Path("workspace/ingest/manifest.json").write_text("{")
     assert main(["status"]) == 7
-    assert "--again" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "ingest     damaged" in said.out.replace("  damaged", "     damaged")
+    assert "train      missing" in said.out.replace("  missing", "     missing")
+    assert f"recon clean ingest -w {Path('workspace').absolute()}" in said.err
     assert main(["ingest", "room.mp4", "--again"]) == 0
     assert main(["status"]) == 0
 

@@ -16,6 +16,7 @@ from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import stage
+from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.manifest import Manifest
 
 
@@ -95,7 +96,7 @@ def test_while_a_run_goes_on_the_finished_result_stays_and_is_used(job: Job) -> 
     partial = job.workspace.partial_run("train")
     assert partial is not None
     assert partial.key.continues == before.digest
-    (job.workspace.partial("train") / "kept.txt").write_text("of the interrupted run")
+    write_bytes(job.workspace.partial("train") / "kept.txt", b"of the interrupted run")
     bring(job, "train", changes=longer(6000))
     assert manifest(job).key.continues == before.digest
     assert (job.workspace.folder("train") / "kept.txt").exists()
@@ -106,7 +107,7 @@ def test_an_interrupted_run_whose_start_is_gone_begins_anew(job: Job) -> None:
     with pytest.raises(KeyboardInterrupt):
         bring(job, "train", changes=longer(6000))
     fake_stages.actions.clear()
-    (job.workspace.partial("train") / "kept.txt").write_text("of the interrupted run")
+    write_bytes(job.workspace.partial("train") / "kept.txt", b"of the interrupted run")
     shutil.rmtree(job.workspace.folder("train"))
     assert plan.status(job)[3].state == "missing"
     bring(job, "train", changes=longer(6000))
@@ -119,7 +120,7 @@ def test_an_interrupted_run_that_began_anew_is_resumed_as_such(job: Job) -> None
     with pytest.raises(KeyboardInterrupt):
         bring(job, "train", changes=longer(6000), again=True)
     fake_stages.actions.clear()
-    (job.workspace.partial("train") / "kept.txt").write_text("of the interrupted run")
+    write_bytes(job.workspace.partial("train") / "kept.txt", b"of the interrupted run")
     bring(job, "train", changes=longer(6000))
     assert manifest(job).key.continues is None
     assert (job.workspace.folder("train") / "kept.txt").exists()

@@ -19,8 +19,10 @@ from recon_cli.sfm.job import (
     Reporter,
     StepLog,
     fresh_folder,
+    is_vouched,
     parse,
     publish,
+    vouch,
 )
 
 
@@ -130,6 +132,36 @@ def test_files_without_a_note_prove_nothing(finished):
 def test_a_note_that_cannot_be_read_proves_nothing(finished):
     (finished / LOG_FILE).write_text('{"features": ')
     assert done(finished) == []
+
+
+def test_a_flipped_byte_is_found_before_a_step_is_believed(finished):
+    assert StepLog(finished).find_damage() is None
+    (finished / "sparse" / "images" / "a.bin").write_bytes(b"12375")
+    assert StepLog(finished).find_damage() == "sparse"
+
+
+def test_a_file_that_a_step_writes_besides_its_folder_is_looked_at_too(tmp_path):
+    (tmp_path / "verdict.json").write_text("{}")
+    StepLog(tmp_path).finish("model", {"points": 7}, also=("verdict.json", "none.json"))
+    assert StepLog(tmp_path).find_damage() is None
+    (tmp_path / "verdict.json").write_text("[]")
+    assert StepLog(tmp_path).find_damage() == "model"
+
+
+def test_a_note_with_a_changed_figure_proves_nothing(finished):
+    text = (finished / LOG_FILE).read_text()
+    (finished / LOG_FILE).write_text(text.replace('"points": 7', '"points": 8', 1))
+    assert done(finished) == []
+
+
+def test_a_folder_is_vouched_for_until_it_changes(tmp_path):
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "a.bin").write_bytes(b"12345")
+    assert not is_vouched(tmp_path / "models")
+    vouch(tmp_path / "models")
+    assert is_vouched(tmp_path / "models")
+    (tmp_path / "models" / "a.bin").write_bytes(b"12346")
+    assert not is_vouched(tmp_path / "models")
 
 
 def test_what_builds_on_a_forgotten_step_is_forgotten_too(finished):

@@ -43,6 +43,7 @@ from recon_cli.train.schedule import (
 from recon_cli.train.state import TrainState, save_state, tensors_of
 from recon_cli.train.stepper import Stepper
 from recon_cli.train.task import Task
+from recon_cli.workspace.atomic import parse_json
 
 _DONE, _FIT = 0, 1  # between fits, and EXCHANGE
 _STOP, _END, _COMPARE = -1, -2, -3  # in a fit
@@ -232,7 +233,7 @@ def pack_fit(fit: Fit) -> dict[str, NDArray[Any]]:
 
 def unpack_fit(arrays: dict[str, NDArray[Any]], ranks: ProcessGroup) -> Fit:
     """Returns the fit that `packed` took apart, for the process that `ranks` is."""
-    said = json.loads(arrays["said"].tobytes())
+    said = parse_json(arrays["said"].tobytes(), finite=False)
     if said["cameras"]:
         ranks.views = [
             TrainView(Camera(**lens, viewmat=arrays[f"viewmat.{i}"]), arrays[f"image.{i}"],
@@ -270,7 +271,7 @@ def receive_arrays(ranks: ProcessGroup) -> dict[str, NDArray[Any]]:
     """Returns the arrays that the leader sends."""
     names = np.zeros(ranks.broadcast_int(0), np.uint8)
     ranks.broadcast(torch.from_numpy(names))
-    arrays = {name: np.zeros(shape, dtype) for name, dtype, shape in json.loads(names.tobytes())}
+    arrays = {name: np.zeros(shape, dtype) for name, dtype, shape in parse_json(names.tobytes())}
     for array in arrays.values():
         ranks.broadcast(torch.from_numpy(array))
     return arrays

@@ -1,0 +1,78 @@
+"""Files are whole and readable by others; JSON of any origin is a value or a typed error."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from recon_cli.errors import FormatError
+from recon_cli.workspace import atomic
+from recon_cli.workspace.atomic import parse_json, read_json, replacing
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o027, 0o640), (0o077, 0o600)])
+def test_a_file_gets_the_permissions_that_the_umask_says(
+    tmp_path: Path, umask: int, mode: int
+) -> None:
+    before = os.umask(umask)
+    try:
+        with replacing(tmp_path / "a.safetensors") as temporary:
+            save_file({"x": np.zeros(3, np.float32)}, temporary)
+        atomic.write_bytes(tmp_path / "b", b"x")
+    finally:
+        os.umask(before)
+    for name in ("a.safetensors", "b"):
+        assert (tmp_path / name).stat().st_mode & 0o777 == mode
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize(("text", "reason"), [
+    ("NaN", "not a finite number"), ('{"a": Infinity}', "not a finite number"),
+    ("1e999", "not a finite number"), ("9" * 5000, "not a finite number"),
+    ("[" * 100_000, "nested too deeply"), ('{"a":' * 100_000, "nested too deeply"),
+    ("{", "Expecting"), ("", "Expecting"), ("[]", "a list, not an object"),
+    ("3", "a single value, not an object")])
+def test_json_that_cannot_be_used_is_an_error_with_its_reason(
+    tmp_path: Path, text: str, reason: str
+) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=reason) as caught:
+        read_json(path, dict)
+    assert str(path) in caught.value.message
+    assert caught.value.hint
+
+
+def test_bytes_folders_fifos_and_huge_files_are_no_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bytes").write_bytes(b'{"a": "\xff"}')
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "large").write_text("[1, 2, 3]")
+    monkeypatch.setattr(atomic, "MAX_TEXT_BYTES", 8)
+    for name in ("bytes", "folder", "fifo", "large", "missing"):
+        with pytest.raises(FormatError, match="cannot be read as JSON") as caught:
+            read_json(tmp_path / name, hint="Do this.")
+        assert caught.value.hint == "Do this."
+
+
+def test_integers_stay_what_they_are_up_to_64_bits_and_are_floats_beyond() -> None:
+    assert parse_json("[18446744073709551615, -9223372036854775808]") == [2**64 - 1, -2**63]
+    assert parse_json("1" + "0" * 25) == 1e25
+    assert parse_json("[NaN]", finite=False)[0] != 0
+
+
+def test_everything_that_is_read_as_json_or_toml_goes_through_one_reader() -> None:
+    package = Path(atomic.__file__).parents[1]
+    others = {"workspace/atomic.py", "config/settings.py",  # the readers
+              "workspace/journal.py",  # on which the reader builds; its lines have checksums
+              "render/self_check.py",  # may import nothing of the workspace
+              }
+    found = {
+        path.relative_to(package).as_posix() for path in package.rglob("*.py")
+        if any(word in path.read_text(encoding="utf-8")
+               for word in ("json.loads(", "json.load(", "tomllib.load"))}
+    assert {name for name in found - others if not name.startswith("io/splats/")} == set()
