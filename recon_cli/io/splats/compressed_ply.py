@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.ply import Element, format_header, read_header, read_tables
+from recon_cli.io.ply_tables import Element, format_header, read_header, read_tables
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
