@@ -193,7 +193,7 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
         raise container.error("values that overflow float32")
     if axes is None:
         axes = _AXES.get(_read_axes(container.json), Z_UP)
-    up = next(name for name, known in _UP.items() if np.array_equal(known, axes))
+    up = next((name for name, known in _UP.items() if np.array_equal(known, axes)), None)
     return LoadedScene(transformed(splats, Similarity(rotation=axes.T)), up)
 
 
