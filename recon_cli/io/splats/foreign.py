@@ -45,7 +45,7 @@ def drop_not_finite(
     in each column, if these rows are more than half of all.
     """
     with np.errstate(over="ignore"):
-        bad = {name: ~np.isfinite(value.reshape(len(value), -1)).all(axis=1)
+        bad = {name: ~np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
                for name, value in (named or columns).items()}
     bad = {name: rows for name, rows in bad.items() if rows.any()}
     if not bad:

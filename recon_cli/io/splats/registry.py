@@ -97,6 +97,8 @@ def load_scene(path: Path, *, axes: str | None = None) -> LoadedScene:
     damaged.
     """
     row = format_of(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
+        raise FormatError(f"{path} is not a file.", hint="Give a file on the disk.")
     try:
         if axes is None:
             return row.load(path)
