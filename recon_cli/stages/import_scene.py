@@ -95,6 +95,10 @@ def _describe(path: Path, scene: LoadedScene, alignment: Alignment | None) -> li
         said.append(
             f"{path.name} was trained for antialiased rendering (Mip-Splatting), which is not "
             "supported: what is smaller than a pixel looks too thick")
+    if alignment is not None and alignment.doubt and path.suffix.lower() == ".spz":
+        said.append(
+            f"{path.name} may have other axes than it says, or than those of a .ply: try `recon "
+            "import --axes rub`")
     if scene.origin is not None and alignment is None:
         said.append(
             f"{path.name}: {scene.origin.describe()}. Exported files have the new positions; "

@@ -12,17 +12,18 @@ from foreign import truth
 from scenes import random_splats
 from tiny_scene import make_inputs
 
-from recon_cli.config.stages import ImportConfig, PruneConfig
+from recon_cli.config.stages import ExportConfig, ImportConfig, PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
 from recon_cli.io.ply import describe_scene, read_ply, write_ply
 from recon_cli.io.records import ImportRecord
+from recon_cli.io.splats.axes import turn_from
 from recon_cli.io.splats.glb import nearest_axes, write_glb
-from recon_cli.io.splats.registry import FORMATS, scene_file
+from recon_cli.io.splats.registry import FORMATS, load_scene, scene_file
 from recon_cli.io.splats.spz import write_spz
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import transformed
-from recon_cli.stages import evaluate, import_scene, prune
+from recon_cli.stages import evaluate, export, import_scene, prune
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_json
 
@@ -259,8 +260,32 @@ def test_a_scene_in_map_coordinates_fits_cameras_that_are_in_them_too(inputs, tm
     assert summary.notices is None
 
 
-def test_what_was_trained_with_antialiasing_is_recorded_and_said(tmp_path):
-    write_spz(tmp_path / "a.spz", truth(), antialiased=True)
-    summary = brought_in(tmp_path / "a.spz", None, tmp_path / "train")
+def test_an_spz_that_does_not_fit_the_views_is_said_to_have_other_axes_perhaps(inputs, tmp_path):
+    write_spz(tmp_path / "a.spz", turn_from("rub", truth()), axes=None)
+    summary = brought_in(tmp_path / "a.spz", inputs, tmp_path / "train")
+    assert "--axes rub" in summary.notices[1]
+    summary = brought_in(tmp_path / "a.spz", inputs, tmp_path / "again", axes="rub")
+    assert summary.notices is None
+    assert summary.frame == "workspace"
+
+
+def test_what_was_trained_with_antialiasing_is_recorded_said_and_exported(tmp_path):
+    write_ply(tmp_path / "a.ply", truth(), comments=["SplatRenderMode: mip"])
+    summary = brought_in(tmp_path / "a.ply", None, tmp_path / "train")
     assert "Mip-Splatting" in summary.notices[0]
     assert ImportRecord.read(tmp_path / "train").antialiased
+    config = ExportConfig(format="spz,sog,ply", max_loss=30)
+    (tmp_path / "export").mkdir()
+    export.run(config, StageInputs({"train": tmp_path / "train"}), tmp_path / "export", CONTEXT)
+    for name in config.formats:
+        assert load_scene(tmp_path / "export" / f"splats.{name}").antialiased, name
+
+
+def test_a_scene_that_was_moved_is_exported_with_the_point_it_was_moved_from(tmp_path):
+    brought_in(far_away(tmp_path / "a.ply", [448262.25, 5411932.5, 301.5]), None,
+               tmp_path / "train")
+    (tmp_path / "export").mkdir()
+    export.run(ExportConfig(), StageInputs({"train": tmp_path / "train"}), tmp_path / "export",
+               CONTEXT)
+    record = json.loads((tmp_path / "export" / "transform.json").read_text())
+    assert record["origin"] == in_record(tmp_path / "train")["origin"]
