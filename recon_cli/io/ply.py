@@ -19,17 +19,31 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
+from recon_cli.io.ply_tables import (
+    Header,
+    format_header,
+    read_elements,
+    read_header,
+    read_tables,
+)
+from recon_cli.io.splats.foreign import (
+    FLAT,
+    count_terms,
+    drop_not_finite,
+    find_origin,
+    undo_activations,
+)
+from recon_cli.io.splats.loaded import LoadedScene
 from recon_cli.io.splats.values import refuse_not_finite, sigmoid, splats_from_arrays, to_arrays
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
@@ -47,31 +61,20 @@ _GROUPS = {
 }
 # For an opacity of exactly 1 or 0, which splat-transform makes of 255 and 0: middle of that step.
 _MAX_LOGIT = math.log(254.75 / 0.25)
-# The third log scale of a flat Gaussian (2D Gaussian Splatting), as SuperSplat sets it.
-_FLAT = math.log(1e-6)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
-_HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
-_END = re.compile(rb"\nend_header[ \t]*\r?\n")
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
-}
-_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 # the comment in the header: how many rows at the end show a backdrop, and its numbers
-_BACKDROP = re.compile(r"comment backdrop (\d{1,9})((?: \S+){7})")
+_BACKDROP = re.compile(r"backdrop (\d{1,9})((?: \S+){7})")
 _ROUNDING = 1e-6  # of a value: what two machines may compute apart
-_DIGITS = 15  # of a count; larger ones fit on no disk
-_OF_MESHES = ("face", "tristrips", "edge")
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 logger = logging.getLogger("recon")
 
 
 def write_ply(
-    path: Path, splats: Splats, extra: Mapping[str, NDArray[np.float32]] | None = None
+    path: Path, splats: Splats, extra: Mapping[str, NDArray[np.float32]] | None = None, *,
+    comments: Sequence[str] = (),
 ) -> None:
-    """Writes `splats` to `path`, whole or not at all.
+    """Writes `splats` to `path`, whole or not at all, with more `comments` in the header.
 
     `extra` are further properties [N] by name, after all others; readers that do not know them
     skip them. Those of the backdrop's sphere, which has none of its own, are the greatest.
@@ -92,7 +95,7 @@ def write_ply(
     table = np.column_stack([
         torch.cat([columns[name] for name in _GROUPS], dim=1).numpy(), *extra.values()])
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(n, splats.sh_degree, tuple(extra), backdrop))
+        file.write(_header(n, splats.sh_degree, tuple(extra), backdrop, comments))
         file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
 
 
@@ -102,22 +105,20 @@ def _properties(sh_degree: int) -> list[str]:
 
 
 def _header(
-    n: int, sh_degree: int, extra: Sequence[str] = (), backdrop: Backdrop | None = None
+    n: int, sh_degree: int, extra: Sequence[str] = (), backdrop: Backdrop | None = None,
+    comments: Sequence[str] = (),
 ) -> bytes:
     names = (*_properties(sh_degree), *extra)
-    comments = [] if backdrop is None else [
-        f"backdrop {SPHERE_GAUSSIANS} {' '.join(map(repr, backdrop.numbers))}"]
+    if backdrop is not None:
+        numbers = " ".join(map(repr, backdrop.numbers))
+        comments = [*comments, f"backdrop {SPHERE_GAUSSIANS} {numbers}"]
     return format_header({"vertex": (n, [f"float {name}" for name in names])}, comments)
 
 
-def format_header(
-    elements: Mapping[str, tuple[int, Sequence[str]]], comments: Sequence[str] = ()
-) -> bytes:
-    """Returns the header of a binary .ply, by element its count and its properties with types."""
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
-    for name, (count, properties) in elements.items():
-        lines += [f"element {name} {count}", *(f"property {text}" for text in properties)]
-    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+def describe_scene(up: str | None, *, antialiased: bool) -> list[str]:
+    """Returns the comments by which other programs know what is up (z only) and the rasterizer."""
+    return [*(["Vertical Axis: z"] if up == "z" else []),
+            *(["SplatRenderMode: mip"] if antialiased else [])]
 
 
 def max_gaussians(size: int, sh_degree: int, backdrop: Backdrop | None = None) -> int:
@@ -134,7 +135,7 @@ def max_gaussians(size: int, sh_degree: int, backdrop: Backdrop | None = None) -
 
 
 def read_ply(path: Path) -> Splats:
-    """Returns the Gaussians of a .ply as float32 tensors, in the file's order.
+    """Returns the Gaussians of a .ply as float32 tensors, in the file's order, with their values.
 
     Those after the last one with a coefficient other than zero are of degree 0. The sphere of a
     backdrop, unless another program has changed it, becomes one again. Elements besides
@@ -143,44 +144,141 @@ def read_ply(path: Path) -> Splats:
     another kind of .ply, or holds other values that are not finite.
     """
     header = read_header(path)
-    table = _vertices(header)
+    columns = _read_columns(header)
+    with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
+        columns["means"] = columns["means"].astype(np.float32)
+    refuse_not_finite(path, _by_property(columns))
+    return _without_sphere(splats_from_arrays(path, columns), _read_backdrop(header))
+
+
+def load_ply(path: Path) -> LoadedScene:
+    """Returns the scene in a .ply of any program, whose values may be written in other ways.
+
+    Gaussians that are not finite are dropped, opacities and sizes that are no logits or logarithms
+    are converted, each with a warning. Positions that float32 would round are moved to the origin.
+    The errors are those of `read_ply`, but up to half of the Gaussians may be not finite.
+    """
+    header = read_header(path)
+    columns = _read_columns(header)
+    columns = drop_not_finite(path, columns, _by_property(columns))
+    origin = None
+    if len(columns["means"]):
+        columns = undo_activations(path, columns)
+        origin = find_origin(columns["means"], columns["log_scales"])
+    if origin is not None:
+        columns["means"] = columns["means"].astype(np.float64) - origin.point
+    splats = _without_sphere(splats_from_arrays(path, columns), _read_backdrop(header))
+    return LoadedScene(splats, read_up(header), is_antialiased(header), origin)
+
+
+def read_up(header: Header) -> str | None:
+    """Returns the axis that is up by a comment `Vertical Axis`: z; None if none says so.
+
+    Brush writes y whatever is up, and -y is up in its scenes, so that y says nothing.
+    """
+    found = [text.partition(":")[2].strip().lower() for text in header.comments
+             if text.lower().startswith("vertical axis:")]
+    axis = found[-1] if found else ""
+    return {"z": "z", "+z": "z", "-y": "-y", "+y": "y"}.get(axis)
+
+
+def is_antialiased(header: Header) -> bool:
+    """Returns whether a comment of Brush or Postshot says that antialiasing was trained with."""
+    said = False
+    for text in header.comments:  # the last one counts
+        words = text.lower().replace(":", " ").split()
+        if words[:1] == ["splatrendermode"]:
+            said = "mip" in words[1:]
+        elif words[:1] == ["antialiased"] and len(words) == 2:
+            said = words[1] in ("1", "true")
+    return said
+
+
+def _read_columns(header: Header) -> dict[str, NDArray[Any]]:
+    """Returns the parameters in a file by their names in `Splats`; means in their own precision."""
+    path, table = header.path, _vertices(header)
     names = table.dtype.names or ()
-    rest = [name for name in _REST if name in names]
-    if len(rest) not in [3 * terms for terms in TERMS] or rest != _REST[: len(rest)]:
-        raise FormatError(
-            f"{path} has {len(rest)} f_rest properties; 0, 9, 24 or 45, numbered from 0, make a "
-            "degree.")
+    rest = [name for name in names if name.startswith("f_rest_")]
+    terms = count_terms(path, len(rest))
+    if set(rest) != {f"f_rest_{at}" for at in range(3 * terms)}:
+        raise FormatError(f"{path} has {len(rest)} f_rest properties that are not numbered from 0.")
+    rest = [f"f_rest_{at}" for at in range(3 * terms)]
     groups = {name: _GROUPS[name] for name in _GROUPS if name != "normals"} | {"sh_rest": rest}
+    plain = not set(_GROUPS["sh_dc"]) & set(names) and set(_COLOR) <= set(names)
+    if plain:
+        groups["sh_dc"] = list(_COLOR)
     missing = [name for group in groups.values() for name in group if name not in names]
     if missing and missing != ["scale_2"]:
         raise FormatError(f"{path} lacks the properties {', '.join(missing)}: no Gaussians.")
     with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
         columns = {name: table[name].astype(np.float32)
-                   for group in groups.values() for name in group if name not in missing}
+                   for group in groups.values() for name in group
+                   if name not in (*missing, *_POSITION)}
     if missing:
         columns["scale_2"] = np.full(len(table), -np.inf, np.float32)
+    if plain:
+        columns |= _read_colors(path, table)
     _make_finite(path, columns)
-    refuse_not_finite(path, columns)
-    values = {key: np.stack([columns[name] for name in group], axis=1) if group
-              else np.zeros((len(table), 0), np.float32) for key, group in groups.items()}
-    by_channel = values["sh_rest"].reshape(len(table), 3, len(rest) // 3)
-    splats = splats_from_arrays(path, values | {
-        "logit_opacities": values["logit_opacities"][:, 0],
-        "sh_rest": by_channel.transpose(0, 2, 1)})
-    return _without_sphere(splats, header.backdrop)
+    values: dict[str, NDArray[Any]] = {
+        key: np.stack([columns[name] for name in group], axis=1) for key, group in groups.items()
+        if key not in ("means", "sh_rest")}
+    by_channel = np.stack([columns[name] for name in rest], axis=1) if rest else np.zeros(
+        (len(table), 0), np.float32)
+    kept = min(terms, TERMS[-1])
+    precise = any(table.dtype[name].itemsize > 4 for name in _POSITION)
+    values["means"] = np.stack([table[name].astype(np.float64 if precise else np.float32)
+                                for name in _POSITION], axis=1)
+    values["logit_opacities"] = values["logit_opacities"][:, 0]
+    values["sh_rest"] = by_channel.reshape(len(table), 3, terms)[:, :, :kept].transpose(0, 2, 1)
+    return values
 
 
-def _without_sphere(splats: Splats, told: tuple[int, Backdrop] | None) -> Splats:
+def _by_property(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Returns columns by the names of their properties; coefficients of one group as one."""
+    named = {}
+    for name, value in columns.items():
+        group = _GROUPS[name]
+        if name == "sh_rest" or value.ndim == 1:
+            named["f_rest" if name == "sh_rest" else group[0]] = value
+        else:
+            named |= dict(zip(group, value.T, strict=True))
+    return named
+
+
+def _read_colors(path: Path, table: NDArray[np.void]) -> dict[str, NDArray[np.float32]]:
+    """Returns the coefficients of degree 0 of plain colours by their names."""
+    most = 1.0
+    kind = table.dtype[_COLOR[0]]
+    if kind.kind in "ui":
+        most = float(np.iinfo(kind).max)
+    elif any((table[name] > 1).any() for name in _COLOR):
+        most = 255.0
+    logger.warning("%s: colours are those of red, green and blue, from every side: there is no "
+                   "f_dc", path.name)
+    return {name: ((table[name].astype(np.float32) / most - 0.5) / SH_C0) for name in _COLOR}
+
+
+def _without_sphere(splats: Splats, said: tuple[int, Backdrop] | None) -> Splats:
     """Returns splats whose last rows show a backdrop with it in place of those rows."""
-    if told is None or told[0] > len(splats):
+    if said is None or said[0] > len(splats):
         return splats
-    count, backdrop = told
+    count, backdrop = said
     near = splats.select(torch.arange(len(splats) - count))
     found = dataclasses.replace(near, backdrop=backdrop)
     ours = found.with_sphere().parameters()
     same = all(ours[name].shape == value.shape and torch.allclose(ours[name], value, rtol=_ROUNDING)
                for name, value in splats.parameters().items())
     return found if same else splats
+
+
+def _read_backdrop(header: Header) -> tuple[int, Backdrop] | None:
+    """Returns the backdrop that a comment describes, after its rows; None if it cannot be read."""
+    for found in filter(None, map(_BACKDROP.fullmatch, header.comments)):
+        try:
+            return int(found[1]), Backdrop.of([float(text) for text in found[2].split()])
+        except ValueError:
+            return None
+    return None
 
 
 def _make_finite(path: Path, columns: dict[str, NDArray[np.float32]]) -> None:
@@ -194,11 +292,11 @@ def _make_finite(path: Path, columns: dict[str, NDArray[np.float32]]) -> None:
     flat = 0
     for name in _GROUPS["log_scales"]:
         is_flat = np.isneginf(columns[name])
-        columns[name][is_flat] = _FLAT
+        columns[name][is_flat] = FLAT
         flat += int(is_flat.sum())
     if flat:
         logger.warning("%s: %s scales of 0 are read as %g units", path.name, f"{flat:,}",
-                       math.exp(_FLAT))
+                       math.exp(FLAT))
 
 
 def _vertices(header: Header) -> NDArray[np.void]:
@@ -237,174 +335,6 @@ def write_points(path: Path, splats: Splats) -> None:
     write_bytes(path, format_header({"vertex": (len(rows), properties)}) + rows.tobytes())
 
 
-@dataclass(frozen=True)
-class Element:
-    """A table of the file."""
-
-    name: str  # as the header has it
-    count: int  # how many rows the header promises
-    row: np.dtype[np.void] | None  # the type of a row; None where a property is a list
-
-
-@dataclass(frozen=True)
-class Header:
-    """The header: name of the format, elements, offset of the data, and backdrop."""
-
-    path: Path
-    format: str
-    elements: tuple[Element, ...]
-    offset: int
-    backdrop: tuple[int, Backdrop] | None = None  # that a comment tells of, after its rows
-
-
-def read_header(path: Path) -> Header:
-    """Returns the header of a .ply; FormatError if the file cannot be read or is none."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEADER_LIMIT)
-    except OSError as error:
-        raise FormatError(f"{path} cannot be read: {error}.") from error
-    end = _END.search(head)
-    if not head.startswith((b"ply\n", b"ply\r\n")) or not end:
-        raise FormatError(f"{path} is no .ply file.")
-    texts = head[:end.start()].decode("ascii", "replace").splitlines()
-    lines = [text.split() for text in texts]
-    lines = [line for line in lines[1:] if line and line[0] not in ("comment", "obj_info")]
-    if not lines or len(lines[0]) != 3 or lines[0][0] != "format" or lines[0][1] not in _ORDERS:
-        raise FormatError(
-            f"{path} is neither an ASCII nor a binary .ply.",
-            hint="Convert it in the program it came from.")
-    kind = lines[0][1]
-    starts = [i for i, line in enumerate(lines) if line[0] == "element"]
-    if starts[:1] != [1]:
-        raise FormatError(f"{path} is a .ply without elements.")
-    elements = tuple(_element(lines[start:stop], kind, path)
-                     for start, stop in zip(starts, [*starts[1:], len(lines)], strict=True))
-    if len({element.name for element in elements}) != len(elements):
-        raise FormatError(f"{path} names an element twice.")
-    return Header(path, kind, elements, end.end(), _told_backdrop(texts))
-
-
-def _told_backdrop(texts: Sequence[str]) -> tuple[int, Backdrop] | None:
-    """Returns the backdrop that a comment tells of; None where none does, or it cannot be read."""
-    for found in filter(None, map(_BACKDROP.fullmatch, texts)):
-        try:
-            return int(found[1]), Backdrop.of([float(text) for text in found[2].split()])
-        except ValueError:
-            return None
-    return None
-
-
-def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
-    """Returns the element of a line `element` and the lines `property` below it."""
-    head, *properties = lines
-    if len(head) != 3 or not head[2].isdecimal() or len(head[2]) > _DIGITS:
-        raise FormatError(f"{path} has a malformed line in its header: {' '.join(head)[:80]}.")
-    name, count = head[1], int(head[2])
-    for line in properties:
-        is_list = line[0] == "property" and line[1:2] == ["list"] and len(line) == 5
-        if not is_list and (line[0] != "property" or len(line) != 3 or line[1] not in _TYPES):
-            raise FormatError(
-                f"{path} has a {name} with {' '.join(line)[:80]}, which is no number.")
-    names = [line[-1] for line in properties]
-    if len(set(names)) != len(names):
-        raise FormatError(f"{path} names a property of {name} twice.")
-    if not properties:
-        raise FormatError(f"{path} has a {name} without properties.")
-    if any(len(line) == 5 for line in properties):
-        return Element(name, count, None)
-    types = [_ORDERS[kind] + _TYPES[line[1]] for line in properties]
-    return Element(name, count, np.dtype(list(zip(names, types, strict=True))))
-
-
-def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
-    """Returns the rows of every element by its name.
-
-    FormatError if the size is not what the header says, or an element holds lists, as in a mesh.
-    """
-    for element in header.elements:
-        if element.count and element.row is None:
-            content = "a mesh" if element.name in _OF_MESHES else "lists"
-            raise FormatError(
-                f"{header.path} holds other elements than vertices: {element.count} of "
-                f"{element.name}, which is {content}, not Gaussians.")
-    return _read(header, header.elements, exact=True)
-
-
-def _read(
-    header: Header, elements: tuple[Element, ...], *, exact: bool
-) -> dict[str, NDArray[np.void]]:
-    """Returns the rows of the first elements; `exact` demands that nothing follows."""
-    rows = [(each.name, each.count, each.row) for each in elements if each.row is not None]
-    is_text = header.format == "ascii"
-    try:
-        with header.path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size - header.offset
-            if is_text:  # a number takes a digit and a space, except at the end
-                fits = sum(2 * count * len(row.names or ()) for _, count, row in rows) <= size + 1
-            else:
-                promised = sum(count * row.itemsize for _, count, row in rows)
-                fits = promised == size if exact else promised <= size
-            if not fits:
-                listed = ", ".join(
-                    f"{count} of {name} of {row.itemsize} bytes" for name, count, row in rows)
-                raise _wrong_size(header, listed, f"{size} bytes of data")
-            file.seek(header.offset)
-            data = file.read(size if is_text else promised)
-    except OSError as error:
-        raise FormatError(f"{header.path} cannot be read: {error}.") from error
-    if is_text:
-        return _text_tables(header, rows, data, exact=exact)
-    tables, start = {}, 0
-    for name, count, row in rows:
-        tables[name] = np.frombuffer(data[start:start + count * row.itemsize], row)
-        start += count * row.itemsize
-    return tables
-
-
-def _wrong_size(header: Header, promised: str, actual: str) -> FormatError:
-    return FormatError(
-        f"{header.path} promises {promised} but holds {actual}: it is truncated or damaged.",
-        hint="Write or copy the file again.")
-
-
-def _text_tables(
-    header: Header, rows: list[tuple[str, int, np.dtype[np.void]]], data: bytes, *, exact: bool
-) -> dict[str, NDArray[np.void]]:
-    lines = [line for line in data.decode("ascii", "replace").splitlines() if line.strip()]
-    promised = sum(count for _, count, _ in rows)
-    if len(lines) < promised or (exact and len(lines) > promised):
-        raise _wrong_size(header, f"{promised} rows", f"{len(lines)}")
-    tables, start = {}, 0
-    for name, count, row in rows:
-        try:
-            tables[name] = _parse_rows(lines[start:start + count], row)
-        except ValueError as error:
-            raise FormatError(
-                f"{header.path} has rows of {name} that are not {len(row.names or ())} numbers: "
-                f"{error}.") from error
-        start += count
-    return tables
-
-
-def _parse_rows(lines: list[str], row: np.dtype[np.void]) -> NDArray[np.void]:
-    """Returns rows of numbers, or raises ValueError."""
-    table = np.zeros(len(lines), row)
-    if not lines:
-        return table  # numpy warns of nothing to load
-    names = row.names or ()
-    columns = np.loadtxt(lines, comments=None, ndmin=2).reshape(len(lines), len(names)).T
-    for name, values in zip(names, columns, strict=True):
-        kind = row[name]
-        if kind.kind in "ui":
-            limits = np.iinfo(kind)
-            if not ((values >= limits.min) & (values <= limits.max)).all():  # NaN fails too
-                raise ValueError(f"{name} is no {kind.name}")
-        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
-            table[name] = values
-    return table
-
-
 def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     """Returns positions [P, 3] and RGB colours [P, 3], None where the file has no colours.
 
@@ -419,7 +349,7 @@ def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
     names = first.row.names or ()
     if not set(_POSITION) <= set(names):
         raise FormatError(f"{path} has points with the properties {', '.join(names)}.")
-    rows = _read(header, (first,), exact=False)[first.name]
+    rows = read_elements(header, (first,), exact=False)[first.name]
     points = np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
     if not np.isfinite(points).all():
         raise FormatError(f"{path} holds a point that is not finite.")

@@ -7,7 +7,8 @@ import pytest
 import torch
 from scenes import random_splats, with_harmonics
 
-from recon_cli.io.ply import max_gaussians, read_header, read_ply, read_tables, write_ply
+from recon_cli.io.ply import max_gaussians, read_ply, write_ply
+from recon_cli.io.ply_tables import read_header, read_tables
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, transformed

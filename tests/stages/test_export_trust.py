@@ -9,7 +9,8 @@ from tiny_stages import CONTEXT
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import StageError
-from recon_cli.io.ply import read_header, read_ply, read_tables
+from recon_cli.io.ply import read_ply
+from recon_cli.io.ply_tables import read_header, read_tables
 from recon_cli.io.records import ImportRecord
 from recon_cli.stages import export
 from recon_cli.trust.ply_property import PLY_PROPERTY, match_rows

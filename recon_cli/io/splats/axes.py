@@ -1,0 +1,52 @@
+"""Axes of splat files by what x, y and z point at, and the way into the axes of recon.
+
+A name such as "rdf" is read as x right, y down, z front. Those that have up or down on y are turned
+into "rdf", the axes of a .ply, whose up is -y; those that have it on z into "rfu", whose up is z.
+Both take nothing but changes of sign. The numbers are those of the extension 0xADBE0003 of SPZ
+(https://github.com/nianticlabs/spz, `CoordinateSystem`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from recon_cli.scene.harmonics import basis_rest
+from recon_cli.scene.splats import Splats
+
+# By number, from 1 on, as of its release 3; drafts had the last eight in another order.
+AXES = ("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf",
+        "lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu")
+PLY, Z_UP = "rdf", "rfu"
+
+
+def up_of(axes: str) -> str:
+    """Returns the axis that is up once a scene of these axes is in those of recon: -y or z."""
+    return "-y" if axes[1] in "du" else "z"
+
+
+def turn_from(axes: str, splats: Splats) -> Splats:
+    """Returns Gaussians of a file with these axes in "rdf", or "rfu" if their up is along z."""
+    return flip(splats, signs(axes))
+
+
+def signs(axes: str) -> list[int]:
+    """Returns what each axis is multiplied with, 1 or -1, to get to "rdf" or "rfu"."""
+    ours = PLY if up_of(axes) == "-y" else Z_UP
+    return [1 if theirs == own else -1 for theirs, own in zip(axes, ours, strict=True)]
+
+
+def flip(splats: Splats, signs: list[int]) -> Splats:
+    """Returns the Gaussians with each axis times a sign [3], without rounding."""
+    if signs == [1, 1, 1]:
+        return splats
+    x, y, z = signs
+    factors = splats.means.new_tensor(signs)
+    direction = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)  # where no basis function is 0
+    parity = (basis_rest(direction * factors.double(), 3) / basis_rest(direction, 3)).round()
+    return replace(
+        splats, means=splats.means * factors,
+        sh_rest=splats.sh_rest * parity[:splats.sh_rest.shape[1], None].to(splats.means),
+        # an axial vector: mirroring one axis turns the other way about the other two
+        quats=splats.quats * splats.quats.new_tensor([1, y * z, x * z, x * y]))
