@@ -1,0 +1,275 @@
+"""Runs `recon` commands in forked children of a process that has imported everything.
+
+A start of Python and torch takes seconds, a fork milliseconds. Each command still is a process of
+its own, so a crash, a hang, a signal and an exit code are seen as the user would see them. What the
+command starts itself (`python -m recon_cli...`) is forked as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib.metadata
+import os
+import resource
+import runpy
+import select
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+MEMORY_BYTES = 16 << 30  # of address space: what a hostile input asks for must not stop the machine
+_ORPHAN_SECONDS = 4.0  # that a child may take to notice the end of its parent
+_ONE_THREAD = {name: "1" for name in (
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
+
+
+@dataclass(frozen=True)
+class Finished:
+    """How a command ended."""
+
+    words: tuple[str, ...]  # after `recon`
+    code: int  # negative for a signal
+    out: str
+    err: str
+    seconds: float
+    timed_out: bool = False
+    orphans: tuple[str, ...] = ()  # processes that outlived it
+
+    def __str__(self) -> str:
+        how = "timed out" if self.timed_out else f"exit code {self.code}"
+        return f"recon {' '.join(self.words)}: {how} in {self.seconds:.1f} s"
+
+
+def preload() -> None:
+    """Imports what commands need and compiles the kernels; starts no thread, for forks lose them.
+
+    Must come before anything imports torch or numpy.
+    """
+    os.environ.update(_ONE_THREAD)
+    from recon_cli import cli
+    from recon_cli.lazy import load
+    from recon_cli.stages import IMPORT, STAGES
+
+    for place, _ in cli.VERBS.values():
+        load(f"recon_cli.commands.{place}")
+    for row in (*STAGES, IMPORT):
+        load(f"{row.module}.run")
+    for late in ("recon_cli.flythrough.run.render_frames", "recon_cli.report.build.write_report",
+                 "recon_cli.io.splats.registry.FORMATS"):
+        load(late)
+    import cv2
+    import pycolmap  # noqa: F401 - the mapping process is forked, too
+    import torch
+
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    load("recon_cli.render.registry.prepare")("numba", lambda: None)
+    gc.freeze()  # else each child copies every page that its first collection marks
+
+
+@dataclass
+class Running:
+    """A command that runs."""
+
+    words: tuple[str, ...]
+    pid: int
+    log: Path  # .out and .err
+    begin: float
+
+    def signal(self, number: int) -> None:
+        """Sends a signal to the command, not to what it started."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, number)
+
+    def wait(self, limit: float) -> bool:
+        """Returns whether the command ends within so many seconds."""
+        descriptor = os.pidfd_open(self.pid)
+        try:
+            poll = select.poll()
+            poll.register(descriptor, select.POLLIN)
+            return bool(poll.poll(max(0.0, limit) * 1000))
+        finally:
+            os.close(descriptor)
+
+    def finish(self, limit: float) -> Finished:
+        """Waits for the end; kills what takes longer, and whatever outlives the command."""
+        timed_out = not self.wait(limit)
+        if timed_out:
+            os.kill(self.pid, signal.SIGKILL)
+        _, status = os.waitpid(self.pid, 0)
+        seconds = time.monotonic() - self.begin
+        orphans = () if timed_out else tuple(_orphans())
+        _end_children()
+        out, err = (self.log.with_suffix(kind).read_bytes().decode(errors="replace")
+                    for kind in (".out", ".err"))
+        return Finished(self.words, os.waitstatus_to_exitcode(status), out, err, seconds,
+                        timed_out, orphans)
+
+
+def start(
+    words: Sequence[str], *, cwd: Path, log: Path, prepare: Callable[[], None] | None = None
+) -> Running:
+    """Starts a command in a forked child; `prepare` is called in it before anything else."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    begin, pid = time.monotonic(), os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            _enter(cwd, log)
+            if prepare is not None:
+                prepare()
+            code = _run_entry_point(words)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            _leave(code)
+    return Running(tuple(words), pid, log, begin)
+
+
+def start_process(words: Sequence[str], *, cwd: Path, log: Path) -> Running:
+    """Starts a command as the user would: a new process."""
+    begin = time.monotonic()
+    with log.with_suffix(".out").open("wb") as out, log.with_suffix(".err").open("wb") as err:
+        process = subprocess.Popen(
+            [str(Path(sys.executable).with_name("recon")), *words], cwd=cwd,
+            stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True)
+    process.returncode = 0  # `finish` waits for it by its number
+    return Running(tuple(words), process.pid, log, begin)
+
+
+def _enter(cwd: Path, log: Path) -> None:
+    """Makes the child look like a process that a shell started."""
+    os.setsid()
+    for number, path, flags in (
+            (0, os.devnull, os.O_RDONLY),
+            *((at, log.with_suffix(kind), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+              for at, kind in ((1, ".out"), (2, ".err")))):
+        descriptor = os.open(path, flags)
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+    os.chdir(cwd)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+    subprocess.Popen = _ForkedPopen  # type: ignore[misc]
+
+
+def _run_entry_point(words: Sequence[str]) -> int:
+    """Runs what the script `recon` runs, and returns the exit code."""
+    sys.argv = ["recon", *words]
+    (entry,) = importlib.metadata.entry_points(group="console_scripts", name="recon")
+    try:
+        return _exit_code(entry.load()())
+    except SystemExit as end:
+        return _exit_code(end.code)
+
+
+def _exit_code(value: object) -> int:
+    return value & 255 if isinstance(value, int) else int(value is not None)
+
+
+def _leave(code: int) -> None:
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):
+            stream.flush()
+    os._exit(code)
+
+
+class _ForkedPopen(subprocess.Popen[Any]):
+    """Forks `python [-P] -m recon_cli...` in place of starting it anew; anything else runs."""
+
+    def __init__(self, args: Any, *more: Any, **options: Any) -> None:
+        module, words = _module_of(args)
+        if module:
+            sys.stdout.flush()
+            options["preexec_fn"] = lambda: _become(module, words, options.get("env"))
+        super().__init__(args, *more, **options)
+
+
+def _module_of(args: Any) -> tuple[str, list[str]]:
+    """Returns the module of ours that a command runs, and its arguments."""
+    if not isinstance(args, (list, tuple)) or str(args[0]) != sys.executable or "-m" not in args:
+        return "", []
+    at = args.index("-m")
+    module = str(args[at + 1])
+    ours = module.split(".")[0] == "recon_cli"
+    return (module if ours else "", [str(word) for word in args[at + 2:]])
+
+
+def _become(module: str, words: list[str], environment: dict[str, str] | None) -> None:
+    """Runs a module in place of the program that the child was to become."""
+    os.closerange(3, 1024)  # among them the pipe whose end tells Popen that the program runs
+    gc.enable()
+    if environment is not None:
+        os.environ.clear()
+        os.environ.update(environment)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT
+                          else signal.SIG_DFL)
+    sys.argv = [module, *words]
+    code = 1
+    try:
+        runpy.run_module(
+            f"{module}.__main__" if module == "recon_cli" else module, run_name="__main__")
+        code = 0
+    except SystemExit as end:
+        code = _exit_code(end.code)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        _leave(code)
+
+
+def adopt_orphans() -> None:
+    """Makes this process the parent of whatever its children leave behind (Linux)."""
+    import ctypes
+
+    ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
+
+
+def _orphans() -> Iterator[str]:
+    """Yields the processes that are still there when they should have ended."""
+    end = time.monotonic() + _ORPHAN_SECONDS
+    while (alive := _children()) and time.monotonic() < end:
+        time.sleep(0.02)
+    for process in alive:
+        with contextlib.suppress(psutil.Error):
+            yield f"{process.pid} {process.status()}"
+
+
+# Commands that run beside the one that is waited for; they are nobody's orphans.
+known: set[int] = set()
+
+
+def _children() -> list[psutil.Process]:
+    found = []
+    for process in psutil.Process().children():
+        with contextlib.suppress(psutil.Error):
+            if process.pid in known:
+                continue
+            if process.status() == psutil.STATUS_ZOMBIE:
+                with contextlib.suppress(ChildProcessError):
+                    os.waitpid(process.pid, os.WNOHANG)
+                continue
+            found.append(process)
+    return found
+
+
+def _end_children() -> None:
+    for process in _children():
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+            process.wait(5)
