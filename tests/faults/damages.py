@@ -14,8 +14,8 @@ from typing import Any
 Damage = Callable[[Path, random.Random, Path], None]
 DEEP = "[" * 100_000
 NUMBERS = ("NaN", "Infinity", "-Infinity", "1e999", "9" * 5000, "-1", "null", '"x"', "[]", "{}",
-           "true", "1e300", "0", "0.5", "99999999999", f'"{"x" * 5000}"', '"\\udcff"', '"a\\u0000b"',
-           '"../../x"')
+           "true", "1e300", "0", "0.5", "99999999999", f'"{"x" * 5000}"', '"\\udcff"',
+           '"a\\u0000b"', '"../../x"')
 
 
 def flip(path: Path, rng: random.Random, _spare: Path) -> None:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from case import Case
+from forked import Finished
 from judge import (
     RIGHT,
     Outcome,
@@ -43,6 +44,14 @@ def mount(folder: Path, size: int, *, again: bool = False) -> bool:
         return False
     return libc.mount(b"tmpfs", os.fsencode(folder), b"tmpfs", _REMOUNT if again else 0,
                       f"size={size}".encode()) == 0
+
+
+def can_mount(folder: Path) -> bool:
+    """Returns whether this process may mount a tmpfs; tried in a child."""
+    pid = os.fork()
+    if pid == 0:
+        os._exit(not mount(folder, 1 << 20))
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
 def _pages(folder: Path) -> int:
@@ -112,7 +121,7 @@ def limited_files(case: Case) -> Verdict:
 
 
 def _judge(case: Case, verb: str, words: Sequence[str], workspace: Path, tops: set[str],
-           right: Path, done, free) -> Verdict:
+           right: Path, done: Finished, free: Callable[[], object]) -> Verdict:
     before = {} if verb == "import" else snapshot(case.lab.tiny)
     before = {name: digest for name, digest in before.items() if name.split("/")[0] not in tops}
     if lost := lost_files(before, workspace, spares(verb)):

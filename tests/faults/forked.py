@@ -8,6 +8,7 @@ command starts itself (`python -m recon_cli...`) is forked as well.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import importlib.metadata
 import os
@@ -24,12 +25,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import psutil
+import pycolmap  # noqa: F401 - the mapping process is forked, too
+import torch
+
+from recon_cli import cli
+from recon_cli.lazy import load
+from recon_cli.stages import IMPORT, STAGES
 
 MEMORY_BYTES = 16 << 30  # of address space: what a hostile input asks for must not stop the machine
 _ORPHAN_SECONDS = 4.0  # that a child may take to notice the end of its parent
-_ONE_THREAD = {name: "1" for name in (
-    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
 
 
 @dataclass(frozen=True)
@@ -52,13 +58,8 @@ class Finished:
 def preload() -> None:
     """Imports what commands need and compiles the kernels; starts no thread, for forks lose them.
 
-    Must come before anything imports torch or numpy.
+    What imports this module has set OMP_NUM_THREADS=1 before.
     """
-    os.environ.update(_ONE_THREAD)
-    from recon_cli import cli
-    from recon_cli.lazy import load
-    from recon_cli.stages import IMPORT, STAGES
-
     for place, _ in cli.VERBS.values():
         load(f"recon_cli.commands.{place}")
     for row in (*STAGES, IMPORT):
@@ -66,10 +67,6 @@ def preload() -> None:
     for late in ("recon_cli.flythrough.run.render_frames", "recon_cli.report.build.write_report",
                  "recon_cli.io.splats.registry.FORMATS"):
         load(late)
-    import cv2
-    import pycolmap  # noqa: F401 - the mapping process is forked, too
-    import torch
-
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     load("recon_cli.render.registry.prepare")("numba", lambda: None)
@@ -108,7 +105,7 @@ class Running:
         _, status = os.waitpid(self.pid, 0)
         seconds = time.monotonic() - self.begin
         orphans = () if timed_out else tuple(_orphans())
-        _end_children()
+        end_children()
         out, err = (self.log.with_suffix(kind).read_bytes().decode(errors="replace")
                     for kind in (".out", ".err"))
         return Finished(self.words, os.waitstatus_to_exitcode(status), out, err, seconds,
@@ -235,8 +232,6 @@ def _become(module: str, words: list[str], environment: dict[str, str] | None) -
 
 def adopt_orphans() -> None:
     """Makes this process the parent of whatever its children leave behind (Linux)."""
-    import ctypes
-
     ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
 
 
@@ -268,7 +263,8 @@ def _children() -> list[psutil.Process]:
     return found
 
 
-def _end_children() -> None:
+def end_children() -> None:
+    """Ends whatever the commands left behind."""
     for process in _children():
         with contextlib.suppress(psutil.Error):
             process.kill()

@@ -98,10 +98,12 @@ def _boxes(path: Path, rng: random.Random) -> Path:
     """Changes the size, the number of entries or a time in a box of an MP4."""
     data = bytearray(path.read_bytes())
     names = [name for name in (b"moov", b"trak", b"mdhd", b"stsz", b"stco", b"stts", b"stsd",
-                               b"ctts", b"stss", b"elst", b"mvhd", b"stsc", b"avcC") if name in data]
+                               b"ctts", b"stss", b"elst", b"mvhd", b"stsc", b"avcC")
+             if name in data]
     box = data.index(rng.choice(names))
     at = box + rng.choice((-4, 4, 8, 12, 16))
-    data[at:at + 4] = rng.choice((b"\xff\xff\xff\xff", b"\0\0\0\0", b"\0\0\0\1", b"\x7f\xff\xff\xff"))
+    data[at:at + 4] = rng.choice(
+        (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\0\0\0\1", b"\x7f\xff\xff\xff"))
     path.write_bytes(data)
     return path
 
@@ -119,9 +121,11 @@ def _named(name: str | bytes) -> Callable[[Path, random.Random], Path]:
 
 _CHANGES: dict[str, Callable[[Path, random.Random], Path]] = {
     "in a zip": _zipped, "huge": _huge, "boxes": _boxes, "boxes 2": _boxes, "boxes 3": _boxes,
-    "/dev/zero": _device("/dev/zero"), "/dev/null": _device("/dev/null"), "/": _device("/proc"),
+    "/dev/zero": _device("/dev/zero"), "/dev/null": _device("/dev/null"),
+    "/dev/full": _device("/dev/full"),
     "a long path": _device("/" + "a" * 5000), "a long name": _device("/tmp/" + "a" * 300 + ".mp4"),
-    "not UTF-8": _named(b"x\xff\xfe.mp4"), "newline": _named("a\nb.mp4"), "quote": _named("a'\".mp4"),
+    "not UTF-8": _named(b"x\xff\xfe.mp4"), "newline": _named("a\nb.mp4"),
+    "quote": _named("a'\".mp4"),
     "percent": _named("%d %s.mp4"), "colon": _named("file:x.mp4"), "dash": _named("-x.mp4"),
     "brackets": _named("[a]*?.mp4"), "empty word": _device("")}
 
@@ -149,7 +153,8 @@ def _spoil_text(path: Path, rng: random.Random, what: str) -> None:
     if what == "line":
         lines = text.splitlines(keepends=True)
         at = rng.randrange(len(lines)) if lines else 0
-        lines[at:at + 1] = rng.choice(([], lines[at:at + 1] * 2, ["\n"], ["# \n"], ["x " * 50 + "\n"]))
+        lines[at:at + 1] = rng.choice(
+            ([], lines[at:at + 1] * 2, ["\n"], ["# \n"], ["x " * 50 + "\n"]))
         text = "".join(lines)
     else:
         pattern = r"[-+]?\d[\d.eE+-]*" if what == "number" else r"[A-Za-z_][\w./]*"

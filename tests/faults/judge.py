@@ -74,7 +74,7 @@ def wrong(kind: Outcome, done: Finished | None, text: str = "") -> Verdict:
 def _last_words(done: Finished) -> str:
     lines = [line for line in done.err.splitlines() if line.strip()]
     told = [line for line in lines if line.startswith(("error:", "hint:"))]
-    return " / ".join(told or lines[-2:])[:600]
+    return " / ".join(line[:250] for line in told or lines[-2:])
 
 
 def broken(done: Finished) -> Verdict | None:
@@ -83,7 +83,7 @@ def broken(done: Finished) -> Verdict | None:
         return wrong(Outcome.HANG, done)
     if done.orphans:
         return wrong(Outcome.CRASH, done, f"processes outlived it: {', '.join(done.orphans)}")
-    if done.code < 0 or done.code >= 128 and done.code not in INTERRUPTED.values():
+    if done.code < 0 or (done.code >= 128 and done.code not in INTERRUPTED.values()):
         return wrong(Outcome.CRASH, done)
     if done.code == 1 or "Traceback (most" in done.err or "This is a bug" in done.err:
         return wrong(Outcome.BUG, done)
@@ -137,8 +137,8 @@ def follow_hint(
         found = verdict
     tried = run(words)
     text = f"typed `recon {' '.join(words)}`"
-    if tried.code == 2 and "Usage" in tried.err + tried.out or tried.code == 2 and (
-            "no such" in tried.err.lower()):
+    if (tried.code == 2 and "Usage" in tried.err + tried.out) or (tried.code == 2 and (
+            "no such" in tried.err.lower())):
         return worst([found, wrong(Outcome.NO_HINT, tried, f"{text}, as the hint of {done} says")])
     if bad := broken(tried):
         return worst([bad, found])
@@ -220,6 +220,9 @@ def _same(lab: Lab, name: str, right: Path, workspace: Path) -> bool:
     if not (one.is_file() and other.is_file()):
         return False
     first, second = one.read_bytes(), other.read_bytes()
+    if name == "report.html":
+        first = first.replace(os.fsencode(lab.made), b"@")
+        second = second.replace(os.fsencode(workspace), b"@")
     if first == second or (name in lab.unstable and not name.endswith(".json")):
         return True
     if name in lab.unstable:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from case import Case
+from forked import Finished
 from judge import (
     INTERRUPTED,
     RIGHT,
@@ -134,11 +135,11 @@ def interrupt(case: Case) -> Verdict:
     case.tell(f"{number.name} at change {at}")
     done = case.finish(case.start(
         *words, moments=Moments(workspace), at=at, act=sending(number)))
-    return worst_of_signal(case, done, number) or _finish_after(
+    return _fault_of_signal(done, number) or _finish_after(
         case, verb, words, workspace, right, tops, before)
 
 
-def worst_of_signal(case: Case, done, number: int) -> Verdict | None:
+def _fault_of_signal(done: Finished, number: int) -> Verdict | None:
     """Returns what is wrong about how a command ended upon a signal."""
     if done.code == 0:  # it was done already
         return broken(done)
@@ -185,7 +186,7 @@ def process_signal(case: Case) -> Verdict:
         return wrong(Outcome.CRASH, done, f"processes outlived it: {done.orphans}")
     if done.timed_out:
         return wrong(Outcome.HANG, done, f"{time.monotonic() - begin:.0f} s after the signal")
-    if number != signal.SIGKILL and (bad := worst_of_signal(case, done, number)):
+    if number != signal.SIGKILL and (bad := _fault_of_signal(done, number)):
         return bad
     if workspace and (gone := vanished(before, workspace, removed=words)):
         return wrong(Outcome.LOST, done, f"{gone} are gone")

@@ -74,6 +74,11 @@ class Lab:
         """The finished workspace, with render/ and report.html."""
         return self.root / "tiny"
 
+    @property
+    def made(self) -> Path:
+        """Where the report of the finished workspace was written, which names that folder."""
+        return self.root / "making" / "ws"
+
     def half(self, stage: str) -> Path:
         """A workspace in which a stage was interrupted."""
         return self.root / f"half-{stage}"
@@ -127,7 +132,7 @@ def make(root: Path, rng: random.Random) -> Lab:
         _sound(lab, VERBS[stage], "-w", str(lab.tiny))
     _export_formats(lab)
     for verb, words in FULL.items():
-        target = copy(lab.tiny, work / verb)
+        target = copy(lab.tiny, lab.made)
         moments = Moments(target)
         done = _sound(lab, *words, "-w", str(target), moments=moments)
         lab.moments[verb], lab.seconds[verb] = moments.count, done.seconds
@@ -154,7 +159,7 @@ def _sound(lab: Lab, *words: str, moments: Moments | None = None) -> Finished:
     log.parent.mkdir(exist_ok=True)
     running = start(words, cwd=lab.root, log=log, prepare=moments.watch if moments else None)
     done = running.finish(4 * LIMIT)
-    assert done.code == 0 and not done.orphans, f"{done}\n{done.err}"
+    assert (done.code, done.orphans) == (0, ()), f"{done}\n{done.err}"
     return done
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import select
 import signal
 import struct
 import sys
@@ -73,8 +74,6 @@ class Gate:
 
     def reached(self, limit: float) -> bool:
         """Returns whether the command comes here within so many seconds."""
-        import select
-
         return bool(select.select([self._reached], [], [], limit)[0])
 
     def let_through(self) -> None:

@@ -23,19 +23,25 @@ import click
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[1:1] = [str(ROOT / "tests"), str(ROOT / "tests" / "bench")]
+# Threads do not survive a fork, so nothing may start any; torch and others look here on import.
+os.environ.update(dict.fromkeys((
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"))
 # As in tests/conftest.py: kernels are kept from run to run, but not among the user's own.
 os.environ.setdefault("RECON_CACHE_DIR", str(ROOT / ".pytest_cache" / "recon"))
 os.environ.pop("RECON_WORKSPACE", None)
+
+import forked
+from case import Case
+from disk_kinds import can_mount
+from judge import Outcome, Verdict
+from kinds import KINDS, schedule
+from lab import Lab, make
+
 FAULT_SECONDS = 400  # a fault runs a few commands, each with a limit of its own
 
 
 def _run_fault(root: Path, seed: int, number: int, keep: bool) -> dict[str, object]:
     """Injects one fault, in this process; returns its row of the report."""
-    from case import Case
-    from judge import Outcome, Verdict
-    from kinds import schedule
-    from lab import Lab
-
     kind, turn = schedule(number + 1)[number]
     folder = Path(tempfile.mkdtemp(prefix=f"{number}-", dir=root / "faults"))
     case = Case(Lab.load(root), random.Random(f"{seed} {number}"), turn + 131 * seed, folder)
@@ -53,9 +59,6 @@ def _run_fault(root: Path, seed: int, number: int, keep: bool) -> dict[str, obje
 
 def _fork_fault(root: Path, seed: int, number: int, keep: bool) -> None:
     """Injects one fault in a child, so that whatever happens to it ends with it."""
-    import forked
-    from judge import Outcome
-
     report = root / "reports" / f"{number}.json"
     pid = os.fork()
     if pid == 0:
@@ -70,6 +73,7 @@ def _fork_fault(root: Path, seed: int, number: int, keep: bool) -> None:
         finally:
             os._exit(0)
     os.waitpid(pid, 0)
+    forked.end_children()
     if not report.exists():
         report.write_text(json.dumps({
             "number": number, "kind": "campaign", "outcome": int(Outcome.HANG), "story": [],
@@ -78,6 +82,7 @@ def _fork_fault(root: Path, seed: int, number: int, keep: bool) -> None:
 
 def _work(root: Path, seed: int, numbers: list[int], core: int, keep: bool) -> None:
     """Takes faults that nobody took yet until there are none."""
+    forked.adopt_orphans()
     os.sched_setaffinity(0, {core})  # one thread a fault: as many faults at once as cores
     for number in numbers:
         with contextlib.suppress(FileExistsError):
@@ -115,7 +120,6 @@ def _run_all(root: Path, seed: int, numbers: list[int], workers: int, keep: bool
 
 
 def _print_row(row: dict[str, object], seed: int, verbose: bool) -> None:
-    from judge import Outcome
 
     outcome = Outcome(row["outcome"])
     if verbose:
@@ -134,15 +138,13 @@ def _first(row: dict[str, object]) -> str:
 
 def _table(rows: list[dict[str, object]]) -> str:
     """Returns kinds by outcome."""
-    from judge import Outcome
-    from kinds import KINDS
-
     counts = Counter((row["kind"], row["outcome"]) for row in rows)
     names = [kind.name for kind in KINDS] + ["campaign"]
     lines = [["kind", *(outcome.words for outcome in Outcome)]]
     lines += [[name, *(str(counts[name, outcome] or "") for outcome in Outcome)]
               for name in names if any(counts[name, outcome] for outcome in Outcome)]
-    lines.append(["all", *(str(sum(counts[name, outcome] for name in names)) for outcome in Outcome)])
+    lines.append(["all", *(str(sum(counts[name, outcome] for name in names))
+                           for outcome in Outcome)])
     widths = [max(len(line[at]) for line in lines) for at in range(len(lines[0]))]
     return "\n".join("  ".join(
         [line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(
@@ -160,14 +162,11 @@ def _table(rows: list[dict[str, object]]) -> str:
 def main(seed: int, count: int, only: tuple[int, ...], kind: str | None, workers: int | None,
          keep: bool, verbose: bool) -> None:
     """Inject faults; print what ended badly, and a table of kinds by outcome."""
-    import forked
-
     begin = time.monotonic()
+    sys.stdout.reconfigure(errors="backslashreplace")  # names need not be UTF-8
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})  # results must be those of one thread, like the faults'
     forked.preload()
-    from kinds import schedule
-    from lab import make
 
     numbers = list(only) or [number for number, (each, _) in enumerate(schedule(count))
                              if kind in (None, each.name)]
@@ -175,8 +174,9 @@ def main(seed: int, count: int, only: tuple[int, ...], kind: str | None, workers
     try:
         forked.adopt_orphans()
         make(root, random.Random(seed))
+        disks = "a tmpfs" if can_mount(root / "making") else "a limit on files, for want of a tmpfs"
         click.echo(f"{len(numbers)} faults of seed {seed}, in {root} "
-                   f"({time.monotonic() - begin:.0f} s to prepare)")
+                   f"({time.monotonic() - begin:.0f} s to prepare); full disks are {disks}")
         os.sched_setaffinity(0, cores)
         rows = _run_all(root, seed, numbers, workers or len(cores), keep, verbose)
     finally:
