@@ -64,11 +64,11 @@ class Case:
             if moments is not None:
                 moments.watch(at, act)
 
-        return start(words, cwd=self.folder, log=self._log(), prepare=ready)
+        return start(words, cwd=self.folder, prepare=ready)
 
     def start_process(self, *words: str) -> Running:
         """Starts a command as a new process of Python."""
-        return start_process(words, cwd=self.folder, log=self._log())
+        return start_process(words, cwd=self.folder)
 
     def finish(self, running: Running, limit: float = LIMIT) -> Finished:
         """Returns how a command ended."""
@@ -80,9 +80,6 @@ class Case:
     def run(self, *words: str, prepare: Callable[[], None] | None = None) -> Finished:
         """Runs a command to its end."""
         return self.finish(self.start(*words, prepare=prepare))
-
-    def _log(self) -> Path:
-        return self.folder / f"log{len(self.ran)}-{self.rng.randrange(1 << 30)}"
 
     def judge_error(self, done: Finished, workspace: Path | None, *, follow: bool = True
                     ) -> Verdict:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import gc
 import importlib.metadata
 import os
@@ -35,6 +36,7 @@ from recon_cli.lazy import load
 from recon_cli.stages import IMPORT, STAGES
 
 MEMORY_BYTES = 16 << 30  # of address space: what a hostile input asks for must not stop the machine
+_PIPE_BYTES = 1 << 20
 _ORPHAN_SECONDS = 4.0  # that a child may take to notice the end of its parent
 
 
@@ -73,13 +75,32 @@ def preload() -> None:
     gc.freeze()  # else each child copies every page that its first collection marks
 
 
+class Said:
+    """What a command prints: a pipe with room for all of it, which no full disk stops."""
+
+    def __init__(self) -> None:
+        self._source, self.target = os.pipe()
+        fcntl.fcntl(self.target, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+
+    def read(self) -> str:
+        """Returns what was printed; to be called once, when the command has ended."""
+        os.close(self.target)
+        os.set_blocking(self._source, False)  # something that outlives it may hold the other end
+        data = b""
+        with contextlib.suppress(BlockingIOError):
+            while more := os.read(self._source, _PIPE_BYTES):
+                data += more
+        os.close(self._source)
+        return data.decode(errors="replace")
+
+
 @dataclass
 class Running:
     """A command that runs."""
 
     words: tuple[str, ...]
     pid: int
-    log: Path  # .out and .err
+    said: tuple[Said, Said]  # on stdout and stderr
     begin: float
 
     def signal(self, number: int) -> None:
@@ -106,23 +127,23 @@ class Running:
         seconds = time.monotonic() - self.begin
         orphans = () if timed_out else tuple(_orphans())
         end_children()
-        out, err = (self.log.with_suffix(kind).read_bytes().decode(errors="replace")
-                    for kind in (".out", ".err"))
+        out, err = (stream.read() for stream in self.said)
         return Finished(self.words, os.waitstatus_to_exitcode(status), out, err, seconds,
                         timed_out, orphans)
 
 
 def start(
-    words: Sequence[str], *, cwd: Path, log: Path, prepare: Callable[[], None] | None = None
+    words: Sequence[str], *, cwd: Path, prepare: Callable[[], None] | None = None
 ) -> Running:
     """Starts a command in a forked child; `prepare` is called in it before anything else."""
     sys.stdout.flush()
     sys.stderr.flush()
+    said = Said(), Said()
     begin, pid = time.monotonic(), os.fork()
     if pid == 0:
         code = 1
         try:
-            _enter(cwd, log)
+            _enter(cwd, said)
             if prepare is not None:
                 prepare()
             code = _run_entry_point(words)
@@ -130,30 +151,25 @@ def start(
             traceback.print_exc()
         finally:
             _leave(code)
-    return Running(tuple(words), pid, log, begin)
+    return Running(tuple(words), pid, said, begin)
 
 
-def start_process(words: Sequence[str], *, cwd: Path, log: Path) -> Running:
+def start_process(words: Sequence[str], *, cwd: Path) -> Running:
     """Starts a command as the user would: a new process."""
-    begin = time.monotonic()
-    with log.with_suffix(".out").open("wb") as out, log.with_suffix(".err").open("wb") as err:
-        process = subprocess.Popen(
-            [str(Path(sys.executable).with_name("recon")), *words], cwd=cwd,
-            stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True)
+    said, begin = (Said(), Said()), time.monotonic()
+    process = subprocess.Popen(
+        [str(Path(sys.executable).with_name("recon")), *words], cwd=cwd, start_new_session=True,
+        stdin=subprocess.DEVNULL, stdout=said[0].target, stderr=said[1].target)
     process.returncode = 0  # `finish` waits for it by its number
-    return Running(tuple(words), process.pid, log, begin)
+    return Running(tuple(words), process.pid, said, begin)
 
 
-def _enter(cwd: Path, log: Path) -> None:
+def _enter(cwd: Path, said: tuple[Said, Said]) -> None:
     """Makes the child look like a process that a shell started."""
     os.setsid()
-    for number, path, flags in (
-            (0, os.devnull, os.O_RDONLY),
-            *((at, log.with_suffix(kind), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-              for at, kind in ((1, ".out"), (2, ".err")))):
-        descriptor = os.open(path, flags)
+    for number, descriptor in enumerate((
+            os.open(os.devnull, os.O_RDONLY), said[0].target, said[1].target)):
         os.dup2(descriptor, number)
-        os.close(descriptor)
     os.chdir(cwd)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
@@ -207,7 +223,9 @@ def _module_of(args: Any) -> tuple[str, list[str]]:
 
 def _become(module: str, words: list[str], environment: dict[str, str] | None) -> None:
     """Runs a module in place of the program that the child was to become."""
-    os.closerange(3, 1024)  # among them the pipe whose end tells Popen that the program runs
+    for descriptor in set(range(3, 1024)) - kept:
+        with contextlib.suppress(OSError):  # the end of one tells Popen that the program runs
+            os.close(descriptor)
     gc.enable()
     if environment is not None:
         os.environ.clear()
@@ -245,6 +263,7 @@ def _orphans() -> Iterator[str]:
             yield f"{process.pid} {process.status()}"
 
 
+kept: set[int] = set()  # file descriptors that what a command starts needs for the campaign
 # Commands that run beside the one that is waited for; they are nobody's orphans.
 known: set[int] = set()
 

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import re
 import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
 
+import compare
 from forked import Finished
 from lab import STAGES, Lab, notices
-
-from recon_cli.stages import STAGES as ROWS
 
 
 class Outcome(IntEnum):
@@ -52,10 +48,8 @@ class Verdict:
 
 
 RIGHT = Verdict(Outcome.RIGHT)
-VOLATILE = {row.name: row.volatile for row in ROWS}
 CLEAR_CODES = range(2, 8)
 INTERRUPTED = {1: 129, 2: 130, 15: 143}  # exit code by signal
-_TIMES = {"render_ms", "train_seconds", "seconds", "cpu_seconds"}
 _SCRATCH = (".partial", ".old", ".lock", ".lock.json", "recon.log")
 _PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|\.\.\.|--help")
 
@@ -199,49 +193,7 @@ def vanished(before: dict[str, str], workspace: Path, *, removed: Sequence[str] 
 def differing(lab: Lab, workspace: Path, names: Iterable[str], *, right: Path | None = None
               ) -> list[str]:
     """Returns which files of stages (or others at the top) are not those of the right result."""
-    right = right or lab.tiny
-    found: list[str] = []
-    for top in names:
-        paths = {path.relative_to(root).as_posix()
-                 for root in (right, workspace) for path in _files(root / top)}
-        found += [name for name in sorted(paths) if not _same(lab, name, right, workspace)]
-    return found
-
-
-def _files(path: Path) -> list[Path]:
-    return [path] if path.is_file() else [one for one in path.rglob("*") if not one.is_dir()]
-
-
-def _same(lab: Lab, name: str, right: Path, workspace: Path) -> bool:
-    stage, _, inner = name.partition("/")
-    if any(fnmatchcase(inner, pattern) for pattern in VOLATILE.get(stage, ())):
-        return True
-    one, other = right / name, workspace / name
-    if not (one.is_file() and other.is_file()):
-        return False
-    first, second = one.read_bytes(), other.read_bytes()
-    if name == "report.html":
-        first = first.replace(os.fsencode(lab.made), b"@")
-        second = second.replace(os.fsencode(workspace), b"@")
-    if first == second or (name in lab.unstable and not name.endswith(".json")):
-        return True
-    if name in lab.unstable:
-        keys = {"outputs", "fingerprint"} if inner == "manifest.json" else None
-        try:
-            return _timeless(json.loads(first), keys) == _timeless(json.loads(second), keys)
-        except ValueError:
-            return False
-    return False
-
-
-def _timeless(value: Any, only: set[str] | None = None) -> Any:
-    """Returns JSON without the times in it; of a manifest the fingerprint and names alone."""
-    if only:
-        return {**{key: value[key] for key in only - {"outputs"}},
-                "outputs": sorted(value["outputs"])}
-    if isinstance(value, dict):
-        return {key: _timeless(inner) for key, inner in value.items() if key not in _TIMES}
-    return [_timeless(inner) for inner in value] if isinstance(value, list) else value
+    return compare.differing(right or lab.tiny, workspace, names, made=lab.made)
 
 
 def new_notices(lab: Lab, verb: str, done: Finished) -> set[str]:

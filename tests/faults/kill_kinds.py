@@ -118,7 +118,7 @@ def _finish_after(case: Case, verb: str, words: Sequence[str], workspace: Path, 
         return wrong(Outcome.LOST, done, f"changed: {lost[:5]}")
     if wrongs := differing(case.lab, workspace, sorted(tops), right=right):
         return wrong(Outcome.SILENTLY_WRONG, done, f"not as without a kill: {wrongs[:5]}")
-    left = [path for kind in ("*.tmp*", ".*.tmp*", ".partial/*", ".old/*", ".lock.json")
+    left = [path for kind in ("*.tmp*", ".*.tmp*", ".partial/*/", ".old/*", ".lock.json")
             for path in workspace.glob(kind)]
     if left and verb not in ("status", "report"):
         return wrong(Outcome.BUG, done, f"left behind: {[path.name for path in left][:5]}")

@@ -14,13 +14,14 @@ from pathlib import Path
 import av
 import colmap_sets
 import posed_sets
+from compare import differing
 from forked import Finished, start
 from moments import Moments, sending
 
 SAMPLE = Path(__file__).resolve().parents[2] / "recon_cli" / "samples" / "room.mp4"
 STAGES = ("ingest", "denoise", "sfm", "train", "prune", "evaluate", "export")
 VERBS = {stage: stage for stage in STAGES} | {"evaluate": "eval"}  # by stage
-LIMIT = 90.0  # seconds for a command; sound ones take 0.1 to 3 on an idle core
+LIMIT = 60.0  # seconds for a command; sound ones take 0.1 to 3 on an idle core
 SETTINGS = """\
 [ingest]
 frames = 8
@@ -61,8 +62,6 @@ class Lab:
     moments: dict[str, int] = field(default_factory=dict)  # changes of files, by verb of FULL
     seconds: dict[str, float] = field(default_factory=dict)  # that a verb takes
     notices: dict[str, set[str]] = field(default_factory=dict)  # that a verb prints
-    # files of stages that hold times, and so differ from run to run
-    unstable: set[str] = field(default_factory=set)
 
     @property
     def clip(self) -> Path:
@@ -93,8 +92,8 @@ class Lab:
 
     def save(self) -> None:
         """Writes what is known beside the folders."""
-        values = {**vars(self), "root": str(self.root), "unstable": sorted(self.unstable),
-                  "notices": {verb: sorted(lines) for verb, lines in self.notices.items()}}
+        lines = {verb: sorted(texts) for verb, texts in self.notices.items()}
+        values = {**vars(self), "root": str(self.root), "notices": lines}
         (self.root / "lab.json").write_text(json.dumps(values))
 
     @classmethod
@@ -102,8 +101,7 @@ class Lab:
         """Returns a lab that was made before."""
         values = json.loads((root / "lab.json").read_text())
         return cls(root, values["moments"], values["seconds"],
-                   {verb: set(lines) for verb, lines in values["notices"].items()},
-                   set(values["unstable"]))
+                   {verb: set(lines) for verb, lines in values["notices"].items()})
 
 
 def copy(source: Path, target: Path, *, without: Sequence[str] = ()) -> Path:
@@ -137,7 +135,8 @@ def make(root: Path, rng: random.Random) -> Lab:
         done = _sound(lab, *words, "-w", str(target), moments=moments)
         lab.moments[verb], lab.seconds[verb] = moments.count, done.seconds
         lab.notices[verb] = notices(done.err)
-        _note_unstable(lab, target)
+        wrongs = differing(lab.tiny, target, STAGES, made=lab.made)
+        assert not wrongs, f"two sound runs differ: {wrongs}"
         if verb == "render":
             copy(target / "render", lab.tiny / "render")
         if verb == "report":
@@ -155,9 +154,7 @@ def make(root: Path, rng: random.Random) -> Lab:
 
 
 def _sound(lab: Lab, *words: str, moments: Moments | None = None) -> Finished:
-    log = lab.root / "making" / "log"
-    log.parent.mkdir(exist_ok=True)
-    running = start(words, cwd=lab.root, log=log, prepare=moments.watch if moments else None)
+    running = start(words, cwd=lab.root, prepare=moments.watch if moments else None)
     done = running.finish(4 * LIMIT)
     assert (done.code, done.orphans) == (0, ()), f"{done}\n{done.err}"
     return done
@@ -191,15 +188,6 @@ def _export_formats(lab: Lab) -> None:
     shutil.rmtree(folder)
 
 
-def _note_unstable(lab: Lab, again: Path) -> None:
-    """Notes which files another run of the same work wrote differently, for the times in them."""
-    for stage in STAGES:
-        for path in (again / stage).rglob("*"):
-            first = lab.tiny / path.relative_to(again)
-            if path.is_file() and first.read_bytes() != path.read_bytes():
-                lab.unstable.add(path.relative_to(again).as_posix())
-
-
 def _interrupt(lab: Lab, stage: str, rng: random.Random) -> None:
     """Kills a stage half-way, in a workspace that has all before it and nothing behind it."""
     later = [*STAGES[STAGES.index(stage):], "render", "report.html"]
@@ -210,7 +198,7 @@ def _interrupt(lab: Lab, stage: str, rng: random.Random) -> None:
         at = max(3, int(rng.uniform(0.35, 0.8) * lab.moments[verb]))
         words = (verb, *((str(lab.clip),) if stage == "ingest" else ()), "-w", str(target))
         running = start(
-            words, cwd=lab.root, log=lab.root / "making" / "log",
+            words, cwd=lab.root,
             prepare=lambda at=at, moments=moments: moments.watch(at, sending(signal.SIGKILL)))
         running.finish(LIMIT)
         if list((target / ".partial").glob(f"{stage}/*")) and not (target / stage).exists():

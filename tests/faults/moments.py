@@ -66,6 +66,7 @@ class Gate:
     def __init__(self) -> None:
         self._reached, self._there = os.pipe()
         self._open, self._go = os.pipe()
+        self.descriptors = {self._reached, self._there, self._open, self._go}
 
     def hold(self, _process: int) -> None:
         """Waits in the command; an act for `Moments.watch`."""
@@ -82,5 +83,5 @@ class Gate:
 
     def close(self) -> None:
         """Frees what the gate is made of."""
-        for descriptor in (self._reached, self._there, self._open, self._go):
+        for descriptor in self.descriptors:
             os.close(descriptor)

@@ -32,6 +32,7 @@ def pair(case: Case) -> Verdict:
     workspace = case.workspace()
     before = snapshot(workspace)
     gate, moments = Gate(), Moments(workspace)
+    forked.kept.update(gate.descriptors)
     at = 1 + case.rng.randrange(max(1, case.lab.moments[first]))
     words = [(*FULL[verb], "-w", str(workspace)) for verb in (first, second)]
     case.tell(f"{first} is held at change {at} while {second} runs")

@@ -80,18 +80,20 @@ def _fork_fault(root: Path, seed: int, number: int, keep: bool) -> None:
             "detail": "the fault did not end", "seconds": FAULT_SECONDS, "folder": ""}))
 
 
-def _work(root: Path, seed: int, numbers: list[int], core: int, keep: bool) -> None:
-    """Takes faults that nobody took yet until there are none."""
+def _work(root: Path, seed: int, numbers: list[int], core: int, keep: bool, end: float) -> None:
+    """Takes faults that nobody took yet, until there are none or the time is up."""
     forked.adopt_orphans()
     os.sched_setaffinity(0, {core})  # one thread a fault: as many faults at once as cores
     for number in numbers:
+        if time.monotonic() > end:
+            return
         with contextlib.suppress(FileExistsError):
             os.close(os.open(root / "taken" / str(number), os.O_CREAT | os.O_EXCL))
             _fork_fault(root, seed, number, keep)
 
 
-def _run_all(root: Path, seed: int, numbers: list[int], workers: int, keep: bool, verbose: bool
-             ) -> list[dict[str, object]]:
+def _run_all(root: Path, seed: int, numbers: list[int], *, workers: int, keep: bool,
+             verbose: bool, end: float) -> list[dict[str, object]]:
     for name in ("faults", "reports", "taken"):
         (root / name).mkdir()
     cores = sorted(os.sched_getaffinity(0))
@@ -100,13 +102,14 @@ def _run_all(root: Path, seed: int, numbers: list[int], workers: int, keep: bool
         pid = os.fork()
         if pid == 0:
             try:
-                _work(root, seed, numbers, cores[worker % len(cores)], keep)
+                _work(root, seed, numbers, cores[worker % len(cores)], keep, end)
             finally:
                 os._exit(0)
         children.append(pid)
     rows: list[dict[str, object]] = []
     seen: set[str] = set()
-    while len(rows) < len(numbers):
+    while children:
+        children = [pid for pid in children if not os.waitpid(pid, os.WNOHANG)[0]]
         for path in (root / "reports").glob("*.json"):
             if path.name in seen or not (text := path.read_text()).endswith("}"):
                 continue
@@ -114,8 +117,6 @@ def _run_all(root: Path, seed: int, numbers: list[int], workers: int, keep: bool
             rows.append(json.loads(text))
             _print_row(rows[-1], seed, verbose)
         time.sleep(0.1)
-    for pid in children:
-        os.waitpid(pid, 0)
     return rows
 
 
@@ -157,10 +158,11 @@ def _table(rows: list[dict[str, object]]) -> str:
 @click.option("--only", type=int, multiple=True, help="Inject only the faults of these numbers.")
 @click.option("--kind", help="Inject only faults of this kind.")
 @click.option("--workers", type=int, help="At once.  [default: one a core]")
+@click.option("--minutes", default=60.0, show_default=True, help="Begin no fault after so many.")
 @click.option("--keep", is_flag=True, help="Keep the folders of the faults.")
 @click.option("-v", "--verbose", is_flag=True, help="Print what each fault did.")
 def main(seed: int, count: int, only: tuple[int, ...], kind: str | None, workers: int | None,
-         keep: bool, verbose: bool) -> None:
+         minutes: float, keep: bool, verbose: bool) -> None:
     """Inject faults; print what ended badly, and a table of kinds by outcome."""
     begin = time.monotonic()
     sys.stdout.reconfigure(errors="backslashreplace")  # names need not be UTF-8
@@ -178,13 +180,16 @@ def main(seed: int, count: int, only: tuple[int, ...], kind: str | None, workers
         click.echo(f"{len(numbers)} faults of seed {seed}, in {root} "
                    f"({time.monotonic() - begin:.0f} s to prepare); full disks are {disks}")
         os.sched_setaffinity(0, cores)
-        rows = _run_all(root, seed, numbers, workers or len(cores), keep, verbose)
+        rows = _run_all(root, seed, numbers, workers=workers or len(cores), keep=keep,
+                        verbose=verbose, end=begin + 60 * minutes)
     finally:
         if not keep:
             shutil.rmtree(root, ignore_errors=True)
     click.echo(_table(rows))
     bad = sum(row["outcome"] > 1 for row in rows)
     slow = sorted(rows, key=lambda row: -row["seconds"])[:3]
+    if len(rows) < len(numbers):
+        click.echo(f"{len(numbers) - len(rows)} faults were not begun: {minutes:g} minutes are up")
     click.echo(f"{bad} of {len(rows)} ended in neither the right result nor a clear error; "
                f"{time.monotonic() - begin:.0f} s; slowest: " + ", ".join(
                    f"{row['kind']} {row['number']} ({row['seconds']:.0f} s)" for row in slow))

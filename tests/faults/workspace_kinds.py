@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 
 from case import Case
+from compare import is_volatile
 from damages import DAMAGES
 from forked import Finished
 from judge import (
     RIGHT,
-    VOLATILE,
     Outcome,
     Verdict,
     broken,
@@ -99,7 +99,6 @@ def repair(case: Case, workspace: Path, stage: str) -> Verdict:
 
 def _judge_success(case: Case, workspace: Path, name: Path, verb: str, done: Finished) -> Verdict:
     lab, stage = case.lab, name.parts[0]
-    inner = "/".join(name.parts[1:])
     if verb == "status":
         return _judge_status(case, workspace, name, done)
     if verb == "clean":
@@ -113,14 +112,10 @@ def _judge_success(case: Case, workspace: Path, name: Path, verb: str, done: Fin
                        for root in (workspace, lab.tiny))
         if len(page) > len(right) or stage == "render":
             return RIGHT
-    if stage in STAGES and verb == VERBS[stage] and wrongs == [str(name)] and _volatile(
-            stage, inner):
+    if stage in STAGES and verb == VERBS[stage] and wrongs == [str(name)] and (
+            is_volatile(str(name))):
         return RIGHT
     return wrong(Outcome.SILENTLY_WRONG, done, f"not as without the damage: {wrongs[:5]}")
-
-
-def _volatile(stage: str, inner: str) -> bool:
-    return any(Path(inner).match(pattern) for pattern in VOLATILE.get(stage, ()))
 
 
 def _judge_status(case: Case, workspace: Path, name: Path, done: Finished) -> Verdict:
@@ -128,14 +123,14 @@ def _judge_status(case: Case, workspace: Path, name: Path, done: Finished) -> Ve
         states = {row["name"]: row["state"] for row in json.loads(done.out)["stages"]}
     except (ValueError, KeyError, TypeError):
         return wrong(Outcome.BUG, done, f"status --json printed {done.out[:200]!r}")
-    stage, inner = name.parts[0], "/".join(name.parts[1:])
-    if stage not in states or _volatile(stage, inner):
+    stage = name.parts[0]
+    if stage not in states or is_volatile(str(name)):
         return RIGHT
     try:
         same = (workspace / name).read_bytes() == (case.lab.tiny / name).read_bytes()
     except OSError:
         same = False
-    if states[stage] == "fresh" and not same and inner != "manifest.json":
+    if states[stage] == "fresh" and not same and name.name != "manifest.json":
         return wrong(Outcome.SILENTLY_WRONG, done, f"{name} is damaged, but {stage} is fresh")
     return RIGHT
 
