@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,6 +15,7 @@ from recon_cli.stages import STAGES
 VOLATILE = {row.name: row.volatile for row in STAGES}
 # Files that hold times beside results; of JSON the rest is compared.
 _TIMED = ("*/manifest.json", "evaluate/metrics.*", "evaluate/table.txt", "render/*/render.json")
+_MINUTE = re.compile(rb"report, \d{4}-\d\d-\d\d \d\d:\d\d")
 _TIMES = {"render_ms", "train_seconds", "seconds", "cpu_seconds"}
 
 
@@ -47,8 +49,8 @@ def _same(name: str, right: Path, workspace: Path, made: Path) -> bool:
         return False
     first, second = one.read_bytes(), other.read_bytes()
     if name == "report.html":
-        return (first.replace(os.fsencode(made), b"@")
-                == second.replace(os.fsencode(workspace), b"@"))
+        return (_MINUTE.sub(b"", first.replace(os.fsencode(made), b"@"))
+                == _MINUTE.sub(b"", second.replace(os.fsencode(workspace), b"@")))
     if first == second:
         return True
     if not any(fnmatchcase(name, pattern) for pattern in _TIMED):

@@ -28,10 +28,10 @@ class Kind:
 KINDS = (
     Kind("kill", 100, kill_kinds.kill),
     Kind("signal", 60, kill_kinds.interrupt),
-    Kind("signal to a process", 12, kill_kinds.process_signal),
+    Kind("signal to a process", 16, kill_kinds.process_signal),
     Kind("full disk", 50, disk_kinds.full_disk),
     Kind("size limit", 28, disk_kinds.limited_files),
-    Kind("finished file", 200, workspace_kinds.finished_file),
+    Kind("finished file", 196, workspace_kinds.finished_file),
     Kind("unfinished file", 160, workspace_kinds.unfinished_file),
     Kind("structure", 70, structure_kinds.structure),
     Kind("manifest names", 40, structure_kinds.manifest_names),

@@ -169,6 +169,7 @@ def main(seed: int, count: int, only: tuple[int, ...], kind: str | None, workers
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})  # results must be those of one thread, like the faults'
     forked.preload()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # pycolmap would print its stack
 
     numbers = list(only) or [number for number, (each, _) in enumerate(schedule(count))
                              if kind in (None, each.name)]

@@ -50,7 +50,7 @@ def settings(case: Case) -> Verdict:
             extra = ("--config", str(path))
     verb = "run" if where == "--set" else rng.choice(
         ("status", "export", "train", "eval", "report", "render", "clean", "prune"))
-    words = ["run", "--print-config"] if verb == "run" else [
+    words = [verb, "--print-config"] if verb in ("run", "train", "prune") else [
         word for word in FULL[verb] if word != "--again"]  # with other settings it takes minutes
     case.tell(f"{where}: {name} = {value[:40]} or {text[:40]!r}, then {' '.join(words)}")
     done = case.run(*words, *extra, "-w", str(workspace))
