@@ -11,7 +11,6 @@ import contextlib
 import ctypes
 import fcntl
 import gc
-import importlib.metadata
 import os
 import resource
 import runpy
@@ -20,6 +19,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -36,8 +36,12 @@ from recon_cli.lazy import load
 from recon_cli.stages import IMPORT, STAGES
 
 MEMORY_BYTES = 16 << 30  # of address space: what a hostile input asks for must not stop the machine
+_PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
+SCRIPT = tomllib.loads(_PROJECT.read_text())["project"]["scripts"]["recon"]  # module:function
+_PROGRAM = "import sys; from {} import {} as main; sys.argv[0] = 'recon'; sys.exit(main())".format(
+    *SCRIPT.split(":"))
 _PIPE_BYTES = 1 << 20
-_ORPHAN_SECONDS = 4.0  # that a child may take to notice the end of its parent
+_ORPHAN_SECONDS = 20.0  # for a child to notice the end of its parent: it may be importing still
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,7 @@ def start_process(words: Sequence[str], *, cwd: Path) -> Running:
     """Starts a command as the user would: a new process."""
     said, begin = (Said(), Said()), time.monotonic()
     process = subprocess.Popen(
-        [str(Path(sys.executable).with_name("recon")), *words], cwd=cwd, start_new_session=True,
+        [sys.executable, "-P", "-c", _PROGRAM, *words], cwd=cwd, start_new_session=True,
         stdin=subprocess.DEVNULL, stdout=said[0].target, stderr=said[1].target)
     process.returncode = 0  # `finish` waits for it by its number
     return Running(tuple(words), process.pid, said, begin)
@@ -182,9 +186,8 @@ def _enter(cwd: Path, said: tuple[Said, Said]) -> None:
 def _run_entry_point(words: Sequence[str]) -> int:
     """Runs what the script `recon` runs, and returns the exit code."""
     sys.argv = ["recon", *words]
-    (entry,) = importlib.metadata.entry_points(group="console_scripts", name="recon")
     try:
-        return _exit_code(entry.load()())
+        return _exit_code(load(SCRIPT.replace(":", "."))())
     except SystemExit as end:
         return _exit_code(end.code)
 
@@ -201,7 +204,10 @@ def _leave(code: int) -> None:
 
 
 class _ForkedPopen(subprocess.Popen[Any]):
-    """Forks `python [-P] -m recon_cli...` in place of starting it anew; anything else runs."""
+    """Forks `python [-P] -m recon_cli.x.y` in place of starting it anew; anything else is started.
+
+    So is a whole command of recon, which must find no traces of the one that starts it.
+    """
 
     def __init__(self, args: Any, *more: Any, **options: Any) -> None:
         module, words = _module_of(args)
@@ -212,12 +218,12 @@ class _ForkedPopen(subprocess.Popen[Any]):
 
 
 def _module_of(args: Any) -> tuple[str, list[str]]:
-    """Returns the module of ours that a command runs, and its arguments."""
+    """Returns the worker of ours that a command runs, and its arguments."""
     if not isinstance(args, (list, tuple)) or str(args[0]) != sys.executable or "-m" not in args:
         return "", []
     at = args.index("-m")
     module = str(args[at + 1])
-    ours = module.split(".")[0] == "recon_cli"
+    ours = module.startswith("recon_cli.")
     return (module if ours else "", [str(word) for word in args[at + 2:]])
 
 
@@ -237,8 +243,7 @@ def _become(module: str, words: list[str], environment: dict[str, str] | None) -
     sys.argv = [module, *words]
     code = 1
     try:
-        runpy.run_module(
-            f"{module}.__main__" if module == "recon_cli" else module, run_name="__main__")
+        runpy.run_module(module, run_name="__main__")
         code = 0
     except SystemExit as end:
         code = _exit_code(end.code)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import signal
 from collections.abc import Sequence
@@ -113,8 +114,8 @@ def copy(source: Path, target: Path, *, without: Sequence[str] = ()) -> Path:
 
 def notices(text: str) -> set[str]:
     """Returns the notices of a command's stderr, without their numbers."""
-    return {"".join("#" if one.isdigit() else one for one in line)
-            for line in text.splitlines() if line.startswith("notice:")}
+    lines = [line for line in text.splitlines() if line.startswith("notice:")]
+    return {re.sub(r"[\d.,]+", "#", line) for line in lines}
 
 
 def make(root: Path, rng: random.Random) -> Lab:
