@@ -10,7 +10,7 @@ HEAVY := integration or browser or compile or slow
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
-.PHONY: demo test test-rest test-all coverage check docs clean
+.PHONY: demo test test-rest test-all coverage faults check docs clean
 
 demo: $(READY)
 	$(BIN)/recon demo
@@ -27,6 +27,13 @@ test-all: $(DEV)
 
 coverage: $(DEV)
 	$(PYTEST) --cov=recon_cli --cov-report=term
+
+# Kills, full disks, damaged files and hostile inputs, at random from a seed.
+SEED ?= 1
+COUNT ?= 1000
+
+faults: $(DEV)
+	$(BIN)/python tests/faults/run.py --seed $(SEED) --count $(COUNT)
 
 check: $(DEV)
 	$(BIN)/ruff check .

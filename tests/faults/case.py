@@ -1,0 +1,93 @@
+"""One fault: its folder, its dice, and the commands that it runs."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from forked import Finished, Running, start, start_process
+from judge import Outcome, Verdict, broken, clear_error, follow_hint, snapshot, wrong
+from lab import LIMIT, Lab, copy
+from moments import Moments
+
+
+@dataclass
+class Case:
+    """What a kind of fault is given."""
+
+    lab: Lab
+    rng: random.Random
+    turn: int  # how many faults of the kind came before: to go through lists in order
+    folder: Path  # empty, and its own
+    ran: list[Finished] = field(default_factory=list)
+    story: list[str] = field(default_factory=list)  # what was done, for -v
+    _canary: dict[str, str] = field(default_factory=dict)
+
+    def tell(self, text: str) -> None:
+        """Notes what is done to whom."""
+        self.story.append(text)
+
+    def pick(self, items: Sequence[object], *, stride: int = 1) -> object:
+        """Returns an item: all of them come up in turn."""
+        return items[self.turn * stride % len(items)]
+
+    def workspace(self, source: Path | None = None, *, without: Sequence[str] = ()) -> Path:
+        """Returns a copy of a workspace, the finished one unless another is named."""
+        return copy(source or self.lab.tiny, self.folder / "ws", without=without)
+
+    def outside(self) -> Path:
+        """Returns a folder of the user's files outside of any workspace, which must survive."""
+        folder = self.folder / "outside"
+        (folder / "photos").mkdir(parents=True)
+        for name in ("thesis.db", "photos/a.jpg", "photos/b.jpg"):
+            (folder / name).write_bytes(name.encode() * 1000)
+        self._canary = snapshot(folder)
+        return folder
+
+    def canary_lost(self) -> Verdict | None:
+        """Returns the verdict where a file outside of the workspace was changed."""
+        if self._canary and snapshot(self.folder / "outside") != self._canary:
+            return wrong(Outcome.LOST, self.ran[-1] if self.ran else None,
+                         "files outside of the workspace are gone or changed")
+        return None
+
+    def start(
+        self, *words: str, moments: Moments | None = None, at: int | None = None,
+        act: Callable[[int], None] | None = None, prepare: Callable[[], None] | None = None,
+    ) -> Running:
+        """Starts a command; `act` is done at its `at`-th moment."""
+        def ready() -> None:
+            if prepare is not None:
+                prepare()
+            if moments is not None:
+                moments.watch(at, act)
+
+        return start(words, cwd=self.folder, prepare=ready)
+
+    def start_process(self, *words: str) -> Running:
+        """Starts a command as a new process of Python."""
+        return start_process(words, cwd=self.folder)
+
+    def finish(self, running: Running, limit: float = LIMIT) -> Finished:
+        """Returns how a command ended."""
+        done = running.finish(limit)
+        self.ran.append(done)
+        self.tell(f"{done}\n{done.err.strip()[-1500:]}")
+        return done
+
+    def run(self, *words: str, prepare: Callable[[], None] | None = None) -> Finished:
+        """Runs a command to its end."""
+        return self.finish(self.start(*words, prepare=prepare))
+
+    def judge_error(self, done: Finished, workspace: Path | None, *, follow: bool = True
+                    ) -> Verdict:
+        """Returns the verdict on a command that failed: clear, with a hint that helps?"""
+        bad = broken(done) or self.canary_lost()
+        if bad:
+            return bad
+        if not follow:
+            return clear_error(done)
+        return follow_hint(done, workspace, lambda words: self.run(*words),
+                           lambda: self.run(*done.words))
