@@ -76,6 +76,7 @@ def test_every_package_that_the_code_imports_is_a_dependency():
     assert needed <= set(versions(floors(PYPROJECT)))
 
 
+@pytest.mark.integration
 def test_every_module_of_the_package_can_be_imported():
     modules = [each.name for each in pkgutil.walk_packages(recon_cli.__path__, "recon_cli.")
                if not each.name.endswith("__main__")]
