@@ -8,15 +8,35 @@ DEV := $(VENV)/.dev
 # Tests by marker: `make test` runs those without any of these.
 HEAVY := integration or browser or compile or slow
 WORKERS ?= 2
-PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
+ON_ALL := -n $(WORKERS) --dist worksteal
+PYTEST := $(BIN)/python -m pytest -q -rs $(ON_ALL)
 
-.PHONY: demo test test-rest test-all coverage faults check docs clean
+# The lowest versions that pyproject.toml allows, on the oldest Python that it allows.
+OLDEST ?= python3.11
+FLOORS := .venv-floors
+# A few tests of each dependency.
+FLOOR_TESTS := tests/test_floors.py tests/commands/test_cli.py tests/capture/test_images.py \
+    tests/capture/test_noise.py tests/capture/test_photos.py tests/capture/test_raw.py \
+    tests/capture/test_tracker.py tests/capture/test_video.py tests/evaluation/test_metrics.py \
+    tests/executors/test_executor.py tests/experiments/test_study_tables.py \
+    tests/export/test_cleanup_islands.py tests/flythrough/test_output.py \
+    tests/flythrough/test_paths.py tests/io/splats/test_coarsen.py \
+    tests/io/splats/test_registry.py tests/io/test_meshes.py tests/report/test_build.py \
+    tests/sfm/test_mapper.py tests/trust/test_standing_places.py tests/viewer/test_view_verb.py \
+    tests/test_end_to_end.py::test_the_sample_video_becomes_a_scene_with_a_table
+
+.PHONY: demo test test-floors test-rest test-all coverage faults check docs clean
 
 demo: $(READY)
 	$(BIN)/recon demo
 
 test: $(DEV)
 	$(PYTEST) -m "not ($(HEAVY))"
+
+# Kernels that one version of numba compiled are of no use to another: they have their own place.
+test-floors: $(FLOORS)/.ready
+	RECON_CACHE_DIR=$(CURDIR)/$(FLOORS)/cache $(FLOORS)/bin/python -m pytest -q $(ON_ALL) \
+	    -m "not (browser or slow)" $(FLOOR_TESTS)
 
 # What `make test` leaves out, and the tests by Hypothesis again with all their examples.
 test-rest: $(DEV)
@@ -44,7 +64,7 @@ docs: $(DEV)
 	$(BIN)/python docs/generate_cli.py
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(FLOORS)
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -53,4 +73,12 @@ $(READY): pyproject.toml constraints.txt
 
 $(DEV): $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+# Nothing is compiled: a version without a wheel fails.
+$(FLOORS)/.ready: pyproject.toml tests/floors.py
+	$(OLDEST) -m venv $(FLOORS)
+	$(FLOORS)/bin/python tests/floors.py pyproject.toml > $(FLOORS)/floors.txt
+	$(FLOORS)/bin/pip install --quiet --disable-pip-version-check --only-binary=:all: --no-compile \
+	    -c $(FLOORS)/floors.txt -e '.[dev,plot,ray]'
 	touch $@

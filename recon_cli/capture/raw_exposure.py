@@ -128,7 +128,8 @@ def complete_exposures(known: Sequence[float | None], pairs: Pairs) -> NDArray[n
     matrix = np.vstack([rows / PAIR_EV, np.eye(len(free)) / LOOSE_EV])
     target = np.concatenate([wanted / PAIR_EV, ev[free] / LOOSE_EV])
     ev[free] = least_squares(
-        lambda x: matrix @ x - target, ev[free], jac=lambda _: matrix, loss="soft_l1").x
+        # a copy: scipy before 1.16 weighs in place what jac returns
+        lambda x: matrix @ x - target, ev[free], jac=lambda _: matrix.copy(), loss="soft_l1").x
     return ev
 
 

@@ -105,8 +105,12 @@ def load_lpips() -> tuple[Perceptual | None, str]:
     """
     try:
         lpips: Any = importlib.import_module("lpips")
-    except ImportError:
+    except ModuleNotFoundError:
         return None, "the package lpips is not installed (pip install 'recon-cli[lpips]')"
+    except (ImportError, OSError, RuntimeError) as error:  # torchvision was built for another torch
+        cause = str(error).partition("\n")[0]
+        return None, (f"the package lpips cannot be imported ({cause}); it needs the torchvision "
+                      f"that belongs to torch {torch.__version__}")
     weights = Path(torch.hub.get_dir()) / "checkpoints" / _LPIPS_WEIGHTS
     if not weights.is_file():
         return None, (f"its weights are not at {weights}; `python -c \"import lpips; "

@@ -136,6 +136,19 @@ def test_lpips_is_left_out_with_its_reason_where_package_or_weights_are_missing(
     assert str(tmp_path) in reason
 
 
+def test_lpips_beside_the_torchvision_of_another_torch_is_left_out_with_its_reason(
+    monkeypatch, tmp_path
+):
+    monkeypatch.delitem(sys.modules, "lpips", raising=False)
+    (tmp_path / "lpips.py").write_text(
+        'raise RuntimeError("operator torchvision::nms does not exist\\nat 1")\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    distance, reason = load_lpips()
+    assert distance is None
+    assert "(operator torchvision::nms does not exist)" in reason
+    assert torch.__version__ in reason
+
+
 def test_lpips_gets_both_pictures_between_minus_one_and_one(monkeypatch, tmp_path):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"x")
