@@ -89,17 +89,6 @@ def cache_root() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "recon"
 
 
-def end_with_parent() -> None:
-    """Ends this process when its standard input does, which is when its parent is gone."""
-
-    def watch() -> None:
-        while os.read(0, 1):  # not sys.stdin, whose lock the interpreter wants at its own end
-            pass
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def yield_to_others() -> None:
     """Lowers the priority of this process: it takes what others leave of the cores."""
     process = psutil.Process()
