@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 
@@ -17,6 +18,8 @@ def main() -> int:
             if os.environ.pop(CHILD, ""):
                 end_with_parent()
             protect_children()
+            if isinstance(sys.stdout, io.TextIOWrapper):  # a file name need not be UTF-8
+                sys.stdout.reconfigure(errors="backslashreplace")
             code: int = load("recon_cli.cli.main")()
         except KeyboardInterrupt as error:  # while modules were imported
             sys.stderr.write(f"{signals.describe_end(error)}\n")

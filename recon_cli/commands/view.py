@@ -23,7 +23,7 @@ from recon_cli.workspace.layout import Workspace
 
 
 @verb("view")
-@click.argument("item", metavar="[ITEM]", required=False, type=click.Path(path_type=Path))
+@click.argument("item", metavar="[ITEM]", required=False, type=options.PathType())
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
     help="Model to show first; auto: pruned if it is fresh, else base.")

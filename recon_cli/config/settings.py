@@ -25,6 +25,7 @@ from recon_cli.config.stages import (
     TrainConfig,
 )
 from recon_cli.errors import ConfigError
+from recon_cli.workspace.paths import refuse_special
 
 SECTIONS: dict[str, type[StageConfig]] = {
     "ingest": IngestConfig,
@@ -47,6 +48,7 @@ _TRUTH = {"true": True, "false": False}
 
 def read_settings(path: Path) -> Settings:
     """Returns the checked settings of a recon.toml; ConfigError if it is missing or wrong."""
+    refuse_special(path)
     try:
         with path.open("rb") as file:
             settings = tomllib.load(file)

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import FormatError
+from recon_cli.workspace.paths import refuse_special
 
+_NAME = 40  # characters of a name that a temporary one keeps
 LEFTOVERS = ".*.tmp*"  # files that `replacing` had not finished when it was killed
 
 
@@ -20,7 +22,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
     It is flushed before the rename, so that a crash leaves the old file or the new one.
     """
-    temporary = path.with_name(f".{path.name}.tmp{os.getpid()}{path.suffix}")
+    # shortened, so that it is no longer than a name may be
+    temporary = path.with_name(f".{path.name[:_NAME]}.tmp{os.getpid()}{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb+") as file:
@@ -37,6 +40,11 @@ def write_bytes(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Writes text as UTF-8, whole or not at all; file names in it need not be UTF-8."""
+    write_bytes(path, text.encode(errors="replace"))
+
+
 def write_json(path: Path, value: Any) -> None:
     """Writes `value` to `path` as readable JSON, whole or not at all. NaN is refused."""
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
@@ -48,6 +56,7 @@ def read_json(path: Path) -> Any:
     Raises:
         FormatError: the file is missing, truncated or no JSON.
     """
+    refuse_special(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -215,15 +215,12 @@ def disk_errors(root: Path, doing: str) -> Iterator[None]:
 
 
 def _explain(error: Exception, root: Path, doing: str) -> ReconError | None:
-    full = disk.explain(error, root, doing)
-    if full or not isinstance(error, OSError):
-        return full
-    inside = error.filename is None or Path(os.fsdecode(error.filename)).is_relative_to(root)
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and inside:
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and (
+            error.filename is None or Path(os.fsdecode(error.filename)).is_relative_to(root)):
         return WorkspaceError(
             f"The workspace is not writable while {doing}: {error}.",
             hint=f"Check the permissions of {root}, or give another workspace with -w.")
-    return None
+    return disk.explain(error, root, doing)
 
 
 def _folders(parent: Path) -> list[Path]:
