@@ -5,19 +5,21 @@ from __future__ import annotations
 import logging
 import os
 from collections import UserDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import click
 
-from recon_cli import __version__
+from recon_cli import __version__, signals
 from recon_cli.commands import console, hints
 from recon_cli.commands.options import Call
-from recon_cli.errors import ReconError
+from recon_cli.errors import ExitCode, ReconError, ReconstructionError
 from recon_cli.lazy import load
 from recon_cli.train.distributed import launch
+from recon_cli.workspace import disk
 
-INTERRUPTED = 130
 MAX_WIDTH = 100  # columns of a help text on a wide terminal
 
 # Each verb: where its command lives in recon_cli.commands, and the first line of its docstring.
@@ -49,6 +51,10 @@ HIDDEN = {"map-segment": "segments.map_segment"}  # verbs that recon types itsel
 logger = logging.getLogger("recon")
 
 
+class _PastClick(Exception):  # noqa: N818  # never seen by anybody
+    """Carries past click an error that it would handle."""
+
+
 class _LazyCommands(UserDict[str, Any]):
     """The commands by verb; a module is imported when its verb is looked up."""
 
@@ -60,6 +66,13 @@ class _LazyCommands(UserDict[str, Any]):
 
 class _LazyGroup(click.Group):
     """Lists the verbs in the order of the work, and imports only the one that was typed."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Runs the verb; click itself would print an empty line, or end the process."""
+        try:
+            return super().invoke(ctx)
+        except (KeyboardInterrupt, OSError) as error:
+            raise _PastClick from error
 
     def list_commands(self, _ctx: click.Context) -> list[str]:
         """Returns the verbs."""
@@ -99,29 +112,65 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     handler = console.show_log(detailed=lambda: call.verbose, complete=complete)
     try:
-        if launch.follows():
-            return launch.follow()
-        with launch.leading() as call.ranks:
-            code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
-        return code if isinstance(code, int) else 0
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted; run the same command again to resume", err=True)
-        return INTERRUPTED
-    except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
-        return error.exit_code
-    except click.ClickException as error:
-        console.print_error(error.format_message(), console.usage_hint(error))
-        return error.exit_code
-    except ReconError as error:
-        logger.debug("failed", exc_info=True)
-        console.print_error(error.message, complete(error.hint))
-        return error.exit_code
-    except Exception as error:
-        logger.debug("failed", exc_info=True)
-        console.print_error(
-            f"{type(error).__name__}: {error}",
-            "This is a bug in recon. Run the command again with -v and report what it prints.")
-        return 1
+        with signals.raising():
+            if launch.follows():
+                return launch.follow()
+            with launch.leading() as call.ranks:
+                code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
+            return code if isinstance(code, int) else ExitCode.DONE
+    except (Exception, KeyboardInterrupt) as raised:
+        error = raised.__cause__ or raised if isinstance(raised, _PastClick) else raised
+        with suppress(OSError):  # of a stderr that nobody reads, or on the disk that is full
+            return _tell(error, complete)
+        return _exit_code(error)
     finally:
         logger.removeHandler(handler)
+
+
+def _tell(error: BaseException, complete: Callable[[str], str]) -> int:
+    """Prints why a command failed, its hint completed, and returns its exit code."""
+    if isinstance(error, (click.Abort, KeyboardInterrupt)):
+        click.echo(signals.describe_end(_signalled(error)), err=True)
+    elif isinstance(error, click.exceptions.NoArgsIsHelpError):
+        error.show()
+    elif isinstance(error, click.ClickException):
+        console.print_error(error.format_message(), console.usage_hint(error))
+    elif isinstance(error, BrokenPipeError):
+        console.silence()
+    else:
+        logger.debug("failed", exc_info=error)
+        known = _known(error)
+        if known is None:
+            console.print_error(
+                f"{type(error).__name__}: {error}",
+                "This is a bug in recon. Run the command again with -v and report what it prints.")
+        else:
+            console.print_error(known.message, complete(known.hint))
+    return _exit_code(error)
+
+
+def _exit_code(error: BaseException) -> int:
+    if isinstance(error, (click.Abort, KeyboardInterrupt)):
+        return signals.exit_code(_signalled(error))
+    if isinstance(error, click.ClickException):
+        return error.exit_code
+    if isinstance(error, BrokenPipeError):  # `recon status | head -1`
+        return ExitCode.BROKEN_PIPE
+    known = _known(error)
+    return ExitCode.BUG if known is None else known.exit_code
+
+
+def _known(error: BaseException) -> ReconError | None:
+    """Returns an error that a user can act on; None for a bug."""
+    if isinstance(error, ReconError):
+        return error
+    if isinstance(error, MemoryError):
+        return ReconstructionError(
+            f"There is not enough memory: {error or 'none is free'}.",
+            hint="Close other programs, or lower --max-gaussians, --max-size or --frames.")
+    return disk.explain(error, Path.cwd(), "writing")
+
+
+def _signalled(error: BaseException) -> BaseException | None:
+    """Returns what interrupted a command; click passes it on as an Abort."""
+    return error.__cause__ if isinstance(error, click.Abort) else error

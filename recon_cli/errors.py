@@ -6,12 +6,32 @@ Programming mistakes stay ValueError or AssertionError and leave the CLI with ex
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of every command; docs/errors.md."""
+
+    DONE = 0
+    BUG = 1
+    USAGE = 2
+    INPUT = 3
+    STAGE = 4
+    RECONSTRUCTION = 5
+    BACKEND = 6
+    WORKSPACE = 7
+    SIGNAL = 128  # plus the number of the signal that ended it, as in a shell
+    HANGUP = 129
+    INTERRUPTED = 130
+    KILLED = 137
+    BROKEN_PIPE = 141
+    TERMINATED = 143
 
 
 class ReconError(Exception):
     """A failure that the user can act on; `hint` says what to type or change next."""
 
-    exit_code = 1
+    exit_code: ExitCode = ExitCode.BUG
     usual_hint = ""  # of a class whose members all call for the same; others give one each
 
     def __init__(self, message: str, *, hint: str = "") -> None:
@@ -23,25 +43,25 @@ class ReconError(Exception):
 class ConfigError(ReconError):
     """An option or a configuration file holds a value that cannot be used."""
 
-    exit_code = 2
+    exit_code = ExitCode.USAGE
 
 
 class InputError(ReconError):
     """The capture cannot be read or does not hold enough."""
 
-    exit_code = 3
+    exit_code = ExitCode.INPUT
 
 
 class StageError(ReconError):
     """A stage needs the result of another one that is missing or stale."""
 
-    exit_code = 4
+    exit_code = ExitCode.STAGE
 
 
 class ReconstructionError(ReconError):
     """The input was read, but gave no reconstruction that can be trusted."""
 
-    exit_code = 5
+    exit_code = ExitCode.RECONSTRUCTION
 
 
 class SfmError(ReconstructionError):
@@ -59,13 +79,13 @@ class LostError(TrainingError):
 class BackendError(ReconError):
     """The rasterizer or device that was asked for is not available."""
 
-    exit_code = 6
+    exit_code = ExitCode.BACKEND
 
 
 class WorkspaceError(ReconError):
     """The workspace cannot be read, written or locked."""
 
-    exit_code = 7
+    exit_code = ExitCode.WORKSPACE
 
 
 class ManifestError(WorkspaceError):

@@ -8,11 +8,12 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
 import psutil
+
+from recon_cli import cgroups
 
 _PACKAGES = {
     "recon": "recon-cli",
@@ -45,26 +46,16 @@ def usable_threads() -> int:
     """Returns how many CPU cores this process may use."""
     process = psutil.Process()
     if hasattr(process, "cpu_affinity"):  # macOS has none
-        return len(process.cpu_affinity())
-    return psutil.cpu_count() or 1
+        cores = len(process.cpu_affinity())
+    else:
+        cores = psutil.cpu_count() or 1
+    return min(cores, cgroups.most_cpus() or cores)
 
 
-_LIMITS = (  # of a container: (limit, in use), cgroups version 2 and 1
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-)
-
-
-def free_memory_bytes(limits: Sequence[tuple[str, str]] = _LIMITS) -> int:
-    """Returns how much memory this process may still take, the container's limit included."""
-    free = int(psutil.virtual_memory().available)
-    for limit, used in limits:
-        try:
-            left = int(Path(limit).read_text()) - int(Path(used).read_text())
-        except (OSError, ValueError):  # no such file, or "max"
-            continue
-        free = min(free, max(0, left))
-    return free
+def free_memory_bytes() -> int:
+    """Returns how much memory this process may still take, the limits of its groups included."""
+    free, left = int(psutil.virtual_memory().available), cgroups.free_memory_bytes()
+    return free if left is None else min(free, left)
 
 
 def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
@@ -87,17 +78,6 @@ def cache_root() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "recon" / "cache"
     return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "recon"
-
-
-def end_with_parent() -> None:
-    """Ends this process when its standard input does, which is when its parent is gone."""
-
-    def watch() -> None:
-        while os.read(0, 1):  # not sys.stdin, whose lock the interpreter wants at its own end
-            pass
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def yield_to_others() -> None:

@@ -12,6 +12,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -242,9 +243,18 @@ def _to_8bit(wide: NDArray[Any]) -> NDArray[np.uint8]:
     return ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
+def open_raw(path: Path) -> rawpy.RawPy:
+    """Opens a RAW photo; rawpy itself takes no path that is not UTF-8."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return rawpy.imread(BytesIO(path.read_bytes()))
+    return rawpy.imread(str(path))
+
+
 def _inspect_raw(path: Path) -> Photo:
     try:
-        with rawpy.imread(str(path)) as raw:
+        with open_raw(path) as raw:
             sizes, focal = raw.sizes, raw.other.focal_length
     except rawpy.LibRawError as error:
         raise unreadable_error(path, error) from error

@@ -18,7 +18,7 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
-from recon_cli.capture.images import Photo, check_size, unreadable_error
+from recon_cli.capture.images import Photo, check_size, open_raw, unreadable_error
 from recon_cli.capture.raw_exposure import RawMeasures, exposures, measure_view, nominal_ev
 from recon_cli.errors import InputError
 from recon_cli.workspace.summaries import JsonRecord
@@ -97,7 +97,7 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     if shot is None:
         raise InputError(plan.broken[photo.path.name])
     try:
-        with rawpy.imread(str(photo.path)) as raw:
+        with open_raw(photo.path) as raw:
             rgb = np.asarray(raw.postprocess(
                 **_develop_options(shot.multipliers, shot.saturation), bright=2.0 ** shot.gain_ev,
                 gamma=SRGB, output_color=rawpy.ColorSpace.sRGB, output_bps=8), np.uint8)
@@ -126,7 +126,7 @@ def _try_read(read: Callable[[Path], T], path: Path, broken: dict[str, str]) -> 
 
 
 def _read_header(path: Path) -> _Header:
-    with rawpy.imread(str(path)) as raw:
+    with open_raw(path) as raw:
         shot, white = raw.other, int(raw.white_level)
         highest = int(raw.raw_image_visible.max())
         if highest == 0:  # how LibRaw answers a compression that it does not know
@@ -162,7 +162,7 @@ def _by_camera(headers: Sequence[_Header]) -> dict[tuple[object, ...], CameraSet
 
 
 def _measure(path: Path, shared: CameraSettings) -> RawMeasures:
-    with rawpy.imread(str(path)) as raw:
+    with open_raw(path) as raw:
         wide = raw.postprocess(
             **_develop_options(*shared), half_size=True, gamma=(1, 1),
             output_color=rawpy.ColorSpace.raw, output_bps=16)

@@ -27,9 +27,9 @@ def _check_assignments(
 
 @verb("batch")
 @click.argument(
-    "inputs", metavar="INPUT...", nargs=-1, required=True, type=click.Path(path_type=Path))
+    "inputs", metavar="INPUT...", nargs=-1, required=True, type=options.PathType())
 @click.option(
-    "--out", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+    "--out", required=True, type=options.PathType(file_okay=False), metavar="DIR",
     help="Folder of the workspaces, of batch.json and batch.html.")
 @options.executor("Captures")
 @click.option(
@@ -40,7 +40,7 @@ def _check_assignments(
     callback=_check_assignments,
     help="Set an option of any stage, such as train.minutes=2; may be repeated.  [default: none]")
 @click.option(
-    "--config", "config_file", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    "--config", "config_file", type=options.PathType(exists=True, dir_okay=False),
     help="TOML file with options.  [default: none]")
 @options.compute(trains=True)
 @options.again

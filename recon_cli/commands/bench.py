@@ -18,8 +18,8 @@ from recon_cli.experiments.outputs import OutputFiles
 from recon_cli.lazy import load
 from recon_cli.progress import TqdmProgress
 
-_FILE = click.Path(dir_okay=False, path_type=Path)
-_SCENE = click.Path(path_type=Path)
+_FILE = options.PathType(dir_okay=False)
+_SCENE = options.PathType()
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def _output_options(plot: str) -> Decorator:
     help="A tiny scene and few rounds: whether it works, not how fast.  [default: off]")
 @_output_options("Draw speed against error")
 @click.option(
-    "--compare", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+    "--compare", type=options.PathType(dir_okay=False), metavar="FILE",
     help="Print the ratio of each figure of an earlier --json FILE to this run's.  "
          "[default: none]")
 @options.verbosity
@@ -197,7 +197,7 @@ bench.add_command(train)
     "--clock", type=click.Choice(["wall", "cpu"]), default="wall",
     help="Which seconds are made equal; cpu on a machine that others use too.  [default: wall]")
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("study"),
+    "--out", type=options.PathType(file_okay=False), default=Path("study"),
     help="Folder of finished runs, study.json, study.md and study.svg; runs found there are not "
          "made again.  [default: study]")
 @_compute_options

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import sys
 from collections.abc import Callable
 from typing import TextIO
 
@@ -61,3 +63,13 @@ def usage_hint(error: click.ClickException) -> str:
     """Returns which --help explains the verb that was typed; empty where none was."""
     ctx = error.ctx if isinstance(error, click.UsageError) else None
     return f"See `{ctx.command_path} --help`." if ctx else ""
+
+
+def silence() -> None:
+    """Sends what is still to be printed nowhere: the reader of stdout or stderr is gone."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            os.dup2(nowhere, stream.fileno())

@@ -28,6 +28,7 @@ from recon_cli.config.settings import (
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
 from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 from recon_cli.executors.executor import CORES
+from recon_cli.workspace.paths import refuse_special
 
 if TYPE_CHECKING:
     from click.types import OptionHelpExtra
@@ -99,6 +100,20 @@ def _print_all(ctx: click.Context, _parameter: click.Parameter, value: bool) -> 
         ctx.exit()
 
 
+class PathType(click.Path):
+    """A path that is no pipe, socket or device, and no longer than one may be."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(path_type=Path, **settings)
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
+        """Returns the path; FormatError if it is one of those."""
+        refuse_special(Path(value))
+        return super().convert(value, param, ctx)
+
+
 class Option(click.Option):
     """An option of a verb; `expert` ones are in --help-all alone."""
 
@@ -163,11 +178,11 @@ def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPAC
     """Returns a decorator that adds -w (default: `envvar`, then `workspace`), --config and -v."""
     return stack([
         click.option(
-            "-w", "--workspace", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+            "-w", "--workspace", type=PathType(file_okay=False), metavar="DIR",
             default=workspace, envvar=envvar, show_default=True, show_envvar=True,
             expose_value=False, callback=_store("workspace"), help="Folder of all results."),
         click.option(
-            "--config", "config_file", type=click.Path(dir_okay=False, path_type=Path),
+            "--config", "config_file", type=PathType(dir_okay=False),
             expose_value=False, callback=_store("config_file"),
             help="TOML file with options.  [default: none]"),
         verbosity,

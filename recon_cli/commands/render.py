@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
@@ -73,7 +72,7 @@ def _color(
     "--crf", cls=options.Option, expert=True, type=int, metavar="N",
     help="Constant rate factor of the video; lower is better and larger.  [default: 18; av1: 28]")
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="FOLDER|FILE",
+    "--out", type=options.PathType(), metavar="FOLDER|FILE",
     help="Folder of the frames, where finished ones are kept; or a file for a single video (.mp4) "
          "or image (.png).  [default: a folder in render/ of the workspace]")
 @options.compute()

@@ -34,7 +34,7 @@ MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune while trainin
 DEMO: Settings = {**MID, "train": {"iterations": 1700, "stereo": "off"}}
 FORMS = ("text", "markdown", "csv", "latex", "json")
 
-_inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=click.Path(path_type=Path))
+_inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=options.PathType())
 
 
 @verb("ingest")
@@ -110,7 +110,7 @@ def train(
 
 
 @verb("import")
-@click.argument("file", required=False, type=click.Path(path_type=Path))
+@click.argument("file", required=False, type=options.PathType())
 @options.stage(ImportConfig, renders=True)
 @pass_call
 def import_scene(call: Call, file: Path | None) -> None:
@@ -157,7 +157,7 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 
 
 @verb("eval")
-@click.argument("items", metavar="[ITEM]...", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("items", metavar="[ITEM]...", nargs=-1, type=options.PathType())
 @click.option(
     "--seeds", type=click.IntRange(min=1), metavar="N",
     help="Train the models N - 1 more times with other seeds; print mean and deviation.  "

@@ -16,13 +16,14 @@ from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.context import TrainCallback
-from recon_cli.errors import InputError
+from recon_cli.errors import ExitCode, InputError
 from recon_cli.lazy import load
+from recon_cli.signals import exit_code
 from recon_cli.workspace.layout import Workspace
 
 
 @verb("view")
-@click.argument("item", metavar="[ITEM]", required=False, type=click.Path(path_type=Path))
+@click.argument("item", metavar="[ITEM]", required=False, type=options.PathType())
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
     help="Model to show first; auto: pruned if it is fresh, else base.")
@@ -66,8 +67,10 @@ def view(
             if _at_a_desktop() if opening is None else opening:
                 webbrowser.open(address)
             wait()
-    except KeyboardInterrupt:  # how a viewer is meant to end
-        click.echo("closed", err=True)
+    except KeyboardInterrupt as error:
+        if exit_code(error) != ExitCode.INTERRUPTED:
+            raise
+        click.echo("closed", err=True)  # by Ctrl-C, which is how a viewer is meant to end
 
 
 @contextmanager

@@ -101,7 +101,7 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
 
 @verb("report")
 @click.option(
-    "-o", "--out", type=click.Path(path_type=Path), metavar="FILE.html",
+    "-o", "--out", type=options.PathType(), metavar="FILE.html",
     help="File to write.  [default: report.html in the workspace]")
 @options.common()
 @pass_call

@@ -8,10 +8,7 @@ is can be read in the workspace.
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -23,19 +20,19 @@ from typing import Protocol, TypeVar
 from filelock import FileLock, Timeout
 
 from recon_cli import machine
+from recon_cli.errors import ExitCode
 from recon_cli.lazy import load
+from recon_cli.processes import CHILD, start_module
 from recon_cli.progress import Bar
 from recon_cli.workspace.layout import LOCK
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-PROGRAM = (sys.executable, "-m", "recon_cli")
-CHILD = "RECON_JOB"  # environment variable of a process that ends with the one that started it
+PROGRAM = "recon_cli"  # the module that is run
 CORES = 4  # of a command where nothing is said; more shorten it by little
 TRIES = 3  # of a command whose process is killed, by the system for want of memory or by somebody
-INTERRUPTED = 130
-KILLED = 128  # exit code of a shell for a process that a signal ended, plus that signal
+_ENDED = (ExitCode.HANGUP, ExitCode.TERMINATED)  # by a signal that recon handles
 _LOOK_SECONDS = 1.0  # between two looks at how far the commands are
 _LOCK_SECONDS = 60.0  # within which a process that lost its parent is gone
 _STOP_SECONDS = 60.0  # for saving a checkpoint
@@ -83,7 +80,7 @@ class LocalExecutor:
         running = RunningCommand(command)
         with self._lock:
             if self._stopped:
-                return INTERRUPTED
+                return ExitCode.INTERRUPTED
             self._running.add(running)
         try:
             return running.wait()
@@ -114,10 +111,10 @@ class RunningCommand:
         """Runs the command until it ends by itself, three times at most; returns its exit code."""
         code = 0
         for _ in range(TRIES):
-            code = INTERRUPTED if self._stopped.is_set() else self._run_once()
-            if code >= 0:
+            code = ExitCode.INTERRUPTED if self._stopped.is_set() else self._run_once()
+            if code >= 0 and code not in _ENDED:
                 return code
-        return KILLED - code
+        return code if code > 0 else ExitCode.SIGNAL - code
 
     def interrupt(self) -> None:
         """Has the command save what it has and end; `wait` returns 130."""
@@ -125,7 +122,7 @@ class RunningCommand:
         process = self._process
         if process is not None:
             with contextlib.suppress(ProcessLookupError):
-                process.send_signal(signal.SIGINT)
+                process.terminate()  # not by SIGINT, which may be ignored in the background
             timer = threading.Timer(_STOP_SECONDS, process.kill)
             timer.daemon = True
             timer.start()
@@ -136,18 +133,18 @@ class RunningCommand:
         command.log.parent.mkdir(parents=True, exist_ok=True)
         if command.workspace.is_dir():
             _wait_until_free(command.workspace)
-        # Beside the log: `python -m` looks for modules in the current folder first. A session of
-        # its own: Ctrl-C is passed on by `interrupt`, once.
-        with command.log.open("wb") as log, subprocess.Popen(
-            [*PROGRAM, *command.words], cwd=command.log.parent,
-            stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
-            env={**os.environ, CHILD: "1"},
+        # A session of its own: Ctrl-C is passed on by `interrupt`, once.
+        with command.log.open("wb") as log, start_module(
+            PROGRAM, *command.words, folder=command.log.parent, out=log, errors=subprocess.STDOUT,
+            session=True, **{CHILD: "1"},
         ) as process:
             self._process = process
             if self._stopped.is_set():
                 self.interrupt()
             try:
-                return process.wait()
+                code = process.wait()
+                ended = code < 0 or code in _ENDED
+                return ExitCode.INTERRUPTED if ended and self._stopped.is_set() else code
             finally:
                 self._process = None
                 process.kill()  # where this thread is interrupted itself
@@ -237,12 +234,12 @@ def find_reason(log: Path, code: int) -> str:
     """Returns why a command failed, by its last error message; empty where it did not."""
     if code == 0:
         return ""
-    if code == INTERRUPTED:
+    if code == ExitCode.INTERRUPTED:
         return "interrupted"
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     _, found, message = text.rpartition("\nerror: " if "\nerror: " in text else "error: ")
     if found:
         return message.partition("\nhint: ")[0].strip()
-    if code > KILLED:
-        return f"its process was killed by signal {code - KILLED}, {TRIES} times"
+    if code > ExitCode.SIGNAL:
+        return f"its process was killed by signal {code - ExitCode.SIGNAL}, {TRIES} times"
     return text.strip().splitlines()[-1] if text.strip() else "it left no message"

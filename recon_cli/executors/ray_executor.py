@@ -9,9 +9,10 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import tempfile
 import threading
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,9 @@ except ImportError:  # `connect` says so
     ray = None
 
 from recon_cli import __version__
-from recon_cli.errors import BackendError, ReconError, WorkspaceError, list_names
-from recon_cli.executors.executor import CORES, INTERRUPTED, TRIES, Command, RunningCommand
+from recon_cli.errors import BackendError, ExitCode, ReconError, WorkspaceError, list_names
+from recon_cli.executors.executor import CORES, TRIES, Command, RunningCommand
+from recon_cli.signals import keeping_handlers
 from recon_cli.workspace.atomic import write_bytes
 
 _PROBE_SECONDS = 60.0  # for a machine that is busy
@@ -31,7 +33,6 @@ _STORE_BYTES = 100 << 20  # of objects that travel; ours are words
 _HEAD_SECONDS = 2.0  # between two looks at the head
 _HEAD_TRIES = 5  # looks in a row that find no head, before it is given up
 _INSIDE = "RECON_RUN_BY_RAY"  # environment variable of what Ray runs
-_WORKER_DIED = 137  # exit code where no process is left to tell one
 
 
 class RayExecutor:
@@ -68,7 +69,8 @@ class RayExecutor:
         address = os.environ.get("RAY_ADDRESS")
         own = {} if address else {"include_dashboard": False, "object_store_memory": _STORE_BYTES}
         try:
-            ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
+            with keeping_handlers(), _in_empty_folder():
+                ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise BackendError(
                 f"No Ray cluster answers at {address or 'this machine'}: {error}",
@@ -87,7 +89,7 @@ class RayExecutor:
         words = list(command.words), str(command.workspace), str(command.log)
         with self._lock:
             if self._stopped:
-                return INTERRUPTED
+                return ExitCode.INTERRUPTED
             reference = ray.remote(max_retries=TRIES - 1, max_calls=1, **self._needs)(
                 _run_command).remote(*words)
             self._running.add(reference)
@@ -104,11 +106,11 @@ class RayExecutor:
                 try:
                     return int(ray.get(reference))
                 except ray.exceptions.TaskCancelledError:
-                    return INTERRUPTED
+                    return ExitCode.INTERRUPTED
                 except ray.exceptions.RayError:
                     if self._stopped:
-                        return INTERRUPTED
-                    return _WORKER_DIED
+                        return ExitCode.INTERRUPTED
+                    return ExitCode.KILLED  # no process is left to tell a code
         raise BackendError(
             "The head of the Ray cluster is lost.",
             hint="Start the cluster again and repeat the same command: finished work is kept.")
@@ -136,6 +138,18 @@ class RayExecutor:
                 misses += 1
             threading.Event().wait(_HEAD_SECONDS)
         self._head_lost.set()
+
+
+@contextlib.contextmanager
+def _in_empty_folder() -> Iterator[None]:
+    """Changes to an empty folder: Ray's workers import modules from that of `ray.init` first."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory(prefix="recon-ray-") as folder:
+        os.chdir(folder)
+        try:
+            yield
+        finally:
+            os.chdir(before)
 
 
 @contextlib.contextmanager

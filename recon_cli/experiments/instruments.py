@@ -7,8 +7,6 @@ pixel while it renders; it changes nothing that is computed.
 from __future__ import annotations
 
 import statistics
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +19,7 @@ import psutil
 import torch
 
 from recon_cli import machine
+from recon_cli.processes import run_code
 from recon_cli.render import registry
 from recon_cli.render.contract import RenderOutput
 from recon_cli.render.numba.kernel import kernel
@@ -166,11 +165,7 @@ print(time.perf_counter() - start)
 def warm_start(rounds: int) -> Timing:
     """Returns the time from importing the backend to kernels that are ready, in new processes."""
     registry.prepare("numba", lambda: None)  # fills the cache
-    command = [sys.executable, "-c", _WARM_START]
-    return timing_of([
-        1e3 * float(subprocess.run(
-            command, capture_output=True, text=True, check=True).stdout.split()[-1])
-        for _ in range(rounds)])
+    return timing_of([1e3 * float(run_code(_WARM_START).split()[-1]) for _ in range(rounds)])
 
 
 # Operations of an evaluated pair, forward and backward, counted in the inner loops of the

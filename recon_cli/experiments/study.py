@@ -182,7 +182,7 @@ def run(request: StudyRequest, progress: Progress) -> str:
             {loaded.folders.name: study.run_scene(loaded) for loaded in scenes},
             {loaded.folders.name: loaded.folders.digest for loaded in scenes})
         atomic.write_json(out / "study.json", result.record())
-        atomic.write_bytes(out / "study.md", markdown(result).encode())
+        atomic.write_text(out / "study.md", markdown(result))
         draw_if_possible(lambda path: draw(result, path), out / "study.svg")
     return text(result)
 

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views

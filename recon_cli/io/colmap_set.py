@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, NamedImage, model_suffix, read_model
+from recon_cli.io.images import decode_file
 from recon_cli.io.posed import SUFFIXES, PosedImage, PosedSet, find_images, is_file, resolve_inside
 from recon_cli.scene.camera import MODELS, Lens
 
@@ -51,8 +52,8 @@ def _colors_agree(model: Model, folder: Path, names: list[str]) -> bool:
     right = 0
     checked = sorted({int((at + 0.5) * len(names) / _CHECKED) for at in range(_CHECKED)})
     for index in checked:
-        pixels = cv2.imread(
-            str(folder / names[index]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels = decode_file(
+            folder / names[index], cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if pixels is None:
             continue
         rgb = pixels[:, :, ::-1].astype(np.float64)

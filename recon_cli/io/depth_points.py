@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import undistort_pixels
+from recon_cli.io.images import decode_file
 from recon_cli.io.posed import PosedImage, PosedSet
 
 MAX_POINTS = 100_000  # as many as INRIA's 3DGS draws if a data set has no points
@@ -62,7 +63,7 @@ def _unproject(image: PosedImage, step: int) -> tuple[NDArray[np.float64], NDArr
 def _read_rgb(image: PosedImage) -> NDArray[np.uint8]:
     lens = image.lens
     # Poses and depth belong to the pixels as they lie in the file.
-    data = cv2.imread(str(image.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    data = decode_file(image.path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if data is None or data.shape[:2] != (lens.height, lens.width):
         raise FormatError(
             f"{image.path} cannot be read as an image of {lens.width}x{lens.height} pixels.",

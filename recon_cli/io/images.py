@@ -54,10 +54,23 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
 
 
 def _read(path: Path, flags: int, kind: str) -> NDArray[np.uint8]:
-    data: NDArray[np.uint8] | None = cv2.imread(str(path), flags)
+    data = decode_file(path, flags)
     if data is None:
         raise FormatError(f"{path} cannot be read as {kind}.", hint="Run `recon sfm --again`.")
     return data
+
+
+def decode_file(path: Path, flags: int) -> NDArray[np.uint8] | None:
+    """Returns an image file as OpenCV decodes it, None where it cannot or there is none.
+
+    cv2.imread itself crashes on a path that is not UTF-8, and finds none with letters beyond ASCII
+    on Windows.
+    """
+    try:
+        data = np.fromfile(path, np.uint8)
+        return cv2.imdecode(data, flags) if len(data) else None
+    except (OSError, cv2.error):  # of more pixels than it allows
+        return None
 
 
 def fill_masked(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -97,9 +110,7 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
 
 def read_png(path: Path) -> NDArray[np.uint8]:
     """Returns the pixels of a frame, RGB, [H, W, 3]."""
-    # Not cv2.imread, which cannot open every path on Windows.
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    bgr = decode_file(path, cv2.IMREAD_COLOR)
     if bgr is None:
         raise FormatError(f"{path} cannot be read as an image.", hint=AGAIN)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

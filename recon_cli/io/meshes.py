@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import trimesh
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.workspace.atomic import write_bytes
 
 SUFFIXES = ("ply", "glb", "obj")

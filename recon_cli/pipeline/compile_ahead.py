@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +11,7 @@ from pathlib import Path
 
 from recon_cli import machine
 from recon_cli.pipeline.execute import Job
+from recon_cli.processes import start_module
 
 _SOURCES = Path(__file__).parents[1] / "render"
 _DRIVER = Path("/proc/driver/nvidia/version")  # of an NVIDIA GPU
@@ -33,11 +32,9 @@ def compile_ahead(job: Job, stages: Sequence[str], *, again: bool) -> Iterator[N
     if not _waits(job, stages, again=again):
         yield
         return
-    command = [sys.executable, "-m", "recon_cli.train.compile_worker", job.compute.backend,
-               job.compute.device]
-    # In the workspace: `python -m` looks for modules in the current folder first.
-    with tempfile.TemporaryFile() as log, subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=job.workspace.root,
+    with tempfile.TemporaryFile() as log, start_module(
+        "recon_cli.train.compile_worker", job.compute.backend, job.compute.device,
+        folder=job.workspace.root, out=log, errors=log,
     ) as child:
         try:
             yield

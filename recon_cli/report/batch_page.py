@@ -61,7 +61,7 @@ def write_batch_page(results: Sequence[CaptureResult], out: Path) -> Path:
               for result in results])
     path = out / FILE
     with disk_errors(out, "writing the page"):
-        atomic.write_bytes(path, page.encode())
+        atomic.write_text(path, page)
     return path
 
 

@@ -13,10 +13,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database as database_file
 
 # A match agrees below the Sampson error, in pixels, at which COLMAP accepted it

@@ -16,9 +16,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 
-import pycolmap
-
 from recon_cli.errors import SfmError
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import (
     checks,
     database,

@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.images import read_png
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.job import MappingJob, Reporter, Result

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.tracks import Tracks
 from recon_cli.scene.covisibility import cut_graph
 from recon_cli.sfm import database, mapper, matching, merge_models, skeleton

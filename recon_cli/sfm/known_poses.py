@@ -13,12 +13,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from recon_cli.errors import SfmError
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.records import KnownPoses, read_poses
 from recon_cli.sfm import checks, database, features, mapper, matching
 from recon_cli.sfm.evidence import gather_evidence

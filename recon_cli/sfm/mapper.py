@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
 

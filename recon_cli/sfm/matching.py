@@ -11,10 +11,10 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, list_names
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.database import scales
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, Result

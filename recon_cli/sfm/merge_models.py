@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import mapper, verdict
 from recon_cli.sfm.checks import MIN_FRAMES
 from recon_cli.sfm.job import MappingJob

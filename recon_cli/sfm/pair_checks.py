@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.evidence import (
     MAX_ERROR,
     explained_matches,

@@ -5,12 +5,10 @@ Native code can abort, hang or fill the memory; in a process of its own it does 
 
 from __future__ import annotations
 
-import os
 import queue
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from recon_cli.errors import ReconError, SfmError
+from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
 from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, parse
@@ -153,11 +152,9 @@ def run_job(
 def _start(job: MappingJob, file: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Yields the running process and kills it on leaving, however that happens."""
     threads = str(job.threads)
-    # In the stage's folder: `python -m` looks for modules in the current folder first.
-    with (job.out / LOG).open("ab") as log, subprocess.Popen(
-        [sys.executable, "-m", "recon_cli.sfm.worker", str(file)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, cwd=job.out,
-        env={**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads},
+    with (job.out / LOG).open("ab") as log, start_module(
+        "recon_cli.sfm.worker", str(file), folder=job.out, out=subprocess.PIPE, errors=log,
+        OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads,
     ) as child:
         try:
             yield child

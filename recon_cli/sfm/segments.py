@@ -19,12 +19,13 @@ from pathlib import Path
 from recon_cli.errors import (
     BackendError,
     ConfigError,
+    ExitCode,
     FormatError,
+    ReconError,
     SfmError,
     WorkspaceError,
 )
 from recon_cli.executors.executor import (
-    KILLED,
     Command,
     Executor,
     find_reason,
@@ -53,7 +54,8 @@ COMMAND = "map-segment"  # of recon, which takes JOB
 # in the folder of a segment: what to do, how much of it is done, and what the command printed
 JOB, PROGRESS, OUTPUT = "segment.json", "progress.json", "output.txt"
 _RECORD_SECONDS = 0.5  # between two writes of how much is done
-_ERRORS = {kind.exit_code: kind for kind in (FormatError, BackendError, WorkspaceError)}
+_ERRORS: dict[int, type[ReconError]] = {
+    kind.exit_code: kind for kind in (FormatError, BackendError, WorkspaceError)}
 
 # Gives what runs so many commands, and the threads that each of them has.
 Start = Callable[[int], tuple[Executor, int]]
@@ -191,7 +193,7 @@ def _run_all(
         dataclasses.replace(jobs[index], max_minutes=left).write(folder / JOB)
         code = executor.run(Command((COMMAND, str(folder / JOB)), folder, folder / OUTPUT))
         reason = find_reason(folder / OUTPUT, code)
-        if 0 < code < KILLED and code != SfmError.exit_code:  # no fault of the segment
+        if 0 < code < ExitCode.SIGNAL and code != SfmError.exit_code:  # no fault of the segment
             raise _ERRORS.get(code, SfmError)(
                 f"Segment {index} could not be mapped: {reason}",
                 hint=f"Finished segments are kept. What was printed is in {folder / OUTPUT}.")

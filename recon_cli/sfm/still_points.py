@@ -7,8 +7,9 @@ text that its recorder had written into every frame.
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
+
+from recon_cli.io.colmap_library import pycolmap
 
 # A point says something from three images on; two that follow each other may be alike.
 MIN_IMAGES = 3

@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
-import pycolmap
-
 from recon_cli.errors import SfmError
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import mapper
 from recon_cli.sfm.checks import MIN_FRAMES
 from recon_cli.sfm.job import MappingJob

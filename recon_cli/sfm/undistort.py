@@ -14,10 +14,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap import Pinhole
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.images import read_png, write_png
 from recon_cli.io.records import read_poses
 from recon_cli.scene.similarity import Similarity

@@ -16,10 +16,10 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from recon_cli.errors import SfmError, list_names
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
 from recon_cli.sfm.still_points import MAX_STILL, find_still_share

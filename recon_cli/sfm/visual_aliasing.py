@@ -17,9 +17,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import faulthandler
 import os
 import shutil
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -19,8 +18,8 @@ from typing import BinaryIO
 import cv2
 import filelock
 
-from recon_cli import machine
 from recon_cli.errors import ReconError, WorkspaceError
+from recon_cli.processes import end_with_parent
 from recon_cli.sfm import (
     database,
     fallbacks,
@@ -40,6 +39,7 @@ from recon_cli.sfm.job import (
     Result,
     StepLog,
 )
+from recon_cli.signals import leave_to_parent
 from recon_cli.workspace.summaries import WorldSummary
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
@@ -130,9 +130,9 @@ def _take_stdout() -> BinaryIO:
 def main() -> None:
     """Runs the job named on the command line and reports errors to the parent."""
     report = Reporter(_take_stdout())
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    leave_to_parent()
     faulthandler.enable()
-    machine.end_with_parent()
+    end_with_parent()
     job = MappingJob.read(Path(sys.argv[1]))
     cv2.setNumThreads(1)  # images are shared out among the threads of the job
     try:

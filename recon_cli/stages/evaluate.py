@@ -56,7 +56,7 @@ from recon_cli.scene.scene import Scene
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.assess import TrustTask, assess
-from recon_cli.workspace.atomic import write_bytes, write_json
+from recon_cli.workspace.atomic import write_json, write_text
 from recon_cli.workspace.summaries import EvaluateSummary, WorldSummary
 
 _GAIN = 4  # of the difference images
@@ -245,14 +245,14 @@ def _write(
         note += (f"pruned minus base: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
                  f"{differences['ssim'].text('+.4f')} (95% by bootstrap over the views)\n")
     first = model_table(by_label)
-    write_bytes(out / "table.txt", f"{first.text(rule=True)}\n{note}".encode())
+    write_text(out / "table.txt", f"{first.text(rule=True)}\n{note}")
     views = view_table(by_label)
-    write_bytes(out / "metrics.md", f"{first.markdown()}\n{views.markdown()}\n{note}".encode())
-    write_bytes(out / "metrics.csv", csv_table(models).encode())
+    write_text(out / "metrics.md", f"{first.markdown()}\n{views.markdown()}\n{note}")
+    write_text(out / "metrics.csv", csv_table(models))
     tex = first.latex()
     if len(models) == 2:
         tex += "\n" + paper_table({workspace: (models["base"], models["pruned"])}).latex()
-    write_bytes(out / "metrics.tex", tex.encode())
+    write_text(out / "metrics.tex", tex)
 
 
 def _difference(models: Mapping[str, ModelMetrics], key: str) -> Interval:

@@ -6,11 +6,12 @@ standard error alone, and does not outlive its parent.
 
 from __future__ import annotations
 
-import signal
 import sys
 
 from recon_cli import machine
+from recon_cli.processes import end_with_parent
 from recon_cli.render import registry
+from recon_cli.signals import leave_to_parent
 from recon_cli.stereo import depths
 
 
@@ -30,8 +31,8 @@ def compile_kernels(backend: str, device: str) -> None:
 
 def main() -> None:
     """Compiles for the options on the command line."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    machine.end_with_parent()
+    leave_to_parent()
+    end_with_parent()
     machine.yield_to_others()
     compile_kernels(*sys.argv[1:])
 

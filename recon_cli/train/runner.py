@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 from recon_cli.context import StageContext, TrainCallback, TrainReport
 from recon_cli.progress import Bar
 from recon_cli.scene.splats import Splats
+from recon_cli.signals import Interrupted, deferring
 from recon_cli.train.distributed.data_parallel import fit_together
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
@@ -41,27 +41,6 @@ class Segment:
     keep: Mapping[int, str] = field(default_factory=dict)
 
 
-@contextmanager
-def _defer_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yields whether Ctrl-C was pressed, so that no step is cut; a second one interrupts."""
-    pressed: list[int] = []
-
-    def handle(number: int, _frame: object) -> None:
-        if pressed:
-            raise KeyboardInterrupt
-        pressed.append(number)
-
-    try:
-        before = signal.signal(signal.SIGINT, handle)
-    except ValueError:  # not the main thread
-        yield lambda: bool(pressed)
-        return
-    try:
-        yield lambda: bool(pressed)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def run_fit(
     state: TrainState, task: Task, until: int, segment: Segment, ctx: StageContext,
     importance: Importance | None = None,
@@ -71,10 +50,10 @@ def run_fit(
     No checkpoints are written while `importance` gets the scores of the steps: they hold no scores.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed; the state has been saved.
+        Interrupted: a signal asked to end; the state has been saved.
     """
     out, total = segment.out, segment.until - segment.first
-    with _defer_interrupt() as interrupted, ctx.progress.bar(
+    with deferring() as interrupted, ctx.progress.bar(
         segment.label, total, unit="step", done=state.iteration - segment.first
     ) as bar:
         log = TrainLog(out / LOG, state.iteration, segment.earlier_seconds)
@@ -194,7 +173,7 @@ class Checkpointer(TrainCallback):
 
     def __init__(
         self, state: TrainState, path: Path | None, every: int, keep: Mapping[int, Path],
-        interrupted: Callable[[], bool], prepare: Callable[[], None],
+        interrupted: Callable[[], int], prepare: Callable[[], None],
         record: Callable[[int], None],
     ) -> None:
         self._state, self._path, self._every, self._keep = state, path, every, keep
@@ -206,7 +185,7 @@ class Checkpointer(TrainCallback):
         return iteration % self._every == 0 or iteration in self._keep
 
     def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
-        """Saves the state where that is due; raises KeyboardInterrupt after Ctrl-C."""
+        """Saves the state where that is due; raises Interrupted after a signal."""
         interrupted = self._interrupted()
         if iteration in self._keep:
             save_state(self._keep[iteration], self._state)
@@ -217,4 +196,4 @@ class Checkpointer(TrainCallback):
                 save_state(self._path, self._state)
             self._record(iteration)
         if interrupted:
-            raise KeyboardInterrupt
+            raise Interrupted(interrupted)

@@ -18,6 +18,7 @@ from recon_cli.errors import ConfigError
 from recon_cli.viewer.content import PhotoPairs, ViewerContent, set_initial_camera
 from recon_cli.viewer.session import UPS, Session
 from recon_cli.viewer.trust_tint import TrustTint
+from recon_cli.viewer.visitors import refusing_strangers
 
 HOST, PORT = "127.0.0.1", 8080
 _TRIED = 100  # ports after the first, if none is given
@@ -43,7 +44,8 @@ def start_server(host: str, port: int | None, *, label: str) -> Iterator[tuple[S
     chosen = _free_port(host, port)
     # viser prints to stdout; the commands print what a user has to know
     rich.get_console().quiet = True
-    server = Server(host, chosen, label=label, verbose=False)
+    with refusing_strangers(host):
+        server = Server(host, chosen, label=label, verbose=False)
     try:
         if server.get_port() != chosen:  # viser moves on to the next port silently
             raise _port_error(chosen)

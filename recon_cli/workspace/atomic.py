@@ -19,6 +19,7 @@ from recon_cli.workspace import journal
 
 MAX_TEXT_BYTES = 256 << 20  # of a JSON or TOML file; parsing takes some twenty times as much memory
 _MOST_DIGITS = 20  # of an integer of 64 bits, with its sign
+_NAME = 40  # characters of a name that a temporary one keeps
 LEFTOVERS = ".*.tmp*"  # files that `replacing` had not finished when it was killed
 
 
@@ -28,7 +29,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
     It is flushed before the rename, so that a crash leaves the old file or the new one.
     """
-    temporary = path.with_name(f".{path.name}.tmp{os.getpid()}{path.suffix}")
+    # shortened, so that it is no longer than a name may be
+    temporary = path.with_name(f".{path.name[:_NAME]}.tmp{os.getpid()}{path.suffix}")
     try:
         yield temporary
         _share(temporary)
@@ -71,6 +73,11 @@ def write_bytes(path: Path, data: bytes) -> None:
     """Writes `data` to `path`, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes text as UTF-8, whole or not at all; file names in it need not be UTF-8."""
+    write_bytes(path, text.encode(errors="replace"))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import InputError
+from recon_cli.workspace.paths import refuse_special
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,10 @@ def read_source(path: Path, *, known: Source | None = None, without: Path) -> So
     `known`, an earlier reading, saves time.
 
     Raises:
-        InputError: the path is missing or cannot be read.
+        InputError: the path is missing, is not a file or folder, or cannot be read.
     """
     path, known_files = path.absolute(), known.files if known else {}
+    refuse_special(path)
     try:
         if path.is_dir():
             paths = {str(p.relative_to(path)): p for p in _files_below(path, without)}

@@ -25,7 +25,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
-from recon_cli.workspace import journal, manifest
+from recon_cli.workspace import disk, journal, manifest
 from recon_cli.workspace.atomic import clear_leftovers, read_json, sync_folder, write_json
 from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, describe_progress
@@ -255,27 +255,22 @@ def disk_errors(root: Path, doing: str) -> Iterator[None]:
     """Turns errors for want of space or permission in a workspace into a WorkspaceError."""
     try:
         yield
-    except OSError as error:
-        raise _explain(error, root, doing) from error
+    except WorkspaceError:
+        raise
+    except Exception as error:
+        explained = _explain(error, root, doing)
+        if explained is None:
+            raise
+        raise explained from error
 
 
-def _explain(error: OSError, root: Path, doing: str) -> ReconError | OSError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        place = next(path for path in (root, *root.parents) if path.exists())
-        free = shutil.disk_usage(place).free / 1e6
-        return WorkspaceError(
-            f"The disk is full while {doing}: {free:.0f} MB free at {root}.",
-            hint="Free some space and run the same command again; finished work is kept.")
-    if error.errno == errno.EFBIG:  # a limit of the process, or of a file system such as FAT32
-        return WorkspaceError(
-            f"A file is larger than {root} can hold, while {doing}.",
-            hint="Give a workspace on another disk with -w, or raise `ulimit -f`.")
-    inside = error.filename is None or Path(os.fsdecode(error.filename)).is_relative_to(root)
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and inside:
+def _explain(error: Exception, root: Path, doing: str) -> ReconError | None:
+    if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and (
+            error.filename is None or Path(os.fsdecode(error.filename)).is_relative_to(root)):
         return WorkspaceError(
             f"The workspace is not writable while {doing}: {error}.",
             hint=f"Check the permissions of {root}, or give another workspace with -w.")
-    return error
+    return disk.explain(error, root, doing)
 
 
 def _folders(parent: Path) -> list[Path]:

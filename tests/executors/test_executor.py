@@ -1,5 +1,4 @@
 import signal
-import sys
 import threading
 import time
 
@@ -11,28 +10,33 @@ from recon_cli.executors.executor import Command, LocalExecutor
 # Stands for recon: counts its starts in the folder in which it runs, and does what it is told.
 STAND_IN = """
 import os, pathlib, signal, sys, time
+signal.signal(signal.SIGTERM, signal.default_int_handler)
 starts = pathlib.Path("starts")
 starts.write_text(starts.read_text() + "x" if starts.exists() else "x")
 count, what = len(starts.read_text()), sys.argv[-1]
 print("argument", what, flush=True)
 if what == "die-once" and count == 1 or what == "die":
     os.kill(os.getpid(), signal.SIGKILL)
+if what == "end-once" and count == 1:
+    raise SystemExit(143)
 if what == "wait":
     try:
         pathlib.Path("waiting").touch()
         time.sleep(600)
     except KeyboardInterrupt:
         pathlib.Path("saved").touch()
-        raise SystemExit(130)
+        raise SystemExit(143)
 raise SystemExit(int(what) if what.isdigit() else 0)
 """
 
 
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch):
-    path = tmp_path / "stand_in.py"
-    path.write_text(STAND_IN, encoding="utf-8")
-    monkeypatch.setattr(executor, "PROGRAM", (sys.executable, str(path)))
+    folder = tmp_path / "modules"
+    folder.mkdir()
+    (folder / "stand_in.py").write_text(STAND_IN, encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.setattr(executor, "PROGRAM", "stand_in")
 
 
 def command(tmp_path, *words):
@@ -52,8 +56,9 @@ def test_the_exit_code_comes_back_and_what_was_printed_is_in_the_log(tmp_path, c
 
 
 @pytest.mark.usefixtures("stand_in")
-def test_a_command_whose_process_was_killed_is_run_again(tmp_path):
-    assert LocalExecutor(1).run(command(tmp_path, "die-once")) == 0
+@pytest.mark.parametrize("how", ["die-once", "end-once"])
+def test_a_command_whose_process_was_killed_is_run_again(tmp_path, how):
+    assert LocalExecutor(1).run(command(tmp_path, how)) == 0
     assert starts(tmp_path) == 2
 
 

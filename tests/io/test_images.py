@@ -1,11 +1,21 @@
 """Images and their masks as training and scores read them."""
 
+import os
+
 import cv2
 import numpy as np
 import pytest
 
 from recon_cli.errors import FormatError
-from recon_cli.io.images import fill_masked, read_mask, read_masked_image, to_uint8, write_png
+from recon_cli.io.images import (
+    fill_masked,
+    read_image,
+    read_mask,
+    read_masked_image,
+    read_png,
+    to_uint8,
+    write_png,
+)
 
 
 def written(path, mask):
@@ -88,3 +98,23 @@ def test_gray_and_sixteen_bits_survive_a_png(tmp_path):
 def test_eight_bits_round_to_the_nearest_step_and_clip():
     values = np.array([-1, 0, 0.49 / 255, 0.51 / 255, 1, 7], np.float32)
     np.testing.assert_array_equal(to_uint8(values), [0, 0, 0, 1, 255, 255])
+
+
+def test_a_path_that_is_not_utf8_is_read(tmp_path):
+    path = tmp_path / os.fsdecode(b"x\xff\xfe") / "m.png"
+    path.parent.mkdir()
+    write_png(path, np.full((4, 6, 3), 200, np.uint8))
+    assert read_png(path).shape == (4, 6, 3)
+    assert read_image(path, 6, 4).mean() == 200
+    assert read_mask(path, 6, 4).sum() == 0
+
+
+@pytest.mark.parametrize("data", [None, b"", b"no image"])
+def test_what_is_missing_empty_or_no_image_is_a_typed_error(tmp_path, data):
+    path = tmp_path / "m.png"
+    if data is not None:
+        path.write_bytes(data)
+    for read in (read_png, lambda path: read_image(path, 6, 4)):
+        with pytest.raises(FormatError, match="cannot be read") as raised:
+            read(path)
+        assert raised.value.hint

@@ -55,6 +55,7 @@ def follow() -> int:
         BackendError: the processes cannot be connected.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # torchrun ends it so, without a word
     logger.setLevel(logging.WARNING)
     processes = load("recon_cli.train.distributed.process_group.TorchProcessGroup")
     try:

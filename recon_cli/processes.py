@@ -1,0 +1,73 @@
+"""Processes of Python that recon starts: of its own code alone, whatever lies beside the data.
+
+`python -m` and `python -c` look for modules in the current folder first, which is often one with
+data of others: a numpy.py there would be run. Nothing else in the package starts a program.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import IO
+
+SAFE_PATH = "PYTHONSAFEPATH"
+CHILD = "RECON_JOB"  # environment variable of a command that ends with the one that started it
+
+
+def protect_children() -> None:
+    """Keeps every process of Python that starts from here on from importing the current folder.
+
+    Libraries start some too, such as the resource tracker of `multiprocessing`.
+    """
+    os.environ[SAFE_PATH] = "1"
+
+
+def python_command(*arguments: str) -> list[str]:
+    """Returns the command line of this Python without the current folder on its path."""
+    return [sys.executable, "-P", *arguments]
+
+
+def child_environment(**more: str) -> dict[str, str]:
+    """Returns the environment of a child; its own children are protected as well.
+
+    An empty entry of PYTHONPATH is the current folder, and a relative one would be looked for in
+    that of the child.
+    """
+    environment = {**os.environ, **more, SAFE_PATH: "1"}
+    paths = [str(Path(entry).absolute())
+             for entry in environment.pop("PYTHONPATH", "").split(os.pathsep) if entry]
+    return {**environment, "PYTHONPATH": os.pathsep.join(paths)} if paths else environment
+
+
+def start_module(
+    module: str, *arguments: str, folder: Path, out: int | IO[bytes], errors: int | IO[bytes],
+    session: bool = False, **environment: str,
+) -> subprocess.Popen[bytes]:
+    """Starts `python -m module` in a folder; the end of its standard input is that of its parent.
+
+    With `session` it is in a session of its own, where Ctrl-C in a terminal does not reach it.
+    """
+    return subprocess.Popen(
+        python_command("-m", module, *arguments), cwd=folder, stdin=subprocess.PIPE, stdout=out,
+        stderr=errors, start_new_session=session, env=child_environment(**environment))
+
+
+def run_code(code: str) -> str:
+    """Runs Python code in a process of its own and returns what it prints."""
+    return subprocess.run(
+        python_command("-c", code), env=child_environment(), capture_output=True, text=True,
+        check=True).stdout
+
+
+def end_with_parent() -> None:
+    """Ends this process when its standard input does, which is when its parent is gone."""
+
+    def watch() -> None:
+        while os.read(0, 1):  # not sys.stdin, whose lock the interpreter wants at its own end
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,83 @@
+"""Who may ask the viewer's server for anything: its own page, by an address that is its own.
+
+A page of somebody else in the same browser reaches it too, and so does one whose name was made to
+point at this machine after it was loaded (DNS rebinding). Both tell on themselves: a browser says
+which page asks (Origin) and by which name (Host).
+"""
+
+from __future__ import annotations
+
+import http
+import ipaddress
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+from urllib.parse import urlsplit
+
+import websockets.asyncio.server as websocket_server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+_Answer = Callable[[ServerConnection, Request], Response | None]
+
+
+def find_refusal(host: str, hosts: list[str], origins: list[str]) -> str:
+    """Returns why a request is refused, empty if it is not.
+
+    `host` is what the server listens on; the others are the values of the request's headers. No
+    Origin is sent by programs that are no browser.
+    """
+    if len(hosts) != 1 or not _is_own(urlsplit(f"//{hosts[0]}").hostname or "", host):
+        return ("This address is not one of this machine. Open the one that recon printed, or the "
+                "machine's IP address.")
+    if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
+        return "Only the viewer's own page may connect."
+    return ""
+
+
+def _is_own(name: str, host: str) -> bool:
+    """Returns whether no stranger can have chosen a name: an IP address, or one of this machine."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        names = {"localhost", host.lower()}
+        for own in (socket.gethostname().lower(), socket.getfqdn().lower()):
+            names |= {own, own.partition(".")[0], f"{own.partition('.')[0]}.local"}
+        return name in names or name.endswith(".localhost")
+    return True
+
+
+@contextmanager
+def refusing_strangers(host: str) -> Iterator[None]:
+    """Has the server of viser that starts in the block refuse strangers.
+
+    viser leaves no other way than the function by which it serves.
+
+    Raises:
+        RuntimeError: it no longer serves by that; it must not run without.
+    """
+    plain, served = websocket_server.serve, []
+
+    def serve(*arguments: Any, process_request: _Answer, **options: Any) -> Any:
+        served.append(True)
+        return plain(*arguments, process_request=partial(_answer, host, process_request), **options)
+
+    websocket_server.serve = serve  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websocket_server.serve = plain  # type: ignore[misc]
+    if not served:
+        raise RuntimeError("viser serves in another way than before, which would admit strangers")
+
+
+def _answer(
+    host: str, answer: _Answer, connection: ServerConnection, request: Request
+) -> Response | None:
+    refusal = find_refusal(
+        host, request.headers.get_all("Host"), request.headers.get_all("Origin"))
+    if refusal:
+        return connection.respond(http.HTTPStatus.FORBIDDEN, f"{refusal}\n")
+    return answer(connection, request)

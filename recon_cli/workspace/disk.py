@@ -1,0 +1,102 @@
+"""A disk that is full, however the library says so that met it.
+
+Only Python raises an OSError. Others raise an error of their own with the system's words in it, and
+streams of C++ say nothing at all, so what was written by one has to be read again.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from recon_cli.errors import ReconError, WorkspaceError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_WORDS = {
+    os.strerror(errno.ENOSPC): errno.ENOSPC,
+    os.strerror(errno.EDQUOT): errno.EDQUOT,
+    os.strerror(errno.EFBIG): errno.EFBIG,
+    "database or disk is full": errno.ENOSPC,  # of SQLite
+}
+# What is wrong with a path or the system, not with recon.
+_OUTSIDE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG, errno.EMFILE,
+            errno.ENFILE, errno.ELOOP, errno.ENXIO, errno.ENODEV, errno.ESTALE)
+_PROBE_BYTES = 1 << 20
+_MUCH_BYTES = 1 << 30  # free: it is another disk, or a quota, that is full
+_SHOWN = 200  # characters of a path
+_NO_TEMPORARY = "No usable temporary directory"  # of tempfile
+
+
+def find_space_errno(error: BaseException) -> int | None:
+    """Returns the number of the system's error for want of space behind an error, or None."""
+    for each in _causes(error):
+        if isinstance(each, OSError) and each.errno in (*_FULL, errno.EFBIG):
+            return each.errno
+        text = str(each)
+        for words, number in _WORDS.items():
+            if words in text:
+                return number
+    return None
+
+
+def refuse_full_disk(folder: Path) -> None:
+    """Raises OSError where a folder has no room for a small file, by writing one."""
+    descriptor, name = tempfile.mkstemp(dir=folder, prefix=".probe.", suffix=".tmp")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(bytes(_PROBE_BYTES))
+            file.flush()
+            os.fsync(descriptor)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def explain(error: BaseException, root: Path, doing: str) -> ReconError | None:
+    """Returns the error that says what has no space while `doing`; None where it is another one."""
+    number = find_space_errno(error)
+    if number in _FULL:
+        place = _fullest(root)
+        free = _free(place)
+        left = f": {free / 1e6:.1f} MB free at {place}" if free < _MUCH_BYTES else ""
+        return WorkspaceError(
+            f"The disk is full while {doing}{left}.",
+            hint="Free some space and run the same command again; finished work is kept.")
+    if number == errno.EFBIG:  # a limit of the process, or of a file system such as FAT32
+        return WorkspaceError(
+            f"A file is larger than {root} can hold, while {doing}.",
+            hint="Give a workspace on another disk with -w, or raise `ulimit -f`.")
+    if isinstance(error, OSError) and _NO_TEMPORARY in str(error):
+        return WorkspaceError(
+            f"No folder for temporary files can be written while {doing}: they are full, or not "
+            "writable.", hint="Free some space in /tmp, or set TMPDIR to a folder of yours.")
+    if isinstance(error, OSError) and error.errno in _OUTSIDE and error.filename is not None:
+        return WorkspaceError(
+            f"{str(os.fsdecode(error.filename))[:_SHOWN]} cannot be opened while {doing}: "
+            f"{error.strerror}.", hint="Check its name, its permissions and its disk.")
+    return None
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """Yields an error, what led to it, and so on."""
+    at: BaseException | None = error
+    while at is not None:
+        yield at
+        at = at.__cause__ or (None if at.__suppress_context__ else at.__context__)
+
+
+def _fullest(root: Path) -> Path:
+    """Returns which of the disks in use has the least space: that of `root` or of TMPDIR."""
+    places = [next(path for path in (root, *root.parents) if path.exists())]
+    try:
+        places.append(Path(tempfile.gettempdir()))
+    except OSError:  # none can be written
+        return places[0]
+    return min(places, key=_free)
+
+
+def _free(path: Path) -> int:
+    return shutil.disk_usage(path).free

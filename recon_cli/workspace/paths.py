@@ -1,0 +1,35 @@
+"""Paths that cannot be read or replaced like a file, told before anything is opened."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+from recon_cli.errors import FormatError
+
+_SHOWN = 60  # characters of a name that is too long
+_KINDS = {
+    stat.S_ISFIFO: "a named pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a device",
+    stat.S_ISBLK: "a device"}
+
+
+def refuse_special(path: Path) -> None:
+    """Raises FormatError unless a path is a file, a folder, or not there.
+
+    A pipe or a device would be waited for, or give bytes without end.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise FormatError(
+                f"{str(path)[:_SHOWN]}... is longer than a path or a name in it can be.",
+                hint="Give a shorter one.") from error
+        return
+    for is_kind, kind in _KINDS.items():
+        if is_kind(mode):
+            raise FormatError(
+                f"{path} is {kind}, not a file.",
+                hint="Save what it gives to a file, and give the path of that.")
