@@ -182,7 +182,7 @@ def main(seed: int, count: int, only: tuple[int, ...], kind: str | None, workers
                    f"({time.monotonic() - begin:.0f} s to prepare); full disks are {disks}")
         os.sched_setaffinity(0, cores)
         rows = _run_all(root, seed, numbers, workers=workers or len(cores), keep=keep,
-                        verbose=verbose, end=begin + 60 * minutes)
+                        verbose=verbose, end=time.monotonic() + 60 * minutes)
     finally:
         if not keep:
             shutil.rmtree(root, ignore_errors=True)
