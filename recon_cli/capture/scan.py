@@ -17,6 +17,7 @@ from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.capture.static_overlay import OverlayMeter
 from recon_cli.capture.tracker import Tracker
+from recon_cli.capture.video_colour import WIDE_GAMUTS
 from recon_cli.errors import InputError
 from recon_cli.io.tracks import Tracks
 from recon_cli.workspace import atomic
@@ -235,6 +236,13 @@ def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> 
     if first.tags.transfer is not None:
         notices.append(
             f"{path.name} is {first.tags.transfer.value} video: tone-mapped to SDR by one curve.")
+    elif first.tags.primaries in WIDE_GAMUTS:
+        notices.append(
+            f"{path.name} has colours of {WIDE_GAMUTS[first.tags.primaries]}: converted to sRGB.")
+    if first.tags.orientation.mirrored:
+        notices.append(
+            f"{path.name} is mirrored as its display matrix says; if players show writing in it "
+            "reversed, the scene is reversed, too.")
     if interlaced:
         notices.append(f"{path.name} is interlaced: {interlaced} frames are deinterlaced.")
     width, height = first.square_size

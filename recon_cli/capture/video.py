@@ -22,7 +22,15 @@ from av.stream import Disposition
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from recon_cli.capture.decoded_picture import DecodedPicture, Gap, Tags, deinterlace, read_tags
+from recon_cli.capture.decoded_picture import (
+    UNSUPPORTED_MATRICES,
+    DecodedPicture,
+    Gap,
+    Tags,
+    deinterlace,
+    read_tags,
+)
+from recon_cli.capture.video_colour import BT2020
 from recon_cli.errors import InputError
 
 # FFmpeg renders text and text art as video; no capture is that.
@@ -154,8 +162,20 @@ def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
                 yield item
                 continue
             # Not before the first frame: some cameras signal HLG only within the stream.
-            tags = tags or read_tags(stream)
+            tags = tags or _read_tags(path, stream, item[0])
             yield DecodedPicture(item[0], tags, item[1])
+
+
+def _read_tags(path: Path, stream: VideoStream, first: av.VideoFrame) -> Tags:
+    """Returns the tags of a video; InputError if its colours cannot be converted."""
+    name = UNSUPPORTED_MATRICES.get(first.colorspace)
+    if name is not None:
+        matrix = "2020_ncl" if stream.codec_context.color_primaries == BT2020 else "709"
+        raise InputError(
+            f"{path} stores its colours as {name}, which cannot be converted here.",
+            hint="Convert it first, for example with "
+            f'ffmpeg -i "{path}" -vf zscale=matrix={matrix} -crf 16 "{path.stem}-{matrix}.mp4"')
+    return read_tags(stream, first)
 
 
 def frames_at(

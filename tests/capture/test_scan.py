@@ -190,6 +190,24 @@ def test_hdr_is_named_with_its_kind(tmp_path):
             f"{name}.mp4 is {name} video: tone-mapped to SDR by one curve.",)
 
 
+@pytest.mark.parametrize(("primaries", "name"), [(9, "BT.2020"), (12, "Display P3")])
+def test_a_wide_gamut_of_sdr_is_named(tmp_path, primaries, name):
+    path = write_luma(tmp_path / "a.mp4", [np.full((64, 96), 500)] * 3, primaries=primaries)
+    assert notices(path) == (f"a.mp4 has colours of {name}: converted to sRGB.",)
+
+
+def test_a_mirrored_video_is_named_and_a_turned_one_is_not(tmp_path):
+    path = write_video(tmp_path / "a.mp4", [texture(64, 96)] * 3)
+    data = path.read_bytes()
+    set_display_matrix(path, (-65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30))
+    assert notices(path) == (
+        "a.mp4 is mirrored as its display matrix says; if players show writing in it reversed, the "
+        "scene is reversed, too.",)
+    path.write_bytes(data)
+    set_display_matrix(path, (-65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30))
+    assert notices(path) == ()
+
+
 def test_ten_bits_of_sdr_give_no_notice(tmp_path):
     assert notices(write_luma(tmp_path / "ten.mp4", [np.full((64, 96), 500)] * 3)) == ()
 
