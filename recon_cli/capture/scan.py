@@ -155,11 +155,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         overlay.advance(gray, *tracker.corners)
         step()
     if first is None:
-        with video.open_video(path) as (_, stream):
-            codec = stream.codec_context.name
-        raise InputError(
-            f"No frame of {path} can be decoded; its codec is {codec}.",
-            hint=f"Copy it from the camera again. {video.convert_hint(path)}")
+        raise _nothing_decoded(path)
     width, height = first.size
     claim = video.read_declared_length(path)
     return Scan(
@@ -171,6 +167,20 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         seconds=tuple(frame.seconds for frame in measures),
         whole=_find_whole(measures, gaps), tracks=tracker.tracks(), overlay=overlay.overlay(),
         notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))
+
+
+def _nothing_decoded(path: Path) -> InputError:
+    """Returns the error for a video of which no frame came out."""
+    with video.open_video(path) as (_, stream):
+        codec, stored = stream.codec_context.name, stream.frames
+    if stored and not video.read_declared_length(path).frames:
+        return InputError(
+            f"{path} holds {stored} frames, but its edit list shows none of them.",
+            hint="Take the trimming back, for example with "
+            f'ffmpeg -ignore_editlist 1 -i "{path}" -c copy "{path.stem}-all.mp4"')
+    return InputError(
+        f"No frame of {path} can be decoded; its codec is {codec}.",
+        hint=f"Copy it from the camera again. {video.convert_hint(path)}")
 
 
 def _measure(

@@ -128,7 +128,7 @@ def convert_hint(path: Path) -> str:
 class DeclaredLength:
     """The length of a video by its container."""
 
-    frames: int  # 0 where it has no count
+    frames: int  # that it shows; 0 where it has no count
     seconds: float  # 0 where unknown
     rate: float  # frames per second; a rough guess where the rate varies
 
@@ -144,7 +144,22 @@ def read_declared_length(path: Path) -> DeclaredLength:
             seconds = float(stream.duration * stream.time_base)
         else:
             seconds = (container.duration or 0) / av.time_base
-        return DeclaredLength(stream.frames, seconds, float(stream.average_rate or 0))
+        return DeclaredLength(
+            _count_frames(container, stream), seconds, float(stream.average_rate or 0))
+
+
+def _count_frames(container: InputContainer, stream: VideoStream) -> int:
+    """Returns how many frames a container says that it shows, 0 where it has no count."""
+    index = list(stream.index_entries)
+    if not stream.frames or not index:
+        return stream.frames
+    if "mov" in container.format.name:
+        # Edit lists, by which phones trim clips, leave out what the file still holds.
+        return sum(not entry.is_discard for entry in index)
+    if container.format.name == "avi":
+        # A place that only repeats the frame before counts, but has no entry.
+        return stream.frames - (index[-1].timestamp - index[0].timestamp + 1 - len(index))
+    return stream.frames
 
 
 def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
