@@ -17,6 +17,7 @@ from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.capture.static_overlay import OverlayMeter
 from recon_cli.capture.tracker import Tracker
+from recon_cli.capture.video_colour import WIDE_GAMUTS
 from recon_cli.errors import InputError
 from recon_cli.io.tracks import Tracks
 from recon_cli.workspace import atomic
@@ -154,11 +155,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         overlay.advance(gray, *tracker.corners)
         step()
     if first is None:
-        with video.open_video(path) as (_, stream):
-            codec = stream.codec_context.name
-        raise InputError(
-            f"No frame of {path} can be decoded; its codec is {codec}.",
-            hint=f"Copy it from the camera again. {video.convert_hint(path)}")
+        raise _nothing_decoded(path)
     width, height = first.size
     claim = video.read_declared_length(path)
     return Scan(
@@ -170,6 +167,20 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         seconds=tuple(frame.seconds for frame in measures),
         whole=_find_whole(measures, gaps), tracks=tracker.tracks(), overlay=overlay.overlay(),
         notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))
+
+
+def _nothing_decoded(path: Path) -> InputError:
+    """Returns the error for a video of which no frame came out."""
+    with video.open_video(path) as (_, stream):
+        codec, stored = stream.codec_context.name, stream.frames
+    if stored and not video.read_declared_length(path).frames:
+        return InputError(
+            f"{path} holds {stored} frames, but its edit list shows none of them.",
+            hint="Take the trimming back, for example with "
+            f'ffmpeg -ignore_editlist 1 -i "{path}" -c copy "{path.stem}-all.mp4"')
+    return InputError(
+        f"No frame of {path} can be decoded; its codec is {codec}.",
+        hint=f"Copy it from the camera again. {video.convert_hint(path)}")
 
 
 def _measure(
@@ -235,6 +246,13 @@ def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> 
     if first.tags.transfer is not None:
         notices.append(
             f"{path.name} is {first.tags.transfer.value} video: tone-mapped to SDR by one curve.")
+    elif first.tags.primaries in WIDE_GAMUTS:
+        notices.append(
+            f"{path.name} has colours of {WIDE_GAMUTS[first.tags.primaries]}: converted to sRGB.")
+    if first.tags.orientation.mirrored:
+        notices.append(
+            f"{path.name} is mirrored as its display matrix says; if players show writing in it "
+            "reversed, the scene is reversed, too.")
     if interlaced:
         notices.append(f"{path.name} is interlaced: {interlaced} frames are deinterlaced.")
     width, height = first.square_size

@@ -22,7 +22,15 @@ from av.stream import Disposition
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from recon_cli.capture.decoded_picture import DecodedPicture, Gap, Tags, deinterlace, read_tags
+from recon_cli.capture.decoded_picture import (
+    UNSUPPORTED_MATRICES,
+    DecodedPicture,
+    Gap,
+    Tags,
+    deinterlace,
+    read_tags,
+)
+from recon_cli.capture.video_colour import BT2020
 from recon_cli.errors import InputError
 
 # FFmpeg renders text and text art as video; no capture is that.
@@ -120,7 +128,7 @@ def convert_hint(path: Path) -> str:
 class DeclaredLength:
     """The length of a video by its container."""
 
-    frames: int  # 0 where it has no count
+    frames: int  # that it shows; 0 where it has no count
     seconds: float  # 0 where unknown
     rate: float  # frames per second; a rough guess where the rate varies
 
@@ -136,7 +144,22 @@ def read_declared_length(path: Path) -> DeclaredLength:
             seconds = float(stream.duration * stream.time_base)
         else:
             seconds = (container.duration or 0) / av.time_base
-        return DeclaredLength(stream.frames, seconds, float(stream.average_rate or 0))
+        return DeclaredLength(
+            _count_frames(container, stream), seconds, float(stream.average_rate or 0))
+
+
+def _count_frames(container: InputContainer, stream: VideoStream) -> int:
+    """Returns how many frames a container says that it shows, 0 where it has no count."""
+    index = list(stream.index_entries)
+    if not stream.frames or not index:
+        return stream.frames
+    if "mov" in container.format.name:
+        # Edit lists, by which phones trim clips, leave out what the file still holds.
+        return sum(not entry.is_discard for entry in index)
+    if container.format.name == "avi":
+        # A place that only repeats the frame before counts, but has no entry.
+        return stream.frames - (index[-1].timestamp - index[0].timestamp + 1 - len(index))
+    return stream.frames
 
 
 def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
@@ -154,8 +177,20 @@ def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
                 yield item
                 continue
             # Not before the first frame: some cameras signal HLG only within the stream.
-            tags = tags or read_tags(stream)
+            tags = tags or _read_tags(path, stream, item[0])
             yield DecodedPicture(item[0], tags, item[1])
+
+
+def _read_tags(path: Path, stream: VideoStream, first: av.VideoFrame) -> Tags:
+    """Returns the tags of a video; InputError if its colours cannot be converted."""
+    name = UNSUPPORTED_MATRICES.get(first.colorspace)
+    if name is not None:
+        matrix = "2020_ncl" if stream.codec_context.color_primaries == BT2020 else "709"
+        raise InputError(
+            f"{path} stores its colours as {name}, which cannot be converted here.",
+            hint="Convert it first, for example with "
+            f'ffmpeg -i "{path}" -vf zscale=matrix={matrix} -crf 16 "{path.stem}-{matrix}.mp4"')
+    return read_tags(stream, first)
 
 
 def frames_at(

@@ -123,6 +123,27 @@ def set_display_matrix(path: Path, matrix):
     path.write_bytes(data)
 
 
+def set_edit_list(path: Path, edits):
+    """Makes an MP4 show these parts of its video: (first second, seconds) each; None is a pause."""
+    data = bytearray(path.read_bytes())
+    movie, media = (
+        struct.unpack_from(">I", data, data.index(name) + 16)[0] for name in (b"mvhd", b"mdhd"))
+    start = data.index(b"elst") - 4
+    length, = struct.unpack_from(">I", data, start)
+    first, = struct.unpack_from(">i", data, start + 20)  # what B-frames need in front
+    entries = b"".join(
+        struct.pack(">Iihh", round(seconds * movie),
+                    -1 if second is None else first + round(second * media), 1, 0)
+        for second, seconds in edits)
+    box = struct.pack(">I4sII", 16 + len(entries), b"elst", 0, len(edits)) + entries
+    for parent in (b"moov", b"trak", b"edts"):
+        at = data.index(parent) - 4
+        size, = struct.unpack_from(">I", data, at)
+        struct.pack_into(">I", data, at, size + len(box) - length)
+    data[start:start + length] = box
+    path.write_bytes(data)
+
+
 def spoil_packets(path: Path, numbers, *, erase=False):
     """Overwrites the inside of the packets that come at these places in the file."""
     with av.open(str(path)) as container:

@@ -1,11 +1,28 @@
 """Frames as they are displayed: colours, aspect, rotation and fields."""
 
 from fractions import Fraction
+from itertools import product
 
 import av
 import cv2
 import numpy as np
 import pytest
+from colour_formulas import (
+    COLOURS,
+    HLG,
+    PQ,
+    centres,
+    depth,
+    displayed,
+    frame_of,
+    hlg_encode,
+    pq_encode,
+    srgb_decode,
+    srgb_encode,
+    to_codes,
+    to_primaries,
+    to_signals,
+)
 from media import (
     set_display_matrix,
     spoil_packets,
@@ -17,25 +34,27 @@ from media import (
 )
 
 from recon_cli.capture.decoded_picture import (
-    BT709,
-    PEAK,
-    SDR_WHITE,
-    WHITE,
+    ROUNDED,
+    TRANSFERS,
     DecodedPicture,
     Gap,
-    Transfer,
-    gray_table,
-    hlg_scene,
-    pq_light,
-    pq_signal,
-    srgb_code,
-    to_sdr,
-    tone_map,
+    Tags,
+    nearest_orientation,
+    read_tags,
 )
 from recon_cli.capture.scan import scan_video
 from recon_cli.capture.video import decode, frames_at
+from recon_cli.capture.video_colour import (
+    PEAK,
+    SDR_WHITE,
+    Transfer,
+    hlg_scene,
+    pq_light,
+    srgb_code,
+    tone_map,
+)
 
-PQ, HLG, BT2020, BT2020_NCL = 16, 18, 9, 9  # codes of H.273
+BT2020, BT2020_NCL = 9, 9  # codes of H.273
 BT2020_10 = 14  # SDR
 LIGHTS = {PQ: pq_light, HLG: lambda signal: PEAK * hlg_scene(signal) ** 1.2}
 CLOCKWISE = (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
@@ -99,6 +118,214 @@ def test_a_ramp_of_ten_bits_equals_that_of_eight(tmp_path):
     assert np.abs(ten.rgb().astype(int) - eight.rgb()).max() <= 1
     # Gray is for measuring alone and takes the short way; swscale's last rows are one darker there.
     assert np.abs(ten.gray().astype(int) - eight.gray()).max() <= 2
+
+
+SDR, BT709, BT601, P3, UNTAGGED, RESERVED = 1, 1, 5, 12, 2, 3  # codes of H.273
+# Of 255: a half for the rounding to bytes; the rest for coefficients of 14 bits, and for tables
+# whose neighbours differ by 0.2 %, a tenth of 255 at the steepest.
+EXACT = 0.6
+# Without ACCURATE_RND: RGB and gray are cut to whole numbers, and chroma once before.
+TRUNCATED = 3
+FORMATS = (
+    "yuv420p", "yuvj420p", "nv12", "yuv422p", "yuvj422p", "nv16", "yuv444p", "yuv420p10le",
+    "p010le", "yuv422p10le", "p210le", "yuv444p10le", "yuv420p12le", "p012le", "yuv422p12le",
+    "yuv444p12le")
+
+
+@pytest.mark.parametrize("primaries", [BT709, BT2020, P3])
+@pytest.mark.parametrize("trc", [SDR, HLG, PQ])
+@pytest.mark.parametrize("pixels", FORMATS)
+def test_saturated_colours_are_those_of_the_formulas(pixels, trc, primaries):
+    tags = Tags(transfer=TRANSFERS.get(trc), primaries=primaries)
+    large = BT2020 if trc != SDR or primaries == BT2020 else BT601  # of 400 columns
+    matrices = {matrix: matrix for matrix in (BT709, BT601, BT2020)}
+    for matrix, meant in {**matrices, UNTAGGED: large, RESERVED: large}.items():
+        for full in (False, True) if "j" not in pixels else (True,):
+            codes = to_codes(COLOURS, meant, full=full, bits=depth(pixels))
+            picture = DecodedPicture(frame_of(codes, pixels, matrix=matrix, full=full), tags)
+            signals = to_signals(codes, meant, full=full, bits=depth(pixels))
+            expected = displayed(signals, trc, primaries)
+            off = np.abs(centres(picture.rgb()) - expected).max()
+            assert off <= EXACT, (matrix, full, off)
+
+
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("pixels", FORMATS)
+def test_gray_is_that_of_bt601_for_any_matrix(pixels, full):
+    for matrix in (BT709, BT601, BT2020):
+        codes = to_codes(COLOURS, matrix, full=full or "j" in pixels, bits=depth(pixels))
+        frame = frame_of(codes, pixels, matrix=matrix, full=full or "j" in pixels)
+        signals = to_signals(codes, matrix, full=full or "j" in pixels, bits=depth(pixels))
+        expected = 255 * signals @ np.array([0.299, 0.587, 0.114])
+        assert np.abs(centres(DecodedPicture(frame).gray()) - expected).max() <= TRUNCATED
+
+
+# What decoders of ProRes, MJPEG, DV, VP9, lossless H.264 and screen recorders give besides.
+@pytest.mark.parametrize(("pixels", "bits"), [
+    ("rgb24", 8), ("bgr0", 8), ("rgba", 8), ("gbrp", 8), ("rgb48le", 10), ("gbrp10le", 10),
+    ("gbrp12le", 10), ("gbrap12le", 10), ("x2rgb10le", 8), ("yuva444p10le", 10),
+    ("yuva444p12le", 10), ("ayuv64le", 10),
+    # A step of limited range in Cb or Cr is nearly two in R or B.
+    ("yuv440p10le", 9), ("y210le", 9), ("xv30le", 9)])
+@pytest.mark.parametrize("trc", [SDR, HLG, PQ])
+def test_other_formats_give_their_colours_to_their_bits(pixels, bits, trc):
+    codes = to_codes(COLOURS, BT2020, full=False, bits=12)
+    signals = to_signals(codes, BT2020, full=False, bits=12)
+    frame = frame_of(codes, "yuv444p12le", matrix=BT2020, full=False).reformat(
+        format=pixels, dst_colorspace=BT2020, interpolation=ROUNDED)
+    expected = displayed(signals, trc, BT2020)
+    off = np.abs(centres(DecodedPicture(frame, Tags(
+        transfer=TRANSFERS.get(trc), primaries=BT2020)).rgb()) - expected)
+    # A step of the format, in any direction of R, G and B.
+    steps = [np.clip(signals + np.array(step) / (1 << bits), 0, 1)
+             for step in product((-1, 0, 1), repeat=3)]
+    reach = np.max([np.abs(displayed(step, trc, BT2020) - expected) for step in steps], axis=0)
+    assert (off <= reach + EXACT).all()
+
+
+@pytest.mark.parametrize("transfer", Transfer)
+def test_untagged_hdr_and_wide_sdr_take_the_matrix_of_bt2020(transfer):
+    codes = to_codes(COLOURS, BT2020, full=False, bits=10)
+    tagged, untagged = (
+        frame_of(codes, "yuv420p10le", matrix=matrix, full=False) for matrix in (BT2020, UNTAGGED))
+    for tags in (Tags(transfer=transfer), Tags(primaries=BT2020)):
+        np.testing.assert_array_equal(
+            DecodedPicture(untagged, tags).rgb(), DecodedPicture(tagged, tags).rgb())
+
+
+@pytest.mark.parametrize("aspect", [Fraction(4, 3), Fraction(2)])
+@pytest.mark.parametrize("trc", [HLG, PQ])
+def test_anamorphic_hdr_keeps_its_colours(trc, aspect):
+    codes = to_codes(COLOURS, BT2020, full=False, bits=10)
+    frame = frame_of(codes, "yuv420p10le", matrix=BT2020, full=False)
+    tags = Tags(aspect, TRANSFERS[trc], BT2020)
+    narrow = cv2.resize(
+        DecodedPicture(frame, tags).rgb(), (frame.width, frame.height),
+        interpolation=cv2.INTER_AREA)
+    signals = to_signals(codes, BT2020, full=False, bits=10)
+    off = np.abs(centres(narrow) - displayed(signals, trc, BT2020))
+    assert off.max() <= 1  # rounded twice
+
+
+def write_frame(path, codes, *, trc, primaries, matrix):
+    """A file of three equal frames of ten bits, 4:2:0, without loss, with these tags."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        frame = frame_of(codes, "yuv420p10le", matrix=matrix, full=False)
+        stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, frame.format.name
+        context = stream.codec_context
+        context.color_trc, context.color_primaries = trc, primaries
+        context.colorspace, context.color_range = matrix, 1
+        for _ in range(3):
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def test_copies_of_one_clip_in_sdr_hlg_and_pq_look_alike(tmp_path):
+    """Colours of BT.709 below the knee of the curve, where HDR shows the light of SDR."""
+    light = srgb_decode(COLOURS) * 0.43  # of the white of SDR: 87 cd/m2
+    wide = to_primaries(light * SDR_WHITE, BT2020)
+    clips = {
+        "sdr": (srgb_encode(light), SDR, BT709), "p3": (
+            srgb_encode(to_primaries(light, P3)), SDR, P3),
+        "bt2020": (srgb_encode(wide / SDR_WHITE), BT2020_10, BT2020),
+        "hlg": (hlg_encode(wide), HLG, BT2020), "pq": (pq_encode(wide), PQ, BT2020)}
+    means = {}
+    for name, (signals, trc, primaries) in clips.items():
+        matrix = BT2020_NCL if primaries == BT2020 else BT709
+        codes = to_codes(signals, matrix, full=False, bits=10)
+        path = write_frame(
+            tmp_path / f"{name}.mkv", codes, trc=trc, primaries=primaries, matrix=matrix)
+        found = centres(pictures(path)[1].rgb())
+        stored = to_signals(codes, matrix, full=False, bits=10)
+        assert np.abs(found - displayed(stored, trc, primaries)).max() <= EXACT, name
+        means[name] = found.mean(axis=0) / found.mean(axis=0).sum()
+    for name, mean in means.items():
+        np.testing.assert_allclose(mean, means["sdr"], atol=0.002, err_msg=name)
+
+
+# a, b, c, d of x' = a x + c y, y' = b x + d y, and what a player does to a picture.
+EIGHT = {
+    "as stored": ((1, 0, 0, 1), lambda picture: picture),
+    "turned right": ((0, 1, -1, 0), lambda picture: np.rot90(picture, -1)),
+    "upside down": ((-1, 0, 0, -1), lambda picture: np.rot90(picture, 2)),
+    "turned left": ((0, -1, 1, 0), lambda picture: np.rot90(picture)),
+    "mirrored": ((-1, 0, 0, 1), np.fliplr),
+    "top down": ((1, 0, 0, -1), np.flipud),
+    "transposed": ((0, 1, 1, 0), lambda picture: picture.swapaxes(0, 1)),
+    "transposed upside down": (
+        (0, -1, -1, 0), lambda picture: np.rot90(picture.swapaxes(0, 1), 2))}
+
+
+def matrix_of(a, b, c, d):
+    """The matrix of an MP4's track header, without a translation."""
+    return (*(round(65536 * value) for value in (a, b)), 0,
+            *(round(65536 * value) for value in (c, d)), 0, 0, 0, 1 << 30)
+
+
+@pytest.mark.parametrize("name", EIGHT)
+@pytest.mark.parametrize("write", [write_video, write_interlaced])
+def test_a_frame_is_shown_as_players_show_it(tmp_path, write, name):
+    shape, show = EIGHT[name]
+    path = write(tmp_path / "a.mp4", [texture(64, 96, coarseness=8)] * 2)
+    stored = pictures(path)[0]
+    if name != "as stored":
+        set_display_matrix(path, matrix_of(*shape))
+    picture = pictures(path)[0]
+    np.testing.assert_array_equal(picture.rgb(), show(stored.rgb()))
+    np.testing.assert_array_equal(picture.gray(), show(stored.gray()))
+    assert picture.size == picture.gray().shape[::-1]
+    assert picture.tags.orientation.mirrored == (np.linalg.det(np.reshape(shape, (2, 2))) < 0)
+
+
+def turn(degrees):
+    """A rotation to the right."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return cos, sin, -sin, cos
+
+
+@pytest.mark.parametrize(("shape", "name"), [
+    ((0, 0, 0, 0), "as stored"),
+    (turn(10), "as stored"), (turn(44), "as stored"), (turn(45), "as stored"),
+    (turn(50), "turned right"), (turn(170), "upside down"), (turn(-80), "turned left"),
+    ((1, 0, 0, 0), "as stored"), ((0, 0, 0, 5), "as stored"), ((0, 1, 0, 0), "turned right"),
+    ((1, 1, 1, 1), "as stored"), ((9, 0, 0, 0.1), "as stored"), ((0, 9, -0.1, 0), "turned right"),
+    ((-0.1, 0, 0, 3), "mirrored"), ((0.01, 5, 5, 0), "transposed")])
+def test_an_odd_matrix_is_the_nearest_of_the_eight(shape, name):
+    assert nearest_orientation(*shape) == nearest_orientation(*EIGHT[name][0])
+
+
+@pytest.mark.parametrize("shape", [(0, 0, 0, 0), turn(10), (1, 0, 0, 0), (1, 1, 1, 1)])
+def test_a_frame_with_an_odd_matrix_is_shown_as_stored(tmp_path, shape):
+    path = write_video(tmp_path / "a.mp4", [texture(64, 96, coarseness=8)] * 2)
+    stored = pictures(path)[0].rgb()
+    set_display_matrix(path, matrix_of(*shape))
+    np.testing.assert_array_equal(pictures(path)[0].rgb(), stored)
+
+
+def test_a_matrix_that_stretches_gives_the_aspect_of_the_pixels(tmp_path):
+    path = write_video(tmp_path / "a.mp4", [texture(64, 96, coarseness=8)] * 2)
+    set_display_matrix(path, matrix_of(-2, 0, 0, 1))
+    picture = pictures(path)[0]
+    assert picture.size == (192, 64)
+    assert picture.tags.orientation.mirrored
+
+
+def test_side_data_that_cannot_be_listed_leaves_the_rotation(tmp_path):
+    class Frame:
+        """A frame with side data of a kind that PyAV does not know."""
+
+        rotation = -90
+
+        @property
+        def side_data(self):
+            raise ValueError(99)
+
+    path = write_video(tmp_path / "a.mp4", [texture(64, 96)])
+    with av.open(str(path)) as container:
+        assert read_tags(container.streams.video[0], Frame()).orientation == nearest_orientation(
+            *EIGHT["turned right"][0])
 
 
 def square_video(path, aspect, *, width=120):
@@ -249,113 +476,3 @@ def test_whole_frames_are_those_of_the_undamaged_video(tmp_path, packet):
     # A group of five, and one frame on either side.
     assert scan.lost <= 7
     assert len(damaged) + sum(isinstance(item, Gap) for item in decode(path, threads=1)) == 20
-
-
-# ITU-R BT.2087-0: linear BT.709 to linear BT.2020.
-TO_BT2020 = np.array([
-    [0.6274, 0.3293, 0.0433],
-    [0.0691, 0.9195, 0.0114],
-    [0.0164, 0.0880, 0.8956],
-])
-KNEE = 87.8  # cd/m2
-
-
-def hlg_signal(light):
-    """The HLG signal of display light in cd/m2 [3]: inverse OOTF and OETF of BT.2100, in words."""
-    luminance = np.dot([0.2627, 0.6780, 0.0593], light) / PEAK
-    scene = light / PEAK * luminance ** (1 / 1.2 - 1)
-    return np.where(
-        scene <= 1 / 12, np.sqrt(3 * scene),
-        0.17883277 * np.log(np.maximum(12 * scene - 0.28466892, 1e-9)) + 0.55991073)
-
-
-def sixteen_bits(signal):
-    return np.round(np.asarray(signal) * WHITE).astype(np.uint16)
-
-
-def gray(signals):
-    return np.repeat(sixteen_bits(signals)[None, :, None], 3, axis=2)
-
-
-# BT.2408, table 1: signal levels of a gray card, white, and the peak.
-@pytest.mark.parametrize(("light", "pq", "hlg"), [(26, 0.38, 0.38), (203, 0.58, 0.75)])
-def test_the_published_levels_of_gray_and_white_are_met(light, pq, hlg):
-    assert pq_light(np.array(pq)) == pytest.approx(light, rel=0.03)  # two digits are published
-    assert PEAK * hlg_scene(np.array(hlg)) ** 1.2 == pytest.approx(light, rel=0.03)
-
-
-def test_both_curves_end_where_the_standard_says():
-    assert pq_light(np.array([0.0, 1.0])) == pytest.approx([0, 10000])
-    assert hlg_scene(np.array([0.0, 0.5, 1.0])) == pytest.approx([0, 1 / 12, 1], abs=1e-6)
-    light = np.geomspace(0.01, 10000, 50)
-    np.testing.assert_allclose(pq_light(pq_signal(light)), light, rtol=1e-9)
-
-
-def test_the_curve_keeps_dark_light_and_bends_the_peak_to_the_white_of_sdr():
-    light = np.linspace(0, 2 * PEAK, 20001)
-    out = tone_map(light)
-    np.testing.assert_allclose(out[light < KNEE], light[light < KNEE], rtol=1e-9)
-    assert out[light >= PEAK] == pytest.approx(SDR_WHITE)
-    assert (np.diff(out[light <= PEAK]) > 0).all()
-    # No corner at the knee: the slope is 1 on both sides.
-    steps = np.diff(out) / np.diff(light)
-    assert np.abs(np.diff(steps)).max() < 0.002
-
-
-def test_srgb_codes_are_those_of_the_standard():
-    light = np.array([0, 0.0031308, 0.215861, 0.5, 1])  # 0.215861 is byte 128
-    assert srgb_code(light).tolist() == [0, 10, 128, 188, 255]
-
-
-@pytest.mark.parametrize("transfer", Transfer)
-def test_a_gray_ramp_follows_the_documented_curve(transfer):
-    signal = np.linspace(0, 1, 1024)
-    light = pq_light(signal) if transfer is Transfer.PQ else PEAK * hlg_scene(signal) ** 1.2
-    expected = srgb_code(tone_map(light) / SDR_WHITE).astype(int)
-    found = to_sdr(gray(signal), transfer)[0].astype(int)
-    assert np.abs(found - expected[:, None]).max() <= 1  # tables in between
-    assert np.ptp(found, axis=1).max() <= 1  # gray stays gray
-    table = gray_table(transfer)[np.round(255 * signal).astype(int)].astype(int)
-    steep = np.abs(np.diff(expected)).max() * 4  # an eighth bit is four steps of the tenth
-    assert np.abs(table - expected).max() <= steep
-
-
-# Below the knee, where the curve changes nothing: the display light is that of the SDR colour.
-@pytest.mark.parametrize("colour", [(80, 20, 5), (5, 70, 30), (3, 8, 85), (60, 60, 60)])
-@pytest.mark.parametrize("transfer", Transfer)
-def test_colours_of_bt709_in_bt2020_are_shown_as_they_are(transfer, colour):
-    light = TO_BT2020 @ np.array(colour, float)
-    signal = hlg_signal(light) if transfer is Transfer.HLG else pq_signal(light)
-    found = to_sdr(sixteen_bits(signal)[None, None], transfer)[0, 0].astype(int)
-    expected = srgb_code(np.array(colour) / SDR_WHITE).astype(int)
-    assert np.abs(found - expected).max() <= 1
-
-
-@pytest.mark.parametrize("transfer", Transfer)
-def test_a_brighter_colour_keeps_its_hue(transfer):
-    colour = np.array([600.0, 200, 100])  # six to two to one, far above the knee
-    light = TO_BT2020 @ colour
-    signal = hlg_signal(light) if transfer is Transfer.HLG else pq_signal(light)
-    code = to_sdr(sixteen_bits(signal)[None, None], transfer)[0, 0] / 255
-    linear = ((code + 0.055) / 1.055) ** 2.4
-    np.testing.assert_allclose(linear / linear[0], colour / colour[0], rtol=0.03)
-    assert linear[0] * SDR_WHITE == pytest.approx(tone_map(colour[:1])[0], rel=0.02)
-
-
-def test_colours_beyond_bt709_stay_in_range():
-    pure = np.eye(3)[None]
-    found = to_sdr(sixteen_bits(pure), Transfer.PQ)[0]
-    assert found.diagonal().tolist() == [255, 255, 255]
-    assert (found[~np.eye(3, dtype=bool)] == 0).all()
-
-
-def test_primaries_that_are_those_of_sdr_stay():
-    light = np.array([80.0, 20, 5])
-    found = to_sdr(sixteen_bits(pq_signal(light))[None, None], Transfer.PQ, primaries=BT709)
-    assert np.abs(found[0, 0].astype(int) - srgb_code(light / SDR_WHITE)).max() <= 1
-
-
-def test_a_pixel_does_not_depend_on_its_neighbours():
-    pixels = np.random.default_rng(0).integers(0, 65536, (300, 200, 3), dtype=np.uint16)
-    whole = to_sdr(pixels, Transfer.HLG)
-    np.testing.assert_array_equal(to_sdr(pixels[100:130], Transfer.HLG), whole[100:130])

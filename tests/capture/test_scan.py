@@ -7,7 +7,14 @@ import av
 import cv2
 import numpy as np
 import pytest
-from media import set_display_matrix, spoil_packets, texture, write_luma, write_video
+from media import (
+    set_display_matrix,
+    set_edit_list,
+    spoil_packets,
+    texture,
+    write_luma,
+    write_video,
+)
 
 from recon_cli.capture.decoded_picture import DecodedPicture
 from recon_cli.capture.frame_measures import measure_sharpness
@@ -153,6 +160,57 @@ def test_a_video_without_one_frame_that_decodes_names_its_codec(video):
     assert "libx264" in told.value.hint
 
 
+# (first second, seconds) of each part that is shown; groups begin at whole seconds.
+@pytest.mark.parametrize(("edits", "shown"), [
+    ([(0, 2)], range(20)), ([(1.5, 2.5)], range(15, 40)), ([(1.3, 1.7)], range(13, 30)),
+    ([(1, 9)], range(10, 40)), ([(None, 1), (1, 2)], range(10, 30)),
+    ([(0, 1), (3, 1)], [*range(10), *range(30, 40)]),
+    ([(2, 1), (1, 1)], [*range(20, 30), *range(10, 20)])])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_an_edit_list_leaves_out_is_not_lost(video, edits, shown, threads):
+    whole = [picture.rgb() for picture in decode(video, threads=1)]
+    set_edit_list(video, edits)
+    scan = scan_video(video, threads=threads, step=quiet)
+    assert (scan.declared, len(scan.whole), scan.lost) == (len(shown), len(shown), 0)
+    for index, rgb in frames_at(video, range(len(shown)), threads=threads):
+        np.testing.assert_array_equal(rgb, whole[shown[index]])
+
+
+def test_damage_within_an_edit_list_is_still_seen(video):
+    set_edit_list(video, [(1, 2)])
+    spoil_packets(video, [7], erase=True)
+    scan = scan_video(video, threads=1, step=quiet)
+    assert (scan.declared, scan.expected) == (20, 20)
+    assert 1 <= scan.lost <= 10
+
+
+def test_an_edit_list_that_shows_nothing_is_named(video):
+    set_edit_list(video, [(1, 0)])
+    with pytest.raises(InputError, match="holds 40 frames, but its edit list shows none") as told:
+        scan_video(video, threads=1, step=quiet)
+    assert "-ignore_editlist 1" in told.value.hint
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+def test_places_of_an_avi_that_repeat_a_frame_are_not_lost(tmp_path, codec):
+    path = tmp_path / "screen.avi"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 96, "yuv420p"
+        for index, rgb in enumerate(walk(60)):
+            if index % 4 == 3 or 20 < index < 30:
+                continue
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb))
+            frame.pts, frame.time_base = index, Fraction(1, 10)
+            container.mux(stream.encode(frame.reformat(format="yuv420p")))
+        container.mux(stream.encode())
+    scan = scan_video(path, threads=1, step=quiet)
+    assert (scan.declared, len(scan.whole), scan.lost) == (38, 38, 0)
+    data = path.read_bytes()
+    path.write_bytes(data[:len(data) * 2 // 3])  # without the index at its end
+    assert scan_video(path, threads=1, step=quiet).lost > 0
+
+
 def test_half_a_file_gives_the_frames_of_its_half(tmp_path):
     path = write_video(tmp_path / "walk.ts", walk())
     data = path.read_bytes()
@@ -188,6 +246,24 @@ def test_hdr_is_named_with_its_kind(tmp_path):
             tmp_path / f"{name}.mp4", [luma] * 3, trc=trc, primaries=BT2020, colorspace=BT2020)
         assert notices(path) == (
             f"{name}.mp4 is {name} video: tone-mapped to SDR by one curve.",)
+
+
+@pytest.mark.parametrize(("primaries", "name"), [(9, "BT.2020"), (12, "Display P3")])
+def test_a_wide_gamut_of_sdr_is_named(tmp_path, primaries, name):
+    path = write_luma(tmp_path / "a.mp4", [np.full((64, 96), 500)] * 3, primaries=primaries)
+    assert notices(path) == (f"a.mp4 has colours of {name}: converted to sRGB.",)
+
+
+def test_a_mirrored_video_is_named_and_a_turned_one_is_not(tmp_path):
+    path = write_video(tmp_path / "a.mp4", [texture(64, 96)] * 3)
+    data = path.read_bytes()
+    set_display_matrix(path, (-65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30))
+    assert notices(path) == (
+        "a.mp4 is mirrored as its display matrix says; if players show writing in it reversed, the "
+        "scene is reversed, too.",)
+    path.write_bytes(data)
+    set_display_matrix(path, (-65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30))
+    assert notices(path) == ()
 
 
 def test_ten_bits_of_sdr_give_no_notice(tmp_path):

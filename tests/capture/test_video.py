@@ -91,6 +91,16 @@ def test_untagged_video_of_high_definition_is_taken_as_bt709(tmp_path):
     assert np.abs(centres(picture.rgb()) - COLOURS).max() <= COLOUR_TOLERANCE
 
 
+@pytest.mark.parametrize("name", ["YCgCo", "ICtCp"])
+def test_a_colour_matrix_that_cannot_be_converted_is_named(tmp_path, name):
+    path = write_video(
+        tmp_path / "a.mkv", [quadrants()] * 3, colorspace=BT709, color_range=LIMITED,
+        options={"qp": "4", "x264-params": f"colormatrix={name}"})
+    with pytest.raises(InputError, match=f"a.mkv stores its colours as {name}") as told:
+        list(decode(path, threads=1))
+    assert f'ffmpeg -i "{path}" -vf zscale=matrix=709' in told.value.hint
+
+
 def test_gray_uses_the_full_range(tmp_path):
     path = write_video(tmp_path / "video.mp4", [np.full((64, 96, 3), 255, np.uint8)] * 3)
     assert first_frame(path).gray().min() >= 255 - COLOUR_TOLERANCE
