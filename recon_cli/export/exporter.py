@@ -30,6 +30,7 @@ from recon_cli.io.colmap import write_colmap
 from recon_cli.io.images import fit_camera
 from recon_cli.io.ply import write_ply, write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
+from recon_cli.io.splats.compressed_ply import write_compressed_ply
 from recon_cli.io.splats.glb import nearest_axes, write_glb
 from recon_cli.io.splats.html import write_html
 from recon_cli.io.splats.lod import LOD_META, make_levels, write_lod
@@ -51,6 +52,7 @@ MAX_LOSS_DB = {"splat": 3.0}
 _MAX_LOSS_DB = 0.3
 _IMAGES = "images"
 _COLOR_SIZE, _COLOR_VIEWS = 400, 100  # pixels and views, at most, that colours are fitted to
+_ROUNDING_VIEWS = 32  # at most, whose mean colour the rounding of a .compressed.ply leaves alone
 _SCORE = "loo"  # which Gaussians --max-mb keeps; docs/pruning.md
 
 logger = logging.getLogger("recon")
@@ -168,6 +170,10 @@ class Exporter:
                        views=self._place(self._scene.train))
         elif name == "splat":
             write_splat(path, self._at_degree(splats, 0).with_sphere())
+        elif name == "compressed.ply":
+            seen_from = self._place(evenly_spread(self._scene.train, _ROUNDING_VIEWS))
+            write_compressed_ply(
+                path, whole, centers=np.stack([camera.center for _, camera in seen_from]))
         else:
             FORMATS[name].write(path, whole)
 
