@@ -12,6 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
@@ -31,6 +32,7 @@ from recon_cli.io.splats.values import (
     splats_from_arrays,
     to_arrays,
 )
+from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.workspace.atomic import replacing
 
@@ -48,22 +50,28 @@ _STEP = 1 / 32  # of a coefficient: 256 steps from -4 to 4
 Words = NDArray[np.uint32]
 
 
-def write_compressed_ply(path: Path, splats: Splats) -> None:
+def write_compressed_ply(
+    path: Path, splats: Splats, *, centers: NDArray[np.float64] | None = None
+) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
 
     What lies far outside comes first: in a chunk of the room it would leave the others no bits.
+    The Gaussians of the room that fill the last chunk of these lose theirs, so they are the most
+    transparent ones: small ones would show, as each is seen as large as a pixel at least.
 
-    Log scales below -20 become -20, coefficients are clipped to -4 to 4, and none stays 0.
+    Log scales below -20 become -20, coefficients are clipped to -4 to 4, and none stays 0. Their
+    rounding changes no mean colour over the `centers` [C, 3] that the scene is seen from, where
+    these are known: it is taken off the base colour, whose steps are finer.
     FormatError if there are no Gaussians, one is too large, or a parameter is not finite.
     """
     values = to_arrays(splats, path.name)
-    # the logarithm of opacity x volume, whose products overflow
-    weights = values["log_scales"].sum(axis=1, dtype=np.float64) - np.logaddexp(
-        0, -values["logit_opacities"])
-    order = compact_order(values["means"], weights, _CHUNK)
+    order = compact_order(values["means"], values["logit_opacities"], _CHUNK)
     means, log_scales, quats, logits, sh_dc, sh_rest = (values[name][order] for name in (
         "means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest"))
     refuse_above(path, log_scales, _SCALE_RANGE)
+    harmonics = _harmonic_bytes(sh_rest)
+    if centers is not None and sh_rest.shape[1]:
+        sh_dc = sh_dc + _mean_change(means, sh_rest - _decode_harmonics(harmonics), centers) / SH_C0
     parts = [means, np.maximum(log_scales, -_SCALE_RANGE),
              (SH_C0 * sh_dc.astype(np.float64) + 0.5).astype(np.float32)]
     bounds, (place, scale, color) = zip(*[_bound_chunks(part) for part in parts], strict=True)
@@ -76,7 +84,7 @@ def write_compressed_ply(path: Path, splats: Splats) -> None:
         file.write(_header(len(splats), sh_rest.shape[1]))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
         file.write(words.astype("<u4").tobytes())
-        file.write(_harmonic_bytes(sh_rest).tobytes())
+        file.write(harmonics.tobytes())
 
 
 def _header(n: int, terms: int) -> bytes:
@@ -122,6 +130,17 @@ def _harmonic_bytes(sh_rest: Floats) -> Bytes:
     steps = np.where(sh_rest == 0, turns, steps)
     flat = steps.transpose(0, 2, 1).reshape(len(sh_rest), -1)
     return np.clip(flat, 0, 255).astype(np.uint8)
+
+
+def _mean_change(means: Floats, sh_rest: Floats, centers: NDArray[np.float64]) -> Floats:
+    """Returns the mean [N, 3] over the centers of the colour that coefficients [N, T, 3] add."""
+    degree = TERMS.index(sh_rest.shape[1])
+    places, rest = torch.from_numpy(means), torch.from_numpy(sh_rest)
+    total = torch.zeros(len(means), 3)
+    for center in torch.from_numpy(centers).float():
+        directions = torch.nn.functional.normalize(places - center, dim=1)
+        total += torch.einsum("nt,ntc->nc", basis_rest(directions, degree), rest)
+    return (total / len(centers)).numpy()
 
 
 def read_compressed_ply(path: Path) -> Splats:
@@ -205,8 +224,12 @@ def _harmonics(path: Path, tables: dict[str, NDArray[np.void]], n: int) -> Float
             kinds[name][0] != "u1" for name in names):
         raise FormatError(f"{path} has harmonics that do not make a degree of its Gaussians.")
     kept = min(count_terms(path, len(names)), TERMS[-1])
-    steps = np.stack([table[name] for name in names], axis=1).astype(np.float32)
+    return _decode_harmonics(np.stack([table[name] for name in names], axis=1))[:, :kept]
+
+
+def _decode_harmonics(coded: Bytes) -> Floats:
+    """Returns the coefficients [N, T, 3] of channel-major bytes [N, 3 T]."""
+    steps = coded.astype(np.float32)
     steps[steps > 0] += 0.5  # a byte means the middle of its step, but 0 and 255 the ends
     steps[steps > 255] = 256
-    by_channel = ((steps - 128) * np.float32(_STEP)).reshape(n, 3, -1)
-    return by_channel[:, :, :kept].transpose(0, 2, 1)
+    return ((steps - 128) * np.float32(_STEP)).reshape(len(coded), 3, -1).transpose(0, 2, 1)
