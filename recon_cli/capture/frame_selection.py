@@ -1,9 +1,9 @@
 """Which frames of a video or photos of a folder are chosen, and the record of the choice.
 
-From a video: locally sharp frames, spread evenly over the camera's path. Frames that are mostly
-black or blown out count as blurred; the best of them bridge gaps. Photos are all kept, except those
-that show nothing or the same view as another: where one of two equal views is held out, a model is
-tested on what it was trained on.
+From a video: locally sharp frames, spread evenly over the camera's path, one of those that show the
+same picture. Frames that are mostly black or blown out count as blurred; the best of them bridge
+gaps. Photos are all kept, except those that show nothing or the same view as another: where one of
+two equal views is held out, a model is tested on what it was trained on.
 """
 
 from __future__ import annotations
@@ -260,6 +260,8 @@ def video_candidates(
     refused: Sequence[Reason | None],  # [F], see `Judgement`
     lengths: NDArray[np.float64],  # [F], `path_length`
     names: dict[int, str],  # of the stored frames by index; at least one
+    *,
+    standing: NDArray[np.int64] | None = None,  # [F], see `pick_representatives`
 ) -> tuple[FrameCandidate, ...]:
     """Returns the record of a selection among the frames of the video `source`."""
     chosen = np.array(sorted(names))
@@ -269,8 +271,11 @@ def video_candidates(
         if index in names:
             reason = Reason.KEPT
         elif reason is None:
-            like = int(chosen[np.argmin(np.abs(lengths[chosen] - lengths[index]))])
-            still = abs(lengths[like] - lengths[index]) <= NO_MOTION
+            like = index if standing is None else int(standing[index])
+            repeated = like in names
+            if not repeated:
+                like = int(chosen[np.argmin(np.abs(lengths[chosen] - lengths[index]))])
+            still = repeated or abs(lengths[like] - lengths[index]) <= NO_MOTION
             reason = Reason.DUPLICATE if still else Reason.CLOSE
         candidates.append(FrameCandidate(
             source, index, reason, round(float(sharpness[index]), 2), names.get(index), like))

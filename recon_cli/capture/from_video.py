@@ -14,6 +14,7 @@ from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_measures import check_exposure, well_exposed
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.masks import write_mask
+from recon_cli.capture.repeats import find_stills, pick_representatives
 from recon_cli.capture.scan import Scan, decode_threads, measure_scene, scan_video
 from recon_cli.capture.static_overlay import MOST, PICTURE, draw_overlay, mask_overlay
 from recon_cli.capture.video import frames_at, read_declared_length
@@ -36,6 +37,13 @@ class ScannedVideo:
     scan: Scan
     lengths: NDArray[np.float64]  # [F], `path_length` up to each frame
     judgement: frame_selection.Judgement
+    standing: NDArray[np.int64]  # [F], the frame that stands for the picture of each
+
+    @property
+    def distinct(self) -> NDArray[np.bool_]:  # [F]
+        """Which usable frames may be chosen: one of each picture."""
+        itself = self.standing == np.arange(len(self.standing))
+        return np.asarray(self.judgement.usable & itself)
 
 
 def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
@@ -68,8 +76,12 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     if warning:
         ctx.notice(warning)
     lengths = frame_selection.path_length(scan.motion)
-    return ScannedVideo(path, scan, lengths, frame_selection.judge_frames(
-        lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness))
+    judgement = frame_selection.judge_frames(
+        lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness)
+    tracks = scan.tracks if scan.overlay is None else scan.tracks.outside(scan.overlay)
+    return ScannedVideo(path, scan, lengths, judgement, pick_representatives(
+        find_stills(tracks, scan.width, scan.height), scan.sharpness, judgement.usable,
+        judgement.bridges))
 
 
 def _scan(config: IngestConfig, path: Path, ctx: IngestContext) -> Scan:
@@ -115,12 +127,13 @@ def ingest(
     """
     path, scan, judgement = source.path, source.scan, source.judgement
     chosen = frame_selection.choose_frames(
-        source.lengths, scan.sharpness, judgement.usable, count, bridges=judgement.bridges)
-    _report_short(scan, len(chosen), None if config.frames is None else count, ctx)
+        source.lengths, scan.sharpness, source.distinct, count, bridges=judgement.bridges)
+    _report_short(source, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
     record = frame_selection.video_candidates(
-        path.name, scan.sharpness, judgement.refused, source.lengths, names)
+        path.name, scan.sharpness, judgement.refused, source.lengths, names,
+        standing=source.standing)
     sheet = ContactSheet(path.name, record, scan.width, scan.height)
     _write(source, names, sheet, config.max_size, out, ctx)
     width, height = fit_size(scan.width, scan.height, config.max_size)
@@ -160,22 +173,35 @@ def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
         ctx.notice(f"{path.name} declares {scan.declared} frames but holds {decoded}.")
 
 
-def _report_short(scan: Scan, chosen: int, requested: int | None, ctx: IngestContext) -> None:
+def _report_short(
+    source: ScannedVideo, chosen: int, requested: int | None, ctx: IngestContext
+) -> None:
     """Says why fewer frames were chosen than requested; refuses too few."""
-    whole = int(scan.whole.sum())
-    if chosen < frame_selection.MIN_FRAMES:
+    whole, usable, distinct = (
+        int(flags.sum()) for flags in (source.scan.whole, source.judgement.usable, source.distinct))
+    if usable < frame_selection.MIN_FRAMES:
         raise InputError(
-            f"Only {chosen} of {whole} frames are sharp, but at least "
+            f"Only {usable} of {whole} frames are sharp, but at least "
             f"{frame_selection.MIN_FRAMES} are needed.",
             hint="Lower --sharpness, or record again with slower movements.")
+    if distinct < frame_selection.MIN_FRAMES:
+        raise InputError(
+            f"{source.path} shows {distinct} different picture{'s' * (distinct != 1)} in {usable} "
+            f"frames, but at least {frame_selection.MIN_FRAMES} are needed.",
+            hint="Record again while you walk sideways through the room.")
     if requested is None or chosen == requested:
         return
     if whole < requested:
         ctx.notice(f"{requested} frames were requested, but the video has {whole}.")
-    if chosen < whole:
+    if distinct < usable:
         ctx.notice(
-            f"Only {chosen} of {whole} frames are sharp enough, and all of them are used; "
-            "--sharpness 0 uses blurred ones too.")
+            f"Only {distinct} of {usable} frames show different pictures, and all of those are "
+            "used; the others repeat one of them.")
+    if usable < whole:
+        used = ", and all of them are used" if distinct == usable else ""
+        ctx.notice(
+            f"Only {usable} of {whole} frames are sharp enough{used}; --sharpness 0 uses blurred "
+            "ones too.")
 
 
 def report_reduced(width: int, height: int, max_size: int, ctx: IngestContext) -> None:

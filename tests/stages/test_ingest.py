@@ -21,6 +21,7 @@ from PIL import Image
 
 from recon_cli.capture import from_photos, from_video
 from recon_cli.config.stages import IngestConfig
+from recon_cli.errors import InputError
 from recon_cli.io import images
 from recon_cli.io.tracks import Tracks
 from recon_cli.stages import ingest
@@ -93,6 +94,31 @@ def test_asking_for_more_frames_than_are_sharp_is_noticed(tmp_path, notices):
     assert len(notices()) == 1
     assert "37 of 40 frames are sharp enough" in notices()[0]
     assert not (tmp_path / "out" / "frames" / "000011.png").exists()
+
+
+@pytest.mark.parametrize("frames", [None, 12, 30])
+def test_of_repeated_pictures_of_a_video_one_is_taken(tmp_path, notices, frames):
+    views = walk(15)
+    video = write_video(tmp_path / "screen.mp4", [views[index // 4] for index in range(60)])
+    summary = take(video, tmp_path / "out", config=IngestConfig(frames=frames))
+    pictures = [int(path.stem) // 4 for path in sorted((tmp_path / "out" / "frames").iterdir())]
+    assert pictures == sorted(set(pictures))
+    assert summary.frames == len(pictures) == min(frames or 15, 15)
+    assert summary.dropped_blurred == 0
+    record = json.loads((tmp_path / "out" / "choice.json").read_text())["candidates"]
+    for one in record:
+        if one["reason"] == "duplicate":
+            assert one["like"] // 4 == one["index"] // 4
+    assert notices() == ([] if frames != 30 else [
+        "Only 15 of 60 frames show different pictures, and all of those are used; the others "
+        "repeat one of them."])
+
+
+def test_a_slide_show_of_two_pictures_is_refused(tmp_path):
+    views = walk(9)
+    video = write_video(tmp_path / "slides.mp4", [views[8 * (index // 20)] for index in range(40)])
+    with pytest.raises(InputError, match=r"shows 2 different pictures in 40 frames"):
+        take(video, tmp_path / "out")
 
 
 def test_the_automatic_number_stays_under_its_bound(video, tmp_path):
