@@ -411,8 +411,11 @@ class ImportConfig(StageConfig):
         "this workspace; auto: the one that shows some training views better.",
         choices=("auto", "source", "workspace"))
     axes: str | None = option(
-        None, "Up axis of the file, if there are no views.",
-        choices=("y-down", "z-up"), automatic="z-up for .glb, else y-down, as in viewers")
+        None, "Axes of the file, whatever it says: z-up and y-down say where up is if there are no "
+        "views; rdf (x right, y down, z front), rub (x right, y up, z back) and so on also turn "
+        "the scene to y-down, or z-up.",
+        choices=("y-down", "z-up", "rdf", "rub", "luf", "ruf", "rfu", "rbu"),
+        automatic="what the file says, else y-down, as in viewers")
     max_size: int = option(
         600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)

@@ -108,7 +108,7 @@ def _find_up(inputs: StageInputs, *, warn: bool) -> NDArray[np.float64]:
     """Returns up in the world of the training; `warn` says whether a guess is worth a warning."""
     record = ImportRecord.read(inputs.folders["train"])
     if record and not has_views(inputs.folders):
-        return np.array(_UP["z" if record.z_up else "-y"])
+        return record.up()
     world = WorldSummary.read(inputs.folders["sfm"])
     if world and world.evidence.up_found:
         return np.array(_UP["z"])

@@ -28,9 +28,10 @@ from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.images import fit_camera
-from recon_cli.io.ply import write_ply, write_points
+from recon_cli.io.ply import describe_scene, write_ply, write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
-from recon_cli.io.splats.glb import nearest_axes, write_glb
+from recon_cli.io.splats.axes import PLY, Z_UP
+from recon_cli.io.splats.glb import nearest_axes, nearest_up, write_glb
 from recon_cli.io.splats.html import write_html
 from recon_cli.io.splats.lod import LOD_META, make_levels, write_lod
 from recon_cli.io.splats.registry import FORMATS, scene_file
@@ -42,6 +43,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.finished_model import FINAL
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.train_data import load_views, read_config
 from recon_cli.workspace.summaries import ExportChange, ExportedFile
@@ -49,6 +51,8 @@ from recon_cli.workspace.summaries import ExportChange, ExportedFile
 # dB on the validation views, unless --max-loss is given; .splat has no harmonics
 MAX_LOSS_DB = {"splat": 3.0}
 _MAX_LOSS_DB = 0.3
+# What an .spz says of its axes, by up. Without a name all programs show it as it is, with y up.
+_SPZ_AXES = {"z": Z_UP, "-y": PLY, "y": None}
 _IMAGES = "images"
 _COLOR_SIZE, _COLOR_VIEWS = 400, 100  # pixels and views, at most, that colours are fitted to
 _SCORE = "loo"  # which Gaussians --max-mb keeps; docs/pruning.md
@@ -69,6 +73,24 @@ class Exporter:
         self._whole: Splats | None = None
         self._lower: tuple[Splats, LowerDegrees] | None = None
         self._mesh: tuple[Splats, MeshResult] | None = None
+
+    @cached_property
+    def _up_axis(self) -> str:
+        """The axis that is nearest to up in the files: z, -y or y."""
+        return nearest_up(self._up)
+
+    @cached_property
+    def _antialiased(self) -> bool:
+        """Whether the Gaussians are those of an imported file that says so, not trained here."""
+        train = self._inputs.folders["train"]
+        record = ImportRecord.read(train)
+        pruned = "prune" in self._inputs.folders and self._config.model != "base"
+        return bool(record and record.antialiased) and not (pruned or (train / FINAL).exists())
+
+    @property
+    def comments(self) -> list[str]:
+        """What the header of the .ply says of the scene."""
+        return describe_scene(self._up_axis, antialiased=self._antialiased)
 
     def reduce(self, splats: Splats) -> tuple[Splats, list[ExportChange]]:
         """Returns the scene after the options that remove something, in order, and the changes.
@@ -141,7 +163,8 @@ class Exporter:
             self._write_file(name, path, splats)
             return gain()
         whole = splats.with_sphere()
-        write = partial(write_sog, path, whole) if name == "sog" else partial(
+        write = partial(
+            write_sog, path, whole, antialiased=self._antialiased) if name == "sog" else partial(
             write_lod, path, make_levels(whole))
         limited = self._config.max_mb is not None and name == self._config.formats[0]
         found = -math.inf
@@ -156,13 +179,14 @@ class Exporter:
 
     def _write_file(self, name: str, path: Path, splats: Splats) -> None:
         if name == "ply":
-            write_ply(path, splats)
+            write_ply(path, splats, comments=self.comments)
             return
         whole = splats.with_sphere(LARGEST_SCALE if name in ("spz", "html") else math.inf)
         if name == "glb":
             write_glb(path, whole, axes=nearest_axes(self._up))
         elif name == "spz":
-            write_spz(path, whole, version=self._config.spz_version)
+            write_spz(path, whole, version=self._config.spz_version,
+                      axes=_SPZ_AXES[self._up_axis], antialiased=self._antialiased)
         elif name == "html":
             write_html(path, whole, title=self._title, up=self._up,
                        views=self._place(self._scene.train))
@@ -284,7 +308,7 @@ class Exporter:
         assert self._whole is not None
         assert record is not None, "trained without views"
         whole = transformed(self._whole, self._similarity.inverse())
-        return synthetic_scene(whole, z_up=record.z_up, max_size=self._train.max_size)
+        return synthetic_scene(whole, up=record.up(), max_size=self._train.max_size)
 
     @cached_property
     def _psnr(self) -> ReferencePsnr | SelfPsnr:

@@ -78,13 +78,14 @@ def read_world(sfm: Path) -> Similarity:
 
 
 def align_to_views(
-    splats: Splats, scene: Scene, world: Similarity, frame: str, max_size: int, ctx: StageContext
+    splats: Splats, scene: Scene, world: Similarity, frame: str, max_size: int, ctx: StageContext,
+    *, moved: Similarity | None = None,
 ) -> Alignment:
     """Returns the frame in which a scene fits the training views best, and how well.
 
     `world` leads from the frame of the source to that of the workspace; `frame` is one of these, or
-    auto. `max_size` is the longest side of the images in pixels. ReconstructionError if no view can
-    be compared.
+    auto. `max_size` is the longest side of the images in pixels; `moved` leads from the splats to
+    the file, if they were moved. ReconstructionError if no view can be compared.
     """
     frames = {WORKSPACE: Similarity(), SOURCE: world}
     if frame != "auto":
@@ -99,8 +100,9 @@ def align_to_views(
             hint="Run `recon ingest` with other images or masks, then `recon sfm`.")
     psnr_db = {}
     for name, similarity in frames.items():
-        moved = transformed(splats, similarity).map(lambda tensor: tensor.to(ctx.device))
-        psnr_db[name] = mean_psnr(moved, views, moved.sh_degree, ctx.backend)
+        there = transformed(splats, similarity.after(moved or Similarity())).map(
+            lambda tensor: tensor.to(ctx.device))
+        psnr_db[name] = mean_psnr(there, views, there.sh_degree, ctx.backend)
     best = max(psnr_db, key=lambda name: psnr_db[name])
     return Alignment(
         best, frames[best], psnr_db, statistics.fmean(map(_flat_psnr, views)), len(views))

@@ -32,18 +32,19 @@ _POINTS = 20_000
 ASSUMED_DB = 30.0
 
 
-def synthetic_scene(splats: Splats, *, z_up: bool, max_size: int) -> Scene:
+def synthetic_scene(
+    splats: Splats, *, up: NDArray[np.float64], max_size: int
+) -> Scene:
     """Returns a scene whose training views are cameras without images; deterministic.
 
     The first four stand around the bulk of the opaque Gaussians and look at its middle, the other
-    four stand where there is most space inside and look outward. Up is z, or -y; `max_size` is the
-    longest side in pixels.
+    four stand where there is most space inside and look outward. `up` is a unit vector [3] along z
+    or y; `max_size` is the longest side in pixels.
     """
     opaque = splats.opacities >= _OPAQUE
     means = splats.means[opaque if bool(opaque.any()) else ~opaque].double().cpu().numpy()
     middle = np.median(means, axis=0)
     radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK)), 1e-3)
-    up = np.array([0.0, 0, 1] if z_up else [0.0, -1, 0])
     x_axis = np.array([1.0, 0, 0])
     y_axis = np.cross(up, x_axis)
     angles = np.pi * (0.25 + np.arange(CAMERAS_AROUND) / 2)

@@ -42,14 +42,20 @@ class TrainedScene:
     scene: Scene
     z_up: bool  # the world's z axis is known to be up
     metres: bool  # one world unit is a metre
-    has_views: bool = True  # False for an import without views: those of `scene` are synthetic
+    # [3], of an import without views: those of `scene` are synthetic
+    assumed_up: NDArray[np.float64] | None = None
+
+    @property
+    def has_views(self) -> bool:
+        """Whether the views of `scene` are those of a capture."""
+        return self.assumed_up is None
 
     def up(self) -> NDArray[np.float64]:
         """Returns the unit vector [3] that is up; if unknown the cameras' mean, with a warning."""
         if self.z_up:
             return np.array([0.0, 0.0, 1.0])
-        if not self.has_views:
-            return np.array([0.0, -1.0, 0.0])
+        if self.assumed_up is not None:
+            return self.assumed_up
         viewmats = np.stack([view.camera.viewmat for view in self.scene.train])
         gravity = find_gravity(self.scene.points, viewmats)
         if gravity.up is not None:
@@ -76,7 +82,7 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
     config = read_config(folder("train"))
     splats = read_ply(folder("prune" if pruned else "train") / "splats.ply")
     if origin is not None and viewless:
-        scene = synthetic_scene(splats, z_up=origin.z_up, max_size=config.max_size)
+        scene = synthetic_scene(splats, up=origin.up(), max_size=config.max_size)
         z_up, metres = origin.z_up, False
     else:
         inputs = StageInputs({name: folder(name) for name in _NEEDS})
@@ -85,7 +91,8 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
         z_up, metres = evidence.up_found, evidence.metres
     return TrainedScene(
         "pruned" if pruned else "base", splats, digest_of(splats), config.sh_degree,
-        config.max_size, scene, z_up, metres, has_views=not viewless)
+        config.max_size, scene, z_up, metres,
+        assumed_up=origin.up() if origin is not None and viewless else None)
 
 
 def _require_fresh(inspection: WorkspaceCheck, name: str, verb: str) -> Manifest:

@@ -155,8 +155,8 @@ def load_ply(path: Path) -> LoadedScene:
     """Returns the scene in a .ply of any program, whose values may be written in other ways.
 
     Gaussians that are not finite are dropped, opacities and sizes that are no logits or logarithms
-    are converted, and positions that float32 would round are moved to the origin; each with a
-    warning. The errors are those of `read_ply`, but not finite may be no more than half.
+    are converted, each with a warning. Positions that float32 would round are moved to the origin.
+    The errors are those of `read_ply`, but up to half of the Gaussians may be not finite.
     """
     header = read_header(path)
     columns = _read_columns(header)
@@ -164,9 +164,9 @@ def load_ply(path: Path) -> LoadedScene:
     origin = None
     if len(columns["means"]):
         columns = undo_activations(path, columns)
-        origin = find_origin(path, columns["means"], columns["log_scales"])
+        origin = find_origin(columns["means"], columns["log_scales"])
     if origin is not None:
-        columns["means"] = columns["means"].astype(np.float64) - origin
+        columns["means"] = columns["means"].astype(np.float64) - origin.point
     splats = _without_sphere(splats_from_arrays(path, columns), _read_backdrop(header))
     return LoadedScene(splats, read_up(header), is_antialiased(header), origin)
 

@@ -220,6 +220,13 @@ class ImportRecord(JsonRecord):
     z_up: bool  # up is z in the file; else it is -y. Given or assumed, never measured
     views: bool  # it was compared with views of this workspace
     doubt: str = ""  # why it may not be in their frame, as a sentence; empty if it fits
+    y_up: bool = False  # up is y in the file
+    antialiased: bool = False  # the file says that it was trained with antialiasing
+    origin: tuple[float, ...] | None = None  # [3] that was subtracted from its positions
+
+    def up(self) -> NDArray[np.float64]:
+        """Returns the unit vector [3] that is taken for up where there are no views."""
+        return np.array([0.0, 0, 1] if self.z_up else [0.0, 1 if self.y_up else -1, 0])
 
     def write(self, folder: Path) -> None:
         """Writes it into the folder of the scene."""

@@ -52,7 +52,8 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     path = out / "splats.ply"
     others = [name for name in config.formats if name != "ply"]
     with ctx.progress.bar("export", 2 + len(others), unit="file") as bar:
-        write_ply(path, splats, _expected_errors(config, inputs, frame, splats, trained, ctx))
+        write_ply(path, splats, _expected_errors(config, inputs, frame, splats, trained, ctx),
+                  comments=exporter.comments)
         bar.advance()
         verify_ply(path, splats)
         bar.advance()
@@ -60,7 +61,8 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         for name in others:
             files[name] = exporter.write(name, splats)
             bar.advance()
-    _write_transform(out / TRANSFORM, frame)
+    record = ImportRecord.read(inputs.folders["train"])
+    _write_transform(out / TRANSFORM, frame, record.origin if record else None)
     return ExportSummary(
         model="pruned" if pruned else "base", file=path.name, gaussians=len(splats),
         bytes=path.stat().st_size, transform=frame.similarity.to_json(),
@@ -107,10 +109,14 @@ def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
             hint=NEEDS_VIEWS_HINT)
 
 
-def _write_transform(path: Path, frame: ExportFrame) -> None:
+def _write_transform(
+    path: Path, frame: ExportFrame, origin: tuple[float, ...] | None
+) -> None:
     write_json(path, {
         "from": "the world of sfm, in which the scene was trained; without views, that of the file "
         "that was imported",
         "to": "splats.ply beside this file",
         "similarity": frame.similarity.to_json(),
-        "measurement": frame.measurement.to_json() if frame.measurement else None})
+        "measurement": frame.measurement.to_json() if frame.measurement else None,
+        # subtracted from the positions of the imported file before
+        **({"origin": list(origin)} if origin else {})})

@@ -9,21 +9,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from recon_cli.config.stages import MIN_GAUSSIANS, ImportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, InputError
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.evaluation.reference_views import load_scene as load_views_of
 from recon_cli.export.import_alignment import Alignment, align_to_views, read_world
 from recon_cli.io.ply import write_ply
 from recon_cli.io.records import ImportRecord
-from recon_cli.io.splats.registry import format_of
+from recon_cli.io.splats.axes import AXES
+from recon_cli.io.splats.loaded import LoadedScene
+from recon_cli.io.splats.registry import format_of, load_scene
+from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.train.train_data import write_config
 from recon_cli.workspace.digests import digest_file
 from recon_cli.workspace.summaries import ImportSummary
-
-_MIP = b"SplatRenderMode: mip"  # a comment of Brush and others
-_HEAD_BYTES = 1 << 16
 
 
 def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> ImportSummary:
@@ -38,35 +40,44 @@ def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
             f"{len(inputs.sources)} files were given, but a workspace holds one scene.",
             hint="Import each into a workspace of its own with -w.")
     path = inputs.sources[0]
-    form = format_of(path)
-    splats = form.read(path)
+    scene = load_scene(path, axes=config.axes if config.axes in AXES else None)
+    splats = scene.splats
     if not len(splats):
         raise FormatError(f"{path} holds no Gaussians.")
-    alignment = _align(splats, config, inputs, ctx)
+    # to the frame of the file, away from which float32 took it
+    origin = scene.origin.point if scene.origin else None
+    moved = Similarity(translation=np.array(origin or (0.0, 0.0, 0.0)))
+    alignment = _align(splats, moved, config, inputs, ctx)
     if alignment is not None:
-        splats = transformed(splats, alignment.similarity)
-    z_up = form.name == "glb" if config.axes is None else config.axes == "z-up"
+        splats = transformed(splats, alignment.similarity.after(moved))
+    up = {"z-up": "z", "y-down": "-y"}.get(config.axes or "", scene.up)
     record = ImportRecord(
-        path.name, form.name, digest_file(path).sha256, len(splats), splats.sh_degree, z_up,
-        views=alignment is not None, doubt=alignment.doubt if alignment else "")
+        path.name, format_of(path).name, digest_file(path).sha256, len(splats), splats.sh_degree,
+        up == "z", views=alignment is not None, doubt=alignment.doubt if alignment else "",
+        y_up=up == "y", antialiased=scene.antialiased, origin=origin if alignment is None else None)
     write_ply(out / "splats.ply", splats)
     write_config(out, _equivalent_run_config(config, splats))
     record.write(out)
-    notices = [*([record.doubt] if record.doubt else []), *_antialiasing_notice(path)]
+    notices = [*([record.doubt] if record.doubt else []), *_describe(path, scene, alignment)]
     for text in notices:
         ctx.notice(text)
-    return _summarize(record, alignment, notices)
+    transform = alignment.similarity if alignment else moved.inverse()
+    return _summarize(record, alignment, transform, notices)
 
 
 def _align(
-    splats: Splats, config: ImportConfig, inputs: StageInputs, ctx: StageContext
+    splats: Splats, moved: Similarity, config: ImportConfig, inputs: StageInputs, ctx: StageContext
 ) -> Alignment | None:
-    """Returns how the scene fits the training views; None if there are none."""
+    """Returns how the scene fits the training views; None if there are none.
+
+    `moved` leads from the splats to the frame of the file.
+    """
     if not {"ingest", "sfm"} <= inputs.folders.keys():
         return None
-    scene = load_scene(inputs, validation=config.validation)
+    scene = load_views_of(inputs, validation=config.validation)
     return align_to_views(
-        splats, scene, read_world(inputs.folders["sfm"]), config.frame, config.max_size, ctx)
+        splats, scene, read_world(inputs.folders["sfm"]), config.frame, config.max_size, ctx,
+        moved=moved)
 
 
 def _equivalent_run_config(config: ImportConfig, splats: Splats) -> RunConfig:
@@ -77,18 +88,26 @@ def _equivalent_run_config(config: ImportConfig, splats: Splats) -> RunConfig:
         stereo="off", exposure="off", poses="off")
 
 
-def _antialiasing_notice(path: Path) -> list[str]:
-    """Returns a sentence if a .ply says that it was trained by Mip-Splatting."""
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES).partition(b"end_header")[0]
-    if not head.startswith(b"ply") or _MIP not in head:
-        return []
-    return [f"{path.name} was trained for antialiased rendering ({_MIP.decode()}), which is not "
-            "supported: what is smaller than a pixel looks too thick"]
+def _describe(path: Path, scene: LoadedScene, alignment: Alignment | None) -> list[str]:
+    """Returns sentences about what the user has to know of the file."""
+    said = []
+    if scene.antialiased:
+        said.append(
+            f"{path.name} was trained for antialiased rendering (Mip-Splatting), which is not "
+            "supported: what is smaller than a pixel looks too thick")
+    if alignment is not None and alignment.doubt and path.suffix.lower() == ".spz":
+        said.append(
+            f"{path.name} may have other axes than it says, or than those of a .ply: try `recon "
+            "import --axes rub`")
+    if scene.origin is not None and alignment is None:
+        said.append(
+            f"{path.name}: {scene.origin.describe()}. Exported files have the new positions; "
+            "`recon export --transform` with that translation moves them back, rounded")
+    return said
 
 
 def _summarize(
-    record: ImportRecord, alignment: Alignment | None, notices: list[str]
+    record: ImportRecord, alignment: Alignment | None, transform: Similarity, notices: list[str]
 ) -> ImportSummary:
     return ImportSummary(
         imported_from=record.file, format=record.format, gaussians=record.gaussians,
@@ -99,5 +118,5 @@ def _summarize(
         flat_psnr_db=round(alignment.flat_db, 3) if alignment else None,
         tried_psnr_db={name: round(value, 3) for name, value in alignment.psnr_db.items()}
         if alignment else None,
-        transform=alignment.similarity.to_json() if alignment else None,
+        transform=None if transform.is_identity and not alignment else transform.to_json(),
         notices=tuple(notices) or None)

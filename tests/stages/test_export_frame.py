@@ -20,6 +20,7 @@ from recon_cli.errors import ConfigError, FormatError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.io.ply import read_ply, read_ply_points, write_ply
 from recon_cli.io.splats.registry import read_splats
+from recon_cli.io.splats.spz import read_spz, unpack
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
@@ -175,6 +176,21 @@ def test_a_glb_has_y_up_whatever_is_up_in_the_scene(inputs, name):
     at = value["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
     highest = float(read_ply(inputs.folders["train"] / "splats.ply").means[:, 2].max())
     assert value["accessors"][at]["max"][1] == pytest.approx(highest, abs=1e-5)
+
+
+@pytest.mark.parametrize(("name", "comment", "axes"), [
+    ("z", b"comment Vertical Axis: z\n", "rfu"), ("-y", b"", "rdf"), ("y", b"", None)])
+def test_a_ply_and_an_spz_say_which_axis_is_up(inputs, name, comment, axes):
+    up_is_z(inputs)
+    out, _ = exported(inputs, format="spz", up=name)
+    head = (out / "splats.ply").read_bytes().partition(b"end_header")[0]
+    assert (b"Vertical Axis" in head) == bool(comment)
+    assert comment in head
+    header, _ = unpack(out / "splats.spz", (out / "splats.spz").read_bytes())
+    assert header.axes == axes
+    # with whatever name, the values are those of the .ply
+    assert torch.allclose(
+        read_spz(out / "splats.spz").means[:20], read_ply(out / "splats.ply").means[:20], atol=1e-3)
 
 
 def test_a_page_stands_upright_in_any_frame(inputs):

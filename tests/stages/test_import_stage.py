@@ -12,14 +12,18 @@ from foreign import truth
 from scenes import random_splats
 from tiny_scene import make_inputs
 
-from recon_cli.config.stages import ImportConfig, PruneConfig
+from recon_cli.config.stages import ExportConfig, ImportConfig, PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.splats.registry import FORMATS, scene_file
+from recon_cli.io.ply import describe_scene, read_ply, write_ply
+from recon_cli.io.records import ImportRecord
+from recon_cli.io.splats.axes import turn_from
+from recon_cli.io.splats.glb import nearest_axes, write_glb
+from recon_cli.io.splats.registry import FORMATS, load_scene, scene_file
+from recon_cli.io.splats.spz import write_spz
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import transformed
-from recon_cli.stages import evaluate, import_scene, prune
+from recon_cli.stages import evaluate, export, import_scene, prune
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_json
 
@@ -166,3 +170,122 @@ def test_a_scene_that_wants_antialiasing_is_said_to(tmp_path):
         b"element", b"comment SplatRenderMode: mip\nelement", 1))
     (notice,) = brought_in(path, None, tmp_path / "train").notices
     assert "antialiased rendering" in notice
+
+
+def in_record(folder):
+    return json.loads((folder / "import.json").read_text())
+
+
+@pytest.mark.parametrize("name", ["ply", "spz", "glb"])
+@pytest.mark.parametrize(("up", "wanted"), [("z", [0, 0, 1]), ("-y", [0, -1, 0])])
+def test_an_exported_scene_comes_back_with_the_same_axis_up(tmp_path, name, up, wanted):
+    """Without views: what `recon export` writes says what is up."""
+    path = tmp_path / f"a.{name}"
+    if name == "ply":
+        write_ply(path, truth(), comments=describe_scene(up, antialiased=False))
+    elif name == "spz":
+        write_spz(path, truth(), axes={"z": "rfu", "-y": "rdf"}[up])
+    else:
+        write_glb(path, truth(), axes=nearest_axes(np.array(wanted)))
+    brought_in(path, None, tmp_path / "train")
+    assert ImportRecord.read(tmp_path / "train").up().tolist() == wanted
+    assert torch.allclose(
+        read_ply(tmp_path / "train" / "splats.ply").means, truth().means, atol=1e-3)
+
+
+@pytest.mark.parametrize(("axes", "up", "signs"), [
+    ("z-up", [0, 0, 1], [1, 1, 1]), ("y-down", [0, -1, 0], [1, 1, 1]),
+    ("rub", [0, -1, 0], [1, -1, -1]), ("luf", [0, -1, 0], [-1, -1, 1]),
+    ("rfu", [0, 0, 1], [1, 1, 1]), ("rbu", [0, 0, 1], [1, -1, 1]),
+])
+@pytest.mark.parametrize("name", ["ply", "spz"])
+def test_axes_that_are_given_win_over_what_the_file_says(tmp_path, name, axes, up, signs):
+    path = tmp_path / f"a.{name}"
+    if name == "ply":
+        write_ply(path, truth(), comments=["Vertical Axis: z"])
+    else:
+        write_spz(path, truth(), axes="rfu")
+    brought_in(path, None, tmp_path / "train", axes=axes)
+    assert ImportRecord.read(tmp_path / "train").up().tolist() == up
+    back = read_ply(tmp_path / "train" / "splats.ply")
+    assert torch.allclose(back.means, truth().means * torch.tensor(signs), atol=1e-3)
+
+
+def test_a_glb_in_axes_that_are_given_is_read_as_it_is_stored(tmp_path):
+    write_glb(tmp_path / "a.glb", truth())  # (x, y, z) becomes (x, z, -y)
+    brought_in(tmp_path / "a.glb", None, tmp_path / "train", axes="rub")
+    back = read_ply(tmp_path / "train" / "splats.ply").means
+    assert torch.allclose(back, truth().means[:, [0, 2, 1]] * torch.tensor([1, -1, 1]), atol=1e-5)
+
+
+def far_away(path, place):
+    """Writes the scene with double positions at a place."""
+    write_ply(path, truth())
+    head, data = path.read_bytes().split(b"end_header\n", 1)
+    for axis in b"xyz":
+        line = b"property float %c\n" % axis
+        head = head.replace(line, line.replace(b"float", b"double"))
+    rest = np.frombuffer(data, "<f4").reshape(60, -1)
+    rows = np.zeros(60, [("means", "<f8", 3), ("rest", "<f4", rest.shape[1] - 3)])
+    rows["means"], rows["rest"] = rest[:, :3] + np.array(place), rest[:, 3:]
+    path.write_bytes(head + b"end_header\n" + rows.tobytes())
+    return path
+
+
+def test_a_scene_in_map_coordinates_is_moved_and_says_by_how_much(tmp_path, caplog):
+    path = far_away(tmp_path / "a.ply", [448262.25, 5411932.5, 301.5])
+    summary = brought_in(path, None, tmp_path / "train")
+    origin = in_record(tmp_path / "train")["origin"]
+    back = read_ply(tmp_path / "train" / "splats.ply")
+    place = np.array([448262.25, 5411932.5, 301.5])
+    assert np.allclose(back.means.double().numpy() + origin,
+                       truth().means.double().numpy() + place, atol=1e-5)
+    assert Similarity.from_json(summary.transform).translation.tolist() == [-x for x in origin]
+    assert "rounds its positions by up to 0.25 units" in summary.notices[0]
+    assert caplog.text.count("rounds its positions") == 1
+
+
+def test_a_scene_in_map_coordinates_fits_cameras_that_are_in_them_too(inputs, tmp_path):
+    place = np.array([448262.25, 5411932.5, 301.5])
+    world = Similarity(translation=-place)
+    record = replace(summaries.WORLD, similarity=world.to_json())
+    write_json(inputs.folders["sfm"] / "world.json", record.to_json())
+    summary = brought_in(far_away(tmp_path / "a.ply", place), inputs, tmp_path / "train")
+    assert summary.frame == "source"
+    assert summary.training_psnr_db > 40
+    back = read_ply(tmp_path / "train" / "splats.ply")
+    assert torch.allclose(back.means, truth().means, atol=1e-4)
+    assert summary.transform == world.to_json()
+    assert "origin" not in in_record(tmp_path / "train")
+    assert summary.notices is None
+
+
+def test_an_spz_that_does_not_fit_the_views_is_said_to_have_other_axes_perhaps(inputs, tmp_path):
+    write_spz(tmp_path / "a.spz", turn_from("rub", truth()), axes=None)
+    summary = brought_in(tmp_path / "a.spz", inputs, tmp_path / "train")
+    assert "--axes rub" in summary.notices[1]
+    summary = brought_in(tmp_path / "a.spz", inputs, tmp_path / "again", axes="rub")
+    assert summary.notices is None
+    assert summary.frame == "workspace"
+
+
+def test_what_was_trained_with_antialiasing_is_recorded_said_and_exported(tmp_path):
+    write_ply(tmp_path / "a.ply", truth(), comments=["SplatRenderMode: mip"])
+    summary = brought_in(tmp_path / "a.ply", None, tmp_path / "train")
+    assert "Mip-Splatting" in summary.notices[0]
+    assert ImportRecord.read(tmp_path / "train").antialiased
+    config = ExportConfig(format="spz,sog,ply", max_loss=30)
+    (tmp_path / "export").mkdir()
+    export.run(config, StageInputs({"train": tmp_path / "train"}), tmp_path / "export", CONTEXT)
+    for name in config.formats:
+        assert load_scene(tmp_path / "export" / f"splats.{name}").antialiased, name
+
+
+def test_a_scene_that_was_moved_is_exported_with_the_point_it_was_moved_from(tmp_path):
+    brought_in(far_away(tmp_path / "a.ply", [448262.25, 5411932.5, 301.5]), None,
+               tmp_path / "train")
+    (tmp_path / "export").mkdir()
+    export.run(ExportConfig(), StageInputs({"train": tmp_path / "train"}), tmp_path / "export",
+               CONTEXT)
+    record = json.loads((tmp_path / "export" / "transform.json").read_text())
+    assert record["origin"] == in_record(tmp_path / "train")["origin"]

@@ -15,9 +15,9 @@ import torch
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import Splats
 
-# By number, from 1 on: right-handed and mirrored ones.
+# By number, from 1 on, as of its release 3; drafts had the last eight in another order.
 AXES = ("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf",
-        "lbd", "rbd", "lbu", "rbu", "lfd", "rfd", "lfu", "rfu")
+        "lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu")
 PLY, Z_UP = "rdf", "rfu"
 
 
@@ -28,9 +28,13 @@ def up_of(axes: str) -> str:
 
 def turn_from(axes: str, splats: Splats) -> Splats:
     """Returns Gaussians of a file with these axes in "rdf", or "rfu" if their up is along z."""
+    return flip(splats, signs(axes))
+
+
+def signs(axes: str) -> list[int]:
+    """Returns what each axis is multiplied with, 1 or -1, to get to "rdf" or "rfu"."""
     ours = PLY if up_of(axes) == "-y" else Z_UP
-    pairs = zip(axes, ours, strict=True)
-    return flip(splats, [1 if theirs == own else -1 for theirs, own in pairs])
+    return [1 if theirs == own else -1 for theirs, own in zip(axes, ours, strict=True)]
 
 
 def flip(splats: Splats, signs: list[int]) -> Splats:

@@ -15,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.io.ply import is_antialiased, read_up
 from recon_cli.io.ply_tables import Element, format_header, read_header, read_tables
+from recon_cli.io.splats.foreign import count_terms, drop_not_finite
+from recon_cli.io.splats.loaded import LoadedScene
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
@@ -124,8 +127,14 @@ def _harmonic_bytes(sh_rest: Floats) -> Bytes:
 def read_compressed_ply(path: Path) -> Splats:
     """Returns the Gaussians of a compressed .ply in the file's order and degree.
 
-    Files without bounds of colours are supported. FormatError if damaged or another kind of .ply.
+    Files without bounds of colours are supported. Gaussians that are not finite are dropped and
+    harmonics of degree 4 cut, with a warning. FormatError if damaged or another kind of .ply.
     """
+    return load_compressed_ply(path).splats
+
+
+def load_compressed_ply(path: Path) -> LoadedScene:
+    """Returns the scene of a compressed .ply, and what its comments say of it."""
     header = read_header(path)
     kinds = {each.name: _property_types(each) for each in header.elements}
     colored = not kinds.get("chunk", {}).keys().isdisjoint(_COLOR)
@@ -140,7 +149,7 @@ def read_compressed_ply(path: Path) -> Splats:
     place, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
     shares = _split_bits(color, (8, 8, 8), (24, 16, 8))
     colors = _interpolate(chunk, _COLOR, shares) if colored else shares
-    return splats_from_arrays(path, {
+    columns = drop_not_finite(path, {
         "means": _interpolate(chunk, _PLACE, _split_bits(place, _BITS, _SHIFTS)),
         "quats": _rotations(rotation),
         "log_scales": _interpolate(chunk, _SCALE, _split_bits(scale, _BITS, _SHIFTS)),
@@ -148,6 +157,8 @@ def read_compressed_ply(path: Path) -> Splats:
         "sh_dc": (colors - 0.5) / SH_C0,
         "sh_rest": _harmonics(path, tables, n),
     })
+    return LoadedScene(
+        splats_from_arrays(path, columns), read_up(header), is_antialiased(header))
 
 
 def _property_types(element: Element) -> dict[str, str]:
@@ -190,10 +201,12 @@ def _harmonics(path: Path, tables: dict[str, NDArray[np.void]], n: int) -> Float
     table = tables["sh"]
     kinds = dict(table.dtype.fields or {})
     names = [f"f_rest_{i}" for i in range(len(kinds))]
-    if len(table) != n or set(names) != kinds.keys() or len(names) not in [
-            3 * terms for terms in TERMS[1:]] or any(kinds[name][0] != "u1" for name in names):
+    if len(table) != n or set(names) != kinds.keys() or any(
+            kinds[name][0] != "u1" for name in names):
         raise FormatError(f"{path} has harmonics that do not make a degree of its Gaussians.")
+    kept = min(count_terms(path, len(names)), TERMS[-1])
     steps = np.stack([table[name] for name in names], axis=1).astype(np.float32)
     steps[steps > 0] += 0.5  # a byte means the middle of its step, but 0 and 255 the ends
     steps[steps > 255] = 256
-    return ((steps - 128) * np.float32(_STEP)).reshape(n, 3, -1).transpose(0, 2, 1)
+    by_channel = ((steps - 128) * np.float32(_STEP)).reshape(n, 3, -1)
+    return by_channel[:, :, :kept].transpose(0, 2, 1)

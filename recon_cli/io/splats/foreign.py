@@ -17,14 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.io.splats.loaded import Origin
 from recon_cli.scene.splats import TERMS
 
 _MOST_BAD = 0.5  # of all rows; a file that has more is another one than its header says
 # Fewer Gaussians, or nearly equal opacities, are no evidence of what their numbers mean.
 _ENOUGH, _SPREAD = 50, 0.25
-# Gaussians that cover a place on the mean: ten scenes had .001 to 2, and some thousand where
-# sizes of centimetres are read as logarithms.
-_COVERED = 10.0
+# Gaussians whose centre is within one size of a place, on the mean: .003 in a trained room, but 45
+# if its sizes are read as logarithms.
+_COVERED = 1.0
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
 _ROUNDING = 0.1  # of the median Gaussian's size: what moves by more, float32 cannot hold
 _MOST_DEGREE = 10
@@ -44,7 +45,7 @@ def drop_not_finite(
     in each column, if these rows are more than half of all.
     """
     with np.errstate(over="ignore"):
-        bad = {name: ~np.isfinite(value.reshape(len(value), -1)).all(axis=1)
+        bad = {name: ~np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
                for name, value in (named or columns).items()}
     bad = {name: rows for name, rows in bad.items() if rows.any()}
     if not bad:
@@ -53,8 +54,8 @@ def drop_not_finite(
     listed = ", ".join(f"{name} ({found.sum():,})" for name, found in bad.items())
     if rows.sum() > _MOST_BAD * len(rows):
         raise FormatError(
-            f"{path} holds values that are not finite in {rows.sum():,} of {len(rows):,} "
-            f"Gaussians: {listed}.",
+            f"{path} holds values that are not finite in {listed}, in {rows.sum():,} of "
+            f"{len(rows):,} Gaussians.",
             hint="Export it again from the program it came from.")
     logger.warning("%s: %s of %s Gaussians are left out: not finite in %s",
                    path.name, f"{rows.sum():,}", f"{len(rows):,}", listed)
@@ -115,24 +116,13 @@ def _covers_everything(means: NDArray[Any], log_scales: NDArray[Any]) -> bool:
     return radius > 0 and math.log(len(means)) + 3 * (size - math.log(radius)) > math.log(_COVERED)
 
 
-def find_origin(
-    path: Path, means: NDArray[Any], log_scales: NDArray[Any]
-) -> tuple[float, float, float] | None:
-    """Returns what to subtract from positions [N, 3] that float32 would round, with a warning.
-
-    None if it rounds them by less than Gaussians are large.
-    """
+def find_origin(means: NDArray[Any], log_scales: NDArray[Any]) -> Origin | None:
+    """Returns what to subtract from positions [N, 3]; None if float32 holds them as they are."""
     middle = np.median(means.astype(np.float64), axis=0)
-    step = float(np.spacing(np.float32(np.abs(middle).max())))
+    rounding = float(np.spacing(np.float32(np.abs(middle).max()))) / 2
     size = math.exp(float(np.median(log_scales)))
-    if not _ROUNDING * size < step / 2 < math.inf:
+    if not _ROUNDING * size < rounding < math.inf:
         return None
-    x, y, z = (float(value) for value in (np.rint(middle) if np.rint(middle).any() else middle))
-    logger.warning(
-        "%s: positions near %.10g %.10g %.10g would be rounded by up to %.2g units, where "
-        "Gaussians have %.2g: %.10g %.10g %.10g is subtracted from all of them",
-        path.name, *middle, step / 2, size, x, y, z)
-    if means.dtype == np.float32:
-        logger.warning("%s: they are rounded that much in the file already: write it with doubles, "
-                       "or move it to the origin before", path.name)
-    return x, y, z
+    whole = np.rint(middle)
+    x, y, z = (float(value) for value in (whole if whole.any() else middle))
+    return Origin((x, y, z), rounding, size, rounded=means.dtype == np.float32)

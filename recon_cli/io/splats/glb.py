@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
+from recon_cli.io.splats.foreign import drop_not_finite, warn_of_degree
+from recon_cli.io.splats.loaded import LoadedScene
 from recon_cli.io.splats.values import (
     UntrustedFile,
     logit,
@@ -47,6 +49,7 @@ Y_UP: NDArray[np.float64] = np.eye(3)
 # By the names under which `asset.extras` records the axes of the scene.
 _AXES = {"z up": Z_UP, "y down": Y_DOWN, "y up": Y_UP}
 _AXES_KEY = "scene_axes"
+_UP = {"z": Z_UP, "-y": Y_DOWN, "y": Y_UP}
 _NAME = "KHR_gaussian_splatting"
 _SUPPORTED = (_NAME, "KHR_mesh_quantization")  # of the extensions that a file may require
 _COLOR_SPACE = "srgb_rec709_display"
@@ -99,7 +102,12 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
 
 def nearest_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns Z_UP, Y_DOWN or Y_UP, whichever has its up nearest to a unit vector [3]."""
-    return max(_AXES.values(), key=lambda axes: float(axes[1] @ up))
+    return _UP[nearest_up(up)]
+
+
+def nearest_up(up: NDArray[np.float64]) -> str:
+    """Returns z, -y or y, whichever is nearest to a unit vector [3]."""
+    return max(_UP, key=lambda name: float(_UP[name][1] @ up))
 
 
 def _coefficient_names(degree: int) -> list[str]:
@@ -155,8 +163,13 @@ def read_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> Splats:
     first. Behind the last one of a primitive that has any, Gaussians are of degree 0. `axes` are as
     in `write_glb`; None for those that the file records, or else `Z_UP`. FormatError if the file is
     missing or damaged, holds no Gaussians, or needs what is not supported: compression, another
-    kernel, linear colours, nodes that stretch.
+    kernel, linear colours, nodes that stretch. Gaussians that are not finite are dropped.
     """
+    return load_glb(path, axes=axes).splats
+
+
+def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedScene:
+    """Returns the scene of a .glb and its axis that is up; see `read_glb`."""
     container = Container(path)
     required = container.json.get("extensionsRequired", [])
     if not isinstance(required, list) or not all(name in _SUPPORTED for name in required):
@@ -178,7 +191,8 @@ def read_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> Splats:
         raise container.error("values that overflow float32")
     if axes is None:
         axes = _AXES.get(_read_axes(container.json), Z_UP)
-    return transformed(splats, Similarity(rotation=axes.T))
+    up = next((name for name, known in _UP.items() if np.array_equal(known, axes)), None)
+    return LoadedScene(transformed(splats, Similarity(rotation=axes.T)), up)
 
 
 def _read_axes(value: Mapping[str, Any]) -> str:
@@ -221,15 +235,18 @@ def _read_primitive(
     def values(name: str, kind: str) -> NDArray[np.float64]:
         if name not in attributes:
             raise container.error(f"Gaussians without {name}")
-        return container.values(attributes[name], kind)
+        return container.values(attributes[name], kind, finite=False)
 
     means = values("POSITION", "VEC3")
     scales, opacities = values(f"{_NAME}:SCALE", "VEC3"), values(f"{_NAME}:OPACITY", "SCALAR")
-    if scales.min() < 0 or opacities.min() < 0 or opacities.max() > 1:
+    # a NaN, which is neither, is dropped below
+    if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():
         raise container.error("scales below 0 or opacities beyond 0 to 1: a draft of the format?")
     present = [name for name in _coefficient_names(3) if name in attributes]
     if len(present) not in TERMS or present != _coefficient_names(TERMS.index(len(present))):
         raise container.error(f"{len(present)} coefficients, which make no degree")
+    if f"{_NAME}:SH_DEGREE_4_COEF_0" in attributes:
+        warn_of_degree(container.path, 4)
     rest = [values(name, "VEC3") for name in present]
     table: dict[str, NDArray[Any]] = {
         "means": means,
@@ -241,7 +258,7 @@ def _read_primitive(
     if {len(column) for column in (*table.values(), *rest)} != {len(means)}:
         raise container.error("attributes of different lengths")
     table["sh_rest"] = np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3))
-    return splats_from_arrays(container.path, table)
+    return splats_from_arrays(container.path, drop_not_finite(container.path, table))
 
 
 def walk_meshes(container: Container) -> Iterator[tuple[dict[str, Any], Similarity]]:
@@ -330,10 +347,12 @@ class Container(UntrustedFile):
         entry: dict[str, Any] = entries[index]
         return entry
 
-    def values(self, accessor: object, kind: str) -> NDArray[np.float64]:
+    def values(
+        self, accessor: object, kind: str, *, finite: bool = True
+    ) -> NDArray[np.float64]:
         """Returns the values [N, C] of an accessor of a type such as VEC3.
 
-        Normalized integers are converted to 0 to 1, or -1 to 1.
+        Normalized integers are converted to 0 to 1, or -1 to 1. All must be `finite`, unless not.
         """
         entry = self.entry("accessors", accessor)
         component = entry.get("componentType")
@@ -350,7 +369,7 @@ class Container(UntrustedFile):
         table = np.ndarray((count, width), item, part, start, (stride, item.itemsize))
         with np.errstate(invalid="ignore"):  # of a NaN that signals
             values = table.astype(np.float64)
-        if not np.isfinite(values).all():
+        if finite and not np.isfinite(values).all():
             raise self.error("values that are not finite")
         if entry.get("normalized") is True and item.kind in "iu":
             values = np.maximum(values / np.iinfo(item).max, -1)

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_splats
+from recon_cli.io.splats.axes import turn_from
+from recon_cli.io.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_scene
 from recon_cli.io.splats.values import read_contents
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -45,6 +46,7 @@ MODULES = {
     "viewer": "viewer.js",
 }
 LICENCES = ("LICENSE-three.txt", "LICENSE-spark.txt", "LICENSE-fflate.txt")
+_STORED = "rub"  # what the page turns; its own inverse
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
 _LEVELS_FROM = 500_000  # Gaussians, of which Spark makes levels of detail
 _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is measured on
@@ -150,8 +152,8 @@ def write_html(
     """
     halvings = _halvings(splats)
     # beside the scripts size hardly counts
-    packed = spz_bytes(path, _enlarged(splats, -halvings), harmonic_step=1,
-                       most_bits=POSITION_BITS + halvings)
+    packed = spz_bytes(path, turn_from(_STORED, _enlarged(splats, -halvings)), harmonic_step=1,
+                       most_bits=POSITION_BITS + halvings, axes=None)
     tag = f' data-halvings="{halvings}"' if halvings else ""
     scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '
              f'data-bytes="{len(packed)}"{tag}>{base64.b64encode(packed).decode("ascii")}</script>')
@@ -196,4 +198,5 @@ def read_html(path: Path) -> Splats:
     if len(packed) != promised:
         raise FormatError(
             f"{path} promises a scene of {promised} bytes, but holds {len(packed)}: it is damaged.")
-    return _enlarged(spz_splats(path, packed), int(matches[0][3] or 0))
+    stored = spz_scene(path, packed, axes=_STORED).splats
+    return _enlarged(stored, int(matches[0][3] or 0))

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from recon_cli.io.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
+from recon_cli.io.splats.loaded import LoadedScene
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
@@ -65,7 +66,8 @@ Doubles = NDArray[np.float64]
 
 
 def write_sog(
-    path: Path, splats: Splats, *, seed: int = 0, sharing: int = SHARING[0]
+    path: Path, splats: Splats, *, seed: int = 0, sharing: int = SHARING[0],
+    antialiased: bool = False,
 ) -> None:
     """Writes `splats` to `path`, whole or not at all; the same seed gives the same bytes.
 
@@ -75,6 +77,8 @@ def write_sog(
     there are no Gaussians, or a value is not finite.
     """
     meta, images = pack_splats(splats, seed=seed, sharing=sharing)
+    if antialiased:
+        meta |= {"antialias": True, "model": "antialiased"}
     write_bytes(path, pack_archive(meta, images))
 
 
@@ -140,7 +144,15 @@ def read_sog(path: Path) -> Splats:
     Those behind the last one that has a coefficient other than zero are of degree 0. FormatError if
     the file is missing, damaged, of version 1, or does not hold what it promises.
     """
-    return read_files(Archive(path))
+    return load_sog(path).splats
+
+
+def load_sog(path: Path) -> LoadedScene:
+    """Returns the scene of a .sog, and whether it says that it was trained with antialiasing."""
+    archive = Archive(path)
+    meta = archive.meta()
+    antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
+    return LoadedScene(read_files(archive), antialiased=antialiased)
 
 
 def read_files(archive: SogFiles) -> Splats:

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from recon_cli.errors import FormatError
+from recon_cli.io.splats.foreign import drop_not_finite
 from recon_cli.io.splats.values import (
     decode_opacities,
     encode_opacities,
     refuse_above,
-    refuse_not_finite,
     round_to_bytes,
     splats_from_arrays,
     to_arrays,
@@ -53,7 +53,10 @@ def write_splat(path: Path, splats: Splats) -> None:
 
 
 def read_splat(path: Path) -> Splats:
-    """Returns the Gaussians of a .splat, degree 0, in the file's order; FormatError if damaged."""
+    """Returns the Gaussians of a .splat, degree 0, in the file's order.
+
+    Those that are not finite are dropped, with a warning. FormatError if the file is damaged.
+    """
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -67,8 +70,9 @@ def read_splat(path: Path) -> Splats:
     if len(data) != size or data.startswith(_OTHER_FORMATS):
         raise FormatError(f"{path} is no .splat file.")
     rows = np.frombuffer(data, _ROW)
+    rows = drop_not_finite(path, {"row": rows}, {
+        "positions": rows["means"], "scales": rows["scales"]})["row"]
     scales = rows["scales"]
-    refuse_not_finite(path, {"positions": rows["means"], "scales": scales})
     if (scales < 0).any():
         raise FormatError(f"{path} holds negative scales: it is damaged or no .splat file.")
     return splats_from_arrays(path, {

@@ -2,8 +2,10 @@
 
 Source: https://github.com/nianticlabs/spz. Positions are fixed point numbers of 24 bits, log scales
 and colours bytes, opacities bytes after the sigmoid, rotations the smallest three components of the
-quaternion (bytes of x, y and z in version 2), harmonics bytes of 1/128. Axes are RUB (y up), in
-a .ply RDF: y and z are negated, with the rotations and harmonics.
+quaternion (bytes of x, y and z in version 2), harmonics bytes of 1/128.
+
+The extension 0xADBE0003 says which axes a file has. Without it the documentation says RUB, but the
+programs that are used write and read the axes of the .ply they convert, which is RDF: docs/formats.
 
 Versions 2 and 3 are one gzip stream (or the same bytes plain): a header of 16 bytes, then
 positions, opacities, colours, scales, rotations and harmonics. Version 4 has an uncompressed header
@@ -18,7 +20,7 @@ import logging
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,9 @@ import zstandard
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.io.splats.axes import AXES, PLY, turn_from, up_of
+from recon_cli.io.splats.foreign import warn_of_degree
+from recon_cli.io.splats.loaded import LoadedScene
 from recon_cli.io.splats.values import (
     Bytes,
     Floats,
@@ -34,7 +39,6 @@ from recon_cli.io.splats.values import (
     decode_smallest_three,
     encode_opacities,
     encode_smallest_three,
-    flip_yz,
     read_contents,
     round_to_bytes,
     splats_from_arrays,
@@ -66,23 +70,33 @@ _SIZES = struct.Struct("<QQ")  # packed, unpacked
 _EXTENSION = struct.Struct("<II")  # type, bytes that follow
 _HAS_EXTENSIONS = 2
 _EXTENSIONS_LIMIT = 1 << 20  # bytes
-_ADOBE, _ORBIT_CAMERA = 0xADBE, 0xADBE0002
+_ADOBE, _ORBIT_CAMERA, _AXES = 0xADBE, 0xADBE0002, 0xADBE0003
+_AXES_RECORD = struct.Struct("<III")  # type, 4, and a number of AXES from 1; 0 means none
+_ANTIALIASED = 1
+# Coefficients a channel of what a file may have; those above degree 3 are cut off.
+_FILE_TERMS = (*TERMS, 24)
 _MAX_FRACTIONAL_BITS = 24
 # Limit of what a file may unpack to. A scene whose harmonics are all 0 reaches 5 times its size.
 _HARMLESS_BYTES, _MAX_RATIO = 1 << 24, 128
 _ZSTD_LEVEL = 12  # that of Niantic's program
 
 
-def write_spz(path: Path, splats: Splats, *, version: int = 3) -> None:
+def write_spz(
+    path: Path, splats: Splats, *, version: int = 3, axes: str | None = PLY,
+    antialiased: bool = False,
+) -> None:
     """Writes `splats` to `path`, whole or not at all; see `spz_bytes`."""
-    write_bytes(path, spz_bytes(path, splats, version=version))
+    write_bytes(path, spz_bytes(
+        path, splats, version=version, axes=axes, antialiased=antialiased))
 
 
 def spz_bytes(
     path: Path, splats: Splats, *, version: int = 3, harmonic_step: int = _HARMONIC_STEP,
-    most_bits: int = _FRACTIONAL_BITS[1],
+    most_bits: int = _FRACTIONAL_BITS[1], axes: str | None = PLY, antialiased: bool = False,
 ) -> bytes:
-    """Returns the bytes of an SPZ file of `splats`.
+    """Returns the bytes of an SPZ file of `splats`, whose values are written as they are.
+
+    `axes` is the name in AXES of what they are, which the file records; None leaves it out.
 
     Log scales below -10 become -10, and above 5.9375, with a warning, 5.9375; coefficients outside
     -1 to 127/128 and dc outside -3.33 to 3.33 are clipped. Positions get `most_bits` fractional
@@ -93,8 +107,8 @@ def spz_bytes(
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is none of {VERSIONS}")
-    values = flip_yz(Splats.of({
-        name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()}))
+    values = Splats.of({
+        name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()})
     means, quats = values.means.numpy(), values.quats.numpy()
     log_scales = values.log_scales.numpy()
     large = int((log_scales.max(axis=1) > _LARGEST_SCALE).sum())
@@ -103,7 +117,8 @@ def spz_bytes(
             "%s: %s Gaussians are made smaller: SPZ holds e^%g units, the largest has e^%.1f",
             path.name, f"{large:,}", _LARGEST_SCALE, log_scales.max())
     bits = _fractional_bits(path, means, most_bits)
-    return pack(SpzHeader(version, len(splats), values.sh_degree, bits), [
+    header = SpzHeader(version, len(splats), values.sh_degree, bits, axes, antialiased)
+    return pack(header, [
         _position_bytes(means, bits),
         encode_opacities(values.logit_opacities.numpy()),
         round_to_bytes(255 * (_COLOR * values.sh_dc.numpy() + 0.5)),
@@ -114,27 +129,39 @@ def spz_bytes(
     ])
 
 
-def read_spz(path: Path) -> Splats:
+def read_spz(path: Path, *, axes: str | None = None) -> Splats:
     """Returns the Gaussians of an SPZ file of version 2, 3 or 4, in the file's order and degree.
 
-    FormatError if the file is missing, damaged, or of another format or version.
+    They are turned from `axes`, or from those that the file records, as `axes.turn_from` does;
+    without either they stay. Harmonics of degree 4 are cut, with a warning. FormatError if the file
+    is missing, damaged, or of another format or version.
     """
-    return spz_splats(path, read_contents(path))
+    return load_spz(path, axes=axes).splats
 
 
-def spz_splats(path: Path, data: bytes) -> Splats:
-    """Returns the Gaussians of the bytes of an SPZ file; see `read_spz`."""
+def load_spz(path: Path, *, axes: str | None = None) -> LoadedScene:
+    """Returns the scene of an SPZ file, and what it says of itself; see `read_spz`."""
+    return spz_scene(path, read_contents(path), axes=axes)
+
+
+def spz_scene(path: Path, data: bytes, *, axes: str | None = None) -> LoadedScene:
+    """Returns the scene of the bytes of an SPZ file; see `read_spz`."""
     header, (places, opacities, colors, scales, rotations, harmonics) = unpack(path, data)
-    n = header.count
-    shape = (n, TERMS[header.sh_degree], 3)
-    return flip_yz(splats_from_arrays(path, {
+    n, kept = header.count, TERMS[min(header.sh_degree, len(TERMS) - 1)]
+    warn_of_degree(path, header.sh_degree)
+    coefficients = harmonics.reshape(n, _FILE_TERMS[header.sh_degree], 3)[:, :kept]
+    splats = splats_from_arrays(path, {
         "means": _positions(places, header.fractional_bits),
         "quats": _rotations(rotations.reshape(n, -1)),
         "log_scales": scales.astype(np.float32).reshape(n, 3) / _SCALE_STEPS - _SCALE_OFFSET,
         "logit_opacities": decode_opacities(opacities),
         "sh_dc": (colors.astype(np.float32).reshape(n, 3) / 255 - 0.5) / _COLOR,
-        "sh_rest": (harmonics.astype(np.float32).reshape(shape) - _HARMONIC) / _HARMONIC,
-    }))
+        "sh_rest": (coefficients.astype(np.float32) - _HARMONIC) / _HARMONIC,
+    })
+    axes = axes or header.axes
+    if axes is None:
+        return LoadedScene(splats, antialiased=header.antialiased)
+    return LoadedScene(turn_from(axes, splats), up_of(axes), header.antialiased)
 
 
 def _fractional_bits(path: Path, means: Floats, most: int) -> int:
@@ -191,17 +218,19 @@ def _rotations(data: Bytes) -> Floats:
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """Version, count, degree and precision of the arrays."""
+    """Version, count, degree and precision of the arrays, and what a file says of them."""
 
     version: int  # 2, 3 or 4
     count: int  # Gaussians, N
-    sh_degree: int  # 0 to 3
+    sh_degree: int  # 0 to 4
     fractional_bits: int  # of the positions
+    axes: str | None = None  # a name in AXES; None where the file does not say
+    antialiased: bool = False
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
-        each = (9, 1, 3, 3, 3 if self.version < 3 else 4, 3 * TERMS[self.sh_degree])
+        each = (9, 1, 3, 3, 3 if self.version < 3 else 4, 3 * _FILE_TERMS[self.sh_degree])
         return tuple(self.count * size for size in each)
 
 
@@ -209,14 +238,17 @@ def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
     """Returns the file of the six arrays, each of the header's size."""
     raw = [array.tobytes() for array in arrays]
     assert tuple(len(item) for item in raw) == header.sizes
-    fields = (_MAGIC, header.version, header.count, header.sh_degree, header.fractional_bits, 0)
+    record = b"" if header.axes is None else _AXES_RECORD.pack(
+        _AXES, 4, 1 + AXES.index(header.axes))
+    flags = (_ANTIALIASED if header.antialiased else 0) | (_HAS_EXTENSIONS if record else 0)
+    fields = (_MAGIC, header.version, header.count, header.sh_degree, header.fractional_bits, flags)
     if header.version < 4:
-        return gzip.compress(_HEAD.pack(*fields, 0) + b"".join(raw), 6, mtime=0)
+        return gzip.compress(_HEAD.pack(*fields, 0) + b"".join(raw) + record, 6, mtime=0)
     raw = [item for item in raw if item]
     packed = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(item) for item in raw]
     sizes = [_SIZES.pack(len(small), len(large)) for small, large in zip(packed, raw, strict=True)]
-    head = _HEAD.pack(*fields, len(raw)) + _MORE.pack(_HEAD.size + _MORE.size)
-    return b"".join([head, *sizes, *packed])
+    table = _HEAD.size + _MORE.size + len(record)
+    return b"".join([_HEAD.pack(*fields, len(raw)), _MORE.pack(table), record, *sizes, *packed])
 
 
 def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
@@ -226,17 +258,18 @@ def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
     """
     try:
         if data.startswith(b"\x1f\x8b"):
-            header, body = _unpack_gzip(path, data)
+            header, body, extensions = _unpack_gzip(path, data)
         elif data.startswith(_MAGIC):
             header, flags, streams = _parse(path, data[:_HEAD.size], len(data))
             if header.version == 4:
-                body = _unpack_streams(path, data, header, flags, streams)
+                body, extensions = _unpack_streams(path, data, header, flags, streams)
             else:
-                body = _without_extensions(path, data[_HEAD.size:], header, flags)
+                body, extensions = _split_extensions(path, data[_HEAD.size:], header, flags)
         else:
             raise FormatError(f"{path} is no SPZ file.")
     except (zlib.error, zstandard.ZstdError) as error:
         raise FormatError(f"{path} cannot be unpacked: {error}.") from error
+    header = replace(header, axes=_read_extensions(path, extensions))
     ends = np.cumsum(header.sizes)[:-1]
     return header, np.split(np.frombuffer(body, np.uint8), ends)
 
@@ -250,11 +283,12 @@ def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
         raise FormatError(f"{path} is no SPZ file.")
     if version not in VERSIONS:
         raise FormatError(f"{path} is of SPZ version {version}; 2, 3 and 4 can be read.")
-    if degree >= len(TERMS):
-        raise FormatError(f"{path} has harmonics of degree {degree}; at most 3 can be read.")
+    if degree >= len(_FILE_TERMS):
+        raise FormatError(f"{path} has harmonics of degree {degree}; at most 4 can be read.")
     if bits > _MAX_FRACTIONAL_BITS:
         raise FormatError(f"{path} has positions of {bits} fractional bits, above 24: damaged.")
-    header = SpzHeader(version, count, degree, bits)
+    header = SpzHeader(
+        version, count, degree, bits, antialiased=bool(flags & _ANTIALIASED))
     if not count or sum(header.sizes) > _HARMLESS_BYTES + _MAX_RATIO * size:
         raise FormatError(
             f"{path} promises {count} Gaussians, which do not fit into its {size} bytes.",
@@ -262,7 +296,7 @@ def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
     return header, flags, streams
 
 
-def _unpack_gzip(path: Path, data: bytes) -> tuple[SpzHeader, bytes]:
+def _unpack_gzip(path: Path, data: bytes) -> tuple[SpzHeader, bytes, bytes]:
     stream = zlib.decompressobj(wbits=31)
     head = stream.decompress(data, _HEAD.size)
     header, flags, _ = _parse(path, head, len(data))
@@ -274,21 +308,25 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[SpzHeader, bytes]:
         raise _too_long_error(path)
     if not stream.eof:
         raise _truncated_error(path)
-    return header, _without_extensions(path, body, header, flags)
+    return header, *_split_extensions(path, body, header, flags)
 
 
-def _without_extensions(path: Path, body: bytes, header: SpzHeader, flags: int) -> bytes:
+def _split_extensions(
+    path: Path, body: bytes, header: SpzHeader, flags: int
+) -> tuple[bytes, bytes]:
+    """Returns the arrays and the extensions behind them, where versions 2 and 3 have these."""
     size = sum(header.sizes)
     if len(body) < size:
         raise _truncated_error(path)
-    if flags & _HAS_EXTENSIONS:
-        _check_extensions(path, body[size:])
-    elif len(body) > size:
+    if len(body) > size and not flags & _HAS_EXTENSIONS:
         raise _too_long_error(path)
-    return body[:size]
+    return body[:size], body[size:]
 
 
-def _unpack_streams(path: Path, data: bytes, header: SpzHeader, flags: int, streams: int) -> bytes:
+def _unpack_streams(
+    path: Path, data: bytes, header: SpzHeader, flags: int, streams: int
+) -> tuple[bytes, bytes]:
+    """Returns the arrays and the extensions before them, where version 4 has these."""
     promised = [size for size in header.sizes if size]
     begin = _HEAD.size + _MORE.size
     if len(data) < begin:
@@ -297,8 +335,7 @@ def _unpack_streams(path: Path, data: bytes, header: SpzHeader, flags: int, stre
     start = table + _SIZES.size * streams
     if streams != len(promised) or table < begin or start > len(data):
         raise FormatError(f"{path} has {streams} streams instead of {len(promised)}: damaged.")
-    if flags & _HAS_EXTENSIONS:
-        _check_extensions(path, data[begin:table])
+    extensions = data[begin:table] if flags & _HAS_EXTENSIONS else b""
     parts = []
     for i, size in enumerate(promised):
         packed, unpacked = _SIZES.unpack_from(data, table + _SIZES.size * i)
@@ -312,27 +349,40 @@ def _unpack_streams(path: Path, data: bytes, header: SpzHeader, flags: int, stre
             raise _truncated_error(path)
     if start != len(data):
         raise _too_long_error(path) if start < len(data) else _truncated_error(path)
-    return b"".join(parts)
+    return b"".join(parts), extensions
 
 
-def _check_extensions(path: Path, data: bytes) -> None:
-    """Raises FormatError for damaged extensions and for those that change what the arrays mean.
+def _read_extensions(path: Path, data: bytes) -> str | None:
+    """Returns the axes that the extensions name, in AXES; None if none does.
 
-    Those of unknown vendors are ignored, as the format requires. Of Adobe's the limits of an orbit
-    camera are harmless; others rotate the axes or scale the harmonics.
+    Those of unknown vendors are ignored, as the format requires, as are Adobe's limits of an orbit
+    camera. FormatError if they are damaged or change in another way what the arrays mean.
     """
-    start = 0
+    start, axes = 0, None
     while start < len(data):
         if start + _EXTENSION.size > len(data):
             raise _truncated_error(path)
         kind, size = _EXTENSION.unpack_from(data, start)
-        if kind >> 16 == _ADOBE and kind != _ORBIT_CAMERA:
+        if kind == _AXES:
+            axes = _read_axes(path, data[start + _EXTENSION.size:start + _EXTENSION.size + size])
+        elif kind >> 16 == _ADOBE and kind != _ORBIT_CAMERA:
             raise FormatError(
                 f"{path} has the extension {kind:#x}, which changes what its values mean.",
                 hint="Write it again without extensions.")
         start += _EXTENSION.size + size
     if start > len(data):
         raise _truncated_error(path)
+    return axes
+
+
+def _read_axes(path: Path, payload: bytes) -> str | None:
+    """Returns the name of the number in the extension of the axes; None for 0, unspecified."""
+    number = int.from_bytes(payload, "little")
+    if len(payload) != 4 or number > len(AXES):
+        raise FormatError(
+            f"{path} names axes by {payload[:8].hex()}, which is none of the {len(AXES)} that the "
+            "format has.", hint="Give the axes with --axes, for example --axes rub.")
+    return AXES[number - 1] if number else None
 
 
 def _truncated_error(path: Path) -> FormatError:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import Splats, with_rows
 
 _FAR = 10.0  # times the median distance of all from their middle
@@ -188,17 +186,6 @@ def decode_smallest_three(largest: NDArray[np.int64], others: NDArray[np.floatin
 
 def _others(largest: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray(np.arange(4) != largest[:, None])
-
-
-def flip_yz(splats: Splats) -> Splats:
-    """Returns the Gaussians with y and z negated (RDF to RUB and back), without rounding."""
-    signs = splats.means.new_tensor([1.0, -1, -1])
-    direction = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)  # where no basis function is 0
-    parity = (basis_rest(direction * signs, 3) / basis_rest(direction, 3)).round()
-    of_terms = parity[:splats.sh_rest.shape[1], None].to(splats.means)
-    return replace(
-        splats, means=splats.means * signs, sh_rest=splats.sh_rest * of_terms,
-        quats=torch.cat([splats.quats[:, :2], -splats.quats[:, 2:]], dim=1))
 
 
 _Float = TypeVar("_Float", bound=np.floating[Any])

@@ -9,6 +9,7 @@ import archive_splats
 import damage
 import numpy as np
 import pytest
+import torch
 from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -158,7 +159,6 @@ def test_a_crowd_of_copies_is_refused(tmp_path, good):
 
 
 @pytest.mark.parametrize(("name", "number", "said"), [
-    ("POSITION", np.nan, "not finite"), (f"{EXT}:SCALE", np.inf, "not finite"),
     (f"{EXT}:SCALE", -0.5, "scales below 0"), (f"{EXT}:OPACITY", 1.5, "beyond 0 to 1"),
     (f"{EXT}:OPACITY", -0.1, "beyond 0 to 1")])
 def test_a_value_that_is_none_is_refused(tmp_path, good, name, number, said):
@@ -168,13 +168,32 @@ def test_a_value_that_is_none_is_refused(tmp_path, good, name, number, said):
     refused(tmp_path, pack_glb(value, data), said)
 
 
-def test_a_nan_that_signals_is_refused_without_a_warning(tmp_path, good):
+@pytest.mark.parametrize(("name", "number"), [
+    ("POSITION", np.nan), (f"{EXT}:SCALE", np.inf), (f"{EXT}:OPACITY", np.nan)])
+def test_a_gaussian_that_is_not_finite_is_left_out_and_counted(
+    tmp_path, good, name, number, caplog
+):
     value, data = good
-    start = of(value, "bufferViews", "POSITION")["byteOffset"]
-    data = data[:start] + (0x7FA00000).to_bytes(4, "little") + data[start + 4:]
+    pack = tmp_path / "good.glb"
+    pack.write_bytes(pack_glb(value, data))
+    whole = read_glb(pack)
+    start = of(value, "bufferViews", name)["byteOffset"]
+    data = data[:start] + np.array([number], "<f4").tobytes() + data[start + 4:]
+    pack.write_bytes(pack_glb(value, data))
+    left = read_glb(pack)
+    assert torch.equal(left.means, whole.means[1:])
+    assert torch.equal(left.sh_dc, whole.sh_dc[1:])
+    assert f"1 of {len(whole)} Gaussians are left out" in caplog.text
+
+
+def test_nans_that_signal_are_refused_without_a_warning_where_most_are_bad(tmp_path, good):
+    value, data = good
+    view = of(value, "bufferViews", "POSITION")
+    start, size = view["byteOffset"], view["byteLength"]
+    data = data[:start] + (0x7FA00000).to_bytes(4, "little") * (size // 4) + data[start + size:]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        refused(tmp_path, pack_glb(value, data), "not finite")
+        refused(tmp_path, pack_glb(value, data), "not finite in means")
 
 
 def _survives(path, data):

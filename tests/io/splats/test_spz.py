@@ -9,7 +9,7 @@ import torch
 from splat_cases import N, edge_splats, few, greatest, plain, rotation_error, unit
 
 from recon_cli.errors import FormatError
-from recon_cli.io.splats.spz import read_spz, write_spz
+from recon_cli.io.splats.spz import load_spz, read_spz, write_spz
 from recon_cli.scene.harmonics import basis_rest
 
 MIB = 1 << 20
@@ -57,30 +57,26 @@ def test_bytes_stay_when_a_file_is_read_and_written_again(tmp_path, version):
     assert rotation_error(once, again) <= 2e-3
 
 
-def test_the_file_has_y_up_and_z_back(tmp_path):
-    """The colour along d of the scene is the colour along the turned d of the file's values."""
+def test_the_values_in_the_file_are_those_of_the_scene(tmp_path):
+    """As splat-transform, Spark and Niantic's ply_to_spz write them: nothing is turned."""
     splats = few(4)
     splats.means[:] = torch.tensor([1.0, 2.0, 4.0])
     splats.quats[:] = torch.tensor([0.8, 0.1, -0.3, 0.5])
     write_spz(tmp_path / "a.spz", splats)
     body = np.frombuffer(plain(tmp_path / "a.spz"), np.uint8)[16:]
-    places, harmonics = body[:9], body[4 * 20:].reshape(4, 15, 3)
+    places, harmonics = body[:9], body[4 * 20:4 * 65].reshape(4, 15, 3)
     wide = np.zeros((3, 4), np.uint8)
     wide[:, :3] = places.reshape(3, 3)
-    assert ((wide.view("<i4")[:, 0] << 8 >> 8) / 4096).tolist() == [1, -2, -4]
-    direction = torch.tensor([[0.36, 0.48, 0.8]], dtype=torch.float64)
-    turned = direction * torch.tensor([1, -1, -1])
-    ours = basis_rest(direction, 3) @ splats.sh_rest[0].double()
-    theirs = basis_rest(turned, 3) @ torch.from_numpy((harmonics[0] - 128.0) / 128)
-    assert torch.allclose(ours, theirs, atol=15 * 0.5 * STEP)
-    # The largest component w is left out (3 of xyzw), x stays, y and z change their sign.
+    assert ((wide.view("<i4")[:, 0] << 8 >> 8) / 4096).tolist() == [1, 2, 4]
+    assert np.abs((harmonics[0] - 128.0) / 128 - splats.sh_rest[0].numpy()).max() <= 0.5 * STEP
+    # The largest component w is left out (3 of xyzw); x, y and z keep their sign.
     word = int(body[4 * 16:4 * 17].view("<u4")[0])
     fields = [word >> shift & 1023 for shift in (20, 10, 0)]
     assert word >> 30 == 3
     signs = [-1 if field & 512 else 1 for field in fields]
     sizes = [(field & 511) / 511 * np.sqrt(0.5) for field in fields]
     length = np.linalg.norm([0.8, 0.1, 0.3, 0.5])
-    assert signs == [1, 1, -1]
+    assert signs == [1, -1, 1]
     assert np.allclose(sizes, np.array([0.1, 0.3, 0.5]) / length, atol=1e-3)
 
 
@@ -104,7 +100,7 @@ def test_version_2_is_version_3_with_bytes_of_rotations(tmp_path):
 
 def test_rotations_of_version_2_are_bytes_of_x_y_z(tmp_path):
     splats = few(3, 0)
-    write_spz(tmp_path / "a.spz", splats)
+    write_spz(tmp_path / "a.spz", splats, axes=None)
     data = plain(tmp_path / "a.spz")
     body = data[16:16 + 16 * 3]
     vectors = np.array([[0, 0, 0], [0.5, -0.5, 0.5], [0, -1, 0]])
@@ -112,7 +108,7 @@ def test_rotations_of_version_2_are_bytes_of_x_y_z(tmp_path):
     (tmp_path / "b.spz").write_bytes(
         gzip.compress(b"NGSP" + struct.pack("<I", 2) + data[8:16] + body + rotations))
     back = read_spz(tmp_path / "b.spz")
-    wanted = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, -0.5], [0, 0, 1, 0]])
+    wanted = np.array([[1, 0, 0, 0], [0.5, 0.5, -0.5, 0.5], [0, 0, -1, 0]])
     assert np.allclose(back.quats, wanted, atol=1.5 / 127.5)
     assert torch.equal(back.means, read_spz(tmp_path / "a.spz").means)
 
@@ -155,29 +151,89 @@ def test_what_lies_outside_the_bytes_is_clamped(tmp_path):
     back = read_spz(tmp_path / "a.spz")
     assert back.log_scales[0, 0] == -10
     assert back.sh_dc[0, 0] == pytest.approx(0.5 / 0.15)
-    assert back.sh_rest[0, 0, 0] == -127 / 128  # of y, which is negated: 4 becomes the byte 255
+    assert back.sh_rest[0, 0, 0] == -1
 
 
-def test_extensions_are_passed_over_unless_they_change_what_values_mean(tmp_path):
+def with_extension(path, kind, payload):
+    """Adds an extension to a file that has none, where its version has them."""
+    record = struct.pack("<II", kind, len(payload)) + payload
+    data = path.read_bytes()
+    if data[:4] != b"NGSP":
+        data = plain(path)
+        data = gzip.compress(data[:14] + b"\2" + data[15:] + record)
+    else:
+        data = data[:14] + b"\2" + data[15:16] + struct.pack("<I", 32 + len(record)) + (
+            bytes(12) + record + data[32:])
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("kind", [0xADBE0002, 0x12340001])
+def test_extensions_that_change_nothing_are_passed_over(tmp_path, version, kind):
     path = tmp_path / "a.spz"
-    for version in (3, 4):
-        for kind, harmless in [(0xADBE0002, True), (0x12340001, True), (0xADBE0003, False)]:
-            write_spz(path, few(), version=version)
-            wanted = read_spz(path)
-            record = struct.pack("<II", kind, 4) + b"\4\0\0\0"
-            if version == 3:
-                data = plain(path)
-                data = gzip.compress(data[:14] + b"\2" + data[15:] + record)
-            else:
-                data = path.read_bytes()
-                data = data[:14] + b"\2" + data[15:16] + struct.pack("<I", 32 + len(record)) + (
-                    bytes(12) + record + data[32:])
-            path.write_bytes(data)
-            if harmless:
-                assert torch.equal(read_spz(path).means, wanted.means)
-            else:
-                with pytest.raises(FormatError, match="extension 0xadbe0003"):
-                    read_spz(path)
+    write_spz(path, few(), version=version, axes=None)
+    wanted = read_spz(path)
+    with_extension(path, kind, b"\4\0\0\0")
+    assert torch.equal(read_spz(path).means, wanted.means)
+
+
+# Numbers of the extension and the signs that lead to "rdf", or "rfu" where up is along z; checked
+# against @adobe/spz 0.2.3, the library of Niantic and Adobe.
+@pytest.mark.parametrize(("number", "signs", "up"), [
+    (4, [1, -1, -1], "-y"), (6, [1, 1, 1], "-y"), (7, [-1, -1, 1], "-y"), (8, [1, -1, 1], "-y"),
+    (1, [-1, 1, -1], "-y"), (12, [1, 1, 1], "z"), (16, [1, -1, 1], "z"), (10, [1, 1, -1], "z"),
+])
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_the_axes_that_a_file_names_are_turned_into_ours(tmp_path, number, signs, up, version):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=version, axes=None)
+    stored = read_spz(path)
+    with_extension(path, 0xADBE0003, struct.pack("<I", number))
+    scene = load_spz(path)
+    assert scene.up == up
+    assert torch.equal(scene.splats.means, stored.means * torch.tensor(signs))
+    # The colour along d of the scene is the one along the d that the signs make of it in the file.
+    direction = torch.tensor([[0.36, 0.48, 0.8]], dtype=torch.float64)
+    ours = basis_rest(direction, 3) @ scene.splats.sh_rest[0].double()
+    theirs = basis_rest(direction * torch.tensor(signs), 3) @ stored.sh_rest[0].double()
+    assert torch.allclose(ours, theirs, atol=1e-6)
+
+
+def test_a_file_that_names_no_axes_stays_and_those_given_win(tmp_path):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), axes=None)
+    stored = read_spz(path)
+    assert load_spz(path).up is None
+    assert torch.equal(read_spz(path, axes="rub").means, stored.means * torch.tensor([1, -1, -1]))
+    with_extension(path, 0xADBE0003, struct.pack("<I", 0))  # unspecified
+    assert torch.equal(read_spz(path).means, stored.means)
+    write_spz(path, few(), axes="rub")
+    assert torch.equal(read_spz(path).means, stored.means * torch.tensor([1, -1, -1]))
+    assert torch.equal(read_spz(path, axes="rdf").means, stored.means)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_the_file_names_its_axes_and_the_antialiasing_of_its_scene(tmp_path, version):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=version)
+    assert struct.pack("<III", 0xADBE0003, 4, 6) in (
+        path.read_bytes() if version == 4 else plain(path))
+    assert (load_spz(path).up, load_spz(path).antialiased) == ("-y", False)
+    write_spz(path, few(), version=version, axes="rfu", antialiased=True)
+    assert (load_spz(path).up, load_spz(path).antialiased) == ("z", True)
+    assert torch.equal(read_spz(path).sh_dc, read_spz(path, axes="rfu").sh_dc)
+
+
+def test_harmonics_of_degree_4_are_cut_to_degree_3_with_a_warning(tmp_path, caplog):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), axes=None)
+    wanted, data = read_spz(path), plain(path)
+    n, start = len(few()), 16 + 20 * len(few())
+    harmonics = np.frombuffer(data[start:], np.uint8).reshape(n, 15, 3)
+    more = np.concatenate([harmonics, np.full((n, 9, 3), 7, np.uint8)], axis=1)
+    path.write_bytes(data[:12] + b"\4" + data[13:start] + more.tobytes())
+    assert torch.equal(read_spz(path).sh_rest, wanted.sh_rest)
+    assert "degree 4 are cut to degree 3" in caplog.text
 
 
 @pytest.mark.parametrize("version", [3, 4])

@@ -17,6 +17,8 @@ from recon_cli.io.splats.spz import read_spz, write_spz
 MIB = 1 << 20
 STEP = 1 / 64  # of harmonics as they are written: every other of the 256 numbers of the format
 
+AXES = 0xADBE0003  # the extension
+
 
 def header(version=3, count=9, degree=3, bits=12, flags=0, streams=0) -> bytes:
     return b"NGSP" + struct.pack("<IIBBBB", version, count, degree, bits, flags, streams)
@@ -30,7 +32,8 @@ def header(version=3, count=9, degree=3, bits=12, flags=0, streams=0) -> bytes:
     (lambda data: data + b"1", "more than its header"),
     (lambda data: header(version=1) + data[16:], "version 1"),
     (lambda data: header(version=5) + data[16:], "version 5"),
-    (lambda data: header(degree=4) + data[16:], "degree 4"),
+    (lambda data: header(degree=4) + data[16:], "truncated"),
+    (lambda data: header(degree=5) + data[16:], "degree 5"),
     (lambda data: header(bits=25) + data[16:], "25 fractional bits"),
     (lambda data: header(count=0) + data[16:], "promises 0"),
     (lambda data: header(count=10) + data[16:], "truncated"),
@@ -38,11 +41,15 @@ def header(version=3, count=9, degree=3, bits=12, flags=0, streams=0) -> bytes:
     (lambda data: header(count=2**32 - 1) + data[16:], "promises 4294967295"),
     (lambda data: header(flags=2) + data[16:] + b"123", "truncated"),
     (lambda data: header(flags=2) + data[16:] + struct.pack("<II", 9, 4), "truncated"),
+    (lambda data: header(flags=2) + data[16:] + struct.pack("<II", AXES, 9), "truncated|names"),
+    (lambda data: header(flags=2) + data[16:] + struct.pack("<III", AXES, 4, 17), "11000000"),
+    (lambda data: header(flags=2) + data[16:] + struct.pack("<IIB", AXES, 1, 4), "names axes"),
+    (lambda data: header(flags=2) + data[16:] + struct.pack("<III", AXES - 2, 4, 1), "0xadbe0001"),
 ])
 @pytest.mark.parametrize("zipped", [False, True])
 def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message, zipped):
     path = tmp_path / "a.spz"
-    write_spz(path, few())
+    write_spz(path, few(), axes=None)
     data = change(plain(path))
     if zipped and message != "no SPZ":
         data = gzip.compress(data)
@@ -66,7 +73,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message, zi
 ])
 def test_damaged_files_of_version_4_are_refused(tmp_path, change, message):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), version=4)
+    write_spz(path, few(), version=4, axes=None)
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(FormatError, match=message):
         read_spz(path)
@@ -77,7 +84,7 @@ def test_a_missing_file_and_a_damaged_gzip_are_refused(tmp_path):
         with pytest.raises(FormatError, match="cannot be read"):
             read_spz(path)
     path = tmp_path / "a.spz"
-    write_spz(path, few())
+    write_spz(path, few(), axes=None)
     data = path.read_bytes()
     for bad in (data[:12], data[:-3], data[:40] + b"\0" + data[41:], data + b"more"):
         path.write_bytes(bad)
@@ -99,7 +106,7 @@ def refused_at(path, limit: int) -> str:
 
 def test_a_gzip_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path):
     path = tmp_path / "a.spz"
-    write_spz(path, few())
+    write_spz(path, few(), axes=None)
     path.write_bytes(gzip.compress(plain(path) + bytes(200 * MIB)))
     assert "more than its header" in refused_at(path, 2 * MIB)
 
@@ -107,7 +114,7 @@ def test_a_gzip_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path):
 @pytest.mark.parametrize("known", [True, False])
 def test_a_zstd_stream_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path, known):
     path = tmp_path / "a.spz"
-    write_spz(path, few(degree=0), version=4)
+    write_spz(path, few(degree=0), version=4, axes=None)
     data = path.read_bytes()
     sizes = [struct.unpack_from("<QQ", data, 32 + 16 * i) for i in range(5)]
     packer = zstandard.ZstdCompressor(write_content_size=known)
@@ -120,7 +127,7 @@ def test_a_zstd_stream_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path, 
 @pytest.mark.parametrize("version", [3, 4])
 def test_a_count_that_no_file_of_this_size_holds_is_refused(tmp_path, version):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), version=version)
+    write_spz(path, few(), version=version, axes=None)
     data = plain(path) if version == 3 else path.read_bytes()
     data = data[:8] + struct.pack("<I", 50_000_000) + data[12:]
     path.write_bytes(gzip.compress(data) if version == 3 else data)
