@@ -2,7 +2,8 @@
 
 One primitive of points: POSITION; ROTATION, a unit quaternion xyzw; SCALE, the standard deviations
 themselves; OPACITY, after the sigmoid; SH_DEGREE_l_COEF_n, in INRIA's basis, signs and order; and
-COLOR_0 for programs that know nothing of Gaussians. All are float32 but COLOR_0. Drafts of the
+COLOR_0 for programs that know nothing of Gaussians, linear as all colours of vertices in glTF. All
+are float32 but COLOR_0, which has 16 bits: 8 are too few for what is dark and linear. Drafts of the
 extension had logarithms in SCALE; a file that has numbers below 0 there is refused.
 
 The world of glTF is right-handed with +Y up. A scene is rotated into it, with its coefficients,
@@ -32,6 +33,7 @@ from recon_cli.io.splats.foreign import drop_not_finite, warn_of_degree
 from recon_cli.io.splats.loaded import LoadedScene
 from recon_cli.io.splats.values import (
     UntrustedFile,
+    linear_from_srgb,
     logit,
     normalize_quats,
     sigmoid,
@@ -53,7 +55,7 @@ _UP = {"z": Z_UP, "-y": Y_DOWN, "y": Y_UP}
 _NAME = "KHR_gaussian_splatting"
 _SUPPORTED = (_NAME, "KHR_mesh_quantization")  # of the extensions that a file may require
 _COLOR_SPACE = "srgb_rec709_display"
-_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
+_FLOAT, _SHORT, _VERTICES, _POINTS = 5126, 5123, 34962, 0
 # Distance from 1 of the nearest opacity below it in float32: a logit has to be finite.
 _LEAST_OPACITY = 2.0 ** -24
 _LEAST_SCALE = float(np.finfo(np.float32).tiny)  # a flat Gaussian has a scale of 0
@@ -84,7 +86,7 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
     colors = (SH_C0 * table["sh_dc"] + 0.5).clip(0, 1)
     columns: dict[str, NDArray[Any]] = {
         "POSITION": table["means"],
-        "COLOR_0": np.rint(np.hstack([colors, opacities]) * 255).astype(np.uint8),
+        "COLOR_0": np.rint(np.hstack([linear_from_srgb(colors), opacities]) * 65535).astype("<u2"),
         f"{_NAME}:ROTATION": table["quats"][:, [1, 2, 3, 0]],
         f"{_NAME}:SCALE": scales,
         f"{_NAME}:OPACITY": opacities.astype(np.float32),
@@ -126,8 +128,8 @@ def _describe(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         accessor: dict[str, Any] = {
             "bufferView": at, "componentType": _FLOAT, "count": len(column),
             "type": _TYPES[column.shape[1]]}
-        if column.dtype == np.uint8:
-            accessor |= {"componentType": _BYTE, "normalized": True}
+        if column.dtype == np.uint16:
+            accessor |= {"componentType": _SHORT, "normalized": True}
         if name == "POSITION":
             accessor |= {"min": column.min(axis=0).tolist(), "max": column.max(axis=0).tolist()}
         accessors.append(accessor)

@@ -240,6 +240,12 @@ def logit(opacities: NDArray[np.float64], least: float) -> NDArray[np.float32]:
     return np.asarray(np.log(inner / (1 - inner)), np.float32)
 
 
+def linear_from_srgb(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Returns linear colours of sRGB ones, both in [0, 1] (IEC 61966-2-1)."""
+    exact = values.astype(np.float64)
+    return np.where(exact <= 0.04045, exact / 12.92, ((exact + 0.055) / 1.055) ** 2.4)
+
+
 def trim_zero_rows(sh_rest: NDArray[_Float]) -> NDArray[_Float]:
     """Returns coefficients [N, T, 3] without trailing rows of zeros."""
     rows = np.flatnonzero(sh_rest.any(axis=(1, 2)))

@@ -33,7 +33,7 @@ def attribute(path, name):
     (primitive,) = value["meshes"][0]["primitives"]
     accessor = value["accessors"][primitive["attributes"][name]]
     view = value["bufferViews"][accessor["bufferView"]]
-    kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+    kind = {5126: "<f4", 5123: "<u2"}[accessor["componentType"]]
     return np.frombuffer(data[view["byteOffset"]:][:view["byteLength"]], kind).reshape(
         accessor["count"], -1)
 
@@ -100,8 +100,12 @@ def test_the_attributes_are_what_the_extension_says(tmp_path):
     np.testing.assert_array_equal(found["SH_DEGREE_1_COEF_2"], splats.sh_rest[:, 2])
     np.testing.assert_array_equal(found["SH_DEGREE_3_COEF_6"], splats.sh_rest[:, 14])
     colors = attribute(tmp_path / "a.glb", "COLOR_0")
-    wanted = torch.cat([SH_C0 * splats.sh_dc + 0.5, splats.opacities[:, None]], dim=1).clip(0, 1)
-    np.testing.assert_allclose(colors / 255, wanted, atol=0.5 / 255 + 1e-6)
+    shown = (SH_C0 * splats.sh_dc + 0.5).clip(0, 1).double()
+    # sRGB into linear light, as glTF has colours of vertices (IEC 61966-2-1)
+    linear = torch.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    wanted = torch.cat([linear, splats.opacities[:, None]], dim=1)
+    assert colors.dtype == np.uint16
+    np.testing.assert_allclose(colors / 65535, wanted, atol=0.5 / 65535 + 1e-6)
 
 
 def test_the_container_is_what_its_format_says(tmp_path):
