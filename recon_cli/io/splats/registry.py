@@ -35,27 +35,22 @@ class SplatFormat:
 
     name: str  # also the suffix of its files, after a dot; but `lod` for lod-meta.json
     read: Callable[[Path], Splats]  # returns the Gaussians of a file; raises FormatError
-    # the same of any program's file, with what it says of itself
-    load: Callable[[Path], LoadedScene]
     # writes a file, whole or not at all; raises InputError if a value does not fit
     write: Callable[[Path, Splats], None]
-
-
-def _load(read: Callable[[Path], Splats]) -> Callable[[Path], LoadedScene]:
-    return lambda path: LoadedScene(read(path))
+    # reads the file of any program with what it says of itself; None where it cannot say anything
+    load: Callable[[Path], LoadedScene] | None = None
 
 
 FORMATS: dict[str, SplatFormat] = {row.name: row for row in (
     SplatFormat(  # before "ply"
-        "compressed.ply", read_compressed_ply, load_compressed_ply, write_compressed_ply),
-    SplatFormat("ply", read_ply, load_ply, write_ply),
-    SplatFormat("splat", read_splat, _load(read_splat), write_splat),
-    SplatFormat("spz", read_spz, load_spz, write_spz),
-    SplatFormat("sog", read_sog, load_sog, write_sog),
-    SplatFormat("glb", read_glb, load_glb, write_glb),
-    SplatFormat("html", read_html, _load(read_html), write_html),
-    SplatFormat("lod", read_lod, _load(read_lod),
-                lambda path, splats: write_lod(path, make_levels(splats))),
+        "compressed.ply", read_compressed_ply, write_compressed_ply, load_compressed_ply),
+    SplatFormat("ply", read_ply, write_ply, load_ply),
+    SplatFormat("splat", read_splat, write_splat),
+    SplatFormat("spz", read_spz, write_spz, load_spz),
+    SplatFormat("sog", read_sog, write_sog, load_sog),
+    SplatFormat("glb", read_glb, write_glb, load_glb),
+    SplatFormat("html", read_html, write_html),
+    SplatFormat("lod", read_lod, lambda path, splats: write_lod(path, make_levels(splats))),
 )}
 
 
@@ -100,12 +95,12 @@ def load_scene(path: Path, *, axes: str | None = None) -> LoadedScene:
     if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
         raise FormatError(f"{path} is not a file.", hint="Give a file on the disk.")
     try:
-        if axes is None:
-            return row.load(path)
-        if row.name == "spz":
+        if axes is not None and row.name == "spz":
             return load_spz(path, axes=axes)
-        scene = load_glb(path, axes=Y_UP) if row.name == "glb" else row.load(path)
-        return _turn(scene, axes)
+        if axes is not None and row.name == "glb":
+            return _turn(load_glb(path, axes=Y_UP), axes)
+        scene = row.load(path) if row.load else LoadedScene(row.read(path))
+        return scene if axes is None else _turn(scene, axes)
     except FormatError as error:
         error.hint = error.hint or (
             f"Copy or export it again; if it is no .{row.name}, rename it to its real format.")
