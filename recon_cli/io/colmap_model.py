@@ -61,6 +61,22 @@ def model_suffix(folder: Path) -> str | None:
     return None
 
 
+def count_images(folder: Path) -> int:
+    """Returns how many images a model claims to have; 0 where that cannot be read."""
+    suffix = model_suffix(folder)
+    path = next((file for name in ("images", "frames")
+                 if (file := folder / f"{name}{suffix}").is_file()), None)
+    if path is None:
+        return 0
+    if suffix == ".bin":
+        with path.open("rb") as stream:
+            head = stream.read(8)
+        return int.from_bytes(head, "little") if len(head) == 8 else 0
+    if path.stem == "frames":
+        return sum(1 for _ in _rows(path))
+    return sum(_is_image(line) for _, line in _lines(path))
+
+
 def read_model(folder: Path) -> Model:
     """Returns the model in a folder, the binary one if it has both forms."""
     suffix = model_suffix(folder)
@@ -170,9 +186,13 @@ def _read_cameras_text(path: Path) -> dict[int, Lens]:
 
 def _read_images_text(path: Path) -> list[NamedImage]:
     images = []
-    lines = iter(_lines(path))
+    lines = _lines(path)
+    observed = False  # this line may hold the observations of the image before
     for at, line in lines:
-        if not line or line.startswith("#"):
+        if line.startswith("#"):
+            continue
+        if not line or (observed and not _is_image(line)):
+            observed = False
             continue
         words = line.split(maxsplit=9)
         where = f"{path}, line {at},"
@@ -181,9 +201,28 @@ def _read_images_text(path: Path) -> list[NamedImage]:
         (camera_id,) = _integers(words[8:9], where, 1)
         pose = _numbers(words[1:8], where, 7)
         images.append((words[9], camera_id, _parse_pose(pose, where)))
-        next(lines, None)  # its observations, which may be an empty line
+        observed = True  # empty, or left out by programs that write none
     _check_complete(path, len(images))
     return images
+
+
+def _is_image(line: str) -> bool:
+    """Returns whether a line is that of an image, and not of observations: x, y, id of each.
+
+    Only a name of three words, all of them numbers, could be mistaken.
+    """
+    words = line.split()
+    if len(words) < 10 or not all(map(_is_number, words[:9])):
+        return False
+    return len(words) % 3 != 0 or not all(map(_is_number, [*words[9:12], words[-1]]))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def read_points_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -245,7 +284,7 @@ def _check_complete(path: Path, count: int) -> None:
     """Raises FormatError if a file holds less than COLMAP's comment at its head promises."""
     for at, line in _lines(path)[:_HEAD]:
         promised = _COUNT.match(line)
-        if promised and count < int(promised[1]):
+        if promised and count < int(promised[1][:18]):
             raise _line_error(
                 f"{path}", f"it ends after {count} of the {promised[1]} entries that line {at} "
                 "promises")

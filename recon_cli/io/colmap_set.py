@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.colmap_model import Model, NamedImage, model_suffix, read_model
+from recon_cli.io.colmap_model import Model, NamedImage, count_images, model_suffix, read_model
+from recon_cli.io.file_finder import FileFinder
 from recon_cli.io.posed import SUFFIXES, PosedImage, PosedSet, find_images, is_file, resolve_inside
 from recon_cli.scene.camera import MODELS, Lens
 
@@ -96,6 +97,10 @@ _PLACES: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 
 
+# Folders of numbered models that did not connect.
+_NUMBERED = ("sparse", "sparse_text", "colmap/sparse")
+
+
 def is_colmap(folder: Path) -> bool:
     """Returns whether a folder holds a COLMAP model in one of the usual places."""
     return _find_model(folder) is not None
@@ -113,30 +118,57 @@ def read_colmap(folder: Path) -> PosedSet:
     place = _find_model(folder)
     if place is None:
         raise FormatError(f"{folder} holds no COLMAP model.")
-    model_at, image_places = folder / place[0], place[1]
+    image_places = place[1]
+    model_at, model_notices = folder / place[0], tuple[str, ...]()
+    if place[0] != ".":  # not a model that was given itself
+        model_at, model_notices = _choose_model(model_at)
     model = read_model(model_at)
-    candidates = [*(folder / name for name in image_places), *_list_reduced_folders(folder)]
+    candidates = [folder / name for name in image_places] + _list_reduced_folders(folder)
     if model.images:
-        named, images, notices = _locate_images(model, candidates, folder)
+        named, home, paths, notices = _locate_images(model, candidates, folder)
     else:
-        named, images = _match_names_by_order(model, candidates, model_at)
+        named, home = _match_names_by_order(model, candidates, model_at)
         notices = (f"the model lacks the names of its {len(named)} images; they were taken in the "
                    "order of the files, and their colours agree with it",)
-    listed = []
-    for name, camera, viewmat in sorted(named, key=lambda image: image[0]):
-        image = PosedImage(name, images / name, model.lenses[camera], viewmat)
-        mask = folder / "masks" / f"{name}.png"  # as COLMAP's --ImageReader.mask_path names them
-        listed.append(replace(image, mask=mask) if is_file(mask) else image)
-    posed = find_images("colmap", listed, model_at)
+        paths = {name: home / name for name, _, _ in named}
+    listed = [PosedImage(name, paths[name], model.lenses[camera], viewmat)
+              for name, camera, viewmat in sorted(named, key=lambda image: image[0])
+              if name in paths]
+    missing = sorted(name for name, _, _ in named if name not in paths)
+    posed = find_images("colmap", listed, model_at, missing=missing)
     if len(model.points):
         posed = replace(posed, points=model.points, colors=model.colors)
-    return replace(posed, notices=(*notices, *_other_models(model_at), *posed.notices))
+    return replace(posed, notices=(*model_notices, *notices, *posed.notices))
 
 
 def _find_model(folder: Path) -> tuple[str, tuple[str, ...]] | None:
-    return next(((place, images) for place, images in _PLACES
+    places = [*_PLACES[:1], *(
+        (path.relative_to(folder).as_posix(), ("images", "input", "."))
+        for parent in _NUMBERED for path in _numbered_models(folder / parent)), *_PLACES[1:]]
+    return next(((place, images) for place, images in places
                  if model_suffix(folder / place) is not None
                  and (place != "undistorted/sparse" or (folder / images[0]).is_dir())), None)
+
+
+def _numbered_models(parent: Path) -> list[Path]:
+    """Returns the models in the folders 0, 1 and so on of a folder, in this order."""
+    models = [path for path in parent.glob("[0-9]*")
+              if path.name.isdecimal() and model_suffix(path) is not None]
+    return sorted(models, key=lambda path: int(path.name))
+
+
+def _choose_model(model_at: Path) -> tuple[Path, tuple[str, ...]]:
+    """Returns the largest of the numbered models beside a model, and a notice of the others."""
+    models = _numbered_models(model_at.parent) if model_at.name.isdecimal() else []
+    if len(models) < 2:
+        return model_at, ()
+    counts = {path: count_images(path) for path in models}
+    largest = max(models, key=lambda path: counts[path])
+    others = ", ".join(f"{path.parent.name}/{path.name} has {counts[path]}"
+                       for path in models if path != largest)
+    return largest, (
+        f"{largest.parent.name}/{largest.name} with {counts[largest]} images is read, the largest "
+        f"of {len(models)} models that did not connect: {others}; give such a folder to read it",)
 
 
 def _list_reduced_folders(folder: Path) -> list[Path]:
@@ -146,26 +178,33 @@ def _list_reduced_folders(folder: Path) -> list[Path]:
 
 
 def _locate_images(
-    model: Model, candidates: Iterable[Path], folder: Path
-) -> tuple[list[NamedImage], Path, tuple[str, ...]]:
-    """Returns the images of the model, the folder where they are, and notices."""
-    for name, _, _ in model.images:
-        resolve_inside(folder, name, f"the COLMAP model in {folder}")
-    for place in candidates:
-        if any(is_file(place / name) for name, _, _ in model.images):
-            reduced = place.name.startswith("images_")
-            return model.images, place, (f"the images are those in {place.name}",) * reduced
+    model: Model, candidates: Sequence[Path], folder: Path
+) -> tuple[list[NamedImage], Path, dict[str, Path], tuple[str, ...]]:
+    """Returns the images of the model, their folder, files that are called otherwise, and notices.
+
+    Images that have another suffix, another case or a path of another machine are found by their
+    names. FormatError if a name leads out of the folder, and no file in it is called so.
+    """
+    names = [name for name, _, _ in model.images]
+    where = f"the COLMAP model in {folder}"
+    place = next((place for place in candidates if any(
+        not PurePosixPath(name).is_absolute() and is_file(place / name) for name in names)), None)
+    places = [path for path in candidates if path.is_dir()] if place is None else [place]
+    for home in places:
+        finder = FileFinder(home, names)
+        found = finder.find_all(where)
+        if found:
+            for name in names:  # of another machine is a path from its root, not one with ..
+                if name not in found and not PurePosixPath(name).is_absolute():
+                    resolve_inside(folder, name, where)
+            reduced = (f"the images are those in {home.name}",) * home.name.startswith("images_")
+            return model.images, home, found, (*reduced, *finder.notices())
+    for name in names:
+        resolve_inside(folder, name, where)
+    there = next((path for home in places for path in sorted(home.rglob("*"))
+                  if path.suffix in SUFFIXES), None)
+    instead = "" if there is None else f" There is {there.relative_to(folder)}, say."
     raise InputError(
-        f"The COLMAP model in {folder} has {len(model.images)} images, but none of their files is "
-        f"there. The first is {model.images[0][0]}.",
-        hint=f"Put the images into {folder / 'images'}.")
-
-
-def _other_models(model_at: Path) -> tuple[str, ...]:
-    """Returns a notice if COLMAP left several models, of which only the first was read."""
-    if model_at.name != "0":
-        return ()
-    others = [path for path in model_at.parent.iterdir()
-              if path != model_at and model_suffix(path) is not None]
-    return (f"only the first of {len(others) + 1} models in {model_at.parent.name} was read",) * (
-        len(others) > 0)
+        f"The COLMAP model in {folder} has {len(names)} images, but none of their files is "
+        f"there. The first is {names[0]}.{instead}",
+        hint=f"Put the images into {folder / 'images'}, called as in the model.")

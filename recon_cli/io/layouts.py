@@ -9,6 +9,7 @@ from pathlib import Path
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_set import is_colmap, lacks_cameras, read_colmap
 from recon_cli.io.kinect import find_unposed, is_seven_scenes, is_tum, read_seven_scenes, read_tum
+from recon_cli.io.mask_files import attach_masks
 from recon_cli.io.posed import PosedSet
 from recon_cli.io.rgbd import is_replica, is_scannet, lacks_trajectory, read_replica, read_scannet
 from recon_cli.io.transforms import is_transforms, read_transforms
@@ -74,7 +75,7 @@ def read_posed(path: Path) -> PosedSet:
         known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
         raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
     try:
-        return layout.read(path)
+        return attach_masks(layout.read(path), path if path.is_dir() else path.parent)
     except FormatError as error:
         if error.hint:
             raise

@@ -11,11 +11,8 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import takewhile
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -23,8 +20,8 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import make_lens, pose_from_viewmat, viewmat_from_pose
+from recon_cli.io.file_finder import FileFinder
 from recon_cli.io.posed import (
-    SUFFIXES,
     DepthFile,
     PosedImage,
     PosedSet,
@@ -135,74 +132,6 @@ class _Frame:
         return PurePosixPath(self.path.relative_to(self.folder).as_posix())
 
 
-class _FileFinder:
-    """Finds the files that a list names, also by paths of the machine that it was written on.
-
-    Such a file is the one below the folder that has the same name, is not listed itself and, among
-    several, shares the most folders at the end of its path. Nothing outside is ever opened.
-    """
-
-    def __init__(self, folder: Path, names: Sequence[object]) -> None:
-        self._folder = folder
-        self._names = names
-        self._moved: list[str] = []  # the names that are no path in the folder
-
-    def find(self, name: object, where: str) -> Path:
-        """Returns the path of a file, which exists unless none has its name.
-
-        FormatError if `name` is no text, or leads out of the folder and no file has its name.
-        """
-        try:
-            path = _with_suffix(resolve_inside(self._folder, name, where))
-        except FormatError:
-            match = self._match(name)
-            if match is None:
-                raise
-            return match
-        return path if is_file(path) else self._match(name) or path
-
-    def notices(self) -> list[str]:
-        """Returns a notice where files were found by their names alone."""
-        if not self._moved:
-            return []
-        return [f"{len(self._moved)} of its paths do not exist here, the first is "
-                f"{self._moved[0]}: the files of the same names in the folder are used"]
-
-    @cached_property
-    def _files(self) -> dict[str, list[tuple[str, ...]]]:
-        """The files below the folder that the list does not name, by name, as parts of paths."""
-        named = set()
-        for name in self._names:
-            with suppress(FormatError):
-                named.add(_with_suffix(resolve_inside(self._folder, name, "")))
-        files: dict[str, list[tuple[str, ...]]] = {}
-        for path in sorted(self._folder.rglob("*")):
-            if path not in named and path.is_file():
-                parts = path.relative_to(self._folder).parts
-                files.setdefault(parts[-1], []).append(parts)
-        return files
-
-    def _match(self, name: object) -> Path | None:
-        """Returns the one file that fits a name best, None if there is none or a tie."""
-        # Windows' rules split at both kinds of slashes.
-        wanted = PureWindowsPath(name).parts if isinstance(name, str) else ()
-        if not wanted:
-            return None
-        candidates = [parts for suffix in ("", *SUFFIXES)
-                      for parts in self._files.get(wanted[-1] + suffix, ())]
-        shared = [_shared_folders(parts[:-1], wanted[:-1]) for parts in candidates]
-        if not candidates or shared.count(max(shared)) > 1:
-            return None
-        self._moved.append(str(name))
-        return self._folder.joinpath(*candidates[shared.index(max(shared))])
-
-
-def _shared_folders(folders: Sequence[str], others: Sequence[str]) -> int:
-    """Returns how many folders two paths share at their ends."""
-    pairs = zip(reversed(folders), reversed(others), strict=False)
-    return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
-
-
 def is_transforms(path: Path) -> bool:
     """Returns whether a folder has the layout, or a file is such a .json by its name."""
     if path.suffix == ".json" and path.is_file():
@@ -219,7 +148,7 @@ def read_transforms(path: Path) -> PosedSet:
     """
     frames: list[_Frame] = []
     lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
-    finder = _FileFinder(path.parent if path.is_file() else path, [
+    finder = FileFinder(path.parent if path.is_file() else path, [
         entry[key] for _, _, (_, entries) in lists for entry in entries
         for key in ("file_path", "depth_file_path", "mask_path") if key in entry])
     for file, part, (common, entries) in lists:
@@ -239,11 +168,20 @@ def read_transforms(path: Path) -> PosedSet:
             missing.append(name)
     posed = find_images("transforms", listed, path, missing=missing)
     points, colors, point_notices = _read_points(path if path.is_file() else path / _FILE)
-    notices += finder.notices()
+    notices += [*finder.notices(), *_describe_unread(used)]
     return replace(
         posed, metric=any(image.depth is not None for image in posed.images),
         splits=any(image.held_out for image in posed.images), points=points, colors=colors,
         notices=(*notices, *posed.notices, *point_notices))
+
+
+def _describe_unread(frames: Sequence[_Frame]) -> list[str]:
+    """Returns a notice about depth that is named by another key than nerfstudio's."""
+    other = sum(frame.entry.get("depth_path") is not None
+                and frame.entry.get("depth_file_path") is None for frame in frames)
+    return [f"{other} frames name their depth by depth_path, as NeRFCapture does, which is not "
+            "read; depth_file_path is, with depth_unit_scale_factor, the metres of a value of 1"
+            ] * (other > 0)
 
 
 def _files(path: Path) -> list[tuple[Path, str | None]]:
@@ -270,7 +208,7 @@ def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 def _list_entries(
     file: Path, part: str | None, common: dict[str, Any], entries: Sequence[dict[str, Any]],
-    finder: _FileFinder,
+    finder: FileFinder,
 ) -> list[_Frame]:
     parts = _read_parts(common, file)
     frames = []
@@ -304,14 +242,6 @@ def _read_parts(shared: Mapping[str, Any], file: Path) -> dict[str, str] | None:
 
 def _plain(name: object) -> str:
     return PurePosixPath(str(name)).as_posix()
-
-
-def _with_suffix(path: Path) -> Path:
-    """Returns the file that a path without its suffix stands for, as NeRF's own scenes write it."""
-    if is_file(path):
-        return path
-    named = (path.with_name(path.name + suffix) for suffix in SUFFIXES)
-    return next((file for file in named if is_file(file)), path)
 
 
 def _drop_duplicates(frames: Sequence[_Frame]) -> tuple[list[_Frame], list[str]]:
@@ -350,7 +280,7 @@ def _short_names(frames: Sequence[_Frame]) -> list[str]:
     return ["/".join(path[shared:]) for path in parts]
 
 
-def _list_frame(frame: _Frame, name: str, held_out: str, finder: _FileFinder) -> PosedImage:
+def _list_frame(frame: _Frame, name: str, held_out: str, finder: FileFinder) -> PosedImage:
     viewmat = viewmat_from_pose(
         frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
@@ -361,7 +291,7 @@ def _list_frame(frame: _Frame, name: str, held_out: str, finder: _FileFinder) ->
         _beside(frame, "mask_path", finder))
 
 
-def _beside(frame: _Frame, key: str, finder: _FileFinder) -> Path | None:
+def _beside(frame: _Frame, key: str, finder: FileFinder) -> Path | None:
     """Returns the file of depth or mask that a frame names, which must exist."""
     if frame.entry.get(key) is None:
         return None

@@ -12,10 +12,13 @@ from colmap_sets import (
     write,
     write_old,
 )
+from facts import assert_facts
+from PIL import Image
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import read_model
 from recon_cli.io.colmap_set import is_colmap, read_colmap
+from recon_cli.io.layouts import read_posed
 from recon_cli.scene.camera import MODELS
 
 
@@ -167,11 +170,98 @@ def test_a_model_without_any_of_its_images_is_refused(folder):
 
 def test_masks_named_as_colmap_does_are_kept(folder):
     posed_sets.write_image(folder / "masks" / "cam1" / "0.png.png")
-    masks = {image.name: image.mask for image in read_colmap(folder).images}
+    masks = {image.name: image.mask for image in read_posed(folder).images}
     assert masks.pop("cam1/0.png") == folder / "masks" / "cam1" / "0.png.png"
     assert set(masks.values()) == {None}
 
 
-def test_other_models_beside_the_first_are_said(folder):
-    write(folder, rig_model(frames=2), "bin", "sparse/1")
-    assert "only the first of 2 models in sparse was read" in read_colmap(folder).notices
+def test_of_several_models_the_largest_is_read_and_the_others_are_said(folder):
+    write(folder, rig_model(frames=5), "bin", "sparse/1")
+    write(folder, rig_model(frames=2), "txt", "sparse/10")
+    posed = read_colmap(folder)
+    assert len(posed.images) == 10
+    (notice,) = posed.notices
+    assert_facts(notice, "sparse/1 with 10 images", "of 3 models", "sparse/0 has 6",
+                 "sparse/10 has 4")
+
+
+def test_a_model_among_several_may_be_named_itself(folder):
+    write(folder, rig_model(frames=5), "bin", "sparse/1")
+    assert len(read_colmap(folder / "sparse" / "0").images) == 6
+
+
+def test_a_model_may_be_numbered_from_one(folder):
+    (folder / "sparse" / "0").rename(folder / "sparse" / "1")
+    assert is_colmap(folder)
+    assert len(read_colmap(folder).images) == 6
+
+
+@pytest.mark.parametrize("change", [
+    lambda path: path.with_suffix(".jpg"), lambda path: path.with_suffix(".PNG")])
+def test_images_with_another_suffix_or_case_are_found_and_said(folder, change):
+    for path in list((folder / "images").rglob("*.png")):
+        image = Image.open(path)
+        path.unlink()
+        image.save(change(path))
+    posed = read_colmap(folder)
+    assert_same_poses(poses(posed), expected_poses(rig_model()))
+    assert all(image.path == change(folder / "images" / image.name) for image in posed.images)
+    assert any("6 of its paths do not exist here" in notice for notice in posed.notices)
+
+
+def test_absolute_paths_of_another_machine_are_found_by_their_ends(tmp_path):
+    write_old(tmp_path)
+    text = (tmp_path / "sparse" / "images.txt").read_text()
+    for name in ("a b.png", "c.png"):
+        text = text.replace(name, f"/home/other/scene/images/{name}")
+    (tmp_path / "sparse" / "images.txt").write_text(text)
+    posed = read_colmap(tmp_path)
+    assert [image.path.name for image in posed.images] == ["a b.png", "c.png"]
+    (tmp_path / "images" / "c.png").unlink()
+    assert read_colmap(tmp_path).missing == ("/home/other/scene/images/c.png",)
+
+
+def test_an_absolute_path_never_opens_a_file_outside(tmp_path):
+    (tmp_path / "set").mkdir()
+    write_old(tmp_path / "set")
+    posed_sets.write_image(tmp_path / "c.png")
+    images = tmp_path / "set" / "sparse" / "images.txt"
+    images.write_text(images.read_text().replace("c.png", f"{tmp_path}/c.png"))
+    (tmp_path / "set" / "images" / "c.png").unlink()
+    posed = read_colmap(tmp_path / "set")
+    assert [image.name for image in posed.images] == ["a b.png"]
+
+
+def test_a_model_whose_images_are_called_otherwise_names_what_is_there(folder):
+    shutil.rmtree(folder / "images")
+    posed_sets.write_image(folder / "images" / "other.png")
+    with pytest.raises(InputError, match=r"none of their files is there.*images/other\.png"):
+        read_colmap(folder)
+
+
+@pytest.mark.parametrize("kept", ["none", "first", "last"])
+def test_a_text_model_without_lines_of_observations_loses_no_image(tmp_path, kept):
+    write(tmp_path, rig_model(), "txt")
+    path = tmp_path / "sparse" / "0" / "images.txt"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    wanted = {"none": (), "first": (0,), "last": (len(lines) // 2 - 1,)}[kept]
+    path.write_text("".join(
+        f"{line}\n" for at, line in enumerate(lines) if at % 2 == 0 or at // 2 in wanted))
+    assert_same_poses(poses(read_colmap(tmp_path)), expected_poses(rig_model()))
+
+
+def test_a_name_of_numbers_is_not_taken_for_observations(tmp_path):
+    write_old(tmp_path)
+    path = tmp_path / "sparse" / "images.txt"
+    path.write_text("7 1 0 0 0 1 2 3 3 12 34.png\n5 1 0 0 0 0 0 1 3 7\n")
+    for name in ("12 34.png", "7"):
+        posed_sets.write_image(tmp_path / "images" / f"{name}.png".replace(".png.png", ".png"))
+    assert [image.name for image in read_colmap(tmp_path).images] == ["12 34.png", "7"]
+
+
+def test_a_count_of_thousands_of_digits_is_more_than_the_file_holds(tmp_path):
+    write_old(tmp_path)
+    path = tmp_path / "sparse" / "images.txt"
+    path.write_text(path.read_text().replace("images: 2", f"images: {'9' * 5000}"))
+    with pytest.raises(FormatError, match="ends after 2"):
+        read_colmap(tmp_path)
