@@ -1,7 +1,7 @@
 """One photo: its upright size, its lens by EXIF, and its pixels as 8-bit RGB.
 
 Pillow reads photos, LibRaw the headers of camera RAW. A photo is read whole or refused with an
-InputError. Colour profiles are not applied, so that the photos of one camera stay comparable.
+InputError. Colours become sRGB by the embedded profile.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import struct
 import warnings
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +23,8 @@ import rawpy
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
+from recon_cli.capture.colour_profile import to_srgb
+from recon_cli.capture.xmp import is_panorama, read_xmp
 from recon_cli.errors import InputError
 
 RAW_SUFFIXES = frozenset({
@@ -30,6 +33,7 @@ RAW_SUFFIXES = frozenset({
     ".srf", ".srw", ".x3f"})
 # What cameras and converters write. Pillow also opens documents (EPS by way of Ghostscript).
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM")
+ANIMATED = frozenset({"WEBP", "PNG", "AVIF", "HEIF"})  # those that may hold a film, or a burst
 # A file with one of these endings that cannot be read is a broken photo; any other is no photo.
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
@@ -54,6 +58,11 @@ UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 SENSOR_MM = (2.0, 70.0)
 
 
+WHITE = 65535
+# Those of sensors with 8, 10, 12 and 14 bits, whose values are stored in 16 as they are.
+NARROW = (255, 1023, 4095, 16383)
+
+
 @dataclass(frozen=True)
 class Photo:
     """A photo whose header could be read; camera and focal lengths are those of EXIF."""
@@ -64,6 +73,16 @@ class Photo:
     focal_px: float | None
     camera: str = ""  # maker and model
     focal_mm: float | None = None
+    label: str = ""  # its path below the folder that was given, if it lies deeper
+    mode: str = "RGB"  # Pillow's, of the file
+    wide: bool = False  # its values have 16 bits
+    pictures: int = 1  # of an animation, of which the first one is read
+    panorama: bool = False  # its metadata says that it is no picture of a pinhole camera
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages and records, unique within a capture."""
+        return self.label or self.path.name
 
     @property
     def is_raw(self) -> bool:
@@ -76,26 +95,41 @@ class Photo:
         return bool(self.camera) or self.focal_px is not None or self.focal_mm is not None
 
 
-def inspect_photo(path: Path) -> Photo:
+def inspect_photo(path: Path, label: str = "") -> Photo:
     """Returns a photo's size, camera and focal length; InputError if damaged or far too large."""
     if path.suffix.lower() in RAW_SUFFIXES:
-        return _inspect_raw(path)
+        return replace(_inspect_raw(path), label=label)
     try:
         with open_image(path) as image:
+            # before the EXIF, for reading that of a PNG consumes its tiles
+            mode, wide, pictures = image.mode, _is_wide(image), _count_pictures(image)
             exif, (width, height) = image.getexif(), _size_in_file(image)
             lens = read_lens(exif, width, height)
+            panorama = is_panorama(read_xmp(image), width, height)
             if exif.get(ExifTags.Base.Orientation) in QUARTER_TURNS:
                 width, height = height, width
     except BROKEN as error:
         raise unreadable_error(path, error) from error
-    return Photo(path, width, height, *lens)
+    return Photo(path, width, height, *lens, label=label, mode=mode, wide=wide,
+                 pictures=pictures, panorama=panorama)
 
 
-def read_photo(photo: Photo) -> NDArray[np.uint8]:
-    """Returns a photo's pixels, upright RGB, [H, W, 3]; `raw.develop` reads RAW instead."""
+def _count_pictures(image: Image.Image) -> int:
+    """Returns how many pictures an animation, or a burst in one HEIC, holds; else 1.
+
+    The further pages of a TIFF and of a JPEG are thumbnails and gain maps.
+    """
+    return getattr(image, "n_frames", 1) if image.format in ANIMATED else 1
+
+
+def read_photo(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
+    """Returns a photo's pixels, upright RGB, [H, W, 3]; `raw.develop` reads RAW instead.
+
+    `white` is the brightest value that 16 bits hold, see `find_white`.
+    """
     if photo.is_raw:
         raise ValueError(f"{photo.path.name} is camera RAW")
-    rgb = read_rgb(photo.path)
+    rgb = _on_black(_decode(photo.path, upright=True, white=white))
     check_size(photo, rgb)
     return rgb
 
@@ -120,9 +154,11 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     return _on_black(_decode(path, upright=True))
 
 
-def read_as_stored(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+def read_as_stored(
+    path: Path, white: int = WHITE
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
     """Returns RGB [H, W, 3] and opacity ([H, W] or None) of a picture; ignores EXIF orientation."""
-    image = _decode(path, upright=False)
+    image = _decode(path, upright=False, white=white)
     return _on_black(image), _alpha(image) if image.has_transparency_data else None
 
 
@@ -189,7 +225,37 @@ def _size_in_file(image: Image.Image) -> tuple[int, int]:
     return tags.get(WIDTH, image.width), tags.get(LENGTH, image.height)
 
 
-def _decode(path: Path, *, upright: bool) -> Image.Image:
+def find_white(paths: Iterable[Path]) -> int:
+    """Returns the brightest value that pictures of 16 bits can hold: 65535, or less.
+
+    Cameras of 8 to 14 bits store their values in 16 without scaling them: then no picture of a set
+    has a value above 4095, say. What cannot be read is left to whoever needs it.
+    """
+    brightest = 0
+    for path in paths:
+        with suppress(*BROKEN), open_image(path) as image:
+            if _is_wide(image):
+                values = np.asarray(image) if image.mode[0] == "I" else _read_wide(path, image)
+                brightest = max(brightest, int(values.max()))
+        if brightest > max(NARROW):
+            return WHITE
+    return next((white for white in NARROW if 0 < brightest <= white), WHITE)
+
+
+def describe_white(count: int, white: int) -> str:
+    """Returns the notice that pictures of 16 bits hold fewer, and are brightened."""
+    return (f"The {count} pictures of 16 bits hold values of {white.bit_length()} bits, up to "
+            f"{white}: {white} is taken for white, instead of {WHITE}.")
+
+
+def is_wide(path: Path) -> bool:
+    """Returns whether a picture that can be read has values of 16 bits."""
+    with suppress(*BROKEN), open_image(path) as image:
+        return _is_wide(image)
+    return False
+
+
+def _decode(path: Path, *, upright: bool, white: int = WHITE) -> Image.Image:
     """Returns a picture of 8 bits a channel, in any mode, if `upright` rotated as EXIF says.
 
     libheif has already rotated HEIC (irot, ISO 23008-12) and cleared the EXIF orientation.
@@ -198,32 +264,37 @@ def _decode(path: Path, *, upright: bool) -> Image.Image:
         with open_image(path) as image:
             image.verify()  # checksums, which loading ignores; consumes the image
         with open_image(path) as image:
-            eight = _eight_bits(path, image)  # first: reading the EXIF of a PNG consumes its tiles
+            # first: reading the EXIF of a PNG consumes its tiles
+            eight = to_srgb(_eight_bits(path, image, white))
             turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
             return eight.transpose(turn) if upright and turn is not None else eight
     except BROKEN as error:
         raise unreadable_error(path, error) from error
 
 
-def _eight_bits(path: Path, image: Image.Image) -> Image.Image:
+def _eight_bits(path: Path, image: Image.Image, white: int) -> Image.Image:
     if image.mode == "F":
         raise ValueError("its pixels are floating point, of unknown range")
-    if image.mode.startswith("I"):
-        return Image.fromarray(_to_8bit(np.asarray(image)))
-    if _is_wide(image):
-        return _decode_wide(path, image)
-    image.load()
-    return image
+    if image.mode[0] == "I":
+        return Image.fromarray(_to_8bit(np.asarray(image), white))
+    if not _is_wide(image):
+        image.load()
+        return image
+    eight = Image.fromarray(_to_8bit(_read_wide(path, image), white))
+    if profile := image.info.get("icc_profile"):
+        eight.info["icc_profile"] = profile
+    return eight
 
 
 def _is_wide(image: Image.Image) -> bool:
-    """Returns whether colours have 16 bits, of which Pillow would drop the lower half."""
-    if max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
+    """Returns whether values have 16 bits; of colours Pillow would drop the lower half."""
+    if image.mode[0] == "I" or max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
         return True
     return any(";16" in str(tile.args) for tile in getattr(image, "tile", ()))
 
 
-def _decode_wide(path: Path, image: Image.Image) -> Image.Image:
+def _read_wide(path: Path, image: Image.Image) -> NDArray[np.uint16]:
+    """Returns colours of 16 bits, RGB or RGBA, [H, W, 3 or 4]."""
     if getattr(image, "tag_v2", {}).get(PLANAR) == APART:  # read wrongly by Pillow and OpenCV
         raise ValueError("its colours have 16 bits in separate planes, which is not supported")
     wide = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -232,14 +303,15 @@ def _decode_wide(path: Path, image: Image.Image) -> Image.Image:
     if image.format == "TIFF":  # OpenCV has turned it, whatever the flags
         image.getexif()[ExifTags.Base.Orientation] = 1
     order = cv2.COLOR_BGR2RGB if wide.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-    return Image.fromarray(_to_8bit(cv2.cvtColor(wide, order)))
+    return np.asarray(cv2.cvtColor(wide, order), np.uint16)
 
 
-def _to_8bit(wide: NDArray[Any]) -> NDArray[np.uint8]:
-    """Returns 16-bit values in 8 bits: 65535 is 257 times 255."""
-    if wide.size and (wide.min() < 0 or wide.max() > 65535):  # a mode of 32 bits
-        raise ValueError(f"its pixels reach from {wide.min()} to {wide.max()}, not to 65535")
-    return ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
+def _to_8bit(wide: NDArray[Any], white: int) -> NDArray[np.uint8]:
+    """Returns 16-bit values in 8 bits; `white` becomes 255."""
+    if wide.size and (wide.min() < 0 or wide.max() > WHITE):  # a mode of 32 bits
+        raise ValueError(f"its pixels reach from {wide.min()} to {wide.max()}, not to {WHITE}")
+    scaled = (wide.astype(np.uint32) * 255 + white // 2) // white
+    return np.minimum(scaled, 255).astype(np.uint8)
 
 
 def _inspect_raw(path: Path) -> Photo:
