@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, ReconError
+from recon_cli.io.calibration import make_lens
 from recon_cli.scene.camera import Lens
 from recon_cli.scene.cells import Cell
 from recon_cli.workspace import atomic
@@ -38,7 +39,7 @@ NEEDS_VIEWS_HINT = (
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(JsonRecord):
     """One stored frame."""
 
     name: str  # file name in the folder of frames
@@ -51,7 +52,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Group:
+class Group(JsonRecord):
     """Frames that share intrinsics: of one camera with one setting of its lens."""
 
     name: str  # of their source, for messages
@@ -79,11 +80,18 @@ def read_frame_list(stage: Path) -> FrameList:
     """Returns the list of frames in ingest's folder; FormatError if it is missing or damaged."""
     value = atomic.read_json(stage / LIST)
     try:
-        frames = tuple(Frame(**frame) for frame in value.pop("frames"))
-        groups = tuple(_group(group) for group in value.pop("groups"))
-        return FrameList(**value, groups=groups, frames=frames)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{stage / LIST} is no list of frames.", hint=AGAIN) from error
+        frames = tuple(Frame.from_json(frame) for frame in value["frames"])
+        groups = tuple(_group(group) for group in value["groups"])
+        source = value["source"]
+    except (AttributeError, KeyError, TypeError, ValueError, ReconError) as error:
+        raise FormatError(f"{stage / LIST} is not a list of frames.", hint=AGAIN) from error
+    if not isinstance(source, str) or not groups or not all(
+            0 <= frame.group < len(groups) and Path(frame.name).name == frame.name
+            for frame in frames):
+        raise FormatError(
+            f"{stage / LIST} is damaged: it names files elsewhere, or groups that are missing.",
+            hint=AGAIN)
+    return FrameList(source, groups, frames)
 
 
 def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[str]:
@@ -110,10 +118,11 @@ def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[
 
 
 def _group(value: dict[str, Any]) -> Group:
-    lens = value.pop("lens")
-    if lens is not None:
-        lens = Lens(**{**lens, "params": tuple(lens["params"])})
-    return Group(**value, lens=lens)
+    lens, group = value["lens"], Group.from_json({**value, "lens": None})
+    if lens is None:
+        return group
+    return dataclasses.replace(group, lens=make_lens(
+        lens["model"], lens["width"], lens["height"], lens["params"], "the list of frames"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,11 +154,14 @@ def read_poses(path: Path) -> KnownPoses:
         viewmats = {
             name: np.array(matrix, np.float64).reshape(4, 4)
             for name, matrix in value["viewmats"].items()}
+        if not all(np.isfinite(matrix).all() for matrix in viewmats.values()):
+            raise ValueError("a pose that is not finite")
         if not value["points"]:
             return KnownPoses(viewmats, bool(value["metric"]))
         tensors = load_file(path.with_name(POINTS))
         return KnownPoses(viewmats, bool(value["metric"]), tensors["points"], tensors["colors"])
-    except (AttributeError, KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError, OSError,
+            SafetensorError) as error:
         raise FormatError(f"{path} holds no poses.", hint=_RERUN) from error
 
 
@@ -179,7 +191,8 @@ class BlockRecord:
                 names = json.loads(file.metadata()["validation"])
                 cell = Cell(file.get_tensor("points"), file.get_tensor("owned").astype(np.bool_))
             return BlockRecord(cell, frozenset(names))
-        except (KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
+        except (KeyError, TypeError, ValueError, OSError, RecursionError,
+                SafetensorError) as error:
             raise FormatError(
                 f"{path} is no record of a block.",
                 hint="Run `recon train --blocks N` on the whole scene again.") from error
