@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.frame_selection import MIN_FRAMES
-from recon_cli.capture.images import read_as_stored
+from recon_cli.capture.images import (
+    WHITE,
+    describe_white,
+    find_white,
+    is_wide,
+    read_as_stored,
+)
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource
 from recon_cli.capture.masks import opaque, read_mask, write_mask
+from recon_cli.capture.photo_tree import describe_unused
 from recon_cli.capture.photos import make_frame_names
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
@@ -35,9 +42,15 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
     ctx.notice(f"{path.name} is read as {describe(posed)}.")
     for notice in posed.notices:
         ctx.notice(f"{notice[0].upper()}{notice[1:]}.")
+    used = {file for image in posed.images
+            for file in (image.path, image.mask, image.depth and image.depth.path) if file}
+    if path.is_dir():
+        for text in describe_unused(path, used, describe(posed).split(":")[0]):
+            ctx.notice(text)
     images = _choose_images(config, posed, ctx)
+    white = _find_white(images, ctx)
     names = make_frame_names([Path(image.name).stem for image in images])
-    broken = _write_images(images, names, config.max_size, out, ctx)
+    broken = _write_images(images, names, config.max_size, white, out, ctx)
     for reason in broken.values():
         ctx.notice(f"An image is left out: {reason}")
     readable = [
@@ -74,8 +87,17 @@ def _choose_images(config: IngestConfig, posed: PosedSet, ctx: IngestContext) ->
     return rest + held_out
 
 
+def _find_white(images: Sequence[PosedImage], ctx: IngestContext) -> int:
+    """Returns the brightest value of images with 16 bits, and says where it is below 65535."""
+    wide = [image.path for image in images if is_wide(image.path)]
+    white = find_white(wide) if wide else WHITE
+    if white < WHITE:
+        ctx.notice(describe_white(len(wide), white))
+    return white
+
+
 def _write_images(
-    images: Sequence[PosedImage], names: Sequence[str], max_size: int, out: Path,
+    images: Sequence[PosedImage], names: Sequence[str], max_size: int, white: int, out: Path,
     ctx: IngestContext,
 ) -> dict[str, str]:
     """Writes frames and masks; returns why some images could not be read, by frame name."""
@@ -85,7 +107,7 @@ def _write_images(
             target = out / store.FOLDER / name
             if not target.exists():
                 try:
-                    rgb, mask = _read_pixels(image, max_size)
+                    rgb, mask = _read_pixels(image, max_size, white)
                 except InputError as error:
                     broken[name] = error.message
                 else:
@@ -98,10 +120,10 @@ def _write_images(
 
 
 def _read_pixels(
-    image: PosedImage, max_size: int
+    image: PosedImage, max_size: int, white: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
     """Returns RGB and mask at the stored size, ignoring EXIF orientation as the poses do."""
-    rgb, opacity = read_as_stored(image.path)
+    rgb, opacity = read_as_stored(image.path, white)
     lens = image.lens
     height, width = rgb.shape[:2]
     if (width, height) != (lens.width, lens.height):

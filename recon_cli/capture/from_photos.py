@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,25 +18,28 @@ from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_selection import FrameCandidate, Reason
 from recon_cli.capture.from_video import report_reduced
-from recon_cli.capture.images import Photo, read_photo
+from recon_cli.capture.images import WHITE, Photo, describe_white, find_white, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.photo_sequence import PhotoSequence, choose_from_sequence, find_sequence
+from recon_cli.capture.photo_tree import find_photo_files
 from recon_cli.capture.photos import (
     PhotoFolder,
     PhotoGroup,
     check_count,
+    drop_other_pictures,
     group_notices,
     group_photos,
     list_photos,
     make_frame_names,
-    photo_folder,
 )
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
 from recon_cli.config.stages import IngestConfig
-from recon_cli.errors import InputError, list_names
+from recon_cli.errors import FormatError, InputError, ManifestError, list_names
 from recon_cli.io import records as store
+from recon_cli.io.foreign import find_foreign, find_lists
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
+from recon_cli.io.mask_files import mask_folders
 from recon_cli.io.records import Frame, Group
 from recon_cli.workspace import atomic
 
@@ -54,15 +57,16 @@ def ingest(
     kept; `prefix` is that of their names. InputError if too few photos can be read or show a view
     of their own, or a mask is broken.
     """
-    path, folder = _list_photos(paths, ctx)
-    check_count(path, len(folder.photos), folder.broken)
+    path, home, folder = _list_photos(paths, out, ctx)
+    check_count(path, folder.photos, folder.broken)
     plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _drop_raw_twins(folder.photos, plan, ctx)
-    masks = _find_masks(paths, photos, ctx)
+    masks = _find_masks(paths, home, photos, ctx)
     stems = make_frame_names([photo.path.stem for photo in photos])
     source = _PhotoSource(path, tuple(photos), tuple(f"{prefix}{stem}" for stem in stems),
-                          masks.by_photo, plan, folder.broken)
-    sequence = find_sequence(config, photos, out / f"{prefix}{SCAN}", ctx)
+                          masks.by_photo, plan, folder.broken, _find_white(photos, ctx))
+    sequence = find_sequence(
+        config, photos, out / f"{prefix}{SCAN}", ctx, white=source.white)
     record, broken = (_take_all(source, config, out, ctx) if sequence is None
                       else _take_from_sequence(source, sequence, config, out, ctx))
     sheet = _make_sheet(source, record, broken, out)
@@ -81,7 +85,7 @@ def ingest(
         "photos",
         _frame_groups(groups, path, config.max_size),
         tuple(sorted((
-            Frame(frame_of[photo], None, photo.path.name, None, held_out=False, group=index,
+            Frame(frame_of[photo], None, photo.name, None, held_out=False, group=index,
                   masked=(out / store.MASKS / frame_of[photo]).exists())
             for index, group in enumerate(groups) for photo in group.photos),
             key=lambda frame: frame.name)),
@@ -101,6 +105,7 @@ class _PhotoSource:
     masks: Mapping[str, Path]  # by file name
     plan: RawPlan
     broken: Mapping[str, str]  # why other files are no photos, by file name
+    white: int  # the brightest value of those with 16 bits
 
 
 def _take_all(
@@ -109,10 +114,11 @@ def _take_all(
     """Writes all photos; returns which are kept, and why some are broken, by file name."""
     measures, unreadable = _write_photos(source, range(len(source.photos)), out, config, ctx)
     broken = {**source.broken, **unreadable}
-    check_count(source.path, len(source.photos) - len(unreadable), broken)
+    check_count(
+        source.path, [photo for photo in source.photos if photo.name not in unreadable], broken)
     _report_broken(broken, ctx)
     record = frame_selection.choose_photos(
-        source.path.name, [photo.path.name for photo in source.photos], source.names, measures)
+        source.path.name, [photo.name for photo in source.photos], source.names, measures)
     for text in frame_selection.describe_dropped(record):
         ctx.notice(text)
     return record, broken
@@ -128,8 +134,9 @@ def _take_from_sequence(
     chosen = [candidate.index for candidate in record if candidate.name is not None]
     _, unreadable = _write_photos(source, chosen, out, config, ctx)
     broken = {**source.broken, **unreadable, **{
-        source.photos[index].path.name: reason for index, reason in sequence.broken.items()}}
-    check_count(source.path, len(chosen) - len(unreadable), broken)
+        source.photos[index].name: reason for index, reason in sequence.broken.items()}}
+    check_count(source.path, [source.photos[index] for index in chosen
+                              if source.photos[index].name not in unreadable], broken)
     _report_broken(broken, ctx)
     return tuple(
         replace(candidate, reason=Reason.DAMAGED, name=None) if candidate.source in unreadable
@@ -144,27 +151,60 @@ def _report_broken(broken: Mapping[str, str], ctx: IngestContext) -> None:
         ctx.notice(f"{more} more photos are left out for similar reasons.")
 
 
-def _list_photos(paths: Sequence[Path], ctx: IngestContext) -> tuple[Path, PhotoFolder]:
-    """Returns the path that represents the photos in messages, and the photos."""
+def _list_photos(
+    paths: Sequence[Path], out: Path, ctx: IngestContext
+) -> tuple[Path, Path, PhotoFolder]:
+    """Returns the path that represents the photos in messages, their folder, and the photos."""
     path = paths[0]
-    if not path.is_dir():
+    if path.is_dir():
+        tree = find_photo_files(path, out)
+        home, found, notices = tree.home, list_photos(tree.files, tree.home), list(tree.notices)
+        taken = {one.path for one in tree.foreign}
+    else:
         (name, count), = Counter(path.name for path in paths).most_common(1)
         if count > 1:
             raise InputError(
                 f"{count} photos are called {name}.",
                 hint="Give their folders instead of the files.")
-        return (path if len(paths) == 1 else path.absolute().parent), list_photos(paths)
-    home = photo_folder(path)
-    if home != path:
-        ctx.notice(f"{path} holds no photos itself: those in {home.name}/ are used.")
-    return path, list_photos(home.iterdir())
+        home, found, taken = path.absolute().parent, list_photos(paths), set()
+        notices = _describe_beside(paths, home)
+        path = path if len(paths) == 1 else home
+    photos, left_out = drop_other_pictures(path if path.is_dir() else home, found.photos)
+    for folder in dict.fromkeys((path, home)):
+        for text in find_lists(folder, [photo.name for photo in photos], known=taken):
+            notices.append(
+                f"{text.name} names the photos and is not read: what it says of them (such as "
+                "places or angles) is not used.")
+    for notice in (*notices, *left_out):
+        ctx.notice(notice)
+    return path, home, PhotoFolder(photos, found.broken)
 
 
-def _find_masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestContext) -> FolderMasks:
+def _describe_beside(paths: Sequence[Path], home: Path) -> list[str]:
+    """Returns what lies beside photos that were given as files, and is not used."""
+    if len({path.absolute().parent for path in paths}) > 1:
+        return []
+    masks = [f"{folder} is not used with files; give {home} to use it."
+             for folder in mask_folders(home)]
+    return masks + [found.notice(home) for found in find_foreign(home)]
+
+
+def _find_white(photos: Sequence[Photo], ctx: IngestContext) -> int:
+    """Returns the brightest value of photos with 16 bits, and says where it is below 65535."""
+    wide = [photo.path for photo in photos if photo.wide]
+    white = find_white(wide) if wide else WHITE
+    if white < WHITE:
+        ctx.notice(describe_white(len(wide), white))
+    return white
+
+
+def _find_masks(
+    paths: Sequence[Path], home: Path, photos: Sequence[Photo], ctx: IngestContext
+) -> FolderMasks:
     """Returns the masks in a given folder; given files have none."""
     if not paths[0].is_dir():
         return FolderMasks({}, ())
-    masks = find_masks(paths[0], photo_folder(paths[0]), photos)
+    masks = find_masks(paths[0], home, photos)
     if masks.outside:
         ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
     if masks.unused:
@@ -172,8 +212,8 @@ def _find_masks(paths: Sequence[Path], photos: Sequence[Photo], ctx: IngestConte
         ctx.notice(f"Masks without a photo are left out: {names}.")
     if masks.unused and not masks.by_photo:
         ctx.notice(
-            f"No mask is used: that of {photos[0].path.name} must be called "
-            f"{photos[0].path.stem}.png or {photos[0].path.name}.png.")
+            f"No mask is used: that of {photos[0].name} must be called "
+            f"{photos[0].path.stem}.png or {photos[0].name}.png.")
     return masks
 
 
@@ -189,7 +229,7 @@ def _make_sheet(
     for index in sorted(sheet.wanted & files.keys()):
         with suppress(InputError):  # only of a photo that is not needed
             sheet.add(index, read_png(written[index]) if index in written
-                      else read_photo(source.photos[index]))
+                      else read_photo(source.photos[index], source.white))
     for candidate in record:
         if candidate.index in written and candidate.name is None:
             for folder in (store.FOLDER, store.MASKS):
@@ -199,28 +239,30 @@ def _make_sheet(
 
 def _plan_raw(photos: Sequence[Photo], record: Path, ctx: IngestContext) -> RawPlan:
     """Returns how to develop the RAW photos; an interrupted run may have left its plan."""
-    paths = [photo.path for photo in photos if photo.is_raw]
-    if not paths:
+    raw = {photo.name: photo.path for photo in photos if photo.is_raw}
+    if not raw:
         return RawPlan({}, {})
     if record.exists():
-        plan = RawPlan.from_json(atomic.read_json(record))
-        if plan.shots.keys() | plan.broken.keys() == {path.name for path in paths}:
-            return plan
-    with ctx.progress.bar("raw", len(paths), unit="photo") as bar:
-        plan = plan_raw(paths, step=bar.advance)
+        with suppress(FormatError, ManifestError):  # damaged: it is planned again
+            plan = RawPlan.from_json(atomic.read_json(record))
+            if plan.shots.keys() | plan.broken.keys() == raw.keys():
+                return plan
+    with ctx.progress.bar("raw", len(raw), unit="photo") as bar:
+        plan = plan_raw(raw, step=bar.advance)
     atomic.write_json(record, plan.to_json())
     return plan
 
 
 def _drop_raw_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) -> list[Photo]:
     """Returns the photos without twins of RAW ones, which could be trained on and held out."""
-    stems = {Path(name).stem for name in plan.shots}
-    twins = [photo.path.name for photo in photos if not photo.is_raw and photo.path.stem in stems]
+    stems = {PurePosixPath(name).with_suffix("") for name in plan.shots}
+    twins = [photo.name for photo in photos
+             if not photo.is_raw and PurePosixPath(photo.name).with_suffix("") in stems]
     if twins:
         ctx.notice(
             f"{len(twins)} photos are left out because there is camera RAW of the same name, "
             f"such as {twins[0]}.")
-    return [photo for photo in photos if photo.path.name not in twins]
+    return [photo for photo in photos if photo.name not in twins]
 
 
 def _write_photos(
@@ -233,12 +275,12 @@ def _write_photos(
     with ctx.progress.bar("photos", len(indices), unit="photo") as bar:
         for index in indices:
             photo, name = source.photos[index], source.names[index]
-            mask = source.masks.get(photo.path.name)
+            mask = source.masks.get(photo.name)
             try:
-                rgb = _write_photo(photo, mask, source.plan, out, name, config.max_size)
+                rgb = _write_photo(photo, mask, source, out, name, config.max_size)
                 measures.append(frame_selection.measure_photo(rgb))
             except InputError as error:
-                unreadable[photo.path.name] = f"{error.message} {error.hint}".rstrip()
+                unreadable[photo.name] = f"{error.message} {error.hint}".rstrip()
                 measures.append(None)
             bar.advance()
             ctx.record(len(measures), len(indices))
@@ -246,13 +288,15 @@ def _write_photos(
 
 
 def _write_photo(
-    photo: Photo, mask_file: Path | None, plan: RawPlan, out: Path, name: str, max_size: int
+    photo: Photo, mask_file: Path | None, source: _PhotoSource, out: Path, name: str,
+    max_size: int,
 ) -> NDArray[np.uint8]:
     """Writes a mask and then its frame, and returns the stored pixels, RGB, [H, W, 3]."""
     target = out / store.FOLDER / name
     if target.exists():
         return read_png(target)
-    rgb = fit_image(develop(photo, plan) if photo.is_raw else read_photo(photo), max_size)
+    rgb = fit_image(develop(photo, source.plan) if photo.is_raw
+                    else read_photo(photo, source.white), max_size)
     height, width = rgb.shape[:2]
     mask = photo_mask(photo, mask_file, width, height)
     if mask is not None:

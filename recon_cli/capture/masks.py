@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.images import PHOTO_SUFFIXES, RAW_SUFFIXES, Photo, read_alpha, read_rgb
+from recon_cli.capture.images import Photo, read_alpha, read_rgb
 from recon_cli.errors import InputError
+from recon_cli.io.mask_files import mask_folders, match_masks
 from recon_cli.workspace import atomic
 
-FOLDER = "masks"
-SUFFIXES = PHOTO_SUFFIXES - RAW_SUFFIXES
 HALF = 128  # from this value on a pixel is white, or opaque
 
 
@@ -34,22 +33,28 @@ class FolderMasks:
 
 
 def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FolderMasks:
-    """Returns the masks of the photos in `home`: the `given` folder, or one in it."""
-    folder = next((path / FOLDER for path in (home, given) if (path / FOLDER).is_dir()), None)
-    if folder is None:
-        beside = given.resolve().parent / FOLDER
-        return FolderMasks({}, (), beside if beside.is_dir() else None)
-    files = sorted(
-        path for path in folder.iterdir()
-        if path.suffix.lower() in SUFFIXES and path.is_file() and path.name[0] != ".")
-    by_stem = {path.stem: path for path in reversed(files)}
-    by_photo = {}
-    for photo in photos:
-        mask = by_stem.get(photo.path.name) or by_stem.get(photo.path.stem)
-        if mask is not None:
-            by_photo[photo.path.name] = mask
-    used = set(by_photo.values())
-    return FolderMasks(by_photo, tuple(path.name for path in files if path not in used))
+    """Returns the masks of the photos below `home`, which is the `given` folder or one in it.
+
+    Those of photos in subfolders lie in the same subfolders of the folder of masks, or in one
+    beside them.
+    """
+    deeper = {photo.path.parent for photo in photos} - {home, given}
+    inner = sorted({folder for place in (home, given) for folder in mask_folders(place)})
+    folders = [*inner, *(folder for place in sorted(deeper) for folder in mask_folders(place))]
+    if not folders:
+        beside = mask_folders(given.resolve().parent)
+        return FolderMasks({}, (), beside[0] if beside else None)
+    by_photo: dict[str, Path] = {}
+    unused: list[str] = []
+    for folder in dict.fromkeys(folders):
+        names = {
+            photo.name: PurePosixPath(photo.name) if folder in inner
+            else PurePosixPath(photo.path.name) for photo in photos
+            if folder in inner or photo.path.parent == folder.parent}
+        found, left = match_masks(folder, names)
+        by_photo = {**found, **by_photo}
+        unused += left
+    return FolderMasks(by_photo, tuple(unused))
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
@@ -100,7 +105,7 @@ def photo_mask(
     It combines the mask file `path`, if there is one, with the photo's transparency. InputError if
     the file cannot be used, or nothing is left.
     """
-    opacity = opaque(read_alpha(photo), photo.path.name, width, height)
+    opacity = opaque(read_alpha(photo), photo.name, width, height)
     mask = None if path is None else read_mask(path, width, height)
     if mask is None:
         mask = opacity
@@ -109,7 +114,7 @@ def photo_mask(
     if mask is None or mask.all():
         return None
     if not mask.any():
-        raise InputError(f"The mask and the transparency of {photo.path.name} leave no pixel.")
+        raise InputError(f"The mask and the transparency of {photo.name} leave no pixel.")
     return mask
 
 

@@ -29,11 +29,11 @@ from recon_cli.capture.frame_measures import (
     measure_exposure,
     measure_sharpness,
 )
-from recon_cli.capture.images import BROKEN, Photo, open_image, read_photo, unreadable_error
+from recon_cli.capture.images import BROKEN, WHITE, Photo, open_image, read_photo, unreadable_error
 from recon_cli.capture.ingested_source import IngestContext
 from recon_cli.capture.photos import group_photos
 from recon_cli.config.stages import IngestConfig
-from recon_cli.errors import InputError
+from recon_cli.errors import FormatError, InputError
 from recon_cli.io.images import fit_size
 from recon_cli.workspace import atomic
 
@@ -79,23 +79,25 @@ class PhotoSequence:
 
 
 def find_sequence(
-    config: IngestConfig, photos: Sequence[Photo], record: Path, ctx: IngestContext
+    config: IngestConfig, photos: Sequence[Photo], record: Path, ctx: IngestContext, *,
+    white: int = WHITE,
 ) -> PhotoSequence | None:
     """Returns the measures of photos that are frames of a video and more than are wanted, or None.
 
-    `record` keeps the measures for the next run.
+    `record` keeps the measures for the next run; `white` is that of photos with 16 bits.
     """
     most = config.frames or MANY
     if len(photos) <= most or not looks_numbered(photos):
         return None
-    if record.exists():
-        return PhotoSequence.from_json(atomic.read_json(record))
+    known = _read_record(record, len(photos))
+    if known is not None:
+        return known
     with ctx.progress.bar("scan", len(photos), unit="photo") as bar:
         def read() -> Iterator[NDArray[np.uint8] | InputError]:
             for photo in photos:
                 bar.advance()
                 try:
-                    yield _read_gray(photo)
+                    yield _read_gray(photo, white)
                 except InputError as error:
                     yield error
 
@@ -103,6 +105,18 @@ def find_sequence(
     if sequence is not None:
         atomic.write_json(record, sequence.to_json())
     return sequence
+
+
+def _read_record(record: Path, count: int) -> PhotoSequence | None:
+    """Returns the measures that an earlier run left; None where they are missing or damaged."""
+    if not record.exists():
+        return None
+    try:
+        known = PhotoSequence.from_json(atomic.read_json(record))
+    except (AttributeError, KeyError, TypeError, ValueError, FormatError):
+        return None
+    lengths = {len(known.motion), len(known.sharpness), len(known.exposure)}
+    return known if lengths == {count} else None
 
 
 def looks_numbered(photos: Sequence[Photo]) -> bool:
@@ -132,7 +146,7 @@ def _read_time(path: Path) -> datetime | None:
         return None
 
 
-def _read_gray(photo: Photo) -> NDArray[np.uint8]:
+def _read_gray(photo: Photo, white: int) -> NDArray[np.uint8]:
     """Returns the gray values of a photo, upright but perhaps mirrored or on its head.
 
     JPEG decodes to gray and to a fraction of its size in a quarter of the time.
@@ -140,12 +154,13 @@ def _read_gray(photo: Photo) -> NDArray[np.uint8]:
     try:
         with open_image(photo.path) as image:
             image.draft("L", fit_size(*image.size, SHARPNESS_SIZE))
-            plain = image.mode in ("L", "RGB") and not image.has_transparency_data
+            plain = (image.mode in ("L", "RGB") and not photo.wide
+                     and not image.has_transparency_data)
             gray = np.array(image.convert("L")) if plain else None
     except BROKEN as error:
         raise unreadable_error(photo.path, error) from error
     if gray is None:
-        return np.asarray(cv2.cvtColor(read_photo(photo), cv2.COLOR_RGB2GRAY), np.uint8)
+        return np.asarray(cv2.cvtColor(read_photo(photo, white), cv2.COLOR_RGB2GRAY), np.uint8)
     turned = (gray.shape[1] < gray.shape[0]) != (photo.width < photo.height)
     return np.ascontiguousarray(gray.T) if turned else gray
 
@@ -214,6 +229,6 @@ def choose_from_sequence(
         folder, sequence.sharpness, judgement.refused, lengths,
         {int(index): names[index] for index in chosen})
     return tuple(
-        replace(candidate, source=photo.path.name,
+        replace(candidate, source=photo.name,
                 sharpness=None if candidate.index in sequence.broken else candidate.sharpness)
         for candidate, photo in zip(candidates, photos, strict=True))

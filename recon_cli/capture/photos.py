@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
-from recon_cli.errors import InputError
+from recon_cli.capture.panoramas import find_panoramas, panorama_advice, panorama_error
+from recon_cli.capture.photo_tree import VIDEO_SUFFIXES
+from recon_cli.errors import InputError, list_names
+from recon_cli.io.picture_names import picture_kind
 
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
-NO_PHOTOS = frozenset({"masks"})  # subfolders that hold pictures, but none of the scene
+_COLOURED = frozenset({"RGB", "RGBA", "RGBX", "P", "PA", "CMYK", "YCbCr", "LAB", "HSV"})
+_DEPTH = "depth maps"
+_NAMED = 4
 # Focal lengths that agree this well are one setting of the lens: EXIF rounds to a tenth of a mm.
 SAME_FOCAL = 0.01
 
@@ -24,53 +29,90 @@ class PhotoFolder:
     """The photos of a folder in natural order (2 before 10), and what is broken."""
 
     photos: tuple[Photo, ...]
-    broken: dict[str, str]  # why a file that is named like a photo cannot be read, by file name
+    broken: dict[str, str]  # why a file that is named like a photo cannot be read, by its name
 
 
-def list_photos(paths: Iterable[Path]) -> PhotoFolder:
-    """Returns the photos among files, by content; hidden files and folders are ignored."""
+def list_photos(paths: Iterable[Path], home: Path | None = None) -> PhotoFolder:
+    """Returns the photos among files, by content; hidden files and folders are ignored.
+
+    They are called by their paths below `home`, else by their names.
+    """
     photos: list[Photo] = []
     broken: dict[str, str] = {}
-    files = (path for path in paths if path.is_file() and path.name[0] != ".")
-    for path in sorted(files, key=lambda path: (_natural_key(path.stem), path.name)):
+    labels = {path: path.name if home is None else path.relative_to(home).as_posix()
+              for path in paths if path.is_file() and path.name[0] != "."}
+    for path, label in sorted(labels.items(), key=lambda item: _order(item[1])):
         try:
-            photos.append(inspect_photo(path))
+            photos.append(inspect_photo(path, label))
         except InputError as error:
             if path.suffix.lower() in PHOTO_SUFFIXES:
-                broken[path.name] = error.message
+                broken[label] = error.message
     return PhotoFolder(tuple(photos), broken)
 
 
-def photo_folder(folder: Path) -> Path:
-    """Returns the folder that holds the photos: itself, images/ in it, or its only subfolder.
+def _order(label: str) -> tuple[list[list[tuple[int, str]]], list[tuple[int, str]], str]:
+    """Returns the sort key of a path: folders as a person counts, then names."""
+    path = PurePosixPath(label)
+    return [_natural_key(part) for part in path.parts[:-1]], _natural_key(path.stem), path.name
 
-    InputError if it holds none, but several of its subfolders do.
+
+def drop_other_pictures(
+    folder: Path, photos: Sequence[Photo]
+) -> tuple[tuple[Photo, ...], list[str]]:
+    """Returns the photos without depth maps, masks, labels and panoramas, and notices.
+
+    Depth maps have one channel of 16 bits, where the others have colours. InputError where nothing
+    but depth maps, or but panoramas, is left.
     """
-    if _holds_photos(folder):
-        return folder
-    inner = [
-        path for path in sorted(folder.iterdir())
-        if path.is_dir() and path.name[0] != "." and path.name.lower() not in NO_PHOTOS
-        and _holds_photos(path)]
-    images = [path for path in inner if path.name == "images"]
-    if len(inner) > 1 and not images:
+    notices = []
+    others = {photo: _other_kind(photo) for photo in photos}
+    coloured = [photo for photo in photos if photo.mode in _COLOURED]
+    if photos and not coloured and all(
+            kind == _DEPTH for kind in others.values()) and picture_kind(folder.name) == _DEPTH:
         raise InputError(
-            f"{folder} holds no photos itself, but {len(inner)} of its subfolders do: "
-            f"{', '.join(path.name for path in inner)}.",
-            hint=f"Give one of them, such as {inner[0]}.")
-    return (images or inner or [folder])[0]
+            f"{folder} holds {len(photos)} depth maps (one channel of 16 bits), not photos.",
+            hint="Give the folder of the photos that belong to them, or that of both: recon "
+            f"ingest {shlex.quote(str(folder.absolute().parent))}")
+    dropped = set()
+    for kind in sorted(set(others.values()) - {""}) if coloured else ():
+        names = [photo.name for photo in photos if others[photo] == kind]
+        dropped.update(names)
+        notices.append(
+            f"{len(names)} pictures are {kind} and not photos, by their channels and names; they "
+            f"are not used: {list_names(names, _NAMED)}."
+            + " Masks are read from masks/, called like their photos." * (kind == "masks"))
+    rest = [photo for photo in photos if photo.name not in dropped]
+    panoramas = find_panoramas(rest)
+    if panoramas and len(rest) - len(panoramas) < MIN_FRAMES:
+        raise panorama_error(folder.name, panoramas, len(rest))
+    if panoramas:
+        names = [photo.name for photo in panoramas]
+        notices.append(
+            f"{len(names)} 360-degree panoramas (equirectangular) are left out, because they are "
+            f"no pictures of ordinary lenses: {list_names(names, _NAMED)}. "
+            f"{panorama_advice(panoramas[0])}")
+    notices += [
+        f"{photo.name} holds {photo.pictures} pictures, of which only the first is used. "
+        f"{unfold_advice(photo)}" for photo in rest if photo.pictures > 1][:_NAMED]
+    return tuple(photo for photo in rest if photo not in panoramas), notices
 
 
-def _holds_photos(folder: Path) -> bool:
-    """Returns whether a folder holds photos, even if they are broken."""
-    files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
-    if any(path.suffix.lower() in PHOTO_SUFFIXES for path in files):
-        return True
-    for path in files:
-        with suppress(InputError):
-            inspect_photo(path)
-            return True
-    return False
+def _other_kind(photo: Photo) -> str:
+    """Returns what a picture of one channel shows instead of colours, "" for nothing else."""
+    if photo.mode in _COLOURED:
+        return ""
+    if photo.mode[0] in "IF":
+        return _DEPTH
+    return picture_kind(photo.path.stem)
+
+
+def unfold_advice(photo: Photo) -> str:
+    """Returns the command that turns an animation into the pictures that it holds."""
+    program = "ffmpeg -i {file} {target}" if photo.path.suffix.lower() in (".png", ".apng") else (
+        "magick {file} -coalesce {target}")
+    folder = shlex.quote(str(photo.path.with_suffix("")) + "_pictures")
+    command = program.format(file=shlex.quote(str(photo.path)), target=f"{folder}/%04d.png")
+    return f"To use all: mkdir -p {folder} && {command} && recon ingest {folder}"
 
 
 def _natural_key(stem: str) -> list[tuple[int, str]]:
@@ -78,20 +120,35 @@ def _natural_key(stem: str) -> list[tuple[int, str]]:
     return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", stem)]
 
 
-def check_count(folder: Path, readable: int, broken: dict[str, str]) -> None:
+def check_count(folder: Path, photos: Sequence[Photo], broken: dict[str, str]) -> None:
     """Raises InputError for too few readable photos; `broken` says why others are not."""
+    readable = len(photos)
     if readable >= MIN_FRAMES:
         return
-    photos = f"{readable or 'no'} photo{'s' * (readable != 1)}"
+    count = f"{readable or 'no'} photo{'s' * (readable != 1)}"
     if not broken:
+        film = next((photo for photo in photos if photo.pictures >= MIN_FRAMES), None)
+        if film is not None:
+            raise InputError(
+                f"{film.path} is an animation, or a burst, of {film.pictures} frames in one file, "
+                "of which photos use the first.", hint=unfold_advice(film))
         raise InputError(
-            f"{folder} holds {photos}, but at least {MIN_FRAMES} are needed.",
-            hint="Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, "
-            "HEIC, camera RAW).")
+            f"{folder} holds {count}, but at least {MIN_FRAMES} are needed.",
+            hint=_count_hint(folder))
     raise InputError(
-        f"{folder} holds {photos} that can be used and {len(broken)} that cannot, but "
+        f"{folder} holds {count} that can be used and {len(broken)} that cannot, but "
         f"at least {MIN_FRAMES} are needed. The first: {next(iter(broken.values()))}",
         hint="Fix the files listed above, or copy the photos from the camera again.")
+
+
+def _count_hint(folder: Path) -> str:
+    """Returns what to give instead of a folder with too few photos: a video in it, if there is."""
+    videos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES
+                    and path.is_file()) if folder.is_dir() else []
+    if videos:
+        return f"It holds videos: recon ingest {shlex.quote(str(videos[0]))}"
+    return ("Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, HEIC, "
+            "camera RAW).")
 
 
 def make_frame_names(stems: Sequence[str]) -> list[str]:
@@ -146,7 +203,7 @@ def group_notices(groups: Sequence[PhotoGroup]) -> list[str]:
     listed = ", ".join(f"{len(group.photos)} of {group.name}" for group in groups)
     return [
         f"The photos form {len(groups)} groups with separate intrinsics: {listed}.",
-        *(f"{photo.path.name} matches no other photo: {photo.width}x{photo.height}, no EXIF. "
+        *(f"{photo.name} matches no other photo: {photo.width}x{photo.height}, no EXIF. "
           "Remove it if it does not belong to the scene." for photo in odd_photos(groups))]
 
 

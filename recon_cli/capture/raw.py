@@ -51,7 +51,7 @@ class RawShot(JsonRecord):
 
 @dataclass(frozen=True)
 class RawPlan(JsonRecord):
-    """How the RAW photos of a folder are developed, by their file names."""
+    """How the RAW photos of a folder are developed, by their names."""
 
     shots: Mapping[str, RawShot]
     broken: Mapping[str, str]  # why a photo cannot be developed
@@ -70,14 +70,22 @@ class _Header:
     f_number: float | None
 
 
-def plan_raw(paths: Sequence[Path], *, step: Callable[[], None] = lambda: None) -> RawPlan:
-    """Returns how to develop RAW photos of one scene, in order, alike; calls `step` per photo."""
+def plan_raw(
+    paths: Mapping[str, Path], *, step: Callable[[], None] = lambda: None
+) -> RawPlan:
+    """Returns how to develop RAW photos of one scene, by their names in order, alike.
+
+    It calls `step` per photo.
+    """
     broken: dict[str, str] = {}
-    headers = [header for path in paths if (header := _try_read(_read_header, path, broken))]
+    names = {path: name for name, path in paths.items()}
+    headers = [header for path in names
+               if (header := _try_read(_read_header, path, names[path], broken))]
     common = _by_camera(headers)
     readable: list[tuple[_Header, RawMeasures]] = []
     for header in headers:
-        view = _try_read(partial(_measure, shared=common[header.camera]), header.path, broken)
+        measure = partial(_measure, shared=common[header.camera])
+        view = _try_read(measure, header.path, names[header.path], broken)
         if view is not None:
             readable.append((header, view))
         step()
@@ -87,15 +95,15 @@ def plan_raw(paths: Sequence[Path], *, step: Callable[[], None] = lambda: None) 
     ev = exposures(measures, _nominal([header for header, _ in readable]))
     gains = -ev - math.log2(_white(measures, ev))
     return RawPlan({
-        header.path.name: RawShot(*common[header.camera], float(gain))
+        names[header.path]: RawShot(*common[header.camera], float(gain))
         for (header, _), gain in zip(readable, gains, strict=True)}, broken)
 
 
 def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     """Returns a RAW photo as upright sRGB, [H, W, 3]; InputError if it is, or was, damaged."""
-    shot = plan.shots.get(photo.path.name)
+    shot = plan.shots.get(photo.name)
     if shot is None:
-        raise InputError(plan.broken[photo.path.name])
+        raise InputError(plan.broken[photo.name])
     try:
         with rawpy.imread(str(photo.path)) as raw:
             rgb = np.asarray(raw.postprocess(
@@ -114,14 +122,16 @@ def _develop_options(multipliers: Sequence[float], saturation: int) -> dict[str,
         "adjust_maximum_thr": 0.0, "highlight_mode": rawpy.HighlightMode.Clip}
 
 
-def _try_read(read: Callable[[Path], T], path: Path, broken: dict[str, str]) -> T | None:
-    """Returns what `read` does, or None with the reason in `broken`."""
+def _try_read(
+    read: Callable[[Path], T], path: Path, name: str, broken: dict[str, str]
+) -> T | None:
+    """Returns what `read` does, or None with the reason in `broken` by the photo's name."""
     try:
         return read(path)
     except InputError as error:
-        broken[path.name] = error.message
+        broken[name] = error.message
     except rawpy.LibRawError as error:
-        broken[path.name] = unreadable_error(path, error).message
+        broken[name] = unreadable_error(path, error).message
     return None
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from recon_cli.capture import from_data_set, from_photos, from_video
+from recon_cli.capture.archives import refuse_other_file
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import IngestedSource, merge_sources
 from recon_cli.config.stages import IngestConfig, parse_holdout
@@ -96,6 +97,8 @@ def _ingest(
         return [from_data_set.ingest(config, _only_data_set(sources, layouts), out, ctx)]
     for path in sources:
         refuse_incomplete(path)
+        if not _is_photos(path):
+            refuse_other_file(path)
     parts = _parts(sources)
     prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
     videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)

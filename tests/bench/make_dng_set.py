@@ -64,7 +64,7 @@ def make(photos: list[Photo], out: Path, white: float, size: int, seed: int) -> 
 def check(photos: list[Photo], out: Path) -> None:
     """Prints how well the set matches the photos after development."""
     paths = [out / f"{photo.path.stem}.dng" for photo in photos]
-    plan, factors = plan_raw(paths), []
+    plan, factors = plan_raw({path.name: path for path in paths}), []
     for photo, path in zip(photos, paths, strict=True):
         found = linear(develop(inspect_photo(path), plan))
         height, width = found.shape[:2]

@@ -21,10 +21,14 @@ def scene(*, brightest=0.5):
     return light * brightest / light.max()
 
 
+def plan_of(*paths):
+    return plan_raw({path.name: path for path in paths})
+
+
 def developed(folder, shots, *, expect=None):
     """Writes and develops shots, (light on the sensor, Shot) each, and returns linear pictures."""
     paths = [write_shot(folder / f"{k}.dng", *shot) for k, shot in enumerate(shots)]
-    plan = plan_raw(paths)
+    plan = plan_of(*paths)
     assert sorted(plan.broken) == (expect or [])
     return [
         linear(develop(inspect_photo(path), plan)) for path in paths
@@ -122,7 +126,7 @@ def test_a_dark_set_is_brightened_as_one(tmp_path):
 def test_a_plan_survives_json(tmp_path):
     paths = [write_shot(tmp_path / f"{k}.dng", scene() * 2.0**-k, Shot()) for k in range(2)]
     (tmp_path / "bad.dng").write_bytes(b"no RAW")
-    plan = plan_raw([*paths, tmp_path / "bad.dng"])
+    plan = plan_of(*paths, tmp_path / "bad.dng")
     assert RawPlan.from_json(json.loads(json.dumps(plan.to_json()))) == plan
 
 
@@ -133,7 +137,7 @@ def test_a_raw_photo_is_turned_once_and_tells_its_lens(tmp_path):
     assert found.focal_px == pytest.approx(np.hypot(160, 240) * 26 / 43.267)
     assert (found.camera, found.focal_mm) == ("Test Mosaic One", pytest.approx(4.36))
     straight = write_shot(tmp_path / "b.dng", scene(), Shot())
-    plan = plan_raw([path, straight])
+    plan = plan_of(path, straight)
     upright = np.rot90(develop(inspect_photo(straight), plan), -1)
     turned = develop(found, plan)
     assert np.median(np.abs(turned.astype(int) - upright)) <= 1  # the mosaic is not turned
@@ -144,7 +148,7 @@ def test_another_camera_keeps_its_own_white_balance(tmp_path):
     paths = [
         write_shot(tmp_path / "a.dng", light, Shot()),
         write_dng(tmp_path / "b.dng", np.full((64, 96), 20000, np.uint16))]
-    first, second = plan_raw(paths).shots.values()
+    first, second = plan_of(*paths).shots.values()
     assert first.multipliers != second.multipliers
     assert first.saturation != second.saturation
 
@@ -154,7 +158,7 @@ def test_what_cannot_be_developed_is_named_and_the_rest_is_planned(tmp_path):
     black = write_dng(tmp_path / "black.dng", np.zeros((64, 96), np.uint16))
     half = write_dng(tmp_path / "half.dng", np.full((64, 96), 8000, np.uint16))
     half.write_bytes(half.read_bytes()[:6000])
-    plan = plan_raw([black, good, half])
+    plan = plan_of(black, good, half)
     assert list(plan.shots) == ["good.dng"]
     assert "black.dng holds only black pixels" in plan.broken["black.dng"]
     assert "half.dng cannot be read" in plan.broken["half.dng"]
@@ -164,7 +168,7 @@ def test_what_cannot_be_developed_is_named_and_the_rest_is_planned(tmp_path):
 
 def test_a_photo_that_breaks_after_the_plan_is_refused(tmp_path):
     path = write_shot(tmp_path / "a.dng", scene(), Shot())
-    found, plan = inspect_photo(path), plan_raw([path])
+    found, plan = inspect_photo(path), plan_of(path)
     path.write_bytes(b"")
     with pytest.raises(InputError, match=r"a\.dng cannot be read"):
         develop(found, plan)
@@ -178,7 +182,7 @@ def test_a_raw_photo_is_not_read_like_a_picture(tmp_path):
 
 @pytest.mark.parametrize("name", ["IMG_1361.dng", "Canon-R6-pruned.CR3"])
 def test_real_raw_files_without_a_picture_are_named(shared_data, name):
-    plan = plan_raw([shared_data / "raw" / name])
+    plan = plan_of(shared_data / "raw" / name)
     assert list(plan.broken) == [name]
     assert name in plan.broken[name]
 

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -211,3 +212,14 @@ def test_a_full_disk_leaves_no_half_written_frame(video, tmp_path, monkeypatch, 
     take(source, tmp_path / "out")
     take(source, tmp_path / "undisturbed")
     assert files(tmp_path / "out") == files(tmp_path / "undisturbed")
+
+
+def test_an_archive_or_poses_are_not_read_as_a_video(tmp_path):
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
+        for path in sorted(write_photos(tmp_path / "room", 4).iterdir()):
+            archive.write(path, path.name)
+    with pytest.raises(InputError, match="is an archive, not a video"):
+        take(tmp_path / "photos.zip", tmp_path / "out")
+    (tmp_path / "cameras.json").write_text("[]")
+    with pytest.raises(InputError, match="camera poses, by its name"):
+        take(tmp_path / "cameras.json", tmp_path / "out")
