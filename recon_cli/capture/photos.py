@@ -68,7 +68,7 @@ def drop_other_pictures(
     others = {photo: _other_kind(photo) for photo in photos}
     coloured = [photo for photo in photos if photo.mode in _COLOURED]
     if photos and not coloured and all(
-            kind == _DEPTH for kind in others.values()) and picture_kind(folder.name) == _DEPTH:
+            kind == _DEPTH for kind in others.values()) and picture_kind(folder.resolve().name) == _DEPTH:
         raise InputError(
             f"{folder} holds {len(photos)} depth maps (one channel of 16 bits), not photos.",
             hint="Give the folder of the photos that belong to them, or that of both: recon "

@@ -6,6 +6,7 @@ writes a reader for one of them removes its row. Data sets that are read are in 
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -145,7 +146,8 @@ class Found:
 
     def advice(self) -> str:
         """Returns what to type to use it, as a sentence; empty where nothing does it."""
-        names = {"folder": self.folder, "file": self.path, "parent": self.path.parent}
+        names = {name: shlex.quote(str(path)) for name, path in (
+            ("folder", self.folder), ("file", self.path), ("parent", self.path.parent))}
         steps = []
         if self.row.convert:
             steps.append(f"`{self.row.convert.format(**names)}`"
