@@ -111,6 +111,13 @@ def test_photos_without_colours_are_photos(tmp_path, mode):
     assert drop_other_pictures(tmp_path / "room", listed) == (listed, [])
 
 
+def test_many_gray_photos_are_not_thrown_away_for_a_coloured_one(tmp_path):
+    listed = pictures(tmp_path, a="I;16")
+    Image.new("RGB", (8, 6)).save(tmp_path / "logo.png")
+    (logo,) = list_photos([tmp_path / "logo.png"]).photos
+    assert drop_other_pictures(tmp_path, [*listed, logo]) == ((*listed, logo), [])
+
+
 def test_a_folder_of_depth_maps_holds_no_photos(tmp_path):
     with pytest.raises(InputError, match="holds 4 depth maps") as caught:
         drop_other_pictures(tmp_path / "depth", pictures(tmp_path / "depth", a="I;16"))
