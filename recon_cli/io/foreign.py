@@ -76,7 +76,8 @@ FOREIGN: tuple[ForeignLayout, ...] = (
     ForeignLayout(
         "a recording of a Quest headset", "poses, depth and raw pictures",
         ("*_camera_mruk_intrinsics.json", "*_camera_characteristics.json", "hmd_poses.csv"),
-        advice="convert it to a COLMAP model with metaquest-3d-reconstruction first"),
+        advice="convert it to a COLMAP model with e2e_quest_to_colmap.py of "
+        "metaquest-3d-reconstruction"),
     ForeignLayout(
         "the cameras of Agisoft Metashape", "poses", ("*.xml",),
         (b"<document", b"<chunk", b"<camera"), _nerfstudio("metashape", "--xml {file} ")),
@@ -100,10 +101,10 @@ FOREIGN: tuple[ForeignLayout, ...] = (
     ForeignLayout(
         "the cameras of OpenSfM or OpenDroneMap", "poses",
         ("reconstruction.json", "opensfm/reconstruction.json", "shots.geojson"), (b"shot",),
-        advice="export a COLMAP model with OpenSfM's export_colmap"),
+        advice="export a COLMAP model with `opensfm export_colmap`"),
     ForeignLayout(
         "the cameras of Meshroom", "poses", ("*.sfm", "*/*.sfm"), (b'"views"', b'"poses"'),
-        advice="export a COLMAP model with Meshroom's node ExportColmap"),
+        "aliceVision_exportColmap -i {file} -o SCENE"),
     ForeignLayout(
         "the cameras of OpenMVG", "poses", ("sfm_data*.json",), (b'"views"', b'"extrinsics"'),
         "openMVG_main_openMVG2Colmap -i {file} -o SCENE"),
@@ -150,9 +151,9 @@ class Found:
             ("folder", self.folder), ("file", self.path), ("parent", self.path.parent))}
         steps = []
         if self.row.convert:
-            steps.append(f"`{self.row.convert.format(**names)}`"
-                         + (" of nerfstudio, then `recon ingest SCENE`"
-                            if self.row.convert.startswith("ns-") else ""))
+            maker = " of nerfstudio" * self.row.convert.startswith("ns-")
+            then = ", then `recon ingest SCENE`" * ("SCENE" in self.row.convert)
+            steps.append(f"`{self.row.convert.format(**names)}`{maker}{then}")
         if self.row.advice:
             steps.append(self.row.advice.format(**names))
         return f"To use them: {', or '.join(steps)}." if steps else ""
