@@ -94,14 +94,24 @@ def test_copies_of_the_photos_above_are_left_out(tmp_path):
     assert "small/ holds 3 other versions of these photos" in notices
 
 
-def test_workspaces_links_and_hidden_folders_hold_no_photos(tmp_path):
+def test_workspaces_and_hidden_folders_hold_no_photos_and_links_are_named(tmp_path):
     photos = tmp_path / "room"
     small(photos / "a.png", photos / ".hidden" / "b.png", tmp_path / "other" / "c.png")
     small(photos / "workspace" / "ingest" / "frames" / "d.png")
     (photos / "workspace" / "ingest" / "manifest.json").write_text("{}")
     small(photos / "new" / "preview of it" / "e.png")
     (photos / "link").symlink_to(tmp_path / "other")
-    assert found(photos, photos / "new" / ".partial" / "ingest")[0] == ["a.png"]
+    files, notices = found(photos, photos / "new" / ".partial" / "ingest")
+    assert files == ["a.png"]
+    assert f"link/ holds 1 photos behind a link and is not used; recon ingest {photos}/link" in (
+        notices)
+
+
+def test_a_link_to_the_only_folder_of_photos_is_followed(tmp_path):
+    small(tmp_path / "there" / "a.png")
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "images").symlink_to(tmp_path / "there")
+    assert found(tmp_path / "room")[0] == ["images/a.png"]
 
 
 def test_videos_and_archives_beside_photos_are_named(tmp_path):
