@@ -102,10 +102,11 @@ def inspect_photo(path: Path, label: str = "") -> Photo:
         return replace(_inspect_raw(path), label=label)
     try:
         with open_image(path) as image:
+            # before the EXIF, for reading that of a PNG consumes its tiles
+            mode, wide, pictures = image.mode, _is_wide(image), _count_pictures(image)
             exif, (width, height) = image.getexif(), _size_in_file(image)
             lens = read_lens(exif, width, height)
             panorama = is_panorama(read_xmp(image), width, height)
-            mode, wide, pictures = image.mode, _is_wide(image), _count_pictures(image)
             if exif.get(ExifTags.Base.Orientation) in QUARTER_TURNS:
                 width, height = height, width
     except BROKEN as error:

@@ -49,7 +49,7 @@ def wraps_around(rgb: NDArray[np.uint8]) -> bool:
     opposite = np.abs(small - np.roll(small, _SMALL[0] // 2, axis=1)).mean()
     spread = small.std(axis=1).mean(axis=1)  # of each row
     pole = min(spread[0], spread[-1]) <= _POLE * np.median(spread)
-    return bool(pole and seam <= _SEAM * np.median(steps) and _OPPOSITE * seam <= opposite)
+    return bool(pole and seam <= _SEAM * np.median(steps) and _OPPOSITE * seam < opposite)
 
 
 def _read_small(photo: Photo) -> NDArray[np.uint8] | None:

@@ -30,6 +30,7 @@ _PICTURE_FOLDERS = frozenset({
     "color", "corrected_images", "frames", "images", "input", "keyframes", "photos", "pictures",
     "rgb", "rgbd"})
 _SAME_NAMES = 0.5  # a subfolder of which more pictures are called like those above holds copies
+_VERSIONS = "other versions of these photos"
 _NAMED = 4
 
 
@@ -37,7 +38,6 @@ _NAMED = 4
 class PhotoTree:
     """The pictures below a folder that may be photos."""
 
-    given: Path
     home: Path  # the folder that holds all photos, directly or deeper: the given one or below it
     files: tuple[Path, ...]  # those that are called or look like pictures, and maybe others
     foreign: tuple[Found, ...]  # what other programs left beside them
@@ -64,7 +64,7 @@ def find_photo_files(folder: Path, out: Path | None = None) -> PhotoTree:
     for place in [place for place in walk.folders if place != home]:
         same = sum(path.stem in top for path in walk.folders[place])
         if same > _SAME_NAMES * len(walk.folders[place]):
-            walk.aside[place] = "other versions", len(walk.folders.pop(place))
+            walk.aside[place] = _VERSIONS, len(walk.folders.pop(place))
     _add_beside(walk, folder, home, out)
     files = tuple(path for paths in walk.folders.values() for path in paths)
     notices = (
@@ -72,7 +72,7 @@ def find_photo_files(folder: Path, out: Path | None = None) -> PhotoTree:
         *_describe_aside(folder, home, walk, [found.row.carries for found in foreign]),
         *_describe_media(list(dict.fromkeys([folder, home]))),
         *(found.notice(folder) for found in foreign))
-    return PhotoTree(folder, home, files, tuple(foreign), notices)
+    return PhotoTree(home, files, tuple(foreign), notices)
 
 
 def _add_beside(walk: _Walk, folder: Path, home: Path, out: Path | None) -> None:
@@ -111,9 +111,9 @@ def _describe_aside(
             if place.name.lower() not in MASK_FOLDERS:
                 yield (f"{name} holds {count} masks, by its name, and is not used: masks are read "
                        f"from {home.parent if home != folder else home}/masks/.")
-        elif kind in ("pictures", "other versions"):
-            yield (f"{name} holds {count} {kind}{' of these photos' * (kind != 'pictures')} and "
-                   f"is not used; recon ingest {shlex.quote(str(place))} uses it instead.")
+        elif kind in ("pictures", "photos behind a link", _VERSIONS):
+            yield (f"{name} holds {count} {kind} and is not used; recon ingest "
+                   f"{shlex.quote(str(place))} uses it instead.")
         else:
             yield (f"{name} holds {count} {kind}, by its name, and is not used: cameras and "
                    "geometry are found from the photos alone.")
@@ -177,7 +177,7 @@ def _choose_home(folder: Path, foreign: Sequence[Found], out: Path | None) -> Pa
                 for place in sorted(folder.glob(pattern)):
                     if place.is_dir() and any(_photos_in(place)):
                         return place
-    if any(path for path in _photos_in(folder) if not _is_excluded(path, foreign)):
+    if not all(_is_excluded(path, foreign) for path in _photos_in(folder)):
         return folder
     inner = [path for path in _subfolders(folder, out)
              if not picture_kind(path.name) and _walk(path, foreign, out).folders]
@@ -207,6 +207,8 @@ def _walk(home: Path, foreign: Sequence[Found], out: Path | None) -> _Walk:
             kind = picture_kind(path.name)
             if not kind and _REDUCED.fullmatch(path.name) and (folder / "images").is_dir():
                 kind = "small copies"
+            if path.is_symlink():  # it may lead round, and is not watched for changes
+                kind = kind or "photos behind a link"
             if not kind:
                 waiting.append(path)
             elif count := _count_pictures(path):
@@ -220,9 +222,9 @@ def _is_excluded(path: Path, foreign: Sequence[Found]) -> bool:
 
 
 def _subfolders(folder: Path, out: Path | None) -> list[Path]:
-    """Returns the folders in a folder without hidden ones, links and workspaces."""
-    return [path for path in _entries(folder) if path.is_dir() and not path.is_symlink()
-            and not Workspace(path).holds_results
+    """Returns the folders in a folder, and links to some, without hidden ones and workspaces."""
+    return [path for path in _entries(folder)
+            if path.is_dir() and not Workspace(path).holds_results
             and not (out is not None and out.resolve().is_relative_to(path.resolve()))]
 
 

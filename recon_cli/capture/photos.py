@@ -64,24 +64,7 @@ def drop_other_pictures(
     Depth maps have one channel of 16 bits, where the others have colours. InputError where nothing
     but depth maps, or but panoramas, is left.
     """
-    notices = []
-    others = {photo: _other_kind(photo) for photo in photos}
-    coloured = [photo for photo in photos if photo.mode in _COLOURED]
-    if photos and not coloured and all(
-            kind == _DEPTH for kind in others.values()) and picture_kind(folder.name) == _DEPTH:
-        raise InputError(
-            f"{folder} holds {len(photos)} depth maps (one channel of 16 bits), not photos.",
-            hint="Give the folder of the photos that belong to them, or that of both: recon "
-            f"ingest {shlex.quote(str(folder.absolute().parent))}")
-    dropped = set()
-    for kind in sorted(set(others.values()) - {""}) if coloured else ():
-        names = [photo.name for photo in photos if others[photo] == kind]
-        dropped.update(names)
-        notices.append(
-            f"{len(names)} pictures are {kind} and not photos, by their channels and names; they "
-            f"are not used: {list_names(names, _NAMED)}."
-            + " Masks are read from masks/, called like their photos." * (kind == "masks"))
-    rest = [photo for photo in photos if photo.name not in dropped]
+    rest, notices = _drop_depth_and_masks(folder, photos)
     panoramas = find_panoramas(rest)
     if panoramas and len(rest) - len(panoramas) < MIN_FRAMES:
         raise panorama_error(folder.name, panoramas, len(rest))
@@ -89,12 +72,38 @@ def drop_other_pictures(
         names = [photo.name for photo in panoramas]
         notices.append(
             f"{len(names)} 360-degree panoramas (equirectangular) are left out, because they are "
-            f"no pictures of ordinary lenses: {list_names(names, _NAMED)}. "
+            f"not pictures of ordinary lenses: {list_names(names, _NAMED)}. "
             f"{panorama_advice(panoramas[0])}")
     notices += [
         f"{photo.name} holds {photo.pictures} pictures, of which only the first is used. "
         f"{unfold_advice(photo)}" for photo in rest if photo.pictures > 1][:_NAMED]
     return tuple(photo for photo in rest if photo not in panoramas), notices
+
+
+def _drop_depth_and_masks(
+    folder: Path, photos: Sequence[Photo]
+) -> tuple[list[Photo], list[str]]:
+    """Returns the photos without pictures of one channel that belong to others, and notices."""
+    kinds = {photo: _other_kind(photo) for photo in photos}
+    coloured = sum(photo.mode in _COLOURED for photo in photos)
+    depth_alone = bool(photos) and set(kinds.values()) == {_DEPTH}
+    if depth_alone and picture_kind(folder.resolve().name) == _DEPTH:
+        raise InputError(
+            f"{folder} holds {len(photos)} depth maps (one channel of 16 bits), not photos.",
+            hint="Give the folder of the photos that belong to them, or that of both: recon "
+            f"ingest {shlex.quote(str(folder.absolute().parent))}")
+    dropped: set[str] = set()
+    notices = []
+    for kind in sorted(set(kinds.values()) - {""}):
+        names = [photo.name for photo in photos if kinds[photo] == kind]
+        if coloured < max(MIN_FRAMES, len(names) / 2):  # gray photos, and a few others
+            continue
+        dropped.update(names)
+        notices.append(
+            f"{len(names)} pictures are {kind} and not photos, by their channels and names; they "
+            f"are not used: {list_names(names, _NAMED)}."
+            + " Masks are read from masks/, called like their photos." * (kind == "masks"))
+    return [photo for photo in photos if photo.name not in dropped], notices
 
 
 def _other_kind(photo: Photo) -> str:

@@ -18,7 +18,9 @@ _ASPECT = 0.02  # a picture reduced to whole pixels keeps its aspect this well
 def read_xmp(image: Image.Image) -> bytes:
     """Returns the XMP of a picture; empty where there is none."""
     value = image.info.get("xmp") or getattr(image, "tag_v2", {}).get(TAG) or b""
-    return value.encode() if isinstance(value, str) else bytes(value)
+    if isinstance(value, str):
+        return value.encode(errors="replace")
+    return value if isinstance(value, bytes) else b""  # numbers, in a TIFF of a wrong type
 
 
 def is_panorama(xmp: bytes, width: int, height: int) -> bool:

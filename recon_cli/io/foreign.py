@@ -6,6 +6,7 @@ writes a reader for one of them removes its row. Data sets that are read are in 
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,8 +14,10 @@ from itertools import islice
 from pathlib import Path
 
 _READ = 1 << 23  # bytes of a file that are searched for its marks
+_TRIED = 50  # files of a pattern; a capture has thousands of one kind
 _LISTED = 0.5  # a text that names this share of the pictures belongs to them
 _TEXTS = frozenset({".csv", ".json", ".jsonl", ".tsv", ".txt", ".xml", ".yaml", ".yml"})
+_ARRAYS = frozenset({".bin", ".geojson", ".npy", ".npz", ".traj", ".tum"})
 _NERFSTUDIO = "ns-process-data {kind} --data {folder} {more}--output-dir SCENE"
 
 
@@ -73,7 +76,8 @@ FOREIGN: tuple[ForeignLayout, ...] = (
     ForeignLayout(
         "a recording of a Quest headset", "poses, depth and raw pictures",
         ("*_camera_mruk_intrinsics.json", "*_camera_characteristics.json", "hmd_poses.csv"),
-        advice="convert it to a COLMAP model with metaquest-3d-reconstruction first"),
+        advice="convert it to a COLMAP model with e2e_quest_to_colmap.py of "
+        "metaquest-3d-reconstruction"),
     ForeignLayout(
         "the cameras of Agisoft Metashape", "poses", ("*.xml",),
         (b"<document", b"<chunk", b"<camera"), _nerfstudio("metashape", "--xml {file} ")),
@@ -97,10 +101,10 @@ FOREIGN: tuple[ForeignLayout, ...] = (
     ForeignLayout(
         "the cameras of OpenSfM or OpenDroneMap", "poses",
         ("reconstruction.json", "opensfm/reconstruction.json", "shots.geojson"), (b"shot",),
-        advice="export a COLMAP model with OpenSfM's export_colmap"),
+        advice="export a COLMAP model with `opensfm export_colmap`"),
     ForeignLayout(
         "the cameras of Meshroom", "poses", ("*.sfm", "*/*.sfm"), (b'"views"', b'"poses"'),
-        advice="export a COLMAP model with Meshroom's node ExportColmap"),
+        "aliceVision_exportColmap -i {file} -o SCENE"),
     ForeignLayout(
         "the cameras of OpenMVG", "poses", ("sfm_data*.json",), (b'"views"', b'"extrinsics"'),
         "openMVG_main_openMVG2Colmap -i {file} -o SCENE"),
@@ -121,7 +125,8 @@ FOREIGN: tuple[ForeignLayout, ...] = (
     ForeignLayout(
         "camera poses, by its name", "poses", (
             "*pose*.txt", "*pose*.npy", "*pose*.json", "*pose*.csv", "*traj*.txt",
-            "*Trajectory*.txt", "groundtruth*.txt", "*.tum", "*odometry*", "cameras.json",
+            "*Trajectory*.txt", "groundtruth*.txt", "*.tum", "*odometry*.csv", "*odometry*.txt",
+            "cameras.json",
             "cameras*.npz")),
 )
 
@@ -142,12 +147,13 @@ class Found:
 
     def advice(self) -> str:
         """Returns what to type to use it, as a sentence; empty where nothing does it."""
-        names = {"folder": self.folder, "file": self.path, "parent": self.path.parent}
+        names = {name: shlex.quote(str(path)) for name, path in (
+            ("folder", self.folder), ("file", self.path), ("parent", self.path.parent))}
         steps = []
         if self.row.convert:
-            steps.append(f"`{self.row.convert.format(**names)}`"
-                         + (" of nerfstudio, then `recon ingest SCENE`"
-                            if self.row.convert.startswith("ns-") else ""))
+            maker = " of nerfstudio" * self.row.convert.startswith("ns-")
+            then = ", then `recon ingest SCENE`" * ("SCENE" in self.row.convert)
+            steps.append(f"`{self.row.convert.format(**names)}`{maker}{then}")
         if self.row.advice:
             steps.append(self.row.advice.format(**names))
         return f"To use them: {', or '.join(steps)}." if steps else ""
@@ -174,7 +180,8 @@ def find_foreign(folder: Path, *, known: Collection[Path] = ()) -> list[Found]:
 
 def recognise_file(path: Path) -> Found | None:
     """Returns the row that a file by itself has, None for none."""
-    rows = (row for row in FOREIGN if row.marks or row.patterns[0] == path.name)
+    named = path.suffix.lower() in _TEXTS | _ARRAYS  # a video may be called odometry.mp4
+    rows = (row for row in FOREIGN if row.marks or named)
     return next((Found(row, path.parent, path) for row in rows
                  if any(Path(path.name).match(Path(pattern).name) for pattern in row.patterns)
                  and has_marks(path, row.marks)), None)
@@ -218,7 +225,7 @@ def _matching(folder: Path, patterns: Iterable[str]) -> list[Path]:
     paths: list[Path] = []
     for pattern in patterns:
         with suppress(OSError):
-            paths += [path for path in islice(sorted(folder.glob(pattern)), 1000)
+            paths += [path for path in islice(sorted(folder.glob(pattern)), _TRIED)
                       if not any(part[0] == "." for part in path.relative_to(folder).parts)]
     return list(dict.fromkeys(paths))
 

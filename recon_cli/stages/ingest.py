@@ -14,6 +14,7 @@ from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import InputError
 from recon_cli.io import records as store
+from recon_cli.io.foreign import FOREIGN, find_foreign
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.io.records import FrameList
 from recon_cli.io.tracks import TRACKS
@@ -103,6 +104,8 @@ def _ingest(
     prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
     videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)
               if not _is_photos(part[0])]
+    for path, _ in videos:
+        _tell_foreign(path, ctx)
     scans = [from_video.scan(config, path, out / f"{prefix}{from_video.SCAN}", ctx)
              for path, prefix in videos]
     numbers = from_video.frame_counts(config, scans)
@@ -126,6 +129,14 @@ def _tell_many(config: IngestConfig, frames: int, ctx: StageContext) -> None:
         minutes = max(1, round(expected_minutes(frames, ctx.threads)))
         ctx.notice(f"{frames:,} frames are chosen{way}; recon sfm will take about {minutes} "
                    "minutes for them. --max-frames limits their number.")
+
+
+def _tell_foreign(video: Path, ctx: StageContext) -> None:
+    """Says which poses and depth an app has left beside its video."""
+    if any(row.video == video.name for row in FOREIGN):
+        for found in find_foreign(video.absolute().parent):
+            if found.row.video == video.name:
+                ctx.notice(found.notice(video.absolute().parent))
 
 
 def _parts(sources: Sequence[Path]) -> list[list[Path]]:

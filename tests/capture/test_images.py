@@ -11,6 +11,7 @@ from PIL import Image
 from recon_cli.capture.images import (
     ExifLens,
     Photo,
+    find_white,
     inspect_photo,
     read_alpha,
     read_lens,
@@ -357,3 +358,26 @@ def test_zero_stands_for_unknown(unknown):
 def test_a_maker_that_the_model_repeats_is_named_once():
     assert lens_of({}, make="Canon\0", model="Canon EOS R6").camera == "Canon EOS R6"
     assert lens_of({}, make="NIKON", model="Z 6").camera == "NIKON Z 6"
+
+
+@pytest.mark.parametrize(("bits", "white"), [(8, 255), (10, 1023), (12, 4095), (14, 16383),
+                                            (16, 65535)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_values_of_fewer_bits_in_sixteen_are_told_by_the_brightest_of_a_set(
+        tmp_path, bits, white, channels):
+    shape = (8, 8) if channels == 1 else (8, 8, 3)
+    for index, top in enumerate((0.3, 0.9, 0.5)):
+        values = np.linspace(0, top * (2**bits - 1), int(np.prod(shape))).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"{index}.png"), values.reshape(shape))
+    paths = sorted(tmp_path.iterdir())
+    assert all(inspect_photo(path).wide for path in paths)
+    assert find_white(paths) == white
+    shown = read_photo(inspect_photo(paths[1]), white)
+    assert abs(int(shown.max()) - 0.9 * 255) <= 1
+
+
+def test_pictures_of_eight_bits_and_black_ones_tell_nothing(tmp_path):
+    Image.fromarray(np.full((8, 8), 9, np.uint8)).save(tmp_path / "a.png")
+    Image.fromarray(np.zeros((8, 8), np.uint16)).save(tmp_path / "b.png")
+    (tmp_path / "c.png").write_bytes(b"broken")
+    assert find_white(sorted(tmp_path.iterdir())) == 65535

@@ -11,12 +11,12 @@ from PIL import Image
 from recon_cli.capture.images import Photo
 from recon_cli.capture.photos import (
     check_count,
+    drop_other_pictures,
     group_notices,
     group_photos,
     list_photos,
     make_frame_names,
     odd_photos,
-    photo_folder,
 )
 from recon_cli.errors import InputError
 
@@ -65,46 +65,83 @@ def test_other_names_are_numbered(stems):
 
 
 def test_too_few_photos_are_refused_with_the_reason():
-    check_count(Path("room"), 3, {})
+    check_count(Path("room"), [photo("a"), photo("b"), photo("c")], {})
     with pytest.raises(InputError, match="room holds 1 photo, but at least 3"):
-        check_count(Path("room"), 1, {})
+        check_count(Path("room"), [photo("a")], {})
     with pytest.raises(InputError, match=r"no photos that can.* 2 that.*a\.jpg cannot be read"):
-        check_count(Path("room"), 0, {"a.jpg": "a.jpg cannot be read.", "b.jpg": "?"})
+        check_count(Path("room"), [], {"a.jpg": "a.jpg cannot be read.", "b.jpg": "?"})
 
 
-def small(path):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (8, 8)).save(path)
+def test_photos_in_folders_are_called_by_their_paths_and_come_after_the_others(tmp_path):
+    for name in ("b.png", "2/a.png", "10/a.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.new("RGB", (8, 8)).save(tmp_path / name)
+    (tmp_path / "2" / "c.jpg").touch()
+    folder = list_photos(tmp_path.rglob("*"), tmp_path)
+    assert [found.name for found in folder.photos] == ["b.png", "2/a.png", "10/a.png"]
+    assert list(folder.broken) == ["2/c.jpg"]
 
 
-def test_a_folder_with_photos_is_taken_itself(tmp_path):
-    small(tmp_path / "a.png")
-    small(tmp_path / "images" / "b.png")
-    assert photo_folder(tmp_path) == tmp_path
+def pictures(folder, **kinds):
+    """Writes four pictures of each kind, by the first letters of their names."""
+    folder.mkdir(exist_ok=True)
+    values = {"I;16": np.full((6, 8), 1500, np.uint16), "L": np.full((6, 8), 200, np.uint8),
+              "RGB": np.full((6, 8, 3), 90, np.uint8)}
+    for name, mode in kinds.items():
+        for index in range(4):
+            Image.fromarray(values[mode]).save(folder / f"{name}_{index}.png")
+    return list_photos(folder.iterdir()).photos
 
 
-def test_the_one_folder_with_photos_inside_is_taken(tmp_path):
-    small(tmp_path / "DCIM" / "a.png")
-    small(tmp_path / "masks" / "a.png")
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes" / "a.txt").write_text("none")
-    assert photo_folder(tmp_path) == tmp_path / "DCIM"
+def names(photos):
+    return sorted({photo.name.rsplit("_", 1)[0] for photo in photos})
 
 
-def test_among_several_inner_folders_the_one_called_images_is_taken(tmp_path):
-    for name in ("images", "images_2", "renders"):
-        small(tmp_path / name / "a.png")
-    assert photo_folder(tmp_path) == tmp_path / "images"
-    (tmp_path / "images").rename(tmp_path / "other")
-    with pytest.raises(InputError, match="3 of its subfolders do: images_2, other") as caught:
-        photo_folder(tmp_path)
-    assert "images_2" in caught.value.hint
+def test_depth_maps_and_masks_among_photos_are_left_out_and_named(tmp_path):
+    photos, notices = drop_other_pictures(tmp_path, pictures(
+        tmp_path, frame="RGB", z="I;16", IMG_mask="L", conf="L"))
+    assert names(photos) == ["frame"]
+    assert [notice.split(" and not")[0] for notice in notices] == [
+        "4 pictures are confidence maps", "4 pictures are depth maps", "4 pictures are masks"]
 
 
-def test_a_folder_of_broken_photos_is_not_left_for_another(tmp_path):
-    (tmp_path / "a.jpg").write_bytes(b"")
-    small(tmp_path / "thumbnails" / "a.png")
-    assert photo_folder(tmp_path) == tmp_path
+@pytest.mark.parametrize("mode", ["I;16", "L"])
+def test_photos_without_colours_are_photos(tmp_path, mode):
+    listed = pictures(tmp_path / "room", a=mode)
+    assert drop_other_pictures(tmp_path / "room", listed) == (listed, [])
+
+
+def test_many_gray_photos_are_not_thrown_away_for_a_coloured_one(tmp_path):
+    listed = pictures(tmp_path, a="I;16")
+    Image.new("RGB", (8, 6)).save(tmp_path / "logo.png")
+    (logo,) = list_photos([tmp_path / "logo.png"]).photos
+    assert drop_other_pictures(tmp_path, [*listed, logo]) == ((*listed, logo), [])
+
+
+def test_a_folder_of_depth_maps_holds_no_photos(tmp_path):
+    with pytest.raises(InputError, match="holds 4 depth maps") as caught:
+        drop_other_pictures(tmp_path / "depth", pictures(tmp_path / "depth", a="I;16"))
+    assert f"recon ingest {tmp_path}" in caught.value.hint
+
+
+@pytest.mark.parametrize(("name", "program"), [("a.webp", "magick"), ("a.png", "ffmpeg")])
+def test_an_animation_is_called_one_with_what_turns_it_into_photos(tmp_path, name, program):
+    frames = [Image.new("RGB", (8, 8), (40 * index, 9, 9)) for index in range(5)]
+    frames[0].save(tmp_path / name, save_all=True, append_images=frames[1:])
+    (photo,) = list_photos([tmp_path / name]).photos
+    with pytest.raises(InputError, match="an animation, or a burst, of 5 frames") as caught:
+        check_count(tmp_path / name, [photo], {})
+    assert f"{program} " in caught.value.hint
+    assert "recon ingest" in caught.value.hint
+    assert "5 pictures, of which only the first" in drop_other_pictures(tmp_path, [photo])[1][0]
+
+
+def test_a_folder_with_a_video_but_no_photos_names_it(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "walk.mp4").touch()
+    with pytest.raises(InputError) as caught:
+        check_count(tmp_path, [], {})
+    assert f"recon ingest {tmp_path}/in/walk.mp4" in caught.value.hint
 
 
 def shot(name, width=64, height=48, *, focal=None, camera="", mm=None):

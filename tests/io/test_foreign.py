@@ -88,9 +88,11 @@ def test_hidden_files_are_not_looked_at(tmp_path):
 
 def test_a_file_is_recognised_by_itself(tmp_path):
     put(tmp_path / "any.xml", METASHAPE)
-    found = recognise_file(tmp_path / "any.xml")
-    assert found is not None
-    assert "Metashape" in found.row.words
+    put(tmp_path / "cameras.json", "[]")
+    put(tmp_path / "odometry walk.mp4", "")
+    found = [recognise_file(path) for path in sorted(tmp_path.iterdir())]
+    assert [one and one.row.words for one in found] == [
+        "the cameras of Agisoft Metashape", "camera poses, by its name", None]
 
 
 def test_a_text_that_lists_the_pictures_is_found_whoever_wrote_it(tmp_path):

@@ -1,3 +1,4 @@
+import json
 import re
 
 import cv2
@@ -12,10 +13,12 @@ from recon_cli.io.records import (
     Frame,
     FrameList,
     Group,
+    KnownPoses,
     choose_held_out,
     describe_stretches,
     prepare_frames_folder,
     read_frame_list,
+    read_poses,
 )
 from recon_cli.scene.camera import Lens
 
@@ -51,6 +54,59 @@ def test_a_file_that_is_no_frame_list_is_refused(tmp_path, text):
     (tmp_path / "frames.json").write_text(text)
     with pytest.raises(FormatError):
         read_frame_list(tmp_path)
+
+
+FRAME = {"name": "a.png", "time_seconds": None, "source": "a.jpg", "sharpness": None,
+         "held_out": False, "group": 0, "masked": False}
+GROUP = {"name": "room", "width": 8, "height": 6, "focal_px": None, "lens": None}
+
+
+def write_list(folder, frame=FRAME, group=GROUP, **more):
+    (folder / "frames.json").write_text(json.dumps(
+        {"source": "photos", "frames": [frame], "groups": [group], **more}))
+
+
+@pytest.mark.parametrize("frame", [
+    {"name": 5}, {"name": "../a.png"}, {"name": "/etc/passwd"}, {"name": None}, {"group": 1},
+    {"group": -1}, {"group": "x"}, {"held_out": "no"}, {"sharpness": []}, {"source": {}}])
+def test_a_frame_of_other_types_or_elsewhere_is_refused(tmp_path, frame):
+    write_list(tmp_path)
+    assert read_frame_list(tmp_path).frames[0].name == "a.png"
+    write_list(tmp_path, FRAME | frame)
+    with pytest.raises(FormatError, match=r"frames\.json") as caught:
+        read_frame_list(tmp_path)
+    assert caught.value.hint
+
+
+@pytest.mark.parametrize("group", [
+    {"width": "x"}, {"lens": 5}, {"lens": {"model": "PINHOLE"}},
+    {"lens": {"model": "NONE", "width": 8, "height": 6, "params": [1]}},
+    {"lens": {"model": "PINHOLE", "width": 8, "height": 6, "params": [float("nan")] * 4}},
+    {"lens": {"model": "PINHOLE", "width": 8, "height": 6, "params": ["x"] * 4}},
+    {"lens": {"model": [], "width": 8, "height": 6, "params": [1, 1, 1, 1]}}])
+def test_a_group_that_is_none_is_refused(tmp_path, group):
+    write_list(tmp_path, group=GROUP | group)
+    with pytest.raises(FormatError, match=r"frames\.json"):
+        read_frame_list(tmp_path)
+
+
+def test_a_list_without_groups_or_with_foreign_fields_is_judged_by_what_is_needed(tmp_path):
+    write_list(tmp_path, FRAME | {"colour": "red"}, foreign=[[]])
+    assert len(read_frame_list(tmp_path).frames) == 1
+    write_list(tmp_path, groups=[])
+    with pytest.raises(FormatError):
+        read_frame_list(tmp_path)
+
+
+def test_poses_that_are_not_finite_are_refused(tmp_path):
+    pose = np.eye(4)
+    KnownPoses({"a.png": pose}, metric=False).write(tmp_path)
+    np.testing.assert_array_equal(read_poses(tmp_path / "poses.json").viewmats["a.png"], pose)
+    text = (tmp_path / "poses.json").read_text()
+    for junk in ("NaN", "1" * 400, '"x"', "[]"):
+        (tmp_path / "poses.json").write_text(text.replace("1.0", junk, 1))
+        with pytest.raises(FormatError, match=r"poses\.json"):
+            read_poses(tmp_path / "poses.json")
 
 
 def test_frames_are_stored_without_loss_as_rgb(tmp_path):

@@ -168,3 +168,39 @@ def test_the_inner_folder_of_a_replica_sequence_is_not_taken_for_photos(tmp_path
     with pytest.raises(FormatError, match="frames and depth maps of a Replica sequence") as caught:
         take(folder / "results", tmp_path / "out")
     assert f"Give {folder}" in caught.value.hint
+
+
+def test_masks_by_stem_are_used_and_what_is_left_is_named(tmp_path, notices):
+    folder = make_transforms(tmp_path / "set")
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:5] = 0
+    for name in ("masks/0001.png", "depth/0000.png"):
+        (folder / name).parent.mkdir()
+        Image.fromarray(mask).save(folder / name)
+    (folder / "bundle.out").write_text("# Bundle file v0.3\n")
+    take(folder, tmp_path / "out")
+    assert [frame["masked"] for frame in listed(tmp_path / "out")["frames"]] == [
+        False, True, False, False]
+    told = "\n".join(notices())
+    for words in ("1 of its images have masks", "depth/ holds 1 depth maps",
+                  "bundle.out is cameras in Bundler's format and is not used"):
+        assert words in told
+
+
+def test_images_of_twelve_bits_are_brightened_and_said(tmp_path, notices):
+    folder = make_transforms(tmp_path / "set")
+    for index, path in enumerate(sorted((folder / "images").iterdir())):
+        wide = blocks(HEIGHT, WIDTH, seed=index)[..., 0].astype(np.uint16) * 16
+        Image.fromarray(wide).save(path)
+    take(folder, tmp_path / "out")
+    assert any("12 bits" in notice for notice in notices())
+    stored = np.asarray(Image.open(tmp_path / "out" / "frames" / "0000.png"))
+    assert stored.max() > 200
+
+
+def test_depth_by_the_key_of_another_program_is_named(tmp_path, notices):
+    value = transforms()
+    for frame in value["frames"]:
+        frame["depth_path"] = "images/0.depth.png"
+    take(make_transforms(tmp_path / "set", value), tmp_path / "out")
+    assert any("4 frames name their depth by depth_path" in notice for notice in notices())

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -211,3 +212,26 @@ def test_a_full_disk_leaves_no_half_written_frame(video, tmp_path, monkeypatch, 
     take(source, tmp_path / "out")
     take(source, tmp_path / "undisturbed")
     assert files(tmp_path / "out") == files(tmp_path / "undisturbed")
+
+
+def test_an_archive_or_poses_are_not_read_as_a_video(tmp_path):
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
+        for path in sorted(write_photos(tmp_path / "room", 4).iterdir()):
+            archive.write(path, path.name)
+    with pytest.raises(InputError, match="is an archive, not a video"):
+        take(tmp_path / "photos.zip", tmp_path / "out")
+    (tmp_path / "cameras.json").write_text("[]")
+    with pytest.raises(InputError, match="camera poses, by its name"):
+        take(tmp_path / "cameras.json", tmp_path / "out")
+
+
+def test_poses_beside_the_video_of_an_app_are_named(tmp_path, notices):
+    (tmp_path / "stray").mkdir()
+    video = write_video(tmp_path / "stray" / "rgb.mp4", walk(20))
+    (tmp_path / "stray" / "odometry.csv").write_text("timestamp, frame, x, y, z, qx, qy, qz, qw\n")
+    with pytest.raises(InputError, match="holds no photos") as caught:
+        take(tmp_path / "stray", tmp_path / "none")
+    assert f"recon ingest {video}" in caught.value.hint
+    found = len(notices())
+    take(video, tmp_path / "out")
+    assert "a recording of Stray Scanner: its poses and depth are not read" in notices()[found]

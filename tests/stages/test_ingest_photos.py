@@ -269,3 +269,98 @@ def test_a_mask_that_does_not_fit_its_frame_of_a_sequence_costs_that_frame(tmp_p
     assert summary.frames == 58
     record = json.loads((tmp_path / "out" / "choice.json").read_text())["candidates"][20]
     assert (record["reason"], record["name"]) == ("damaged", None)
+
+
+def test_photos_beside_and_in_subfolders_are_all_used(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 3)
+    for index, path in enumerate(sorted(write_photos(tmp_path / "more", 6).iterdir())[3:]):
+        path.rename(tmp_path / f"{path.name}")
+        (folder / "more").mkdir(exist_ok=True)
+        (tmp_path / path.name).rename(folder / "more" / f"IMG_{index:04d}.jpg")
+    (folder / "more" / "IMG_0000.jpg").rename(folder / "more" / "IMG_0009.jpg")
+    (folder / "more" / "IMG_0001.jpg").rename(folder / "more" / "IMG_0008.jpg")
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[0] = 0
+    mask_of(folder / "masks", "IMG_0000.png", mask)
+    (folder / "masks" / "more").mkdir()
+    mask_of(folder / "masks" / "more", "IMG_0002.png", mask)
+    assert take(folder, tmp_path / "out").frames == 6
+    frames = listed(tmp_path / "out")["frames"]
+    assert [(frame["source"], frame["masked"]) for frame in frames] == [
+        ("IMG_0000.jpg", True), ("IMG_0001.jpg", False), ("IMG_0002.jpg", False),
+        ("more/IMG_0002.jpg", True), ("more/IMG_0008.jpg", False), ("more/IMG_0009.jpg", False)]
+    assert any("3 photos in subfolders are used too: more/" in notice for notice in notices())
+
+
+def test_raw_photos_of_one_name_in_two_folders_are_developed_each(tmp_path):
+    light = linear(blocks(96, 128).astype(np.float32))
+    for place, seed in (("", 0), ("more", 7)):
+        (tmp_path / "room" / place).mkdir(parents=True, exist_ok=True)
+        for index in range(2):
+            light = linear(blocks(96, 128, seed=seed + index).astype(np.float32))
+            name = f"IMG_{index + (1 if place else 0)}.dng"
+            write_shot(tmp_path / "room" / place / name, light, Shot())
+    assert take(tmp_path / "room", tmp_path / "out").frames == 4
+    assert "more/IMG_1.dng" in json.loads((tmp_path / "out" / "raw.json").read_text())["shots"]
+
+
+def test_values_of_twelve_bits_are_no_dark_photos(tmp_path, notices):
+    folder = tmp_path / "room"
+    folder.mkdir()
+    for index in range(4):
+        wide = blocks(48, 64, seed=index)[..., 0].astype(np.uint16) * 16
+        Image.fromarray(wide).save(folder / f"{index}.png")
+    take(folder, tmp_path / "out")
+    (notice,) = notices()
+    assert_facts(notice, "4 pictures", "12 bits", "4095")
+    stored = np.asarray(Image.open(tmp_path / "out" / "frames" / "0.png"))
+    expected = blocks(48, 64)[..., 0].astype(float) * 16 / 4095 * 255
+    assert np.abs(stored[..., 0] - expected).max() <= 0.51
+
+
+def test_panoramas_are_not_taken_for_photos(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 3)
+    xmp = b'<r GPano:ProjectionType="equirectangular"/>'
+    for index in range(3):
+        Image.fromarray(blocks(64, 128, seed=9 + index)).save(
+            folder / f"pano_{index}.jpg", xmp=xmp)
+    assert take(folder, tmp_path / "out").frames == 3
+    assert any("3 360-degree panoramas" in notice for notice in notices())
+    for path in folder.glob("IMG_*"):
+        path.unlink()
+    with pytest.raises(InputError, match="are 360-degree panoramas"):
+        take(folder, tmp_path / "again")
+
+
+def test_poses_and_lists_beside_photos_are_named(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 3)
+    (folder / "bundle.out").write_text("# Bundle file v0.3\n")
+    (folder / "places.txt").write_text("".join(f"IMG_{k:04d}.jpg 1 2 3\n" for k in range(3)))
+    take(folder, tmp_path / "out")
+    assert any("bundle.out is cameras in Bundler's format: its poses are not read" in notice
+               for notice in notices())
+    assert any("places.txt names the photos and is not read" in notice for notice in notices())
+    found = len(notices())
+    take(tuple(sorted(folder.glob("*.jpg"))), tmp_path / "files")
+    assert any("bundle.out" in notice for notice in notices()[found:])
+
+
+def test_masks_beside_given_files_are_named(tmp_path, notices):
+    folder = write_photos(tmp_path / "room", 3)
+    mask_of(folder / "masks", "IMG_0001.png", np.full((48, 64), 255, np.uint8))
+    take(tuple(sorted(folder.glob("*.jpg"))), tmp_path / "out")
+    assert any("masks is not used with files" in notice for notice in notices())
+
+
+def test_a_damaged_record_of_an_earlier_run_is_made_again(tmp_path):
+    light = linear(blocks(96, 128).astype(np.float32))
+    (tmp_path / "room").mkdir()
+    for index in range(3):
+        light = linear(blocks(96, 128, seed=index).astype(np.float32))
+        write_shot(tmp_path / "room" / f"{index}.dng", light, Shot())
+    take(tmp_path / "room", tmp_path / "out")
+    kept = (tmp_path / "out" / "raw.json").read_bytes()
+    for damage in (b"", b"[]", b'{"shots": 5, "broken": {}}'):
+        (tmp_path / "out" / "raw.json").write_bytes(damage)
+        take(tmp_path / "room", tmp_path / "out")
+        assert (tmp_path / "out" / "raw.json").read_bytes() == kept
