@@ -102,7 +102,7 @@ class FrameFolder:
         path = self.root / RECORD
         if not path.exists():
             return None
-        record = read_json(path)
+        record = read_json(path, hint=f"Delete {self.root}.")
         if not isinstance(record, dict) or not isinstance(record.get("settings"), dict) or not (
                 {"digest", "video"} <= record.keys()):
             raise FormatError(
