@@ -102,7 +102,7 @@ class FrameFolder:
         path = self.root / RECORD
         if not path.exists():
             return None
-        record = read_json(path)
+        record = read_json(path, hint=f"Delete {self.root}.")
         if not isinstance(record, dict) or not isinstance(record.get("settings"), dict) or not (
                 {"digest", "video"} <= record.keys()):
             raise FormatError(
@@ -112,6 +112,8 @@ class FrameFolder:
     def _clear(self) -> None:
         """Removes the files of an earlier run; its record stays until there is a new one."""
         for folder in {folder for folders in FOLDERS.values() for folder in folders}:
+            if (self.root / folder).is_symlink():  # it may lead anywhere
+                (self.root / folder).unlink()
             for picture in (self.root / folder).glob("*.png"):
                 picture.unlink()
         for path in (*(self.root / f"{output}.mp4" for output in FOLDERS), self.root / PATH):

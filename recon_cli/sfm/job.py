@@ -268,8 +268,9 @@ class Phase:
     done: int  # those that an interrupted run had done
 
 
-# A number is that of the finished units of the current phase; an error ends the process.
-Event = Phase | int | ReconError | OSError
+# A number is that of the finished units of the current phase, a text a notice for the user; an
+# error ends the process.
+Event = Phase | int | str | ReconError | OSError
 
 
 class Reporter:
@@ -305,6 +306,10 @@ class Reporter:
         """Reports how many units of the phase are done."""
         self._send({"count": count})
 
+    def tell(self, text: str) -> None:
+        """Passes a notice for the user."""
+        self._send({"notice": text})
+
     def fail(self, error: ReconError | OSError) -> None:
         """Passes an error to the parent."""
         if isinstance(error, OSError):
@@ -326,6 +331,8 @@ def parse(line: bytes) -> Event:
         return Phase(value["phase"], value["total"], value["done"])
     if "count" in value:
         return int(value["count"])
+    if "notice" in value:
+        return str(value["notice"])
     if "errno" in value:
         return OSError(value["errno"], value["text"], value["file"])
     return _ERRORS[value["error"]](value["message"], hint=value["hint"])

@@ -5,6 +5,7 @@ Native code can abort, hang or fill the memory; in a process of its own it does 
 
 from __future__ import annotations
 
+import logging
 import queue
 import re
 import signal
@@ -34,6 +35,7 @@ _DOING = {
 _STEP = {"skeleton": "features", "coarse": "matches", "first": "matches", "mapping": "model",
          "joining": "model"}
 LOG = "log.txt"
+logger = logging.getLogger("recon")
 _LOG_TAIL = 64 * 1024  # bytes
 _GLOG = re.compile(r"^[IWEF]\d{8} [\d:.]+ +\d+ \S+\] ")  # severity, time, thread, place in the code
 
@@ -130,7 +132,9 @@ def run_job(
                     raise event
                 if time.monotonic() > deadline:
                     raise _timeout_error(max_minutes, monitor)
-                if event is not None:
+                if isinstance(event, str):
+                    logger.warning("sfm: %s", event)
+                elif event is not None:
                     monitor.show(event)
             try:
                 code = child.wait(timeout=max(1.0, deadline - time.monotonic()))

@@ -161,7 +161,7 @@ def _segment_job(job: MappingJob, index: int, threads: int) -> MappingJob:
         segments=(), split=0, last="model")
     listed = folder / "frames.txt"
     text = "".join(f"{name}\n" for name in names)
-    if not job.split and not (listed.exists() and listed.read_text(encoding="utf-8") == text):
+    if not job.split and not (listed.is_file() and listed.read_bytes() == text.encode()):
         shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     if job.tracks is not None:
@@ -169,7 +169,7 @@ def _segment_job(job: MappingJob, index: int, threads: int) -> MappingJob:
         chosen = {row: name for row, name in enumerate(tracks.names) if name in set(names)}
         segment = dataclasses.replace(segment, tracks=folder / "tracks.safetensors")
         tracks.select(chosen).write(folder / "tracks.safetensors")
-    listed.write_text(text, encoding="utf-8")
+    listed.write_bytes(text.encode())
     return segment
 
 
@@ -209,10 +209,10 @@ def _share(job: MappingJob) -> float:
     if StepLog(job.out).result(job.last) is not None:
         return 1.0
     try:
-        done, total = read_json(job.out / PROGRESS)
-    except FormatError:  # it has not begun
+        done, total = read_json(job.out / PROGRESS, list)
+        return float(done) / float(total)
+    except (FormatError, TypeError, ValueError, ZeroDivisionError):  # it has not begun
         return 0.0
-    return float(done) / float(total)
 
 
 def map_segment(file: Path) -> None:

@@ -112,7 +112,13 @@ def load_skeleton(
     """
     def build() -> list[pycolmap.Reconstruction]:
         report.phase("skeleton", len(job.names))
-        return build_skeleton(job, images or job.database)
+        if images is not None:
+            return build_skeleton(job, images)
+        # Pairs that were matched would count against the model, but not where it is built first.
+        copy = fresh_folder(job.attempts / f"{SKELETON}.partial") / "images.db"
+        shutil.copyfile(replace(job, linked=None).database, copy)
+        database.clear_matches(copy)
+        return build_skeleton(job, copy)
 
     return _load_models(job, SKELETON, build)
 

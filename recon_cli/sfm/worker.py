@@ -63,10 +63,10 @@ def work(job: MappingJob, report: Reporter) -> None:
         "sparse": lambda: undistort.place_model(job),
         "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)
-    _forget_damaged(job, log)
+    rematch = _forget_damaged(job, log, report)
     done = job.last == STEPS[-1] and all(log.result(step) is not None for step in job.steps)
     if "features" in job.steps and not done:  # else nothing reads it any more
-        _prepare_database(job, log)
+        _prepare_database(job, log, report, rematch=rematch)
     for step in job.steps:
         if log.result(step) is not None:
             continue
@@ -83,34 +83,35 @@ def work(job: MappingJob, report: Reporter) -> None:
                    _BESIDES.get(step, ()))
 
 
-def _forget_damaged(job: MappingJob, log: StepLog) -> None:
-    """Forgets finished steps whose files were damaged since, and what builds on them."""
+def _forget_damaged(job: MappingJob, log: StepLog, report: Reporter) -> bool:
+    """Forgets finished steps whose files were damaged since, and what builds on them.
+
+    Returns whether all matches must be found anew.
+    """
     step = log.find_damage()
     if step is not None:
-        _tell(f"files of the step {step} were damaged: it is taken again")
+        report.tell(f"unfinished work is damaged: {step} is made anew")
         log.forget_from(step)
-    if StepLog(job.attempts).find_damage() is not None:
-        _tell("a model was damaged: frames are matched again")
-        shutil.rmtree(job.attempts)
-        if "features" in job.steps and job.database.exists():
-            # later attempts have added pairs, with which the earlier ones would find other models
-            database.clear_matches(job.database)
-            database.seal(job.database)
+    if step == "model" or StepLog(job.attempts).find_damage() is not None:
+        shutil.rmtree(job.attempts, ignore_errors=True)
         log.forget_from("matches")
+        # later attempts may have added pairs, with which the first ones would find other models
+        return True
+    return False
 
 
-def _tell(text: str) -> None:
-    sys.stderr.write(f"{text}\n")  # into the log of the mapping process
-
-
-def _prepare_database(job: MappingJob, log: StepLog) -> None:
+def _prepare_database(
+    job: MappingJob, log: StepLog, report: Reporter, *, rematch: bool
+) -> None:
     """Keeps the database of an interrupted run where it is intact, else starts a new one."""
     sound = database.is_sound(job.database, job.names, len(job.groups))
     damaged = database.keep_sealed(job.database) if sound else "features"
+    if damaged and log.result(damaged) is not None:
+        report.tell(f"unfinished work is damaged: {damaged} are found anew")
     if damaged == "features":
         log.forget_from("features")
         matching.create_database(job)
-    elif damaged:
+    elif damaged or rematch:
         log.forget_from("matches")
         database.clear_matches(job.database)
     for step in ("features", "matches"):

@@ -109,6 +109,13 @@ def find_damage(folder: Path) -> str:
     return ""
 
 
+def remove_links(folder: Path) -> None:
+    """Removes links below a folder of unfinished work: no stage makes any."""
+    for path in _files_below(folder):
+        if path.is_symlink():
+            path.unlink()
+
+
 def crc32(path: Path, size: int | None = None) -> int:
     """Returns the CRC-32 of a file, or of its first `size` bytes."""
     value, left = 0, path.stat().st_size if size is None else size

@@ -193,6 +193,10 @@ def sent(say):
     return parse(line)
 
 
+def test_a_notice_arrives_as_its_text():
+    assert sent(lambda report: report.tell("model is made anew")) == "model is made anew"
+
+
 def test_phases_and_counts_arrive():
     assert sent(lambda report: report.phase("matches", 78, done=3)) == Phase("matches", 78, 3)
     assert sent(lambda report: report.done(5)) == 5

@@ -233,3 +233,13 @@ def test_a_folder_that_cannot_be_renamed_to_another_disk_is_copied_whole(
     assert os.readlink(target / "link") == "nowhere"
     assert not source.exists()
     assert not (tmp_path / ".target.moving").exists()
+
+
+def test_a_link_in_unfinished_work_is_not_followed(workspace: Workspace, thesis: Path) -> None:
+    with workspace.writing("train"):
+        out, first = workspace.begin(KEY, own_digests=True)
+        (out / "model").symlink_to(thesis)
+        again, earlier = workspace.begin(KEY, own_digests=True)
+        assert earlier == first
+        assert list(again.iterdir()) == []
+    assert untouched(thesis)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -36,6 +35,7 @@ from recon_cli.io.splats.sog import (
 from recon_cli.io.splats.values import Floats, UntrustedFile, normalize_quats
 from recon_cli.scene.splats import Splats, joined, with_rows
 from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.layout import remove
 
 LOD_META = "lod-meta.json"
 _VERSION = 1
@@ -71,7 +71,7 @@ def write_lod(
     path.unlink(missing_ok=True)  # first of all, as it names the others
     for other in [*folder.glob("*_*")]:
         if _FOLDER.fullmatch(other.name) and other.is_dir():
-            shutil.rmtree(other)
+            remove(other)
     tree = _Tree.of(levels[0].means.detach().cpu().numpy())
     names: list[str] = []
     for level, splats in enumerate(levels):

@@ -220,7 +220,7 @@ def _without_scipy() -> Iterator[None]:
 def _clear(folder: Path) -> None:
     """Deletes what a folder holds; another process may do so at the same time."""
     for path in folder.iterdir():
-        if path.is_dir():
+        if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
