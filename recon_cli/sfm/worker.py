@@ -29,6 +29,7 @@ from recon_cli.sfm import (
 )
 from recon_cli.sfm.job import LOCK, LOG_FILE, SPLIT, MappingJob, Reporter, Result, StepLog
 from recon_cli.signals import leave_to_parent
+from recon_cli.workspace.disk import find_space_errno
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
@@ -99,6 +100,11 @@ def main() -> None:
             f"Another process is still working in {job.out}.", hint="End it, then run this again."))
     except (ReconError, OSError) as error:
         report.fail(error)
+    except Exception as error:
+        number = find_space_errno(error)  # SQLite in COLMAP tells it in words
+        if number is None:
+            raise
+        report.fail(OSError(number, os.strerror(number)))
 
 
 if __name__ == "__main__":
