@@ -168,7 +168,7 @@ def _known(error: BaseException) -> ReconError | None:
         return ReconstructionError(
             f"There is not enough memory: {error or 'none is free'}.",
             hint="Close other programs, or lower --max-gaussians, --max-size or --frames.")
-    return disk.explain(error, Path.cwd(), "writing")
+    return disk.explain(error, Path.cwd(), "writing") or disk.explain_outside(error)
 
 
 def _signalled(error: BaseException) -> BaseException | None:

@@ -16,7 +16,7 @@ from PIL import Image, UnidentifiedImageError
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
-from recon_cli.io.colmap_library import pycolmap
+from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
@@ -211,7 +211,7 @@ def write_part(
         if lost or not keep[number]:
             model.delete_point3D(number)
     target.mkdir(parents=True)
-    model.write_binary(target)
+    write_model(model, target)
     return int(model.num_points3D())
 
 
@@ -249,7 +249,7 @@ def write_colmap(
     partial = folder.with_name(f".{folder.name}.tmp{os.getpid()}")
     partial.mkdir(parents=True)
     try:
-        model.write_binary(partial)
+        write_model(model, partial)
         if folder.exists():
             folder.rmdir()
         partial.rename(folder)

@@ -17,7 +17,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 
 from recon_cli.errors import SfmError
-from recon_cli.io.colmap_library import pycolmap
+from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import (
     checks,
     database,
@@ -232,7 +232,7 @@ def _try_fallback(
     if candidate is None:
         return MapperAttempt(fallback.name, reason, seconds), None
     (folder / "model").mkdir()
-    candidate.model.write(folder / "model")
+    write_model(candidate.model, folder / "model")
     attempt = MapperAttempt(
         fallback.name, reason, seconds, "", tuple(mapper.list_registered(candidate.model)),
         shortfall(candidate, reachable(job, candidate)), candidate.apart, candidate.rejected,
@@ -269,7 +269,7 @@ def _publish_best(
     check_weak_link(verdict, job.accept_weak)
     atomic.write_json(job.out / VERDICT, verdict.to_json())
     folder = fresh_folder(job.attempts / "sharp")
-    model.write(folder)
+    write_model(model, folder)
     publish(folder, job.model)
     shutil.rmtree(job.attempts)
     return {

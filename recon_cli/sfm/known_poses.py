@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from recon_cli.errors import SfmError
-from recon_cli.io.colmap_library import pycolmap
+from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.records import KnownPoses, read_poses
 from recon_cli.sfm import checks, database, features, mapper, matching
 from recon_cli.sfm.evidence import gather_evidence
@@ -109,7 +109,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         atomic.write_json(job.out / VERDICT, verdict.to_json())
         lines = verdict.lines()
     folder = fresh_folder(job.out / "model.partial")
-    model.write(folder)
+    write_model(model, folder)
     publish(folder, job.model)
     shutil.rmtree(job.attempts, ignore_errors=True)
     return {

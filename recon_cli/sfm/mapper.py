@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.io.colmap_library import pycolmap
+from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
 
@@ -75,7 +75,7 @@ def extend_model(
     not given.
     """
     start, options = fresh_folder(job.attempts / START), _options(job)
-    model.write(start)
+    write_model(model, start)
     if rounds is not None:
         options.ba_global_max_refinements = rounds
     options.multiple_models = False

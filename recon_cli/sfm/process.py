@@ -21,6 +21,7 @@ from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
 from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, parse
+from recon_cli.workspace.disk import refuse_full_disk
 
 _DOING = {
     "features": ("finding features", "frame"),
@@ -129,6 +130,7 @@ def run_job(
         with _start(job, file) as child, monitor:
             for event in _events(child):
                 if isinstance(event, (ReconError, OSError)):
+                    refuse_full_disk(job.out)  # which may be why there is no model
                     raise event
                 if time.monotonic() > deadline:
                     raise _timeout_error(max_minutes, monitor)
@@ -141,6 +143,7 @@ def run_job(
             except subprocess.TimeoutExpired as error:  # native code may hang on its way out
                 raise _timeout_error(max_minutes, monitor) from error
             if code != 0:
+                refuse_full_disk(job.out)
                 raise _crash_error(job.out / LOG, code, monitor)
     except BaseException:
         if monitor.doing != "starting":  # what was found before has been checked

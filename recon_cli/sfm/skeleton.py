@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.io.colmap_library import pycolmap
+from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, is_vouched, publish, vouch
@@ -132,7 +132,7 @@ def _load_models(
         unfinished = fresh_folder(job.attempts / f"{name}.found")
         for index, model in enumerate(build()):
             (unfinished / str(index)).mkdir()
-            model.write(unfinished / str(index))
+            write_model(model, unfinished / str(index))
         publish(unfinished, folder)
         vouch(folder)
     return [pycolmap.Reconstruction(path) for path in sorted(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap import Pinhole
-from recon_cli.io.colmap_library import pycolmap
+from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.io.records import read_poses
 from recon_cli.scene.similarity import Similarity
@@ -47,7 +47,7 @@ def place_model(job: MappingJob) -> Result:
         pinholes={name: _pinhole(image.camera) for name, image in images.items()})
     move_model(model, world.similarity)
     folder = fresh_folder(job.out / "sparse.partial")
-    model.write(folder)
+    write_model(model, folder)
     publish(folder, job.out / "sparse")
     summary = world.summary().to_json()
     atomic.write_json(job.out / WorldSummary.FILE, summary)
@@ -73,7 +73,7 @@ def undistort(job: MappingJob, report: Reporter) -> Result:
     names = sorted(images)
     report.phase("undistorted", len(names))
     work = fresh_folder(job.out / "undistorted.partial")
-    flat = _write_model(job, names[0], work)
+    flat = _write_model(job, model, names[0], work)
     warps = {number: _warp(camera, flat.cameras[number])
              for number, camera in model.cameras.items()}
     masked = {name for name in names if job.masks and (job.masks / name).exists()}
@@ -103,13 +103,16 @@ def undistort(job: MappingJob, report: Reporter) -> Result:
     return {"cameras": cameras}
 
 
-def _write_model(job: MappingJob, name: str, work: Path) -> pycolmap.Reconstruction:
-    """Writes the undistorted model into work/sparse and returns it.
+def _write_model(
+    job: MappingJob, model: pycolmap.Reconstruction, name: str, work: Path
+) -> pycolmap.Reconstruction:
+    """Writes the undistorted `model` into work/sparse and returns it.
 
     COLMAP undistorts images with it, at a fifth of OpenCV's speed; it is given a single one.
     """
     between = work / "between"
     pycolmap.undistort_images(between, job.out / SPARSE, job.frames, [name], num_threads=1)
+    check_model(model, between / SPARSE)
     (between / SPARSE).rename(work / SPARSE)
     shutil.rmtree(between)
     return pycolmap.Reconstruction(work / SPARSE)

@@ -40,6 +40,7 @@ from recon_cli.sfm.job import (
     StepLog,
 )
 from recon_cli.signals import leave_to_parent
+from recon_cli.workspace.disk import find_space_errno
 from recon_cli.workspace.summaries import WorldSummary
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
@@ -144,6 +145,11 @@ def main() -> None:
             f"Another process is still working in {job.out}.", hint="End it, then run this again."))
     except (ReconError, OSError) as error:
         report.fail(error)
+    except Exception as error:
+        number = find_space_errno(error)  # SQLite in COLMAP tells it in words
+        if number is None:
+            raise
+        report.fail(OSError(number, os.strerror(number)))
 
 
 if __name__ == "__main__":

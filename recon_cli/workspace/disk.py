@@ -26,7 +26,6 @@ _WORDS = {
 _OUTSIDE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG, errno.EMFILE,
             errno.ENFILE, errno.ELOOP, errno.ENXIO, errno.ENODEV, errno.ESTALE)
 _PROBE_BYTES = 1 << 20
-_MUCH_BYTES = 1 << 30  # free: it is another disk, or a quota, that is full
 _SHOWN = 200  # characters of a path
 _NO_TEMPORARY = "No usable temporary directory"  # of tempfile
 
@@ -60,10 +59,8 @@ def explain(error: BaseException, root: Path, doing: str) -> ReconError | None:
     number = find_space_errno(error)
     if number in _FULL:
         place = _fullest(root)
-        free = _free(place)
-        left = f": {free / 1e6:.1f} MB free at {place}" if free < _MUCH_BYTES else ""
         return WorkspaceError(
-            f"The disk is full while {doing}{left}.",
+            f"The disk is full while {doing}: {_free(place) / 1e6:.1f} MB free at {place}.",
             hint="Free some space and run the same command again; finished work is kept.")
     if number == errno.EFBIG:  # a limit of the process, or of a file system such as FAT32
         return WorkspaceError(
@@ -73,11 +70,16 @@ def explain(error: BaseException, root: Path, doing: str) -> ReconError | None:
         return WorkspaceError(
             f"No folder for temporary files can be written while {doing}: they are full, or not "
             "writable.", hint="Free some space in /tmp, or set TMPDIR to a folder of yours.")
-    if isinstance(error, OSError) and error.errno in _OUTSIDE and error.filename is not None:
-        return WorkspaceError(
-            f"{str(os.fsdecode(error.filename))[:_SHOWN]} cannot be opened while {doing}: "
-            f"{error.strerror}.", hint="Check its name, its permissions and its disk.")
     return None
+
+
+def explain_outside(error: BaseException) -> ReconError | None:
+    """Returns the error for what is wrong with a path or the system; None for any other."""
+    if not isinstance(error, OSError) or error.errno not in _OUTSIDE or error.filename is None:
+        return None
+    return WorkspaceError(
+        f"{os.fsdecode(error.filename)[:_SHOWN]} cannot be opened: {error.strerror}.",
+        hint="Check its name, its permissions and its disk.")
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:

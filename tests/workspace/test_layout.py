@@ -272,7 +272,7 @@ def test_what_a_dead_holder_left_does_not_lock(workspace: Workspace) -> None:
 
 
 def test_a_full_disk_is_said_with_the_space_left(tmp_path: Path) -> None:
-    said = pytest.raises(WorkspaceError, match=r"full while running train: \d+ MB free")
+    said = pytest.raises(WorkspaceError, match=r"full while running train: [\d.]+ MB free")
     with said, disk_errors(tmp_path, "running train"):
         raise OSError(errno.ENOSPC, "No space left on device")
 
