@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from forked import Finished, Running, start, start_process
 from judge import Outcome, Verdict, broken, clear_error, follow_hint, snapshot, wrong
 from lab import LIMIT, Lab, copy
 from moments import Moments
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -32,6 +36,14 @@ class Case:
     def pick(self, items: Sequence[object], *, stride: int = 1) -> object:
         """Returns an item: all of them come up in turn."""
         return items[self.turn * stride % len(items)]
+
+    def draw(self, items: Iterable[T]) -> T:
+        """Returns an item at random; the same one again where a few others came or went.
+
+        For what an interrupted command left, which differs a little from run to run.
+        """
+        salt = self.rng.random()
+        return min(items, key=lambda item: hashlib.sha256(f"{salt} {item}".encode()).digest())
 
     def workspace(self, source: Path | None = None, *, without: Sequence[str] = ()) -> Path:
         """Returns a copy of a workspace, the finished one unless another is named."""

@@ -40,7 +40,8 @@ def is_volatile(name: str) -> bool:
 
 
 def _files(path: Path) -> list[Path]:
-    return [path] if path.is_file() else [one for one in path.rglob("*") if not one.is_dir()]
+    files = [path] if path.is_file() else [one for one in path.rglob("*") if not one.is_dir()]
+    return [one for one in files if one.name != ".lock"]
 
 
 def _same(name: str, right: Path, workspace: Path, made: Path) -> bool:

@@ -240,6 +240,8 @@ def _become(module: str, words: list[str], environment: dict[str, str] | None) -
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT
                           else signal.SIG_DFL)
+    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them from its start on
+        signal.signal(number, signal.SIG_IGN)
     sys.argv = [module, *words]
     code = 1
     try:

@@ -172,7 +172,7 @@ def owned(verb: str, words: Sequence[str] = ()) -> set[str]:
         "train": {"denoise", "sfm", "train"}, "import": {"train"}, "prune": {"prune"},
         "eval": {"evaluate"}, "export": {"export"}, "run": set(STAGES),
         "render": {"render"}, "report": {"report.html"}, "status": set(), "batch": set(STAGES),
-        "clean": {"sfm", *words}}[verb]
+        "clean": {"sfm", "blocks", "seeds", *words}}[verb]
     return stages | ({"prune"} if "--prune" in words else set())
 
 

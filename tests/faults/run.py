@@ -170,6 +170,8 @@ def main(seed: int, count: int, only: tuple[int, ...], kind: str | None, workers
     os.sched_setaffinity(0, {min(cores)})  # results must be those of one thread, like the faults'
     forked.preload()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # pycolmap would print its stack
+    # A shell lets what it runs in the background ignore Ctrl-C, and all below inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     numbers = list(only) or [number for number, (each, _) in enumerate(schedule(count))
                              if kind in (None, each.name)]

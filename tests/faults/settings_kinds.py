@@ -85,7 +85,7 @@ def camera_path(case: Case) -> Verdict:
         return case.judge_error(done, workspace)
     pictures = list(out.rglob("*.png"))
     try:
-        frames = len(json.loads(path.read_text())["camera_path"])
+        frames = len(json.loads(path.read_text())["camera_path"]) if path.is_file() else -1
     except (ValueError, KeyError, TypeError):
         frames = -1
     if len(pictures) != frames:

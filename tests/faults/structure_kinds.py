@@ -102,8 +102,10 @@ def structure(case: Case) -> Verdict:
     verb = case.rng.choice((
         "status", "clean", "clean", "report", "render",
         *(VERBS[top] if top in STAGES else "train", "train", "eval", "export", "denoise")))
+    if top in (".partial", ".old", "blocks", "seeds") and case.rng.random() < 0.6:
+        verb = "clean"
     words = (*FULL[verb], *((case.rng.choice(STAGES),) if verb == "clean"
-                            and case.rng.random() < 0.4 else ()), "-w", str(workspace))
+                            and case.rng.random() < 0.3 else ()), "-w", str(workspace))
     if top == "recon.toml":  # with other settings it takes minutes
         words = tuple(word for word in words if word != "--again")
     case.tell(f"{place} is {change}, then {' '.join(words)}")
@@ -147,11 +149,13 @@ _NAMES = (
 def manifest_names(case: Case) -> Verdict:
     """A manifest with a valid checksum whose outputs lie elsewhere."""
     outside, workspace = case.outside(), case.workspace()
-    stage = str(case.rng.choice(("sfm", "train", *STAGES)))
+    # Large outputs of sfm that only it reads are what `clean` removes.
+    removed = case.rng.random() < 0.6
+    stage = "sfm" if removed else str(case.rng.choice(STAGES))
     name = str(case.pick(_NAMES)).replace("{outside}", str(outside))
     if name == "model/link":
         (workspace / "sfm" / "model" / "link").symlink_to(outside)
-    how = case.rng.choice(("new", "renamed", "stage", "source"))
+    how = "new" if removed else case.rng.choice(("new", "renamed", "stage", "source"))
 
     def change(content: dict[str, object]) -> None:
         outputs = content["outputs"]
@@ -166,8 +170,9 @@ def manifest_names(case: Case) -> Verdict:
             outputs[name] = large
 
     resign(workspace / stage / "manifest.json", change)
-    verb = case.rng.choice(("clean", "clean", "clean", "status", "report", VERBS[stage], "export"))
-    words = (*FULL[verb], *((stage,) if verb == "clean" and case.rng.random() < 0.3 else ()),
+    verb = "clean" if removed else case.rng.choice(
+        ("clean", "status", "report", VERBS[stage], "export"))
+    words = (*FULL[verb], *((stage,) if verb == "clean" and not removed else ()),
              "-w", str(workspace))
     case.tell(f"the manifest of {stage} names {name[:60]!r} ({how}), then {' '.join(words)}")
     return _judge(case, workspace, verb, words, stage)
