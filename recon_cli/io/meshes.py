@@ -1,11 +1,14 @@
-"""Triangle meshes with colours: .ply, .glb and .obj, and their simplification by COLMAP."""
+"""Triangle meshes with colours: .ply, .glb and .obj, their simplification by COLMAP; points."""
 
 from __future__ import annotations
 
+import json
 import os
+import struct
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -16,6 +19,12 @@ from recon_cli.errors import FormatError
 from recon_cli.workspace.atomic import write_bytes
 
 SUFFIXES = ("ply", "glb", "obj")
+_UNLIT = "KHR_materials_unlit"  # the photos hold the light of the room already
+# Linear light of each sRGB code (IEC 61966-2-1), which glTF wants in COLOR_0, in 16 bits: 8 would
+# merge the dark codes
+_CODES = np.arange(256) / 255
+_LIGHT = np.rint(65535 * np.where(
+    _CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4)).astype(np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +42,47 @@ def write_mesh(path: Path, mesh: Mesh, *, axes: NDArray[np.float64] | None = Non
     `axes` [3, 3] are the axes of the file in those of the mesh, as in `glb.write_glb`.
     """
     vertices = mesh.vertices if axes is None else mesh.vertices @ axes.T
-    kind = path.suffix[1:].lower()
-    whole = trimesh.Trimesh(
-        vertices.astype(np.float32), mesh.faces, vertex_colors=mesh.colors, process=False)
+    kind, places = path.suffix[1:].lower(), vertices.astype(np.float32)
+    if kind == "glb":
+        write_bytes(path, _glb_bytes(places, mesh.faces, mesh.colors))
+        return
+    whole = trimesh.Trimesh(places, mesh.faces, vertex_colors=mesh.colors, process=False)
     data = whole.export(file_type=kind)
     write_bytes(path, data.encode() if isinstance(data, str) else data)
+
+
+def _glb_bytes(
+    vertices: NDArray[np.float32], faces: NDArray[np.int64], colors: NDArray[np.uint8]
+) -> bytes:
+    """Returns a .glb whose colours are shown as they are, without lights.
+
+    trimesh writes colours in 8 bits alone, so they go in as an attribute that is renamed.
+    """
+    opaque = np.full((len(colors), 1), 65535, np.uint16)
+    light = np.concatenate([_LIGHT[colors], opaque], axis=1)
+    whole = trimesh.Trimesh(
+        vertices, faces, vertex_attributes={"_COLOR_0": light}, process=False)
+
+    def add_material(tree: dict[str, Any]) -> None:
+        primitive = tree["meshes"][0]["primitives"][0]
+        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
+        tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] = True
+        primitive["material"] = 0
+        tree["materials"] = [{  # without the extension it is no metal, as the default is
+            "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
+            "extensions": {_UNLIT: {}}}]
+        tree["extensionsUsed"] = [*tree.get("extensionsUsed", ()), _UNLIT]
+
+    data: bytes = trimesh.exchange.gltf.export_glb(
+        trimesh.Scene(whole), tree_postprocessor=add_material)
+    return data
+
+
+def write_point_cloud(
+    path: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]
+) -> None:
+    """Writes points [P, 3] with RGB colours [P, 3] as a .ply, whole or not at all."""
+    write_bytes(path, trimesh.PointCloud(points.astype(np.float32), colors).export(file_type="ply"))
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -47,12 +92,27 @@ def read_mesh(path: Path) -> Mesh:
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        colors = np.asarray(mesh.visual.vertex_colors, np.uint8)[:, :3]
+        colors = (_read_glb_colors(path) if path.suffix.lower() == ".glb" else
+                  np.asarray(mesh.visual.vertex_colors, np.uint8)[:, :3])
     except Exception as error:  # of trimesh and what it calls, of many kinds
         raise FormatError(f"{path} cannot be read as a mesh: {error}.") from error
     if not len(faces) or not np.isfinite(vertices).all() or faces.max() >= len(vertices):
         raise FormatError(f"{path} holds no triangles, or broken ones.")
     return Mesh(vertices, faces, colors)
+
+
+def _read_glb_colors(path: Path) -> NDArray[np.uint8]:
+    """Returns the colours [V, 3] of a .glb as `_glb_bytes` writes it: trimesh rounds to 8 bits."""
+    data = path.read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    tree = json.loads(data[20:20 + length])
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    view = tree["bufferViews"][accessor["bufferView"]]
+    start = 28 + length + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    light = np.frombuffer(data, "<u2", 4 * accessor["count"], start).reshape(-1, 4)[:, :3]
+    after = np.searchsorted(_LIGHT, light).clip(1, 255)
+    below = light - _LIGHT[after - 1].astype(int) < _LIGHT[after].astype(int) - light
+    return np.asarray(after - below, np.uint8)
 
 
 def simplify(

@@ -42,6 +42,32 @@ def test_a_glb_is_in_the_axes_of_gltf(tmp_path):
     assert np.allclose(read_mesh(tmp_path / "mesh.glb").vertices, ball().vertices @ Z_UP.T)
 
 
+def test_a_glb_holds_linear_colours_that_no_light_changes(tmp_path):
+    faces = np.array([[i, i + 1, i + 2] for i in range(0, 255, 3)])
+    codes = np.arange(256).repeat(3).reshape(-1, 3).astype(np.uint8)
+    codes[:, 1] = codes[::-1, 1]
+    places = np.random.default_rng(0).normal(size=(256, 3))
+    write_mesh(tmp_path / "mesh.glb", Mesh(places, faces, codes))
+    data = (tmp_path / "mesh.glb").read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    gltf = json.loads(data[20:20 + length])
+    primitive = gltf["meshes"][0]["primitives"][0]
+    accessor = gltf["accessors"][primitive["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (
+        5123, "VEC4", True)
+    start = gltf["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    stored = np.frombuffer(data, "<u2", 4 * 256, 28 + length + start).reshape(-1, 4) / 65535
+    share = codes / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    assert np.abs(stored[:, :3] - linear).max() <= 0.5 / 65535 + 1e-9
+    assert (stored[:, 3] == 1).all()
+    material = gltf["materials"][primitive["material"]]
+    assert material["extensions"] == {"KHR_materials_unlit": {}}
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
+    assert gltf["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert np.array_equal(read_mesh(tmp_path / "mesh.glb").colors, codes)  # dark ones, too
+
+
 @pytest.mark.parametrize("content", [b"", b"ply\n", b"glTF" + bytes(40), b"v 1 2\nf 1 2 9\n"])
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_damaged_mesh_is_refused(content, suffix, tmp_path):
