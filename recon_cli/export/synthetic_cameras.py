@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
 from recon_cli.evaluation.reference_views import render_view
+from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
@@ -19,6 +20,8 @@ from recon_cli.scene.splats import Splats
 CAMERAS_AROUND = 4  # cameras outside, and as many inside
 _BULK = 0.9  # of the opaque Gaussians lie within the radius; far ones behind windows do not count
 _OPAQUE = 0.5
+_WIDTHS = 3.0  # standard deviations that a radius has at least: centres alone may all be one
+_LEAST_RADIUS = NEAR  # else what is in the middle is too near to be drawn
 _DISTANCE = 2.5  # radii: the bulk and some space around it fill a field of view of 60 degrees
 _HEIGHT = 0.6  # radii, of the cameras outside
 _INSIDE = 0.6  # radii from the middle, within which the emptiest position is searched
@@ -40,9 +43,12 @@ def synthetic_scene(splats: Splats, *, z_up: bool, max_size: int) -> Scene:
     longest side in pixels.
     """
     opaque = splats.opacities >= _OPAQUE
-    means = splats.means[opaque if bool(opaque.any()) else ~opaque].double().cpu().numpy()
+    shown = opaque if bool(opaque.any()) else ~opaque
+    means = splats.means[shown].double().cpu().numpy()
     middle = np.median(means, axis=0)
-    radius = max(float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK)), 1e-3)
+    radius = max(
+        float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK)),
+        _WIDTHS * float(splats.scales[shown].amax(dim=1).double().median()), _LEAST_RADIUS)
     up = np.array([0.0, 0, 1] if z_up else [0.0, -1, 0])
     x_axis = np.array([1.0, 0, 0])
     y_axis = np.cross(up, x_axis)

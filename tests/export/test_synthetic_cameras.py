@@ -30,6 +30,12 @@ def shell(radius=2.0, n=1500):
     return radius * ways / np.linalg.norm(ways, axis=1, keepdims=True)
 
 
+@pytest.mark.parametrize("scale", [1e-4, 0.1, 20.0])
+def test_one_gaussian_of_any_size_is_seen(scale):
+    one = gaussians([[3.0, 0, 0]], scale=scale)
+    SelfPsnr.of(one, synthetic_scene(one, z_up=True, max_size=48), CONTEXT)
+
+
 def center(view):
     return view.camera.center
 
