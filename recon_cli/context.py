@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from recon_cli.progress import NullProgress, Progress
 
@@ -116,6 +116,17 @@ def _leave_idle() -> None:
 
 
 @dataclass(frozen=True)
+class EarlierResult:
+    """The finished result that a stage replaces, of one that keeps what it does not write again."""
+
+    folder: Path
+    summary: Mapping[str, Any]  # that the stage returned then; empty where that is not known
+    changed: frozenset[str] = frozenset()  # relative paths of files that were changed by hand
+    missing: frozenset[str] = frozenset()  # of those that were removed
+    foreign: frozenset[str] = frozenset()  # of those that the stage did not write
+
+
+@dataclass(frozen=True)
 class StageInputs:
     """What a stage may read."""
 
@@ -123,6 +134,9 @@ class StageInputs:
     folders: Mapping[str, Path] = field(default_factory=dict)
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
     continues: Path | None = None  # finished result of the stage itself that the run goes on from
+    digests: Mapping[str, str] = field(default_factory=dict)  # of what each of `folders` holds
+    earlier: EarlierResult | None = None  # only of stages that add to it
+    again: bool = False  # files that are up to date are written again as well
 
 
 @dataclass(frozen=True)

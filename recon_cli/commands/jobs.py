@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from recon_cli.pipeline.plan import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress, format_duration
 from recon_cli.stages import IMPORT, STAGES, Stage
 from recon_cli.workspace.layout import Workspace
+
+logger = logging.getLogger("recon")
 
 
 def run_stages(
@@ -91,14 +94,28 @@ def report_outcome(outcome: Outcome) -> None:
         summary = ": ".join(filter(None, [outcome.stage, summary_text(run.summary)]))
         click.echo(f"{summary} ({format_duration(run.seconds)})")
     else:
-        click.echo(f"{outcome.stage} is up to date")
+        record = outcome.manifest.run.summary
+        click.echo(": ".join(filter(None, [
+            f"{outcome.stage} is up to date", ", ".join(_fresh_files(record))])))
+        for notice in record.get("notices") or ():
+            logger.warning("%s", notice)
+
+
+def _fresh_files(summary: Mapping[str, Any]) -> list[str]:
+    """Returns the names of an export's files that are up to date; none of another stage."""
+    files = summary.get("files") or {}
+    if not files:
+        return []
+    return [summary["file"], *(one["file"] for one in files.values() if not one.get("stale"))]
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
     """Returns a stage's summary on one line: numbers and words, no lists, nothing that is empty."""
-    return ", ".join(
+    parts = [
         f"{name.replace('_', ' ')} {_value_text(value)}" for name, value in summary.items()
-        if value is not None and value != "" and not isinstance(value, (list, dict)))
+        if value is not None and value != "" and not isinstance(value, (list, dict))]
+    others = _fresh_files(summary)[1:]
+    return ", ".join([*parts, f"also {', '.join(others)}"] if others else parts)
 
 
 def _value_text(value: object) -> str:

@@ -27,6 +27,8 @@ class OptionInfo:
     minimum: float | None = None
     maximum: float | None = None
     hashed: bool = True  # the field affects the result, and so the fingerprint of its stage
+    # it decides on some files of its stage alone: their records are compared, not the fingerprint
+    per_file: bool = False
     expert: bool = False  # --help leaves it to --help-all
     # help of each choice that gets a flag of its own in place of one option: --force
     flags: Mapping[str, str] = field(default_factory=dict)
@@ -120,6 +122,12 @@ class StageConfig:
         return ConfigError(
             f"{name} is {value!r}, but it must be {needed}.",
             hint=f"Change --{name.replace('_', '-')} or {name} in recon.toml.")
+
+    @classmethod
+    def per_file_fields(cls) -> tuple[str, ...]:
+        """Returns the fields that decide on some files of the stage alone."""
+        return tuple(
+            item.name for item in dataclasses.fields(cls) if option_info(item).per_file)
 
     def hashed_fields(self) -> dict[str, Any]:
         """Returns the fields that affect the result, for the fingerprint; a tuple as a list."""

@@ -254,6 +254,16 @@ class RunConfig(TrainConfig):
     sh_degree: int = option(3, "Degree of the spherical harmonics.", minimum=0, maximum=3)
     max_gaussians: int = option(60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
 
+    @property
+    def is_reference(self) -> bool:
+        """Whether this is the recipe of 3DGS (Kerbl et al. 2023), whatever the steps and images."""
+        fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
+                 "densify_scale", "min_opacity", "means_rate", "quats_rate", "scales_rate",
+                 "opacities_rate", "sh_rate")
+        return self.densify == "reference" and all(
+            getattr(self, part) == "off" for part in ("far", "stereo", "exposure", "poses")) and (
+            all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
+
 
 # Those that beat a random choice, and the paper's; `train.importance` knows more. docs/pruning.md
 PRUNE_SCORES = ("loo", "blend_max", "paper")
@@ -370,18 +380,20 @@ class ExportConfig(StageConfig):
         "Gaussian from where it is seen best.")
     format: str = option(
         "ply", "Formats besides the .ply, with commas between or repeated: "
-        f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...", repeatable=True)
+        f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...", repeatable=True,
+        per_file=True)
     max_loss: float | None = option(
         None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
-        automatic="0.3; 3 for .splat, which has no harmonics")
+        per_file=True, automatic="0.3; 3 for .splat, which has no harmonics")
     max_triangles: int = option(
-        300_000, "Maximum number of triangles of a mesh.", minimum=4)
+        300_000, "Maximum number of triangles of a mesh.", minimum=4, per_file=True)
     voxel: float | None = option(
         None, "Side of the voxels that a mesh is made in, in units of the exported scene.",
-        minimum=0.0, automatic="1/128 of the median depth; 2 cm in a room", expert=True)
+        minimum=0.0, per_file=True, expert=True,
+        automatic="1/128 of the median depth; 2 cm in a room")
     spz_version: int = option(
         3, "Version of .spz: 3 is what most programs read; 2 is for older ones, with coarser "
-        "rotations; 4 uses zstd.", minimum=2, maximum=4, expert=True)
+        "rotations; 4 uses zstd.", minimum=2, maximum=4, per_file=True, expert=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -28,6 +28,7 @@ from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.images import fit_camera
+from recon_cli.io.meshes import write_point_cloud
 from recon_cli.io.ply import write_ply, write_points
 from recon_cli.io.records import ImportRecord, has_views, read_frame_list
 from recon_cli.io.splats.compressed_ply import write_compressed_ply
@@ -45,12 +46,10 @@ from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.train_data import load_views, read_config
-from recon_cli.workspace.summaries import ExportChange, ExportedFile
+from recon_cli.workspace.export_record import ExportChange, ExportedFile, max_loss_db
 
-# dB on the validation views, unless --max-loss is given; .splat has no harmonics
-MAX_LOSS_DB = {"splat": 3.0}
-_MAX_LOSS_DB = 0.3
 _IMAGES = "images"
+_SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
 _COLOR_SIZE, _COLOR_VIEWS = 400, 100  # pixels and views, at most, that colours are fitted to
 _ROUNDING_VIEWS = 32  # at most, whose mean colour the rounding of a .compressed.ply leaves alone
 _SCORE = "loo"  # which Gaussians --max-mb keeps; docs/pruning.md
@@ -115,11 +114,9 @@ class Exporter:
             "transforms.json": self._write_transforms,
             **{mesh: partial(self._write_mesh, mesh) for mesh in MESH_FORMATS}}
         if name in others:
-            return ExportedFile(file=others[name](splats).name)
+            return ExportedFile(file=others[name](splats).relative_to(self._out).as_posix())
         path = scene_file(self._out, name)
-        max_loss = self._config.max_loss
-        if max_loss is None:
-            max_loss = MAX_LOSS_DB.get(name, _MAX_LOSS_DB)
+        max_loss = max_loss_db(name, dataclasses.asdict(self._config))
         gain = self._write_format(name, path, splats, max_loss)
         size, whole = _size(path), (self._out / "splats.ply").stat().st_size
         text = f"{name}: {whole / size:.1f}x smaller, {gain:+.2f} dB"
@@ -231,7 +228,7 @@ class Exporter:
         return path
 
     def _write_colmap(self, _: Splats) -> Path:
-        path, scene = self._out / "colmap", self._scene
+        path, scene = self._out / "sparse" / "0", self._scene
         shutil.rmtree(path, ignore_errors=True)  # of a run that was killed
         write_colmap(path, self._copy_images(), self._similarity.points(scene.points), scene.colors)
         return path
@@ -239,8 +236,13 @@ class Exporter:
     def _write_transforms(self, _: Splats) -> Path:
         path = self._out / "transforms.json"
         views = [(f"{_IMAGES}/{name}", camera) for name, camera in self._copy_images()]
+        scene, points = self._scene, None
+        if len(scene.points):
+            points = _SPARSE
+            write_point_cloud(
+                self._out / points, self._similarity.points(scene.points), scene.colors)
         write_transforms(
-            path, views, held_out={f"{_IMAGES}/{view.name}" for view in self._scene.test})
+            path, views, held_out={f"{_IMAGES}/{view.name}" for view in scene.test}, points=points)
         return path
 
     def _write_mesh(self, name: str, splats: Splats) -> Path:

@@ -15,7 +15,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.prune_loop import survivors
-from recon_cli.workspace.summaries import ExportChange
+from recon_cli.workspace.export_record import ExportChange
 
 Box = tuple[float, float, float, float, float, float]  # x, y, z of the lowest corner, the highest
 

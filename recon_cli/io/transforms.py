@@ -402,14 +402,16 @@ def _read_points(
 
 
 def write_transforms(
-    path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = ()
+    path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = (),
+    points: str | None = None,
 ) -> None:
     """Writes the cameras of images, by paths below the folder of the file, whole or not at all.
 
     Intrinsics that all cameras share are written once. With held-out paths the lists
     train_filenames, val_filenames and test_filenames are written; the last two are those images,
-    because nerfstudio requires both. InputError if there are no views; ValueError if a path leaves
-    the folder, appears twice, or is held out but no view.
+    because nerfstudio requires both. `points` is the name of a point cloud beside the file, in the
+    same world, where nerfstudio starts Gaussians. InputError if there are no views; ValueError if
+    a path leaves the folder, appears twice, or is held out but no view.
     """
     if not views:
         raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
@@ -422,6 +424,8 @@ def write_transforms(
     inner = [_intrinsics(camera) for _, camera in views]
     shared = all(intrinsics == inner[0] for intrinsics in inner)
     value: dict[str, Any] = {"camera_model": "PINHOLE", **(inner[0] if shared else {})}
+    if points is not None:
+        value["ply_file_path"] = points
     if held_out:
         test = [name for name in names if name in held_out]
         value |= {"train_filenames": [name for name in names if name not in held_out],

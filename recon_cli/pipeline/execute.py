@@ -17,15 +17,23 @@ from recon_cli import machine
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.context import SINGLE_PROCESS, ProcessGroup, StageContext, StageInputs, TrainCallback
+from recon_cli.context import (
+    SINGLE_PROCESS,
+    EarlierResult,
+    ProcessGroup,
+    StageContext,
+    StageInputs,
+    TrainCallback,
+)
 from recon_cli.errors import BackendError, ConfigError, ManifestError, ReconError
 from recon_cli.lazy import load
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.stages import STAGES, Stage
-from recon_cli.workspace.digests import Source, digest_outputs, read_source
+from recon_cli.workspace.digests import Source, digest_file, digest_outputs, read_source
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.manifest import NAME as MANIFEST
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, RunRecord
 from recon_cli.workspace.summaries import JsonRecord
 
@@ -65,7 +73,7 @@ class Job:
 
 def run_stage(
     job: Job, checks: WorkspaceCheck, row: Stage, config: StageConfig,
-    sources: tuple[Source, ...] | None = None, *, start: Start = Start.AUTO,
+    sources: tuple[Source, ...] | None = None, *, start: Start = Start.AUTO, again: bool = False,
 ) -> Manifest:
     """Runs a stage whose needs are fresh and returns its manifest; no `sources` are the last ones.
 
@@ -81,7 +89,11 @@ def run_stage(
     inputs = StageInputs(
         {name: workspace.folder(name) for name, digest in key.upstream.items() if digest},
         tuple(Path(source.path) for source in sources),
-        workspace.folder(row.name) if key.continues else None)
+        workspace.folder(row.name) if key.continues else None,
+        {name: digest for name, digest in key.upstream.items() if digest},
+        _find_earlier(workspace, row) if row.adds else None, again)
+    if row.adds:  # unfinished work may hold links to the files of the last result
+        workspace.discard(row.name)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key)
     with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):
@@ -90,7 +102,7 @@ def run_stage(
         with importing_ahead(job) as on_idle:
             summary: JsonRecord = run_it(
                 config, inputs, out, dataclasses.replace(ctx, on_idle=on_idle))
-    outputs = workspace.seal(row.name)
+    outputs = workspace.seal(row.name, without=summary.not_recorded())
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
         peak_memory_bytes=meter.peak_memory_bytes, summary=summary.to_json(),
@@ -101,6 +113,26 @@ def run_stage(
     workspace.commit(manifest)
     logger.debug("%s: finished in %.1f s", row.name, run.seconds)
     return manifest
+
+
+def _find_earlier(workspace: Workspace, row: Stage) -> EarlierResult | None:
+    """Returns the result that a stage adds to; what it held is not known by a damaged manifest."""
+    folder = workspace.folder(row.name)
+    try:
+        finished = workspace.manifest(row.name)
+    except ManifestError:
+        return EarlierResult(folder, {})
+    if finished is None:
+        return None
+    present = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")
+               if path.is_symlink() or not path.is_dir()}
+    changed = {name for name, path in present.items()
+               if (known := finished.outputs.get(name)) is not None
+               and (not path.is_file() or digest_file(path, known).sha256 != known.sha256)}
+    return EarlierResult(
+        folder, finished.run.summary, frozenset(changed),
+        frozenset(finished.outputs.keys() - present.keys()),
+        frozenset(present.keys() - finished.outputs.keys() - {MANIFEST}))
 
 
 @contextmanager

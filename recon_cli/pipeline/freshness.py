@@ -148,7 +148,9 @@ class WorkspaceCheck:
         reasons = [
             f"{check.row.name} is stale" for check in needs if check.manifest and not check.fresh]
         expected = self._current_key(row, config, manifest.key, sources)
-        reasons += differences(manifest.key, expected, section=layers.section_of(row.config))
+        reasons += differences(
+            manifest.key, expected, section=layers.section_of(row.config),
+            without=row.config.per_file_fields())
         reasons += find_changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)
         try:  # another version may have written another record
             summary = row.summary.from_json(manifest.run.summary)

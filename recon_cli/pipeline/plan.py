@@ -112,7 +112,17 @@ def run(
                 for outcome in _bring_up_to_date(job, target, again=again):
                     job.report(outcome)
                     outcomes.append(outcome)
+        for outcome in outcomes:
+            _raise_failure(job, outcome)
     return tuple(outcomes)
+
+
+def _raise_failure(job: Job, outcome: Outcome) -> None:
+    """Raises what a stage that has run did not achieve, though its result is worth keeping."""
+    row = next(row for row in job.table if row.name == outcome.stage)
+    failure = row.summary.from_json(outcome.manifest.run.summary).failure()
+    if outcome.ran and failure is not None:
+        raise failure
 
 
 def run_needs(job: Job, verb: str, stage: str) -> None:
@@ -224,7 +234,8 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         fresh = None if again else _find_fresh(job, checks, target, sources)
     if fresh is None:
         start = Start.ANEW if again and target.start is Start.AUTO else target.start
-        manifest = run_stage(job, checks, row, target.config, sources, start=start)
+        manifest = run_stage(
+            job, checks, row, target.config, sources, start=start, again=again)
         yield Outcome(row.name, manifest, ran=True)
     else:
         yield Outcome(row.name, fresh, ran=False)

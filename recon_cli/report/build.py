@@ -39,8 +39,8 @@ from recon_cli.report.stage_status import (
 )
 from recon_cli.report.trust_section import read_trust
 from recon_cli.workspace import atomic
+from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.layout import disk_errors
-from recon_cli.workspace.summaries import ExportSummary
 
 FILE = "report.html"
 _SUFFIXES = (".html", ".htm")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
+from recon_cli.config.stages import PLAN
 from recon_cli.errors import FormatError
 from recon_cli.export.mesh.files import MEASURES
 from recon_cli.report.stage_status import StageReport
@@ -41,7 +42,10 @@ def read_room(export: StageReport) -> Room | None:
                 f"{wall['value']:.2f} ± {max(wall['error'], 0.01):.2f} m"
                 for wall in value["walls"])))
         notes = [str(note) for note in value["notes"]]
-        drawing = (export.folder / "plan.svg").read_bytes()
+        stale = export.summary.get("files", {}).get(PLAN, {}).get("stale")
+        if stale:
+            notes.insert(0, f"These measures are stale: {stale}")
+        drawing = (export.folder / PLAN).read_bytes()
     except (FormatError, OSError, KeyError, TypeError, ValueError) as error:
         return Room((), (f"The measures are not shown: {error}",), None)
     plan = None

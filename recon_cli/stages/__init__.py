@@ -20,10 +20,10 @@ from recon_cli.config.stages import (
     SfmConfig,
     TrainConfig,
 )
+from recon_cli.workspace import export_record
 from recon_cli.workspace.summaries import (
     DenoiseSummary,
     EvaluateSummary,
-    ExportSummary,
     ImportSummary,
     IngestSummary,
     JsonRecord,
@@ -52,6 +52,7 @@ class Stage:
     renders: bool = False  # it needs a rasterizer, and so torch and a device
     takes: str = ""  # input from the user, as in usage; empty for stages that only read others
     spares: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
+    adds: bool = False  # it keeps the files of its last result that it does not write again
 
 
 STAGES: tuple[Stage, ...] = (
@@ -67,10 +68,10 @@ STAGES: tuple[Stage, ...] = (
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig,
-          EvaluateSummary, 2, False, "recon_cli.stages.evaluate", renders=True),
+          EvaluateSummary, 3, False, "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
-          ExportSummary, 4, False, "recon_cli.stages.export", renders=True,
-          spares=("ingest", "sfm")))
+          export_record.ExportSummary, export_record.VERSION, False, "recon_cli.stages.export",
+          renders=True, spares=("ingest", "sfm"), adds=True))
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, takes="FILE")

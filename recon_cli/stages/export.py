@@ -7,6 +7,8 @@ exported one.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +16,19 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import MESH_FORMATS, PLAN, ExportConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import StageError
+from recon_cli.errors import ReconError, StageError, WorkspaceError
 from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.export.bounds import describe_bounds
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
 from recon_cli.export.exporter import Exporter
+from recon_cli.export.kept_files import (
+    KeptFiles,
+    discard_files,
+    find_fresh,
+    keep_files,
+    made_of,
+    read_records,
+)
 from recon_cli.export.verify import verify_ply
 from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
@@ -26,14 +37,19 @@ from recon_cli.train.train_data import read_config
 from recon_cli.trust.ply_property import PLY_PROPERTY, expected_errors, match_rows
 from recon_cli.trust.scene_trust import measure_trust, refuse_without, views_looked_at
 from recon_cli.workspace.atomic import write_json
-from recon_cli.workspace.summaries import ExportSummary
+from recon_cli.workspace.export_record import (
+    ExportedFile,
+    ExportSummary,
+    FailedFormat,
+    limited_format,
+)
 
 TRANSFORM = "transform.json"
 _VIEW_FORMATS = ("colmap", "transforms.json", *MESH_FORMATS)  # made of views
 
 
 def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> ExportSummary:
-    """Writes splats.ply, the other formats and transform.json."""
+    """Writes splats.ply, transform.json and the other formats; what is there already is kept."""
     if config.model == "pruned" and "prune" not in inputs.folders:
         raise StageError(
             "The pruned model was requested, but there is no fresh one.",
@@ -47,24 +63,62 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     trained = splats
     if not frame.similarity.is_identity:
         splats = transformed(splats, frame.similarity)
+    model = "pruned" if pruned else "base"
+    records = read_records(config, inputs, model)
+    fresh = find_fresh(config, inputs, records)
     exporter = Exporter(config, inputs, out, frame, ctx)
     splats, changes = exporter.reduce(splats)
+    far = describe_bounds(splats)
+    if far:
+        ctx.notice(far)
     path = out / "splats.ply"
-    others = [name for name in config.formats if name != "ply"]
+    others = [name for name in config.formats if name != "ply" and name not in fresh]
     with ctx.progress.bar("export", 2 + len(others), unit="file") as bar:
         write_ply(path, splats, _expected_errors(config, inputs, frame, splats, trained, ctx))
         bar.advance()
         verify_ply(path, splats)
         bar.advance()
-        files = {}
-        for name in others:
-            files[name] = exporter.write(name, splats)
-            bar.advance()
+        files, failed = _write_formats(others, exporter, out, splats, bar.advance)
     _write_transform(out / TRANSFORM, frame)
+    files = {name: dataclasses.replace(file, made_of=made_of(name, config, inputs, model))
+             for name, file in files.items()}
+    kept = keep_files(out, inputs.earlier, records, ["ply", *files])
+    notices = _notices(kept)
+    for text in notices:
+        ctx.notice(text)
     return ExportSummary(
-        model="pruned" if pruned else "base", file=path.name, gaussians=len(splats),
+        model=model, file=path.name, gaussians=len(splats),
         bytes=path.stat().st_size, transform=frame.similarity.to_json(),
-        changes=tuple(changes) or None, files=files or None)
+        changes=tuple(changes) or None, files={**files, **kept.files} or None,
+        limited=limited_format(dataclasses.asdict(config)), failed=failed or None,
+        own_files=kept.own_files or None, notices=notices or None)
+
+
+def _write_formats(
+    names: Sequence[str], exporter: Exporter, out: Path, splats: Splats, advance: Callable[[], None]
+) -> tuple[dict[str, ExportedFile], dict[str, FailedFormat]]:
+    """Writes the scene in each format; one that fails takes nothing from the others."""
+    files: dict[str, ExportedFile] = {}
+    failed: dict[str, FailedFormat] = {}
+    for name in names:
+        try:
+            files[name] = exporter.write(name, splats)
+        except WorkspaceError:
+            raise
+        except ReconError as error:
+            discard_files(out, name, ["ply", *files])
+            failed[name] = FailedFormat(message=error.message, hint=error.hint)
+        advance()
+    return files, failed
+
+
+def _notices(kept: KeptFiles) -> tuple[str, ...]:
+    """Returns what the user should know of the files that are kept."""
+    return (
+        *(f"{file.file} is stale: {file.stale}. It is kept; --format {name} writes it again."
+          for name, file in kept.files.items() if file.stale),
+        *(f"{old} was not written by recon, or changed since: it is kept as {new}."
+          for old, new in kept.renamed.items()))
 
 
 def _expected_errors(

@@ -14,7 +14,7 @@ import logging
 import os
 import shutil
 import socket
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -124,14 +124,20 @@ class Workspace:
         remove(self._record(stage))
         remove(self.partial(stage))
 
-    def seal(self, stage: str) -> dict[str, FileDigest]:
-        """Flushes what a stage wrote and returns the digest of every file, by relative path."""
+    def seal(self, stage: str, *, without: Collection[str] = ()) -> dict[str, FileDigest]:
+        """Flushes what a stage wrote and returns the digest of every file, by relative path.
+
+        Files `without` are in its folder, but not of its making.
+        """
         folder = self.partial(stage)
         outputs = {}
         for path in sorted(folder.rglob("*")):
+            name = path.relative_to(folder).as_posix()
+            if name in without:
+                continue
             _flush(path)
             if path.is_file():
-                outputs[path.relative_to(folder).as_posix()] = digest_file(path)
+                outputs[name] = digest_file(path)
         return outputs
 
     def commit(self, finished: Manifest) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -149,13 +149,20 @@ class PartialRun:
             return None
 
 
-def differences(old: ResultKey, new: ResultKey, *, section: str) -> list[str]:
-    """Returns in words how the key of a result differs from the one that a run would have now."""
+def differences(
+    old: ResultKey, new: ResultKey, *, section: str, without: Collection[str] = ()
+) -> list[str]:
+    """Returns in words how the key of a result differs from the one that a run would have now.
+
+    Options `without` are not compared.
+    """
     reasons = []
     if old.version != new.version:
         reasons.append(f"stage version {old.version} -> {new.version}")
     for name in [*new.config, *(name for name in old.config if name not in new.config)]:
         before, after = old.config.get(name), new.config.get(name)
+        if name in without:
+            continue
         if name not in old.config:
             reasons.append(f"option {section}.{name} is new")
         elif name not in new.config:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from recon_cli.errors import ManifestError
+from recon_cli.errors import ManifestError, ReconError
 from recon_cli.workspace.atomic import read_json
 
 _SCALARS: Mapping[Any, tuple[type, ...]] = {
@@ -30,6 +30,14 @@ class JsonRecord:
     def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG002
         """Returns why `options` that take no part in the fingerprint would give another result."""
         return ()
+
+    def not_recorded(self) -> tuple[str, ...]:
+        """Returns the files in the folder of the result that are not of the stage's making."""
+        return ()
+
+    def failure(self) -> ReconError | None:
+        """Returns what the user asked for and did not get, though the result is worth keeping."""
+        return None
 
     def to_json(self) -> dict[str, Any]:
         """Returns JSON values that `from_json` reads; tuples become lists."""
@@ -408,38 +416,3 @@ class MergeSummary(JsonRecord):
     # their PSNR less that of the best block that trained beside them, mean and least
     seam_change_db: float | None = None
     worst_seam_db: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportChange(JsonRecord):
-    """What an option of export removed."""
-
-    option: str
-    gaussians: int
-    gaussians_before: int
-    degree: int  # of the spherical harmonics
-    degree_before: int
-    psnr_change_db: float  # on the views that the export is checked on
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportedFile(JsonRecord):
-    """A file or folder beside the exported .ply."""
-
-    file: str  # name
-    bytes: int | None = None  # None, as the next two, for cameras and points
-    smaller: float | None = None  # size of the .ply over its size
-    psnr_change_db: float | None = None  # on the views that the export is checked on
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportSummary(JsonRecord):
-    """What export wrote."""
-
-    model: str  # base or pruned
-    file: str  # name of the .ply
-    gaussians: int
-    bytes: int  # of the .ply
-    transform: Mapping[str, Any]  # similarity from the world of the training to the files
-    changes: tuple[ExportChange, ...] | None = None  # by options, in order
-    files: Mapping[str, ExportedFile] | None = None  # the other formats by name

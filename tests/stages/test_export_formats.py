@@ -15,12 +15,12 @@ from recon_cli.config.stages import EXPORT_FORMATS as EVERY_FORMAT
 from recon_cli.config.stages import PLAN, ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError, StageError
-from recon_cli.export import exporter
 from recon_cli.io.colmap import read_images
 from recon_cli.io.ply import read_ply, read_ply_points, write_ply
 from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS
 from recon_cli.stages import export
+from recon_cli.workspace.export_record import MAX_LOSS_DB
 
 EXPORT_FORMATS = [name for name in EVERY_FORMAT if name != PLAN]  # the tiny scene has no scale
 
@@ -55,13 +55,13 @@ def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported):
         size = sum(file.stat().st_size for file in files)
         assert told.bytes == size
         assert told.smaller == pytest.approx(ply.stat().st_size / size, abs=1e-3)
-        assert -exporter.MAX_LOSS_DB.get(name, 0.3) <= told.psnr_change_db < 0.3, name
+        assert -MAX_LOSS_DB.get(name, 0.3) <= told.psnr_change_db < 0.3, name
     assert abs(summary.files["glb"].psnr_change_db) < 1e-3  # it keeps every value
 
 
 def test_cameras_are_those_of_the_scene(exported, inputs):
     out, _ = exported
-    found = {name: viewmat for name, _, viewmat in read_images(out / "colmap" / "images.bin")}
+    found = {name: viewmat for name, _, viewmat in read_images(out / "sparse" / "0" / "images.bin")}
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
     for name, _, viewmat in read_images(sparse / "images.bin"):
         assert np.allclose(found[name], viewmat, atol=1e-12)
@@ -87,7 +87,7 @@ def test_an_export_that_was_killed_goes_on_over_what_it_left(inputs, tmp_path):
     before = {path.relative_to(tmp_path): path.read_bytes()
               for path in tmp_path.rglob("*") if path.is_file()}
     (tmp_path / "transforms.json").unlink()
-    (tmp_path / "colmap" / "images.bin").unlink()
+    (tmp_path / "sparse" / "0" / "images.bin").unlink()
     export.run(config, inputs, tmp_path, CONTEXT)
     assert before == {path.relative_to(tmp_path): path.read_bytes()
                       for path in tmp_path.rglob("*") if path.is_file()}
@@ -123,10 +123,16 @@ def test_a_format_that_loses_more_than_it_may_is_refused(inputs, tmp_path, monke
         return splats
 
     monkeypatch.setitem(FORMATS, "spz", SplatFormat("spz", darker, real.write))
-    with pytest.raises(ReconstructionError, match=r"may lose 0\.3 dB") as caught:
-        export.run(ExportConfig(format="spz"), inputs, tmp_path, CONTEXT)
-    assert "--max-loss" in caught.value.hint
-    export.run(ExportConfig(format="spz", max_loss=100.0), inputs, tmp_path, CONTEXT)
+    summary = export.run(ExportConfig(format="spz,glb"), inputs, tmp_path, CONTEXT)
+    assert set(summary.files) == {"glb"}
+    assert not (tmp_path / "splats.spz").exists()
+    error = summary.failure()
+    assert isinstance(error, ReconstructionError)
+    assert "may lose 0.3 dB" in error.message
+    assert "Written: splats.ply, splats.glb." in error.message
+    assert "--max-loss" in error.hint
+    summary = export.run(ExportConfig(format="spz", max_loss=100.0), inputs, tmp_path, CONTEXT)
+    assert summary.failure() is None
 
 
 def test_a_scene_that_is_measured_is_scored_in_its_new_world(inputs, tmp_path):

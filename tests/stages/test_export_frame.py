@@ -105,7 +105,7 @@ def test_files_and_cameras_that_are_handed_out_show_the_same_pictures(inputs, op
         inputs, format="compressed.ply,spz,glb,html,colmap,transforms.json", **options)
     before = pictures(read_ply(inputs.folders["train"] / "splats.ply"),
                       of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse"))
-    for cameras in (of_colmap(out / "colmap"), of_transforms(out / "transforms.json")):
+    for cameras in (of_colmap(out / "sparse" / "0"), of_transforms(out / "transforms.json")):
         for name in ("ply", "glb"):
             after = pictures(read_splats(out / f"splats.{name}"), cameras)
             assert most_apart(before, after) < EXACT, name
@@ -121,13 +121,13 @@ def test_harmonics_that_did_not_turn_would_be_seen(inputs):
                       of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse"))
     after = read_ply(out / "splats.ply")
     after.sh_rest = read_ply(inputs.folders["train"] / "splats.ply").sh_rest
-    assert most_apart(before, pictures(after, of_colmap(out / "colmap"))) > 0.2
+    assert most_apart(before, pictures(after, of_colmap(out / "sparse" / "0"))) > 0.2
 
 
 def test_points_move_with_the_scene(inputs):
     out, _ = exported(inputs, format="points.ply,colmap", transform=flat(MOVED))
     own, _ = read_points(inputs.folders["sfm"] / "undistorted" / "sparse" / "points3D.bin")
-    sparse, _ = read_points(out / "colmap" / "points3D.bin")
+    sparse, _ = read_points(out / "sparse" / "0" / "points3D.bin")
     assert np.allclose(np.sort(sparse, axis=0), np.sort(MOVED.points(own), axis=0))
     points, _ = read_ply_points(out / "points.ply")
     splats = read_ply(inputs.folders["train"] / "splats.ply")

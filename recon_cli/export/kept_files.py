@@ -1,0 +1,172 @@
+"""What an export leaves in its folder: the files of an earlier one that it does not write again.
+
+They are hard links to those of the result that is replaced, made last, so that nothing writes
+through them. Each is fresh or stale by its own record. A file that the user put there or changed
+is never lost either: where an export writes one of its name, it gets another one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import shutil
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recon_cli.config.stages import EXPORT_FORMATS, ExportConfig
+from recon_cli.context import EarlierResult, StageInputs
+from recon_cli.errors import ManifestError
+from recon_cli.workspace.atomic import LEFTOVERS
+from recon_cli.workspace.digests import matches
+from recon_cli.workspace.export_record import (
+    CAMERA_FORMATS,
+    VERSION,
+    ExportedFile,
+    ExportSummary,
+    deciding_options,
+    describe_changes,
+    loss_is_small,
+    main_file,
+    max_loss_db,
+    owns,
+)
+from recon_cli.workspace.manifest import NAME as MANIFEST
+
+_CHANGED, _MISSING = "it was changed by hand", "some of its files are missing"
+
+
+@dataclass(frozen=True)
+class KeptFiles:
+    """What is kept of an earlier export."""
+
+    files: Mapping[str, ExportedFile]  # by format
+    own_files: tuple[str, ...]  # relative paths of those that the user made or changed
+    renamed: Mapping[str, str]  # of these, the new path by the old one
+
+
+def read_records(
+    config: ExportConfig, inputs: StageInputs, model: str
+) -> dict[str, ExportedFile]:
+    """Returns the record of each format of the earlier export, with why it is stale now."""
+    earlier = inputs.earlier
+    if earlier is None:
+        return {}
+    try:
+        files = ExportSummary.from_json(earlier.summary).files or {}
+    except ManifestError:  # of another version, or damaged: what the files were made of is unknown
+        files = {name: ExportedFile(file=path) for name in EXPORT_FORMATS if name != "ply"
+                 if (path := _find_file(earlier, name))}
+    return {
+        name: dataclasses.replace(record, stale=_find_reason(name, record, config, inputs, model))
+        for name, record in files.items()
+        if (earlier.folder / main_file(name, record.file)).exists()}
+
+
+def _find_file(earlier: EarlierResult, name: str) -> str | None:
+    """Returns the file of a format in a folder without records, or None."""
+    usual = {"colmap": "sparse/0", "lod": "lod/lod-meta.json"}
+    bare = name.startswith("mesh.") or name in ("points.ply", "transforms.json", "plan.svg")
+    path = usual.get(name, name if bare else f"splats.{name}")
+    return path if (earlier.folder / main_file(name, path)).exists() else None
+
+
+def _find_reason(
+    name: str, record: ExportedFile, config: ExportConfig, inputs: StageInputs, model: str
+) -> str | None:
+    earlier = inputs.earlier
+    assert earlier is not None
+    if record.stale in (_CHANGED, _MISSING):
+        return record.stale
+    main = main_file(name, record.file)
+    if main in earlier.foreign or any(owns(name, path) for path in earlier.changed):
+        return _CHANGED
+    if any(owns(name, path) for path in earlier.missing):
+        return _MISSING
+    return describe_changes(record.made_of, made_of(name, config, inputs, model)) or None
+
+
+def made_of(
+    name: str, config: ExportConfig, inputs: StageInputs, model: str
+) -> dict[str, Any]:
+    """Returns what a file of a format is made of now, as JSON values."""
+    stages = ["ingest", "sfm"]
+    if name not in CAMERA_FORMATS:
+        stages += ["train", "prune"] if model == "pruned" else ["train"]
+    digests = {stage: inputs.digests[stage] for stage in stages if stage in inputs.digests}
+    shown = {} if name in CAMERA_FORMATS else {"model": model}
+    options = deciding_options(name, dataclasses.asdict(config))
+    return {"version": VERSION, **shown, **digests, **options}
+
+
+def find_fresh(
+    config: ExportConfig, inputs: StageInputs, records: Mapping[str, ExportedFile]
+) -> set[str]:
+    """Returns the formats that need not be written again."""
+    if inputs.again:
+        return set()
+    options = dataclasses.asdict(config)
+    return {name for name, record in records.items()
+            if not record.stale and loss_is_small(record, max_loss_db(name, options))}
+
+
+def discard_files(out: Path, name: str, written: Collection[str]) -> None:
+    """Removes what was written of a format that failed, and of no other one."""
+    for path in list(_files_below(out)):
+        relative = path.relative_to(out).as_posix()
+        if owns(name, relative) and not any(owns(other, relative) for other in written):
+            path.unlink()
+
+
+def keep_files(
+    out: Path, earlier: EarlierResult | None, records: Mapping[str, ExportedFile],
+    written: Collection[str],
+) -> KeptFiles:
+    """Puts into `out` what it lacks of the earlier export, without the formats now written."""
+    kept = {name: record for name, record in records.items() if name not in written}
+    own_files: list[str] = []
+    renamed: dict[str, str] = {}
+    if earlier is None:
+        return KeptFiles(kept, (), renamed)
+    for path in _files_below(earlier.folder):
+        name = path.relative_to(earlier.folder).as_posix()
+        target = out / name
+        if name in earlier.foreign | earlier.changed or not any(
+                owns(one, name) for one in EXPORT_FORMATS):
+            # INRIA's reader leaves a points3D.ply beside a model, and prefers it to a new model
+            if os.path.lexists(target) or any(owns(one, name) for one in written):
+                target = _free_name(out, name)
+                renamed[name] = target.relative_to(out).as_posix()
+            own_files.append(target.relative_to(out).as_posix())
+        elif os.path.lexists(target) or not any(owns(one, name) for one in kept):
+            continue  # replaced, or left of a format that is
+        _link_or_copy(path, target)
+    return KeptFiles(kept, tuple(own_files), renamed)
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    """Yields the files and links below a folder but the manifest; links are not followed."""
+    for path in sorted(folder.iterdir()):
+        if path.is_dir() and not path.is_symlink():
+            yield from _files_below(path)
+        elif path.name != MANIFEST and not matches(path.name, [LEFTOVERS]):
+            yield path
+
+
+def _free_name(out: Path, name: str) -> Path:
+    """Returns a path below `out` that is free, such as splats.kept.ply for splats.ply."""
+    path = out / name
+    stem, dot, suffix = path.name.partition(".")
+    free = (path.with_name(f"{stem}.kept{number if number > 1 else ''}{dot}{suffix}")
+            for number in itertools.count(1))
+    return next(one for one in free if not os.path.lexists(one))
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:  # not every file system has hard links, nor do they lead to another one
+        shutil.copy2(source, target, follow_symlinks=False)

@@ -1,0 +1,210 @@
+"""What an export wrote, file by file, and what each file was made of.
+
+An export adds to its folder: a file of a format that is not asked for again stays. So every file
+has a record of its own, by which it is fresh or stale whatever the stage's fingerprint says of
+splats.ply.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from recon_cli.errors import ReconstructionError
+from recon_cli.workspace.digests import matches
+from recon_cli.workspace.summaries import JsonRecord
+
+VERSION = 5  # of the stage; goes up when the meaning of a file changes, and makes the others stale
+CAMERA_FORMATS = ("colmap", "transforms.json")  # of views alone
+# dB that a file may lose on the validation views, unless --max-loss is given; .splat has no
+# harmonics
+MAX_LOSS_DB = {"splat": 3.0}
+_MAX_LOSS_DB = 0.3
+_FRAME = ("scale_between", "transform", "up")
+_SCENE = (*_FRAME, "crop", "drop_floaters", "drop_islands", "drop_backdrop", "sh_degree", "max_mb")
+_MESH = ("max_triangles", "voxel")
+_OWN: Mapping[str, tuple[str, ...]] = {  # options that decide on files of one format alone
+    "spz": ("spz_version",), "sog": ("max_loss",), "lod": ("max_loss",),
+    "mesh.ply": _MESH, "mesh.glb": _MESH, "mesh.obj": _MESH, "plan.svg": _MESH}
+_PATTERNS: Mapping[str, tuple[str, ...]] = {  # of files by format; of others splats.<format>
+    "ply": ("splats.ply", "transform.json"), "lod": ("lod/*",),
+    "colmap": ("sparse/*", "images/*", "colmap/*"),  # colmap/: before version 5
+    "transforms.json": ("transforms.json", "sparse_pc.ply", "images/*"),
+    "plan.svg": ("plan.svg", "measures.json"),
+    **{name: (name,) for name in ("points.ply", "mesh.ply", "mesh.glb", "mesh.obj")}}
+_EARLIER = {"ingest": "other frames", "sfm": "earlier cameras", "train": "an earlier training",
+            "prune": "an earlier pruning"}
+
+
+def file_patterns(name: str) -> tuple[str, ...]:
+    """Returns the patterns of the files of a format, relative to the folder of the export."""
+    return _PATTERNS.get(name, (f"splats.{name}",))
+
+
+def owns(name: str, path: str) -> bool:
+    """Returns whether a relative path is that of a file of a format."""
+    return matches(path, file_patterns(name))
+
+
+def max_loss_db(name: str, options: Mapping[str, Any]) -> float:
+    """Returns how many dB a file of a format may lose on the validation views."""
+    given = options["max_loss"]
+    return float(MAX_LOSS_DB.get(name, _MAX_LOSS_DB) if given is None else given)
+
+
+def deciding_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the options of export that decide what a file of a format holds, as JSON values."""
+    own = _own_options(name, options)
+    names = _FRAME if name in CAMERA_FORMATS else _SCENE
+    chosen = {key: options[key] for key in names} | own
+    return {key: list(value) if isinstance(value, tuple) else value
+            for key, value in chosen.items()}
+
+
+def _own_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns those of the deciding options that the fingerprint of the stage leaves out."""
+    own = {key: options[key] for key in _OWN.get(name, ())}
+    if "max_loss" in own:  # how a .sog shares its colours depends on it
+        own["max_loss"] = max_loss_db(name, options)
+    if name not in CAMERA_FORMATS:
+        own["limited"] = limited_format(options)
+    return own
+
+
+def limited_format(options: Mapping[str, Any]) -> str | None:
+    """Returns the format whose size --max-mb limits, and the scene for its sake; None: none."""
+    if options["max_mb"] is None:
+        return None
+    return str(options["format"]).split(",")[0].strip()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportChange(JsonRecord):
+    """What an option of export removed."""
+
+    option: str
+    gaussians: int
+    gaussians_before: int
+    degree: int  # of the spherical harmonics
+    degree_before: int
+    psnr_change_db: float  # on the views that the export is checked on
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportedFile(JsonRecord):
+    """A file or folder beside the exported .ply."""
+
+    file: str  # name
+    bytes: int | None = None  # None, as the next two, for cameras and points
+    smaller: float | None = None  # size of the .ply over its size
+    psnr_change_db: float | None = None  # on the views that the export is checked on
+    # what it was made of: version, model, digests of stages, options; None: an older version did
+    made_of: Mapping[str, Any] | None = None
+    stale: str | None = None  # why it no longer fits the .ply; None where it does
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailedFormat(JsonRecord):
+    """Why a format was not written."""
+
+    message: str
+    hint: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSummary(JsonRecord):
+    """What export wrote."""
+
+    model: str  # base or pruned
+    file: str  # name of the .ply
+    gaussians: int
+    bytes: int  # of the .ply
+    transform: Mapping[str, Any]  # similarity from the world of the training to the files
+    changes: tuple[ExportChange, ...] | None = None  # by options, in order
+    files: Mapping[str, ExportedFile] | None = None  # the other formats by name, kept ones too
+    limited: str | None = None  # the format that --max-mb limited
+    failed: Mapping[str, FailedFormat] | None = None  # the formats that could not be written
+    own_files: tuple[str, ...] | None = None  # of the user, kept as they were
+    notices: tuple[str, ...] | None = None  # for the user
+
+    def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:
+        """Returns which files that `options` ask for are missing, stale or made otherwise."""
+        asked = (name.strip() for name in str(options["format"]).split(","))
+        reasons = [self._doubt(name, options) for name in dict.fromkeys(asked) if name != "ply"]
+        if self.limited != limited_format(options):
+            reasons.insert(0, "another format was first, which --max-mb limits")
+        return tuple(filter(None, reasons))
+
+    def _doubt(self, name: str, options: Mapping[str, Any]) -> str:
+        """Returns why the file of a format does not do; empty where it does."""
+        found, failed = (self.files or {}).get(name), (self.failed or {}).get(name)
+        if failed is not None:
+            return f"{name} could not be written"
+        if found is None:
+            return f"{name} is not there yet"
+        if found.stale:
+            return f"{found.file} is stale: {found.stale}"
+        if not loss_is_small(found, max_loss_db(name, options)):
+            return f"{found.file} loses more than {max_loss_db(name, options):g} dB"
+        made_of = found.made_of or {}
+        before = {key: value for key, value in made_of.items() if key in _own_options(
+            name, options)}
+        changed = describe_changes(before, _own_options(name, options))
+        return f"{found.file} is stale: {changed}" if changed else ""
+
+    def not_recorded(self) -> tuple[str, ...]:
+        """Returns the files of the user, which may change without making the export stale."""
+        return self.own_files or ()
+
+    def failure(self) -> ReconstructionError | None:
+        """Returns the error about the formats that failed, where any did."""
+        if not self.failed:
+            return None
+        kept = [self.file, *(one.file for one in (self.files or {}).values() if not one.stale)]
+        reasons = [one.message for one in self.failed.values()]
+        hints = dict.fromkeys(one.hint for one in self.failed.values() if one.hint)
+        return ReconstructionError(
+            f"{' '.join(reasons)} Written: {', '.join(kept)}.", hint=" ".join(hints))
+
+
+def loss_is_small(found: ExportedFile, most: float) -> bool:
+    """Returns whether a file loses at most so many dB; a NaN does not."""
+    return found.psnr_change_db is None or found.psnr_change_db >= -most
+
+
+def describe_changes(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> str:
+    """Returns in words what a file was made of that is not so any more; empty where all is."""
+    if before is None or before.get("version") != now.get("version"):
+        return "another version of recon wrote it"
+    for key, value in now.items():
+        had = before.get(key)
+        if had == value:
+            continue
+        if key == "model":
+            return f"it shows the {had} model"
+        if key in _EARLIER:
+            return f"it was made from {_EARLIER[key]}" if had else f"{key} was missing"
+        if key == "limited":
+            return f"--max-mb limited {had or 'nothing'}"
+        if had is None or had is False:
+            return f"it was written before {_option_text(key, value)}"
+        return f"it was written with {_option_text(key, had)}"
+    return ""
+
+
+def _option_text(name: str, value: Any) -> str:
+    """Returns an option as it is typed; the path of a matrix is not known."""
+    words = [f"--{name.replace('_', '-')}"]
+    if name != "transform" and value is not True:
+        words += map(_number_text, value if isinstance(value, list) else [value])
+    return " ".join(words)
+
+
+def _number_text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def main_file(name: str, recorded: str) -> str:
+    """Returns the path of the file of a format that is always there."""
+    return f"{recorded}/images.bin" if name == "colmap" else recorded
