@@ -15,7 +15,6 @@ from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import CONVENTION_LINES, CONVENTIONS, MASK_CONVENTION
 from recon_cli.evaluation.reference_views import (
-    LABELS,
     ReferenceView,
     reference_digest,
     score_views,
@@ -50,6 +49,7 @@ class ScoredModel:
     label: str  # in tables
     score: ModelMetrics  # on the held-out views
     digest: str  # of these views; scores can be paired where it is equal
+    kind: str = ""  # of a model of a workspace: base, pruned or 3DGS, as in tables
 
 
 def read_workspace_scores(name: str, folder: Path) -> list[ScoredModel]:
@@ -60,8 +60,10 @@ def read_workspace_scores(name: str, folder: Path) -> list[ScoredModel]:
         raise FormatError(
             f"{folder / Metrics.FILE} does not hold scores: {error.message}.",
             hint="Run `recon eval --again` in that workspace.") from error
-    return [ScoredModel(name, model, f"{name}, {LABELS[model]}", score, metrics.truth_digest)
-            for model, score in metrics.models.items()]
+    return [
+        ScoredModel(name, model, f"{name}, {metrics.label(model)}", score, metrics.truth_digest,
+                    metrics.label(model))
+        for model, score in metrics.models.items()]
 
 
 def score_file(
@@ -134,12 +136,14 @@ def _difference(ours: ScoredModel, theirs: ScoredModel, key: str) -> Interval:
 
 
 def _paper_rows(models: Sequence[ScoredModel]) -> Table:
-    """Returns 3DGS against ours for each workspace that has both."""
+    """Returns the base model against the pruned one for each workspace that has both."""
     scores = {(scored.group, scored.model): scored.score for scored in models}
-    groups = dict.fromkeys(scored.group for scored in models)
-    return paper_table({
-        group: (scores[group, "base"], scores[group, "pruned"]) for group in groups
-        if (group, "base") in scores and (group, "pruned") in scores})
+    groups = [group for group in dict.fromkeys(scored.group for scored in models)
+              if (group, "base") in scores and (group, "pruned") in scores]
+    kinds = {scored.kind for scored in models if scored.model == "base" and scored.group in groups}
+    return paper_table(
+        {group: (scores[group, "base"], scores[group, "pruned"]) for group in groups},
+        (kinds.pop() if len(kinds) == 1 else "base", "pruned"))
 
 
 def _record(models: Sequence[ScoredModel]) -> dict[str, Any]:

@@ -39,7 +39,6 @@ from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.summaries import WorldSummary
 
-LABELS = {"base": "3DGS", "pruned": "ours (pruned)"}  # of the models of a workspace
 MASK_HINT = "Run `recon ingest` with masks that hide less."
 _AT_ONCE = 4  # views a thread: renders that are in memory together
 _Item = TypeVar("_Item")

@@ -18,6 +18,7 @@ from recon_cli.workspace.summaries import JsonRecord
 _TEX = str.maketrans({
     "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"})
+REFERENCE = "3DGS"  # the recipe of Kerbl et al. 2023
 _VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips")
 
 
@@ -98,6 +99,7 @@ class Metrics(JsonRecord):
     unregistered_test: tuple[str, ...]  # held-out frames without a camera
     masked_out_test: tuple[str, ...] | None = None  # held-out frames whose masks leave too little
     imported_from: str | None = None  # name of the file of an imported scene
+    base_recipe: str | None = None  # REFERENCE where base was trained so; None: not, or unknown
     frames: int | None = None  # of ingest; None, as the next two, in files of older versions
     training_views: int | None = None  # None for an imported scene, too
     unregistered: tuple[str, ...] | None = None  # names of all frames without a camera
@@ -112,6 +114,10 @@ class Metrics(JsonRecord):
         left_out, held_out = len(self.unregistered), len(self.unregistered_test)
         return (f"{trained}{left_out} frames left out, as they have no camera that can be trusted, "
                 f"{held_out or 'none'} of them held out{' and so not scored' * bool(held_out)}")
+
+    def label(self, model: str) -> str:
+        """Returns what tables call a model: 3DGS only what was trained as 3DGS is."""
+        return self.base_recipe if model == "base" and self.base_recipe else model
 
     @classmethod
     def read(cls, evaluate: Path) -> Self:
@@ -227,10 +233,12 @@ def view_table(models: Mapping[str, ModelMetrics]) -> Table:
         for views in zip(*(model.views for model in models.values()), strict=True)))
 
 
-def paper_table(sets: Mapping[str, tuple[ModelMetrics, ModelMetrics]]) -> Table:
-    """Returns a row for each data set, of (3DGS, ours), as in the paper's tables I and II."""
+def paper_table(
+    sets: Mapping[str, tuple[ModelMetrics, ModelMetrics]], labels: tuple[str, str]
+) -> Table:
+    """Returns a row for each data set, of two models, as in the paper's tables I and II."""
     return Table(
-        ("data set", "PSNR 3DGS", "PSNR ours", "SSIM 3DGS", "SSIM ours"),
+        ("data set", *(f"{score} {label}" for score in ("PSNR", "SSIM") for label in labels)),
         tuple((name, f"{base.psnr_db:.2f}", f"{ours.psnr_db:.2f}", f"{base.ssim:.4f}",
                f"{ours.ssim:.4f}") for name, (base, ours) in sets.items()))
 

@@ -22,7 +22,6 @@ from recon_cli.config.stages import EvaluateConfig, TrainConfig
 from recon_cli.errors import StageError, WorkspaceError
 from recon_cli.evaluation.comparison import ScoredModel, read_workspace_scores
 from recon_cli.evaluation.intervals import Spread
-from recon_cli.evaluation.reference_views import LABELS
 from recon_cli.evaluation.scores import Table
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
@@ -49,6 +48,7 @@ class SeedScores:
     seeds: tuple[int, ...]
     models: Mapping[str, Figures]
     difference: Figures  # pruned minus base; empty where nothing is pruned
+    kinds: Mapping[str, str]  # what tables call each model
 
     def table(self) -> Table:
         """Returns mean and deviation of every figure."""
@@ -56,7 +56,7 @@ class SeedScores:
             return [Spread.of(values).text(sign + _FORMATS[name])
                     for name, values in figures.items()]
 
-        rows = [(LABELS[name], *cells(figures)) for name, figures in self.models.items()]
+        rows = [(self.kinds[name], *cells(figures)) for name, figures in self.models.items()]
         if self.difference:
             rows.append(("pruned minus base", *cells(self.difference, "+")))
         return Table(("model", "PSNR dB", "SSIM", "Gaussians", "train s"), rows)
@@ -167,4 +167,4 @@ def _collect(seeds: tuple[int, ...], by_seed: Sequence[Sequence[ScoredModel]]) -
         ours - theirs for ours, theirs in zip(
             models["pruned"][name], models["base"][name], strict=True))
         for name in _FORMATS if {"base", "pruned"} <= models.keys()}
-    return SeedScores(seeds, models, difference)
+    return SeedScores(seeds, models, difference, {one.model: one.kind for one in by_seed[0]})

@@ -29,7 +29,6 @@ from recon_cli.evaluation.metrics import (
     load_lpips,
 )
 from recon_cli.evaluation.reference_views import (
-    LABELS,
     ReferenceView,
     evenly_spread,
     load_held_out_views,
@@ -42,6 +41,7 @@ from recon_cli.evaluation.reference_views import (
     sizes_of,
 )
 from recon_cli.evaluation.scores import (
+    REFERENCE,
     Metrics,
     ModelMetrics,
     csv_table,
@@ -229,9 +229,11 @@ def _write(
         truth_digest=reference_digest(held_out),
         **size_summary([view.camera for view in held_out]), **evaluation.counts(),
         imported_from=evaluation.import_record.file if evaluation.import_record else None,
+        base_recipe=REFERENCE if evaluation.config.is_reference and not (
+            evaluation.import_record) else None,
         **evaluation.coverage())
     write_json(out / Metrics.FILE, metrics.to_json())
-    by_label = {LABELS[name]: model for name, model in models.items()}
+    by_label = {metrics.label(name): model for name, model in models.items()}
     note = evaluation.note(lacking)
     if metrics.coverage:
         stretches = describe_stretches(evaluation.frames, metrics.unregistered or ())
@@ -251,7 +253,9 @@ def _write(
     write_bytes(out / "metrics.csv", csv_table(models).encode())
     tex = first.latex()
     if len(models) == 2:
-        tex += "\n" + paper_table({workspace: (models["base"], models["pruned"])}).latex()
+        tex += "\n" + paper_table(
+            {workspace: (models["base"], models["pruned"])},
+            (metrics.label("base"), "pruned")).latex()
     write_bytes(out / "metrics.tex", tex.encode())
 
 

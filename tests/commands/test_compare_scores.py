@@ -97,7 +97,7 @@ def test_paths_of_one_name_are_told_apart_in_every_table(room, tmp_path, capsys)
     shutil.copytree(room / "b", twin)
     found = as_json(compared(capsys, room / "a", twin, "--form", "json"))
     labels = [one["label"] for one in found["models"]]
-    assert labels == [f"{room / 'a'}, 3DGS", f"{room / 'a'}, ours (pruned)", f"{twin}, 3DGS"]
+    assert labels == [f"{room / 'a'}, base", f"{room / 'a'}, pruned", f"{twin}, base"]
     means = [line for line in compared(capsys, room / "a", twin, "--form", "csv").splitlines()
              if ",mean," in line]
     assert len(means) == 3
@@ -121,7 +121,7 @@ def test_every_form_holds_the_figures(room, capsys):
     text = compared(capsys, room / "a")
     assert shown in text
     assert "difference, 95%" in text
-    assert "PSNR 3DGS" in text  # both models are there: the paper's table
+    assert "PSNR base" in text  # both models are there: the paper's table
     assert f"| {shown} |" in compared(capsys, room / "a", "--form", "markdown")
     assert r"\begin{tabular}" in compared(capsys, room / "a", "--form", "latex")
     lines = compared(capsys, room / "a", "--form", "csv").splitlines()
