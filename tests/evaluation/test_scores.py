@@ -4,7 +4,10 @@ import csv
 
 import pytest
 
+from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.scores import (
+    REFERENCE,
+    Metrics,
     ModelMetrics,
     Table,
     ViewScore,
@@ -62,6 +65,32 @@ def test_the_table_of_the_paper_sets_two_models_side_by_side_by_data_set():
     table = paper_table({"room0": (base, pruned)}, ("3DGS", "pruned"))
     assert table.headings == ("data set", "PSNR 3DGS", "PSNR pruned", "SSIM 3DGS", "SSIM pruned")
     assert table.rows == (("room0", "31.00", "31.00", "0.8500", "0.8500"),)
+
+
+@pytest.mark.parametrize(("changes", "expected"), [
+    ({}, True),
+    ({"iterations": 30_000, "images": "denoised", "seed": 4}, True),
+    ({"densify": "budget"}, False),
+    ({"far": "on"}, False),
+    ({"ssim_weight": 0.0}, False),
+    ({"sh_degree": 1}, False),
+])
+def test_only_the_recipe_of_3dgs_is_the_reference(changes, expected):
+    plain = {"densify": "reference", "far": "off", "stereo": "off", "exposure": "off",
+             "poses": "off"}
+    assert RunConfig(**{**plain, **changes}).is_reference is expected
+
+
+@pytest.mark.parametrize(("recipe", "labels"), [
+    (REFERENCE, ["3DGS", "pruned"]), (None, ["base", "pruned"])])
+def test_tables_name_a_base_model_3dgs_only_where_it_was_trained_so(recipe, labels):
+    named = dict(zip(("base", "pruned"), scores().values(), strict=True))
+    metrics = Metrics(
+        models=named, psnr_convention="", psnr_8bit_convention="", ssim_convention="",
+        ssim_padded_convention="", lpips_convention="", truth_digest="", width=1, height=1,
+        test_views=2, unregistered_test=(), base_recipe=recipe)
+    assert [metrics.label(name) for name in metrics.models] == labels
+    assert Metrics.from_json(metrics.to_json()).base_recipe == recipe
 
 
 def test_a_table_says_the_same_in_every_form():
