@@ -129,7 +129,8 @@ def _read_pixels(
     if (width, height) != (lens.width, lens.height):
         raise InputError(
             f"{image.name} holds {width}x{height} pixels, but its camera has "
-            f"{lens.width}x{lens.height}.")
+            f"{lens.width}x{lens.height}.",
+            hint="Give the images that the cameras were made for, or scale both alike.")
     rgb = fit_image(rgb, max_size)
     height, width = rgb.shape[:2]
     if image.mask is not None:

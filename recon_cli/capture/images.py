@@ -181,7 +181,8 @@ def check_size(photo: Photo, pixels: NDArray[np.uint8]) -> None:
     if (width, height) != (photo.width, photo.height):
         raise InputError(
             f"{photo.path.name} holds {width}x{height} pixels, but its header says "
-            f"{photo.width}x{photo.height}.")
+            f"{photo.width}x{photo.height}.",
+            hint="Copy it from the camera again, or leave it out.")
 
 
 def open_image(path: Path) -> Image.Image:
@@ -194,7 +195,9 @@ def open_image(path: Path) -> Image.Image:
 
 def unreadable_error(path: Path, error: Exception) -> InputError:
     """Returns the error for a picture that a library does not read."""
-    return InputError(f"{path.name} cannot be read: {_reason(path, error)}.")
+    return InputError(
+        f"{path.name} cannot be read: {_reason(path, error)}.",
+        hint="Copy it from the camera again, or leave it out.")
 
 
 def _reason(path: Path, error: Exception) -> str:

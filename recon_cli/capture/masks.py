@@ -93,7 +93,8 @@ def opaque(
     if alpha is None or alpha.min() >= HALF:
         return None
     if alpha.max() < HALF:
-        raise InputError(f"{name} is transparent everywhere.")
+        raise InputError(
+            f"{name} is transparent everywhere.", hint="Leave it out, or save it opaque.")
     return _resample(alpha, width, height)
 
 
@@ -114,7 +115,9 @@ def photo_mask(
     if mask is None or mask.all():
         return None
     if not mask.any():
-        raise InputError(f"The mask and the transparency of {photo.name} leave no pixel.")
+        raise InputError(
+            f"The mask and the transparency of {photo.name} leave no pixel.",
+            hint="Leave the photo out, or give a mask that is white where it counts.")
     return mask
 
 

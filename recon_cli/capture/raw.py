@@ -103,7 +103,8 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     """Returns a RAW photo as upright sRGB, [H, W, 3]; InputError if it is, or was, damaged."""
     shot = plan.shots.get(photo.name)
     if shot is None:
-        raise InputError(plan.broken[photo.name])
+        raise InputError(
+            plan.broken[photo.name], hint="Copy it from the camera again, or leave it out.")
     try:
         with open_raw(photo.path) as raw:
             rgb = np.asarray(raw.postprocess(
@@ -140,7 +141,9 @@ def _read_header(path: Path) -> _Header:
         shot, white = raw.other, int(raw.white_level)
         highest = int(raw.raw_image_visible.max())
         if highest == 0:  # how LibRaw answers a compression that it does not know
-            raise InputError(f"{path.name} holds only black pixels.")
+            raise InputError(
+                f"{path.name} holds only black pixels.",
+                hint="Convert it to DNG or TIFF with the camera's own program, or leave it out.")
         f_number = shot.aperture if shot.aperture > 0 else None
         # Per camera and bit depth: a maximum of 4095 says nothing about 16383.
         camera = (raw.rgb_xyz_matrix.tobytes(), raw.color_desc, round(math.log2(max(white, 1))))

@@ -324,7 +324,8 @@ def write_points(path: Path, splats: Splats) -> None:
     opaque = sigmoid(table["logit_opacities"]) >= MIN_OPACITY
     if not opaque.any():
         raise InputError(
-            f"None of {len(splats)} Gaussians has an opacity of {MIN_OPACITY:g} or more.")
+            f"None of {len(splats)} Gaussians has an opacity of {MIN_OPACITY:g} or more.",
+            hint="Leave points.ply out of --format, or train longer.")
     colors = np.rint((SH_C0 * table["sh_dc"][opaque] + 0.5).clip(0, 1) * 255).astype(np.uint8)
     names = (*"xyz", "red", "green", "blue")
     kinds = {name: ("float", "<f4") if name in "xyz" else ("uchar", "u1") for name in names}

@@ -57,7 +57,7 @@ class Stage:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 4, False,
+    Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 5, False,
           "recon_cli.stages.ingest", takes="VIDEO"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 2, True,
           "recon_cli.stages.denoise"),

@@ -81,7 +81,9 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
     with np.errstate(over="ignore"):
         scales = np.exp(table["log_scales"])
     if not np.isfinite(scales).all():
-        raise InputError("The scene holds Gaussians whose size overflows float32.")
+        raise InputError(
+            "The scene holds Gaussians whose size overflows float32.",
+            hint="Leave glb out of --format, or take the large ones away with --crop.")
     opacities = sigmoid(table["logit_opacities"])[:, None]
     colors = (SH_C0 * table["sh_dc"] + 0.5).clip(0, 1)
     columns: dict[str, NDArray[Any]] = {
