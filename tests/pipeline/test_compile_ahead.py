@@ -10,6 +10,7 @@ import psutil
 import pytest
 from fake_stages import TABLE
 
+from recon_cli import processes
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.pipeline import compile_ahead
 from recon_cli.pipeline.plan import Job
@@ -161,7 +162,7 @@ def starts(folder, stages, *, again=False, **compute):
             pass
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compile_ahead.subprocess, "Popen", Child)
+        patch.setattr(processes.subprocess, "Popen", Child)
         with compile_ahead.compile_ahead(job_in(folder, **compute), stages, again=again):
             pass
     return commands

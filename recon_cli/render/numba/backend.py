@@ -22,7 +22,7 @@ from torch import Tensor
 
 from recon_cli.render.contract import (
     EXACT, Approximation, RenderOutput, Statistics, StepOptions, TargetImage)
-from recon_cli.render.numba.kernel import cache_folder
+from recon_cli.render.numba.kernel import cache_folder, unsaved
 from recon_cli.render.numba.optimizer import step
 from recon_cli.render.numba.step import PhotometricStep, camera_gradient
 from recon_cli.render.numba.thread_pool import pool
@@ -201,7 +201,8 @@ def _compile(folder: Path) -> None:
         logger.warning("the compiled kernels in %s cannot be read; compiling them again", folder)
         _clear(folder)
         _run_all()
-    (folder / _READY).touch()
+    if not unsaved:
+        (folder / _READY).touch()
 
 
 @contextmanager

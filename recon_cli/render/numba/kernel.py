@@ -16,7 +16,7 @@ import platform
 import stat
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from recon_cli import machine
 logger = logging.getLogger("recon")
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
 Compiled = Callable[..., Any]
+unsaved: list[OSError] = []  # why kernels were not kept
 
 
 def kernel(function: Compiled) -> Compiled:
@@ -42,7 +43,20 @@ def kernel(function: Compiled) -> Compiled:
             dispatcher.enable_caching()
         finally:
             config.CACHE_DIR = before
+        dispatcher._cache.save_overload = partial(_save, dispatcher._cache.save_overload)
     return dispatcher  # type: ignore[no-any-return]
+
+
+def _save(save: Callable[..., None], signature: Any, machine_code: Any) -> None:
+    """Keeps machine code where there is room for it; without, it serves this run alone."""
+    try:
+        save(signature, machine_code)
+    except OSError as error:
+        if not unsaved:
+            logger.warning(
+                "compiled kernels cannot be kept (%s); they are compiled in every run. Free some "
+                "space, or set RECON_CACHE_DIR to a folder on another disk.", error)
+        unsaved.append(error)
 
 
 def inlined(function: Compiled) -> Compiled:
