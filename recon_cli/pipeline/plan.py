@@ -122,9 +122,11 @@ def run(
 
 def _raise_failure(job: Job, outcome: Outcome) -> None:
     """Raises what a stage that has run did not achieve, though its result is worth keeping."""
+    if not outcome.ran:
+        return
     row = next(row for row in job.table if row.name == outcome.stage)
     failure = row.summary.from_json(outcome.manifest.run.summary).failure()
-    if outcome.ran and failure is not None:
+    if failure is not None:
         raise failure
 
 

@@ -44,7 +44,7 @@ def read_room(export: StageReport) -> Room | None:
         notes = [str(note) for note in value["notes"]]
         stale = export.summary.get("files", {}).get(PLAN, {}).get("stale")
         if stale:
-            notes.insert(0, f"These measures are stale: {stale}")
+            notes.insert(0, f"The plan is stale: {stale}.")
         drawing = (export.folder / PLAN).read_bytes()
     except (FormatError, OSError, KeyError, TypeError, ValueError) as error:
         return Room((), (f"The measures are not shown: {error}",), None)

@@ -17,7 +17,7 @@ VALUE = {"unit": "m", "ceiling_height": {"value": 2.5, "error": 0.02}, "floor_ar
 def export(tmp_path):
     (tmp_path / "measures.json").write_text(json.dumps(VALUE))
     (tmp_path / "plan.svg").write_text("<svg/>")
-    return SimpleNamespace(there=True, folder=tmp_path)
+    return SimpleNamespace(there=True, folder=tmp_path, summary={})
 
 
 def test_measures_are_shown_with_their_intervals(export):
@@ -27,6 +27,12 @@ def test_measures_are_shown_with_their_intervals(export):
     assert "Floor area" not in dict(room.figures)
     assert room.notes == ("No floor.",)
     assert room.plan.startswith("data:image/svg+xml;base64,")
+
+
+def test_measures_that_were_kept_of_an_earlier_export_are_called_stale(export):
+    export.summary = {"files": {"plan.svg": {"stale": "it was made from earlier cameras"}}}
+    assert read_room(export).notes == (
+        "The plan is stale: it was made from earlier cameras.", "No floor.")
 
 
 def test_without_a_plan_there_is_no_room(export):
