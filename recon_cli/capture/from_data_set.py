@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,7 +59,8 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
         raise InputError(
             f"{path}: {len(readable)} images can be read, but at least {MIN_FRAMES} are needed.",
             hint="Check that the images are where the data set says.")
-    poses = _make_known_poses(posed, readable)
+    damaged = {image.path for name, image in zip(names, images, strict=True) if name in broken}
+    poses = _make_known_poses(posed, readable, damaged)
     poses.write(out)
     masks, lenses = out / store.MASKS, posed.lenses
     sizes = [fit_size(lens.width, lens.height, config.max_size) for lens in lenses]
@@ -138,11 +139,14 @@ def _read_pixels(
     return rgb, opaque(opacity, image.name, width, height)
 
 
-def _make_known_poses(posed: PosedSet, readable: Sequence[tuple[str, PosedImage]]) -> KnownPoses:
+def _make_known_poses(
+    posed: PosedSet, readable: Sequence[tuple[str, PosedImage]], damaged: Collection[Path]
+) -> KnownPoses:
     viewmats = {name: image.viewmat for name, image in readable}
     points, colors = posed.points, posed.colors
     if points is None and any(image.depth for image in posed.images):
         # Views that the set holds out give no depth: it would reveal what they are scored on.
-        rest = tuple(image for image in posed.images if not image.held_out)
+        rest = tuple(image for image in posed.images
+                     if not image.held_out and image.path not in damaged)
         points, colors = points_from_depth(replace(posed, images=rest))
     return KnownPoses(viewmats, posed.metric, points, colors)

@@ -169,7 +169,7 @@ def _switch(flag: str, help: str, *short: str) -> Decorator:
 
 
 verbosity = _switch("--verbose", "Show details and tracebacks.", "-v")
-again = _switch("--again", "Run from the start, even if up to date.")
+again = _switch("--again", "Run anew, even if up to date.")
 from_import = _switch("--from-import", "Train the imported scene further.")
 print_config = _switch("--print-config", "Print options as TOML and exit.")
 

@@ -69,7 +69,7 @@ def read_camera_path(path: Path) -> CameraPath:
     FormatError if it is missing or no JSON, lists no cameras, or one lacks a finite rigid pose or a
     valid field of view.
     """
-    value = read_json(path, hint=_HINT)
+    value = read_json(path, hint=_HINT, finite=False)
     entries = value.get("camera_path") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FormatError(

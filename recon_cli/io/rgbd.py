@@ -69,7 +69,7 @@ def _read_params(folder: Path) -> tuple[Lens, float]:
             f"{folder} has no {_PARAMS}, neither beside {_TRAJ} nor one level up.",
             hint='Write one: {"camera": {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, '
             '"cx": 599.5, "cy": 339.5, "scale": 6553.5}} are the numbers of Replica.')
-    value = read_json(path)
+    value = read_json(path, finite=False)
     try:
         camera: dict[str, Any] = value["camera"]
         width, height, fx, fy, cx, cy, scale = (

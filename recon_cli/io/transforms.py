@@ -196,7 +196,7 @@ def _files(path: Path) -> list[tuple[Path, str | None]]:
 
 def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Returns what a file says of all frames, and its entries."""
-    value = read_json(file)
+    value = read_json(file, hint=_HINT, finite=False)
     entries = value.get("frames") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{file} lists no frames.", hint=_HINT)
@@ -318,7 +318,7 @@ def _read_points(
     """Returns nerfstudio's sparse points and their colours, and notices."""
     if not file.is_file():
         return None, None, ()
-    name = read_json(file).get("ply_file_path")
+    name = read_json(file, hint=_HINT, finite=False).get("ply_file_path")
     if name is None:
         return None, None, ()
     path = resolve_inside(file.parent, name, f"{file}, ply_file_path,")

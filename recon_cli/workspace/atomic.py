@@ -16,6 +16,7 @@ from typing import Any
 
 from recon_cli.errors import FormatError
 from recon_cli.workspace import journal
+from recon_cli.workspace.paths import describe_special
 
 MAX_TEXT_BYTES = 256 << 20  # of a JSON or TOML file; parsing takes some twenty times as much memory
 _MOST_DIGITS = 20  # of an integer of 64 bits, with its sign
@@ -85,15 +86,19 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path, kind: type | None = None, *, hint: str = "") -> Any:
+def read_json(
+    path: Path, kind: type | None = None, *, hint: str = "", finite: bool = True
+) -> Any:
     """Returns what a JSON file holds: a value of a `kind` (dict or list), if that is given.
+
+    NaN and infinity are refused unless `finite` is off, for readers that say where they stand.
 
     Raises:
         FormatError: the file is missing, no plain file, too large, truncated, or not such JSON.
     """
     hint = hint or f"Make {path.name} again, or restore it from a copy."
     try:
-        return parse_json(read_text(path), kind)
+        return parse_json(read_text(path), kind, finite=finite)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise FormatError(f"{path} cannot be read as JSON: {reason}.", hint=hint) from error
@@ -138,11 +143,12 @@ def read_text(path: Path) -> str:
         OSError: it cannot be read.
         ValueError: it is no plain file, too large, or not UTF-8.
     """
-    found = path.stat()  # before it is opened: a FIFO would wait for its writer
+    special = describe_special(path)  # before it is opened: a FIFO would wait for its writer
+    if special:
+        raise ValueError(f"it is {special}, not a file")
+    found = path.stat()
     if stat.S_ISDIR(found.st_mode):
         raise ValueError("it is a folder")
-    if not stat.S_ISREG(found.st_mode):
-        raise ValueError("it is not a plain file")
     if found.st_size > MAX_TEXT_BYTES:
         raise ValueError(f"it has {found.st_size / 1e6:,.0f} MB, and "
                          f"{MAX_TEXT_BYTES / 1e6:,.0f} MB are the most that is read")

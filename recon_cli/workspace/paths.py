@@ -21,15 +21,20 @@ def refuse_special(path: Path) -> None:
     A pipe or a device would be waited for, or give bytes without end.
     """
     try:
-        mode = os.stat(path).st_mode
+        kind = describe_special(path)
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             raise FormatError(
                 f"{str(path)[:_SHOWN]}... is longer than a path or a name in it can be.",
                 hint="Give a shorter one.") from error
         return
-    for is_kind, kind in _KINDS.items():
-        if is_kind(mode):
-            raise FormatError(
-                f"{path} is {kind}, not a file.",
-                hint="Save what it gives to a file, and give the path of that.")
+    if kind:
+        raise FormatError(
+            f"{path} is {kind}, not a file.",
+            hint="Save what it gives to a file, and give the path of that.")
+
+
+def describe_special(path: Path) -> str:
+    """Returns what a path is in words, empty for a file or a folder; OSError if it is not there."""
+    mode = os.stat(path).st_mode
+    return next((kind for is_kind, kind in _KINDS.items() if is_kind(mode)), "")

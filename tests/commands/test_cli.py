@@ -3,6 +3,7 @@
 import errno
 import json
 import logging
+import re
 from pathlib import Path
 
 import fake_stages
@@ -214,8 +215,8 @@ def test_a_broken_manifest_is_7(capsys: Said) -> None:
     Path("workspace/ingest/manifest.json").write_text("{")
     assert main(["status"]) == 7
     said = capsys.readouterr()
-    assert "ingest     damaged" in said.out.replace("  damaged", "     damaged")
-    assert "train      missing" in said.out.replace("  missing", "     missing")
+    assert re.search(r"^ingest +damaged", said.out, re.MULTILINE)
+    assert re.search(r"^train +missing", said.out, re.MULTILINE)
     assert f"recon clean ingest -w {Path('workspace').absolute()}" in said.err
     assert main(["ingest", "room.mp4", "--again"]) == 0
     assert main(["status"]) == 0

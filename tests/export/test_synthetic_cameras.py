@@ -34,7 +34,7 @@ def shell(radius=2.0, n=1500):
 @pytest.mark.parametrize("scale", [1e-4, 0.1, 20.0])
 def test_one_gaussian_of_any_size_is_seen(scale):
     one = gaussians([[3.0, 0, 0]], scale=scale)
-    SelfPsnr.of(one, synthetic_scene(one, z_up=True, max_size=48), CONTEXT)
+    SelfPsnr.of(one, synthetic_scene(one, up=Z_UP, max_size=48), CONTEXT)
 
 
 def center(view):

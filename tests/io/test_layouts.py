@@ -54,7 +54,7 @@ def test_recognition_opens_nothing(tmp_path):
     assert recognise(tmp_path) == "transforms"
     with pytest.raises(FormatError, match="cannot be read as JSON") as refused:
         read_posed(tmp_path)
-    assert "export it again" in refused.value.hint
+    assert "Export it again" in refused.value.hint
 
 
 @pytest.mark.parametrize(("make", "lost", "message"), [

@@ -148,7 +148,7 @@ def test_a_damaged_manifest_is_said_and_a_damaged_first_one_is_7(workspace, caps
     assert "<svg" not in section(page, "scores")
     (workspace / "ingest" / "manifest.json").write_text("{")
     assert report(workspace) == 7
-    assert "--again" in capsys.readouterr().err
+    assert "`recon clean ingest" in capsys.readouterr().err
 
 
 def test_an_unfinished_run_is_said(workspace):

@@ -235,7 +235,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
     job, truth = capture
     owner, name = {
         "match": (fallbacks.database, "pair_names"), "models": (mapper, "map_incrementally"),
-        "model": (fallbacks.pycolmap.Reconstruction, "write"), "note": (StepLog, "finish"),
+        "model": (fallbacks, "write_model"), "note": (StepLog, "finish"),
         "verdict": (fallbacks.atomic, "write_json"), "publish": (fallbacks, "publish")}[place]
 
     def full(*_, **__):

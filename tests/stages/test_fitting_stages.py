@@ -150,10 +150,10 @@ def test_export_of_a_pruned_model_that_is_not_there_names_the_command(inputs, tm
 
 
 def test_an_export_that_reads_back_differently_fails(inputs, tmp_path, monkeypatch):
-    def lossy(path, splats, *extra):
+    def lossy(path, splats, *extra, **comments):
         changed = splats.map(torch.clone)
         changed.means[0, 0] += 1e-3
-        write_ply(path, changed, *extra)
+        write_ply(path, changed, *extra, **comments)
 
     monkeypatch.setattr(export, "write_ply", lossy)
     with pytest.raises(Exception, match="reads back"):

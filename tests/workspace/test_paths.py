@@ -45,7 +45,7 @@ def test_a_pipe_a_device_and_a_socket_are_named(tmp_path, pipe, monkeypatch):
 @pytest.mark.parametrize("read", [
     read_json, read_settings, lambda path: read_source(path, without=path.parent)])
 def test_no_reader_waits_for_a_pipe(pipe, read):
-    with pytest.raises(FormatError, match="named pipe"):
+    with pytest.raises(ReconError, match="named pipe"):
         read(pipe)
 
 
