@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 import tempfile
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.atomic import parse_json, write_bytes
 
 SUFFIXES = ("ply", "glb", "obj")
 _UNLIT = "KHR_materials_unlit"  # the photos hold the light of the room already
@@ -105,7 +104,7 @@ def _read_glb_colors(path: Path) -> NDArray[np.uint8]:
     """Returns the colours [V, 3] of a .glb as `_glb_bytes` writes it: trimesh rounds to 8 bits."""
     data = path.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
-    tree = json.loads(data[20:20 + length])
+    tree = parse_json(data[20:20 + length], dict)
     accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
     view = tree["bufferViews"][accessor["bufferView"]]
     start = 28 + length + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
