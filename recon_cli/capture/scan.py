@@ -74,7 +74,7 @@ class Scan:
         value: dict[str, Any] = atomic.read_json(path, dict)
         overlay = None
         if value["overlay"]:
-            data = np.frombuffer(path.with_suffix(".png").read_bytes(), np.uint8)
+            data = np.frombuffer(atomic.read_bytes(path.with_suffix(".png")), np.uint8)
             overlay = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)) > 0
         return cls(**{
             **value, "overlay": overlay,

@@ -16,6 +16,9 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from recon_cli.errors import ConfigError
 
+_SHOWN = 100  # characters of a value
+MOST = 2**31 - 1  # of any whole number: what COLMAP and others hold
+
 
 @dataclass(frozen=True)
 class OptionInfo:
@@ -100,6 +103,8 @@ class StageConfig:
             raise self._error(name, value, f"at least {info.minimum:g}")
         if info.maximum is not None and value > info.maximum:
             raise self._error(name, value, f"at most {info.maximum:g}")
+        if isinstance(value, int) and abs(value) > MOST:
+            raise self._error(name, value, f"at most {MOST}")
         return value
 
     def _check_members(self, name: str, value: Any, kinds: tuple[type, ...]) -> tuple[Any, ...]:
@@ -120,7 +125,7 @@ class StageConfig:
 
     def _error(self, name: str, value: object, needed: str) -> ConfigError:
         return ConfigError(
-            f"{name} is {value!r}, but it must be {needed}.",
+            f"{name} is {repr(value)[:_SHOWN]}, but it must be {needed}.",
             hint=f"Change --{name.replace('_', '-')} or {name} in recon.toml.")
 
     @classmethod

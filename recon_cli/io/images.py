@@ -15,7 +15,7 @@ from recon_cli.errors import FormatError
 from recon_cli.io.records import AGAIN
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.atomic import read_bytes, write_bytes
 
 _COUNTS = 255  # in a mask file; anything less is ignored, half-covered edges included
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
@@ -67,9 +67,9 @@ def decode_file(path: Path, flags: int) -> NDArray[np.uint8] | None:
     on Windows.
     """
     try:
-        data = np.fromfile(path, np.uint8)
+        data = np.frombuffer(read_bytes(path), np.uint8)
         return cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):  # of more pixels than it allows
+    except (OSError, ValueError, cv2.error):  # of more pixels than it allows
         return None
 
 

@@ -30,6 +30,7 @@ from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, matches, read_source
 from recon_cli.workspace.layout import LOG, disk_errors, has_link, remove, size_of
 from recon_cli.workspace.manifest import Manifest
+from recon_cli.workspace.paths import is_plain_file
 
 __all__ = ["Job", "Outcome", "StageStatus", "Target", "plan", "run", "run_stage", "status"]
 
@@ -300,6 +301,10 @@ class _LogFile(logging.FileHandler):
 @contextmanager
 def _log_to(path: Path) -> Iterator[None]:
     """Writes everything that is logged, failures with their traceback, to a file as well."""
+    if os.path.lexists(path) and not is_plain_file(path):
+        logger.warning("%s is not a plain file: this run is not logged", path)
+        yield
+        return
     # File names need not be UTF-8, and a message that names one must not be lost for it.
     handler = _LogFile(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))

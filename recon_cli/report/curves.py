@@ -17,6 +17,7 @@ from recon_cli.report.stage_status import StageReport, StageReports
 from recon_cli.workspace.summaries import LogRow, PruneSummary, TrainSummary
 
 _STEP, _DECIBELS, _LEFT = Axis("step"), Axis("PSNR, dB"), Axis("Gaussians left")
+_LOG = "log.jsonl"
 _STAGES = {"train": ("training", 0), "prune": ("after pruning", 1)}  # label and color
 
 
@@ -42,9 +43,10 @@ def draw_training_curves(stages: StageReports, metrics: Metrics | None) -> Train
     """Returns the charts of the logs of train and prune, with held-out scores as marks."""
     logs, damaged, notes = {}, [], []
     for name, (label, _) in _STAGES.items():
-        if stages[name].there:
+        manifest = stages[name].manifest
+        if manifest is not None and _LOG in manifest.outputs:  # an imported scene has none
             try:
-                logs[name] = read_log(stages[name].folder / "log.jsonl")
+                logs[name] = read_log(stages[name].folder / _LOG)
             except FormatError as error:
                 damaged.append(f"The log of {name} is not shown: {error.message}")
         notes += [f"Validation PSNR stopped improving: {label} jumped from step {row.iteration:,} "

@@ -34,8 +34,9 @@ def read_metrics(folder: Path) -> Metrics:
 
 
 def read_log(path: Path) -> tuple[LogRow, ...]:
-    """Returns the rows of a log.jsonl; FormatError if it is damaged."""
+    """Returns the rows of a log.jsonl; FormatError if it is gone or damaged."""
     with _format_errors(path):
+        path.stat()  # OSError
         return LogRow.read_all(path)
 
 

@@ -11,7 +11,7 @@ from recon_cli.config.stages import PLAN
 from recon_cli.errors import FormatError
 from recon_cli.export.mesh.files import MEASURES
 from recon_cli.report.stage_status import StageReport
-from recon_cli.workspace.atomic import read_json
+from recon_cli.workspace.atomic import read_bytes, read_json
 
 _MOST_BYTES = 3_000_000  # of a plan; the page has a limit of its own
 
@@ -45,7 +45,7 @@ def read_room(export: StageReport) -> Room | None:
         stale = export.summary.get("files", {}).get(PLAN, {}).get("stale")
         if stale:
             notes.insert(0, f"The plan is stale: {stale}.")
-        drawing = (export.folder / PLAN).read_bytes()
+        drawing = read_bytes(export.folder / PLAN)
     except (FormatError, OSError, KeyError, TypeError, ValueError) as error:
         return Room((), (f"The measures are not shown: {error}",), None)
     plan = None

@@ -143,16 +143,26 @@ def read_text(path: Path) -> str:
         OSError: it cannot be read.
         ValueError: it is no plain file, too large, or not UTF-8.
     """
+    return read_bytes(path, most=MAX_TEXT_BYTES).decode("utf-8")
+
+
+def read_bytes(path: Path, *, most: int | None = None) -> bytes:
+    """Returns the content of a file of at most `most` bytes.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no plain file, or too large.
+    """
     special = describe_special(path)  # before it is opened: a FIFO would wait for its writer
     if special:
         raise ValueError(f"it is {special}, not a file")
     found = path.stat()
     if stat.S_ISDIR(found.st_mode):
         raise ValueError("it is a folder")
-    if found.st_size > MAX_TEXT_BYTES:
+    if most is not None and found.st_size > most:
         raise ValueError(f"it has {found.st_size / 1e6:,.0f} MB, and "
-                         f"{MAX_TEXT_BYTES / 1e6:,.0f} MB are the most that is read")
-    return path.read_bytes().decode("utf-8")
+                         f"{most / 1e6:,.0f} MB are the most that is read")
+    return path.read_bytes()
 
 
 def clear_leftovers(folder: Path) -> None:

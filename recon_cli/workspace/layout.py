@@ -11,14 +11,14 @@ removed, never what it points to.
 
 from __future__ import annotations
 
-import contextlib
 import errno
+import json
 import logging
 import os
 import shutil
 import socket
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -26,9 +26,10 @@ from filelock import FileLock, Timeout
 
 from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
 from recon_cli.workspace import disk, journal, manifest
-from recon_cli.workspace.atomic import clear_leftovers, read_json, sync_folder, write_json
+from recon_cli.workspace.atomic import LEFTOVERS, clear_leftovers, read_json, sync_folder
 from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, describe_progress
+from recon_cli.workspace.paths import is_plain_file
 
 LOG = "recon.log"
 LOCK = ".lock"  # dropped by the system when its holder dies
@@ -195,7 +196,7 @@ class Workspace:
         old.parent.mkdir(exist_ok=True)
         remove(old)
         if folder.is_symlink():  # moved, a relative link would point elsewhere
-            target = folder.resolve()
+            target = Path(os.path.realpath(folder))  # of a loop, too
             old.symlink_to(target)
             folder.unlink()
             logger.warning("%s was a link to %s, which is left as it is", folder, target)
@@ -233,8 +234,9 @@ class Workspace:
         Where one of these folders is a link, that is the link, not what it leads to.
         """
         parents = [self.root / name for name in (journal.PARTIAL, _OLD, SEEDS, BLOCKS)]
-        return [path for parent in parents
-                for path in ([parent] if parent.is_symlink() else sorted(parent.glob("*")))]
+        return [*(path for parent in parents
+                  for path in ([parent] if parent.is_symlink() else sorted(parent.glob("*")))),
+                *sorted(self.root.glob(LEFTOVERS))]
 
     def _refuse_foreign(self, stage: str) -> None:
         """Refuses to replace a folder that is not ours: -w may point anywhere."""
@@ -254,7 +256,8 @@ def size_of(path: Path) -> int:
 def has_link(path: Path, root: Path) -> bool:
     """Returns whether a path below `root`, or a folder between them, is a link."""
     between = [path, *path.parents]
-    return any(part.is_symlink() for part in between[:between.index(root)])
+    return any(os.path.islink(part)  # False, too, for a name that no system takes
+               for part in between[:between.index(root)])
 
 
 @contextmanager
@@ -333,6 +336,9 @@ def hold_lock(root: Path, verb: str, *, other: str = "another workspace with -w"
     Raises:
         WorkspaceError: another process holds the lock; the message says which.
     """
+    if os.path.lexists(root / LOCK) and not is_plain_file(root / LOCK):
+        raise WorkspaceError(
+            f"{root / LOCK}, the lock, is not a plain file.", hint="Move or delete it.")
     lock = FileLock(root / LOCK)
     try:
         lock.acquire(timeout=0)
@@ -341,14 +347,24 @@ def hold_lock(root: Path, verb: str, *, other: str = "another workspace with -w"
             f"{root} is in use by {_describe_holder(root)}.",
             hint=f"Wait until it is done, or give {other}.") from error
     try:
-        write_json(root / HOLDER, {
-            "pid": os.getpid(), "host": socket.gethostname(), "verb": verb,
-            "since": datetime.now().astimezone().isoformat(timespec="seconds")})
+        _name_holder(root / HOLDER, verb)
         yield
     finally:
-        with contextlib.suppress(OSError):  # the error that led here says more
+        with suppress(OSError):  # the error that led here says more
             (root / HOLDER).unlink(missing_ok=True)
         lock.release()
+
+
+def _name_holder(path: Path, verb: str) -> None:
+    """Writes who holds the lock. The lock is what counts, so a full disk does not matter here.
+
+    Nor does half a file of a process that was killed: the next one writes another.
+    """
+    with suppress(OSError):
+        remove(path)
+        path.write_text(json.dumps({
+            "pid": os.getpid(), "host": socket.gethostname(), "verb": verb,
+            "since": datetime.now().astimezone().isoformat(timespec="seconds")}))
 
 
 def _describe_holder(root: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from recon_cli.workspace.digests import FileDigest, Source, digest_file, matches
 
 NAME = "manifest.json"
 SCHEMA = 1
+_NAME_BYTES = 255  # the most that file systems take
 _MAX_REASONS = 3  # changes of one kind that are named; the rest is counted
 
 
@@ -147,7 +149,7 @@ def _check_output(name: str) -> None:
     """Raises ValueError unless a name stays in the folder that it is relative to, on any system."""
     parts = name.split("/")
     if ("\0" in name or "\\" in name or ".." in parts or "" in parts or "." in parts
-            or ":" in parts[0]):
+            or ":" in parts[0] or max(len(os.fsencode(part)) for part in parts) > _NAME_BYTES):
         raise ValueError(f"it names the output {name[:100]!r}, which is no file of a stage")
 
 
@@ -226,7 +228,7 @@ def find_changed_outputs(folder: Path, finished: Manifest, volatile: Sequence[st
         path = folder / name
         if matches(name, volatile):
             continue
-        if not path.is_file():
+        if not os.path.isfile(path):  # False, too, for a name that no system takes
             changes.append(f"output {name} is missing")
         elif digest_file(path, known).sha256 != known.sha256:
             changes.append(f"output {name} was changed by hand")

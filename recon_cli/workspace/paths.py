@@ -15,6 +15,14 @@ _KINDS = {
     stat.S_ISBLK: "a device"}
 
 
+def is_plain_file(path: Path) -> bool:
+    """Returns whether there is a file that is no link, which another process may have put there."""
+    try:
+        return stat.S_ISREG(os.lstat(path).st_mode)
+    except OSError:
+        return False
+
+
 def refuse_special(path: Path) -> None:
     """Raises FormatError unless a path is a file, a folder, or not there.
 

@@ -174,6 +174,10 @@ def _enter(cwd: Path, said: tuple[Said, Said]) -> None:
     for number, descriptor in enumerate((
             os.open(os.devnull, os.O_RDONLY), said[0].target, said[1].target)):
         os.dup2(descriptor, number)
+    # Those of the campaign may be files, and take it ill that they no longer are.
+    sys.stdout, sys.stderr = (
+        open(number, "w", encoding="utf-8", errors=errors, closefd=False)  # noqa: SIM115
+        for number, errors in ((1, "strict"), (2, "backslashreplace")))
     os.chdir(cwd)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))

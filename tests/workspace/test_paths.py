@@ -8,7 +8,7 @@ import pytest
 
 from recon_cli.cli import main
 from recon_cli.config.settings import read_settings
-from recon_cli.errors import ExitCode, FormatError
+from recon_cli.errors import ExitCode, FormatError, ReconError
 from recon_cli.workspace.atomic import LEFTOVERS, read_json, replacing, write_bytes
 from recon_cli.workspace.digests import read_source
 from recon_cli.workspace.paths import refuse_special

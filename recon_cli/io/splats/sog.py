@@ -44,7 +44,7 @@ from recon_cli.io.splats.values import (
     to_arrays,
 )
 from recon_cli.scene.splats import TERMS, Splats
-from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.atomic import read_bytes, write_bytes
 
 _LEAST_OPACITY = 1e-6  # that PlayCanvas reads for a byte of 0; a logit has to be finite
 ROW = 64  # palette entries in a row of their image
@@ -386,13 +386,9 @@ class Unpacked(SogFiles):
         if "/" in name or path_escapes(name):
             raise self.error(f"the name {name!r:.80}, which leaves the folder")
         try:
-            with (self.path.parent / name).open("rb") as file:
-                data = file.read(most + 1)
+            return read_bytes(self.path.parent / name, most=most)
         except (OSError, ValueError) as error:
             raise self.error(f"{name}, which cannot be read: {error}") from error
-        if len(data) > most:
-            raise self.error(f"{name}, which has more than {most} bytes")
-        return data
 
 
 def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
