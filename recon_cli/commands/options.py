@@ -7,6 +7,7 @@ declared once, in config/stages.py, and only what was typed reaches the settings
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -145,7 +146,8 @@ def verb(name: str) -> Callable[[Command], Verb]:
 def explicit_settings(call: Call) -> Settings:
     """Returns what recon.toml, --config and --set set; ConfigError if a value cannot be used."""
     in_workspace = call.workspace / FILE
-    files = [in_workspace] if in_workspace.exists() else []
+    # A link that leads nowhere is an error, not the same as none.
+    files = [in_workspace] if os.path.lexists(in_workspace) else []
     files += [call.config_file] if call.config_file else []
     settings = merge([*map(read_settings, files), call.assigned])
     check(settings)

@@ -53,7 +53,7 @@ def read_settings(path: Path) -> Settings:
     except OSError as error:
         raise ConfigError(
             f"{path} cannot be read: {error.strerror}.",
-            hint="Check the path after --config.") from error
+            hint=f"Check {path.name}, and the path after --config where you gave one.") from error
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
         raise ConfigError(

@@ -128,6 +128,7 @@ def keep_files(
     kept = {name: record for name, record in records.items() if name not in written}
     own_files: list[str] = []
     renamed: dict[str, str] = {}
+    moved: dict[Path, Path] = {}  # folders by the files that have their names now
     if earlier is None:
         return KeptFiles(kept, (), renamed)
     for path in _files_below(earlier.folder):
@@ -136,8 +137,14 @@ def keep_files(
         if name in earlier.foreign | earlier.changed or not any(
                 owns(one, name) for one in EXPORT_FORMATS):
             # INRIA's reader leaves a points3D.ply beside a model, and prefers it to a new model
-            if os.path.lexists(target) or any(owns(one, name) for one in written):
+            blocker = _find_blocker(out, name)
+            if blocker is not None:
+                if blocker not in moved:
+                    moved[blocker] = _free_name(out, blocker.relative_to(out).as_posix())
+                target = moved[blocker] / target.relative_to(blocker)
+            elif os.path.lexists(target) or any(owns(one, name) for one in written):
                 target = _free_name(out, name)
+            if target != out / name:
                 renamed[name] = target.relative_to(out).as_posix()
             own_files.append(target.relative_to(out).as_posix())
         elif os.path.lexists(target) or not any(owns(one, name) for one in kept):
@@ -153,6 +160,14 @@ def _files_below(folder: Path) -> Iterator[Path]:
             yield from _files_below(path)
         elif path.name != MANIFEST and not matches(path.name, [LEFTOVERS]):
             yield path
+
+
+def _find_blocker(out: Path, name: str) -> Path | None:
+    """Returns the file below `out` that has the name of a folder in a relative path, if any."""
+    for part in reversed(Path(name).parents):
+        if os.path.lexists(out / part) and not (out / part).is_dir():
+            return out / part
+    return None
 
 
 def _free_name(out: Path, name: str) -> Path:

@@ -14,6 +14,7 @@ from recon_cli.evaluation.scores import Metrics, Sweep
 from recon_cli.report.chart import MARKS, Axis, Series, draw_chart
 from recon_cli.report.records import BASE, PRUNED, read_log, read_sweep
 from recon_cli.report.stage_status import StageReport, StageReports
+from recon_cli.workspace.digests import digest_file
 from recon_cli.workspace.summaries import LogRow, PruneSummary, TrainSummary
 
 _STEP, _DECIBELS, _LEFT = Axis("step"), Axis("PSNR, dB"), Axis("Gaussians left")
@@ -46,7 +47,11 @@ def draw_training_curves(stages: StageReports, metrics: Metrics | None) -> Train
         manifest = stages[name].manifest
         if manifest is not None and _LOG in manifest.outputs:  # an imported scene has none
             try:
-                logs[name] = read_log(stages[name].folder / _LOG)
+                path = stages[name].folder / _LOG
+                logs[name] = read_log(path)
+                known = manifest.outputs[_LOG]
+                if digest_file(path, known).sha256 != known.sha256:
+                    notes.append(f"The log of {name} was changed since: its curves may be wrong.")
             except FormatError as error:
                 damaged.append(f"The log of {name} is not shown: {error.message}")
         notes += [f"Validation PSNR stopped improving: {label} jumped from step {row.iteration:,} "

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.workspace import atomic
+from recon_cli.workspace import atomic, layout
 
 KEYPOINT_COLUMNS = 6  # x, y and the 2x2 matrix of its shape, which COLMAP writes for SIFT
 _TABLES = {"features": "descriptors", "matches": "two_view_geometries"}
@@ -57,7 +57,7 @@ def seal(path: Path) -> None:
 
 def unseal(path: Path) -> None:
     """Deletes the digests of a database that no later run will go on from."""
-    _digests_path(path).unlink(missing_ok=True)
+    layout.remove(_digests_path(path))
 
 
 def keep_sealed(path: Path) -> str | None:
@@ -186,7 +186,7 @@ def remove(path: Path) -> None:
     """Deletes a database together with SQLite's side files and its digests."""
     unseal(path)
     for suffix in ("", "-wal", "-shm", "-journal"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
+        layout.remove(path.with_name(path.name + suffix))
 
 
 def _connect(path: Path) -> sqlite3.Connection:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ from typing import Any, BinaryIO
 
 from recon_cli.errors import ConfigError, FormatError, ReconError, SfmError, WorkspaceError
 from recon_cli.scene.camera import Lens
-from recon_cli.workspace import atomic
+from recon_cli.workspace import atomic, layout
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.journal import crc32
 
@@ -236,16 +235,14 @@ def publish(folder: Path, target: Path) -> None:
     for path in _files(folder):
         with path.open("rb+") as file:
             os.fsync(file.fileno())
-    if target.exists():
-        shutil.rmtree(target)
+    layout.remove(target)
     folder.rename(target)
     atomic.sync_folder(target.parent)
 
 
 def fresh_folder(folder: Path) -> Path:
     """Returns `folder`, made anew and empty."""
-    if folder.exists():
-        shutil.rmtree(folder)
+    layout.remove(folder)
     folder.mkdir(parents=True)
     return folder
 

@@ -22,6 +22,7 @@ from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
 from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, parse
 from recon_cli.workspace.disk import refuse_full_disk
+from recon_cli.workspace.journal import make_way
 
 _DOING = {
     "features": ("finding features", "frame"),
@@ -125,6 +126,8 @@ def run_job(
     deadline = time.monotonic() + 60 * max_minutes
     file = job.out / "job.json"
     job.write(file)
+    for kept in (job.out / LOG, job.out / LOCK):
+        make_way(kept)
     monitor = Monitor(job, progress, record, on_idle)
     try:
         with _start(job, file) as child, monitor:

@@ -37,6 +37,7 @@ def replacing(path: Path) -> Iterator[Path]:
         _share(temporary)
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
+        journal.make_way(path)
         journal.expect(path, temporary)
         temporary.replace(path)
         journal.confirm(path)

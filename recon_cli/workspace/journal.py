@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from recon_cli.workspace.paths import is_plain_file
 
 PARTIAL = ".partial"  # the folder, in a workspace, of what is not finished
 SUFFIX = ".digests"
@@ -109,11 +112,17 @@ def find_damage(folder: Path) -> str:
     return ""
 
 
-def remove_links(folder: Path) -> None:
-    """Removes links below a folder of unfinished work: no stage makes any."""
+def remove_strange(folder: Path) -> None:
+    """Removes links, pipes and the like below a folder of unfinished work: no stage makes any."""
     for path in _files_below(folder):
-        if path.is_symlink():
+        if not is_plain_file(path):
             path.unlink()
+
+
+def make_way(path: Path) -> None:
+    """Removes a folder of unfinished work where a file is to be."""
+    if path.is_dir() and not path.is_symlink() and PARTIAL in path.parts:
+        shutil.rmtree(path)
 
 
 def crc32(path: Path, size: int | None = None) -> int:
@@ -143,7 +152,8 @@ def _find(path: Path) -> tuple[Path, str] | None:
     for folder in path.parents:
         if folder.parent.name == PARTIAL:
             journal = journal_path(folder)
-            return (journal, path.relative_to(folder).as_posix()) if journal.is_file() else None
+            return (journal, path.relative_to(folder).as_posix()) if (
+                is_plain_file(journal)) else None
     return None
 
 
@@ -165,6 +175,8 @@ def _read(journal: Path) -> dict[str, _History]:
 
     A last line without its end was being written.
     """
+    if not is_plain_file(journal):
+        raise ValueError("it is not a plain file")
     histories: dict[str, _History] = {}
     for line in journal.read_bytes().split(b"\n")[:-1]:
         crc, _, text = line.partition(b" ")

@@ -116,7 +116,7 @@ class Workspace:
             progress = describe_progress(earlier.done, earlier.total)
             logger.info("%s: resuming (%s)", key.stage, progress)
             clear_leftovers(partial)
-            journal.remove_links(partial)
+            journal.remove_strange(partial)
             return partial, earlier
         if doubt:
             logger.warning("%s: unfinished work is discarded: %s", key.stage, doubt)

@@ -203,6 +203,13 @@ def test_usage_errors_are_2_and_leave_no_traceback(words: list[str], capsys: Sai
     assert "error: " in said or "Usage: " in said
 
 
+def test_a_recon_toml_that_leads_nowhere_is_2_and_not_passed_over(capsys: Said) -> None:
+    Path("workspace").mkdir()
+    Path("workspace/recon.toml").symlink_to("gone.toml")
+    assert main(["status"]) == 2
+    assert "recon.toml cannot be read" in capsys.readouterr().err
+
+
 def test_an_unknown_key_in_recon_toml_is_2(capsys: Said) -> None:
     Path("workspace").mkdir()
     Path("workspace/recon.toml").write_text("[train]\niteration = 3\n")

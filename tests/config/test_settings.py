@@ -115,6 +115,14 @@ def test_a_measurement_that_measures_nothing_is_refused(
         config(scale_between=value)  # type: ignore[arg-type]
 
 
+def test_a_whole_number_that_no_library_holds_is_refused() -> None:
+    for value in (2**31, -(2**31), 10**26):
+        with pytest.raises(ConfigError, match=r"seed is|at most 2147483647") as raised:
+            SfmConfig(seed=value)
+        assert len(raised.value.message) < 200
+    assert SfmConfig(seed=2**31 - 1).seed == 2**31 - 1
+
+
 def test_build_ignores_other_sections() -> None:
     assert layers.build(IngestConfig, {"train": {"iterations": 3}}) == IngestConfig()
 

@@ -242,6 +242,21 @@ def test_a_scene_of_one_gaussian_is_written_in_every_format(tmp_path):
     assert len(record(tmp_path / "ws")["files"]) == 8
 
 
+def test_a_folder_of_the_user_with_the_name_of_a_file_is_kept_whole_under_another(tmp_path):
+    earlier, out = tmp_path / "earlier", tmp_path / "out"
+    (earlier / "splats.ply" / "deep").mkdir(parents=True)
+    out.mkdir()
+    (out / "splats.ply").write_text("new")
+    for name in ("a.txt", "deep/b.txt"):
+        (earlier / "splats.ply" / name).write_text(name)
+    result = EarlierResult(earlier, {}, foreign=frozenset({
+        "splats.ply/a.txt", "splats.ply/deep/b.txt"}))
+    kept = keep_files(out, result, {}, ["ply"])
+    assert (out / "splats.ply").read_text() == "new"
+    assert kept.own_files == ("splats.kept.ply/a.txt", "splats.kept.ply/deep/b.txt")
+    assert (out / "splats.kept.ply" / "deep" / "b.txt").read_text() == "deep/b.txt"
+
+
 def test_files_left_of_a_format_that_is_written_again_are_not_kept(tmp_path):
     earlier, out = tmp_path / "earlier", tmp_path / "out"
     for name in ("lod/lod-meta.json", "lod/0_0/meta.json", "lod/0_9/meta.json", "images/a.png",

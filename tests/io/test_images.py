@@ -8,6 +8,7 @@ import pytest
 
 from recon_cli.errors import FormatError
 from recon_cli.io.images import (
+    decode_file,
     fill_masked,
     read_image,
     read_mask,
@@ -98,6 +99,11 @@ def test_gray_and_sixteen_bits_survive_a_png(tmp_path):
 def test_eight_bits_round_to_the_nearest_step_and_clip():
     values = np.array([-1, 0, 0.49 / 255, 0.51 / 255, 1, 7], np.float32)
     np.testing.assert_array_equal(to_uint8(values), [0, 0, 0, 1, 255, 255])
+
+
+def test_a_pipe_is_no_image_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    assert decode_file(tmp_path / "pipe.png", cv2.IMREAD_COLOR) is None
 
 
 def test_a_path_that_is_not_utf8_is_read(tmp_path):

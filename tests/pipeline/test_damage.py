@@ -19,7 +19,10 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
                                              + path.read_bytes()[1:]),
     "cut": lambda path: os.truncate(path, path.stat().st_size // 2),
     "emptied": lambda path: os.truncate(path, 0),
-    "deleted": Path.unlink}
+    "deleted": Path.unlink,
+    "a folder": lambda path: (path.unlink(), (path / "folder").mkdir(parents=True)),
+    "a pipe": lambda path: (path.unlink(), os.mkfifo(path)),
+    "a link to itself": lambda path: (path.unlink(), path.symlink_to(path.name))}
 
 
 def stop_in_mid_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:

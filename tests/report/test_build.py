@@ -129,6 +129,15 @@ def test_a_log_that_cannot_be_read_is_said_in_its_place(workspace):
     assert "after pruning" in training
 
 
+def test_a_log_that_was_changed_or_is_gone_is_said_in_its_place(workspace):
+    log = workspace / "train" / "log.jsonl"
+    log.write_text("".join(log.read_text().splitlines(True)[:-1]))
+    assert "The log of train was changed since" in section(page_of(workspace), "training")
+    log.unlink()
+    training = section(page_of(workspace), "training")
+    assert "The log of train is not shown: log.jsonl cannot be read" in training
+
+
 def test_pictures_that_are_gone_are_said_and_the_others_are_shown(workspace):
     (workspace / "evaluate" / "truth" / "000004.png").unlink()
     (workspace / "evaluate" / "renders" / "base" / "000008.png").write_bytes(b"no picture")

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -269,6 +270,49 @@ def test_what_a_dead_holder_left_does_not_lock(workspace: Workspace) -> None:
     with workspace.writing("train"):
         assert json.loads((workspace.root / layout.HOLDER).read_text())["pid"] == os.getpid()
     assert not (workspace.root / layout.HOLDER).exists()
+
+
+@pytest.mark.parametrize("make", [
+    Path.mkdir, os.mkfifo, lambda path: path.symlink_to(path.name),
+    lambda path: path.symlink_to("thesis.txt")])
+def test_a_lock_that_is_no_plain_file_is_said_and_left_alone(
+    workspace: Workspace, make: Callable[[Path], object]
+) -> None:
+    workspace.root.mkdir()
+    (workspace.root / "thesis.txt").write_text("years of work")
+    make(workspace.root / layout.LOCK)
+    with pytest.raises(WorkspaceError, match="not a plain file"), workspace.writing("train"):
+        pass
+    assert (workspace.root / "thesis.txt").read_text() == "years of work"
+    assert os.path.lexists(workspace.root / layout.LOCK)
+
+
+@pytest.mark.parametrize("make", [
+    Path.mkdir, os.mkfifo, lambda path: path.symlink_to("thesis.txt")])
+def test_whatever_has_the_name_of_the_holder_makes_way(
+    workspace: Workspace, make: Callable[[Path], object]
+) -> None:
+    workspace.root.mkdir()
+    (workspace.root / "thesis.txt").write_text("years of work")
+    make(workspace.root / layout.HOLDER)
+    with workspace.writing("train"):
+        assert json.loads((workspace.root / layout.HOLDER).read_text())["pid"] == os.getpid()
+    assert (workspace.root / "thesis.txt").read_text() == "years of work"
+
+
+def test_no_temporary_file_is_made_that_a_kill_would_leave_beside_the_lock(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "replace", lambda *_: pytest.fail("a temporary file"))
+    with workspace.writing("train"):
+        assert {path.name for path in workspace.root.iterdir()} == {layout.LOCK, layout.HOLDER}
+
+
+def test_what_a_killed_report_left_is_a_scrap(workspace: Workspace) -> None:
+    workspace.root.mkdir()
+    left = workspace.root / ".report.html.tmp123.html"
+    left.touch()
+    assert workspace.scraps() == [left]
 
 
 def test_a_full_disk_is_said_with_the_space_left(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def rewrite(path: Path, change: Callable[[dict[str, object]], object]) -> None:
 
 @pytest.mark.parametrize("name", [
     "../thesis.txt", "model/../../thesis.txt", "/etc/passwd", "", ".", "a//b", "a/./b", "a\0b",
-    "C:\\thesis", "C:/thesis", "a\\..\\b"])
+    "C:\\thesis", "C:/thesis", "a\\..\\b", "a" * 300, "é" * 128])
 def test_a_manifest_that_names_files_elsewhere_is_refused(
     workspace: Workspace, name: str
 ) -> None:
@@ -178,9 +178,10 @@ def test_a_crash_while_a_linked_result_is_replaced_leaves_the_old_one(
     assert content(workspace) in ("one", "two")
 
 
-def test_a_link_that_leads_nowhere_is_replaced(workspace: Workspace, tmp_path: Path) -> None:
+@pytest.mark.parametrize("target", ["unplugged/train", "train"])
+def test_a_link_that_leads_nowhere_is_replaced(workspace: Workspace, target: str) -> None:
     workspace.root.mkdir()
-    workspace.folder("train").symlink_to(tmp_path / "unplugged" / "train")
+    workspace.folder("train").symlink_to(target)
     finish(workspace, "one")
     assert content(workspace) == "one"
 

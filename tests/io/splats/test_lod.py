@@ -1,6 +1,7 @@
 """lod-meta.json: levels that tile a scene, read back, and refused when they are damaged."""
 
 import json
+import os
 import shutil
 
 import archive_splats
@@ -180,6 +181,15 @@ def test_a_truncated_or_missing_file_is_refused(tmp_path, name, keep):
     if keep:
         path.write_bytes(data[:keep])
     with pytest.raises(FormatError):
+        read_lod(tmp_path / "lod-meta.json")
+
+
+def test_a_pipe_among_the_files_is_not_waited_for(tmp_path):
+    written(tmp_path)
+    path = tmp_path / "0_0" / "means_l.webp"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(FormatError, match="not a plain file"):
         read_lod(tmp_path / "lod-meta.json")
 
 
