@@ -74,8 +74,9 @@ _watch: _Watch | None = None  # of the running command
 def raising(*, restore: bool = True) -> Iterator[None]:
     """Raises Interrupted in the block where a signal asks this process to end.
 
-    Signals that are ignored, as nohup has it, stay so. Without `restore` they are still handled
-    when the block is left: what remains is the end of the process.
+    Signals that are ignored, as nohup has it, stay so. Without `restore` they are ignored when the
+    block is left: what remains is the end of the process, in the midst of which Python would give
+    them back their default action, and with it another exit code to a command that is done.
     """
     global _watch
     if _watch is not None or threading.current_thread() is not threading.main_thread():
@@ -90,10 +91,9 @@ def raising(*, restore: bool = True) -> Iterator[None]:
     try:
         yield
     finally:
-        if restore:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-            _watch = None
+        for number, handler in before.items():
+            signal.signal(number, handler if restore else signal.SIG_IGN)
+        _watch = None
 
 
 @contextmanager

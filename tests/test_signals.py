@@ -44,6 +44,15 @@ def test_a_signal_that_is_ignored_stays_so():
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.parametrize("number", CODES)
+def test_a_signal_at_the_very_end_does_not_change_the_exit_code(number):
+    code = (f"import os, sys\nfrom recon_cli.__main__ import main\nclass Last:\n"
+            f"    def __del__(self, kill=os.kill, process=os.getpid()): kill(process, {number})\n"
+            "last, sys.argv = Last(), ['recon', '--version']\nsys.exit(main())")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_signal_that_is_sent_twice_at_once_counts_once():
     done = []
 
