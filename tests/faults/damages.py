@@ -52,7 +52,7 @@ def replace_text(path: Path, rng: random.Random, _spare: Path) -> None:
 
 
 def replace_other(path: Path, rng: random.Random, _spare: Path) -> None:
-    """Puts another file into its place, of the same type or of another."""
+    """Puts another file of the folder above into its place, of the same type or of another."""
     top = path.parent.parent
     others = sorted(one for one in top.rglob("*") if one.is_file() and not one.is_symlink()
                     and one != path and one.read_bytes() != path.read_bytes())

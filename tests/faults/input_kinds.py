@@ -170,14 +170,15 @@ def _spoil_text(path: Path, rng: random.Random, what: str) -> None:
 def hostile_splats(case: Case) -> Verdict:
     """A splat file with damage to its bytes or to what it packs."""
     form = str(case.pick(FORMATS))
-    source, path = case.lab.splats(form), case.folder / f"room.{form}"
-    shutil.copy(source, path)
+    folder = case.folder / "in"
+    shutil.copytree(case.lab.splats(form).parent, folder / "others")  # to be taken in its place
+    path = shutil.copy(case.lab.splats(form), folder / f"room.{form}")
     kind = case.rng.choice(("inside", "inside", "inside", "inside", "inside", *DAMAGES, "renamed"))
     if kind == "inside":
         path.write_bytes(hurt(path.read_bytes(), case.rng))
     elif kind == "renamed":
         other = case.rng.choice([one for one in (*FORMATS, "zip", "txt", "mp4") if one != form])
-        path = path.rename(case.folder / f"other.{other}")
+        path = path.rename(folder / f"other.{other}")
     else:
         DAMAGES[kind](path, case.rng, case.folder / "spare")
     case.tell(f"import of {path.name}: {kind}")

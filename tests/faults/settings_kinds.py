@@ -69,7 +69,8 @@ def _camera_path() -> dict[str, object]:
 
 def camera_path(case: Case) -> Verdict:
     """A camera path that is damaged or asks for what cannot be drawn."""
-    workspace, path = case.workspace(), case.folder / "path.json"
+    workspace, path = case.workspace(), case.folder / "paths" / "path.json"
+    path.parent.mkdir()
     path.write_text(json.dumps(_camera_path()))
     damage = str(case.pick(("value", "value", "value", "value", *DAMAGES)))
     if damage == "value":
