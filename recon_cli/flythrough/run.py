@@ -7,7 +7,7 @@ kept, so an interrupted run continues; with other settings all are rendered agai
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError, FormatError, WorkspaceError
+from recon_cli.errors import ConfigError, FormatError, WorkspaceError, list_names
 from recon_cli.flythrough.camera_path import write_camera_path
 from recon_cli.flythrough.camera_plan import CameraPlan, check_frame_memory, plan_cameras
 from recon_cli.flythrough.model_trust import load_trust
@@ -31,6 +31,7 @@ from recon_cli.flythrough.output import (
 )
 from recon_cli.flythrough.request import DEPTH, TRUST, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
+from recon_cli.io.images import is_whole_png
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render import render
 from recon_cli.trust.scene_trust import Trust
@@ -43,6 +44,7 @@ from recon_cli.workspace.atomic import (
     write_json,
 )
 from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.journal import crc32
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
 
 FOLDER = "render"  # in the workspace
@@ -80,14 +82,44 @@ class FrameFolder:
             before = None
         clear_leftovers(self.root)
         missing = tuple(name for name in self.names if not all(
-            self.frame_path(folder, name).is_file() for folder in self._folders))
+            is_whole_png(self.frame_path(folder, name)) for folder in self._folders))
+        known = self._keep_changed(before, missing)
         video = before["video"] if before and not missing else None
         write_json(self.root / RECORD, {
             "digest": sha256_json(settings), "settings": settings, "frames": len(self.names),
-            **about, "video": video})
+            **about, "video": video, "pictures": known})
         for folder in self._folders:
             (self.root / folder).mkdir(exist_ok=True)
         return missing
+
+    def _keep_changed(
+        self, before: Mapping[str, Any] | None, missing: Collection[str]
+    ) -> dict[str, Any]:
+        """Returns the digests of the pictures that stay, and names those that were changed."""
+        recorded = before.get("pictures") if before else None
+        known = recorded if isinstance(recorded, dict) else {}
+        known = {name: known[name] for name in self._pictures
+                 if name in known and Path(name).stem not in missing}
+        changed = [name for name, crc in known.items() if crc32(self.root / name) != crc]
+        if changed:
+            logger.warning("%s: kept, though not as they were rendered (delete them to render them "
+                           "again): %s", self.root, list_names(changed))
+        return known
+
+    def record_pictures(self) -> None:
+        """Adds the CRC-32 of every picture that has none in the record yet."""
+        record = self.read_record() or {}
+        known = record.get("pictures", {})
+        pictures = {name: known[name] if name in known else crc32(self.root / name)
+                    for name in self._pictures}
+        if pictures != known:
+            write_json(self.root / RECORD, {**record, "pictures": pictures})
+
+    @property
+    def _pictures(self) -> list[str]:
+        """The paths of all pictures, relative to the folder."""
+        return [self.frame_path(folder, name).relative_to(self.root).as_posix()
+                for folder in self._folders for name in self.names]
 
     def frame_path(self, folder: str, name: str) -> Path:
         """Returns the path of a frame's picture in one of the folders."""
@@ -144,6 +176,7 @@ def render_frames(request: RenderRequest, job: Job) -> str:
         if plan.path is not None:
             write_camera_path(folder / PATH, plan.path)
         _render_missing(frames, missing, request, plan, trained, scale, trust, ctx)
+        frames.record_pictures()
         files = _encode_videos(frames, encoding, ctx) if encoding else []
     if request.out_file is not None:
         with disk_errors(request.out_file.absolute().parent, f"writing {request.out_file.name}"):

@@ -20,6 +20,7 @@ from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
+from recon_cli.workspace.paths import refuse_special
 
 _PINHOLE = 1  # COLMAP's id of the model with fx, fy, cx, cy
 _HINT = "Run `recon sfm --again`."
@@ -279,6 +280,7 @@ class Reader:
         self._path = path
         self._hint = hint
         self._at = 0
+        refuse_special(path)
         try:
             self._data = path.read_bytes()
         except FileNotFoundError as error:

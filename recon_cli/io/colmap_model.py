@@ -19,6 +19,7 @@ from recon_cli.errors import FormatError
 from recon_cli.io.calibration import make_lens
 from recon_cli.io.colmap import Reader, model_error, pose_matrix, read_images, read_points
 from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.workspace.paths import refuse_special
 
 # COLMAP's ids of its camera models, src/colmap/sensor/models.h and pycolmap 4.2's CameraModelId.
 _IDS = (
@@ -273,6 +274,7 @@ def _read_frames_text(path: Path) -> Frames:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
+    refuse_special(path)
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError as error:

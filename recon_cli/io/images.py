@@ -5,6 +5,8 @@ There is one way to reduce an image, because the choice of filter alone can move
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -18,6 +20,7 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import read_bytes, write_bytes
 
 _COUNTS = 255  # in a mask file; anything less is ignored, half-covered edges included
+_PNG = b"\x89PNG\r\n\x1a\n"  # what every PNG begins with
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 
 
@@ -106,6 +109,22 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
     if not encoded:
         raise ValueError(f"OpenCV cannot encode an image of shape {image.shape}")
     write_bytes(path, data.tobytes())
+
+
+def is_whole_png(path: Path) -> bool:
+    """Returns whether a file is a PNG as it was written: every chunk with its CRC, and no more."""
+    try:
+        data = read_bytes(path)
+        at, kind = len(_PNG), b""
+        while data.startswith(_PNG) and kind != b"IEND" and at < len(data):
+            length, = struct.unpack_from(">I", data, at)
+            kind, end = data[at + 4:at + 8], at + 8 + length
+            if struct.unpack_from(">I", data, end) != (zlib.crc32(data[at + 4:end]),):
+                return False
+            at = end + 4
+    except (OSError, ValueError, struct.error):
+        return False
+    return kind == b"IEND" and at == len(data)
 
 
 def read_png(path: Path) -> NDArray[np.uint8]:

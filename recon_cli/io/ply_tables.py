@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.workspace.paths import refuse_special
 
 _HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
 _END = re.compile(rb"\nend_header[ \t]*\r?\n")
@@ -61,6 +62,7 @@ class Header:
 
 def read_header(path: Path) -> Header:
     """Returns the header of a .ply; FormatError if the file cannot be read or is none."""
+    refuse_special(path)
     try:
         with path.open("rb") as file:
             head = file.read(_HEADER_LIMIT)

@@ -23,6 +23,7 @@ from recon_cli.render import render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import parse_json, replacing
+from recon_cli.workspace.paths import refuse_special
 
 CARRIES = 0.01  # of a pixel's colour, from which a view shows a Gaussian
 MAX_VIEWS = 300  # that are looked at, evenly spread; more show next to nothing new
@@ -127,6 +128,7 @@ class Support:
     @staticmethod
     def load(path: Path) -> Support:
         """Returns what `save` wrote; FormatError if the file is missing, damaged or of another."""
+        refuse_special(path)
         try:
             with safe_open(path, framework="pt") as file:
                 head = parse_json((file.metadata() or {})["support"], dict)

@@ -27,6 +27,7 @@ class Case:
     folder: Path  # empty, and its own
     ran: list[Finished] = field(default_factory=list)
     story: list[str] = field(default_factory=list)  # what was done, for -v
+    may_add: bool = False  # to the user's files outside, where a link asks for that
     _canary: dict[str, str] = field(default_factory=dict)
 
     def tell(self, text: str) -> None:
@@ -60,7 +61,10 @@ class Case:
 
     def canary_lost(self) -> Verdict | None:
         """Returns the verdict where a file outside of the workspace was changed."""
-        if self._canary and snapshot(self.folder / "outside") != self._canary:
+        found = snapshot(self.folder / "outside") if self._canary else {}
+        if self.may_add:
+            found = {name: digest for name, digest in found.items() if name in self._canary}
+        if found != self._canary:
             return wrong(Outcome.LOST, self.ran[-1] if self.ran else None,
                          "files outside of the workspace are gone or changed")
         return None

@@ -131,6 +131,30 @@ def test_only_what_is_missing_is_rendered_again(room, tmp_path, capsys):
     assert pictures(tmp_path / "out", "alpha") == sorted(after)
 
 
+@pytest.mark.parametrize("damage", [
+    lambda data: data[:-20], lambda data: data + b"more", lambda _: b"text", lambda _: b"",
+    lambda data: data[:60] + bytes([data[60] ^ 1]) + data[61:]])
+def test_a_damaged_frame_is_rendered_again(room, tmp_path, damage):
+    words, frame = ["--path", "orbit", *SHORT, "--out", tmp_path / "out"], tmp_path / "out" / "rgb"
+    frame /= "00001.png"
+    assert render(room, *words) == 0
+    content = frame.read_bytes()
+    frame.write_bytes(damage(content))
+    assert render(room, *words) == 0
+    assert frame.read_bytes() == content
+
+
+def test_a_frame_that_was_replaced_by_another_picture_is_kept_and_named(room, tmp_path, caplog):
+    words, folder = ["--path", "orbit", *SHORT, "--out", tmp_path / "out"], tmp_path / "out" / "rgb"
+    assert render(room, *words) == 0
+    other = (folder / "00002.png").read_bytes()
+    (folder / "00001.png").write_bytes(other)
+    assert render(room, *words) == 0
+    assert "kept, though not as they were rendered" in caplog.text
+    assert "rgb/00001.png" in caplog.text
+    assert (folder / "00001.png").read_bytes() == other
+
+
 @pytest.mark.parametrize(("change", "said"), [
     (["--size", "40"], "cameras, sizes"),
     (["--background", "1,2,3"], "background"),
