@@ -28,7 +28,13 @@ from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceEr
 from recon_cli.workspace import disk, journal, manifest
 from recon_cli.workspace.atomic import LEFTOVERS, clear_leftovers, read_json, sync_folder
 from recon_cli.workspace.digests import FileDigest, digest_file
-from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, describe_progress
+from recon_cli.workspace.manifest import (
+    Manifest,
+    PartialRun,
+    ResultKey,
+    describe_progress,
+    find_changed_outputs,
+)
 from recon_cli.workspace.paths import is_plain_file
 
 LOG = "recon.log"
@@ -90,7 +96,7 @@ class Workspace:
             ManifestError: there is one that cannot be trusted.
         """
         folder = self.folder(stage)
-        return Manifest.read(folder) if (folder / manifest.NAME).exists() else None
+        return Manifest.read(folder) if _has_manifest(folder) else None
 
     def partial_run(self, stage: str) -> PartialRun | None:
         """Returns how far an interrupted run of a stage came, or None."""
@@ -212,7 +218,14 @@ class Workspace:
                     os.path.lexists(path) and not path.is_dir()):
                 path.unlink()
         for partial in _folders(self.root / journal.PARTIAL):
-            if self._record(partial.name).is_file() and _complete(partial):
+            if not self._record(partial.name).is_file() or not _complete(partial):
+                continue
+            damage = find_changed_outputs(partial, Manifest.read(partial), ())
+            if damage:
+                logger.warning("%s: what a crash interrupted was damaged since (%s), and is "
+                               "discarded", partial.name, "; ".join(damage))
+                self.discard(partial.name)
+            else:
                 logger.info("%s: finishing what a crash interrupted", partial.name)
                 self._swap(partial.name)
         for old in _folders(self.root / _OLD):
@@ -241,7 +254,7 @@ class Workspace:
     def _refuse_foreign(self, stage: str) -> None:
         """Refuses to replace a folder that is not ours: -w may point anywhere."""
         folder = self.folder(stage)
-        if folder.exists() and not (folder / manifest.NAME).exists():
+        if folder.exists() and not _has_manifest(folder):
             raise WorkspaceError(
                 f"{folder} is in the way: recon did not make it, for it holds no {manifest.NAME}.",
                 hint="Move or delete it, or give another workspace with -w.")
@@ -287,10 +300,15 @@ def _folders(parent: Path) -> list[Path]:
     return sorted(path for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
 
 
+def _has_manifest(folder: Path) -> bool:
+    """Returns whether a folder has a manifest, be it a link that leads nowhere."""
+    return os.path.lexists(folder / manifest.NAME)
+
+
 def _complete(folder: Path) -> bool:
     """Returns whether a folder holds a manifest that can be trusted: it is written last."""
     try:
-        return (folder / manifest.NAME).exists() and bool(Manifest.read(folder))
+        return _has_manifest(folder) and bool(Manifest.read(folder))
     except ManifestError:
         return False
 

@@ -349,3 +349,37 @@ def test_a_place_where_no_workspace_can_be_made_is_said(
     writing = Workspace(tmp_path / "not" / "mine").writing("train")
     with pytest.raises(WorkspaceError, match="Permission denied"), writing:
         pass
+
+
+def test_a_result_that_was_damaged_before_its_last_rename_replaces_nothing(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    with monkeypatch.context() as patch:
+        def die(*_: object) -> None:
+            raise Killed
+
+        patch.setattr(Workspace, "_swap", die)
+        with pytest.raises(Killed), workspace.writing("train"):
+            finish(workspace, "two")
+    damaged = workspace.partial("train") / "sub" / "data.txt"
+    damaged.unlink()
+    damaged.mkdir()
+    with workspace.writing("status"):
+        assert content(workspace) == "one"
+    assert not workspace.partial("train").exists()
+    assert "damaged since (output sub/data.txt is missing)" in caplog.text
+
+
+def test_a_manifest_that_is_a_link_to_nowhere_is_damaged_not_missing(workspace: Workspace) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    manifest = workspace.folder("train") / "manifest.json"
+    manifest.unlink()
+    manifest.symlink_to("nowhere")
+    with pytest.raises(ManifestError):
+        workspace.manifest("train")
+    with workspace.writing("train"):
+        finish(workspace, "two")
+    assert content(workspace) == "two"
