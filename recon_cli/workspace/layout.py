@@ -15,6 +15,7 @@ import errno
 import json
 import logging
 import os
+import re
 import shutil
 import socket
 from collections.abc import Collection, Iterator
@@ -22,6 +23,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+import psutil
 from filelock import FileLock, Timeout
 
 from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
@@ -249,7 +251,7 @@ class Workspace:
         parents = [self.root / name for name in (journal.PARTIAL, _OLD, SEEDS, BLOCKS)]
         return [*(path for parent in parents
                   for path in ([parent] if parent.is_symlink() else sorted(parent.glob("*")))),
-                *sorted(self.root.glob(LEFTOVERS))]
+                *(path for path in sorted(self.root.glob(LEFTOVERS)) if not _is_in_use(path))]
 
     def _refuse_foreign(self, stage: str) -> None:
         """Refuses to replace a folder that is not ours: -w may point anywhere."""
@@ -298,6 +300,12 @@ def _explain(error: Exception, root: Path, doing: str) -> ReconError | None:
 
 def _folders(parent: Path) -> list[Path]:
     return sorted(path for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
+
+
+def _is_in_use(leftover: Path) -> bool:
+    """Returns whether the process that writes a file still runs: a report takes no lock."""
+    number = re.search(r"\.tmp(\d+)", leftover.name)
+    return number is not None and psutil.pid_exists(int(number[1]))
 
 
 def _has_manifest(folder: Path) -> bool:

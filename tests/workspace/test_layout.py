@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -383,3 +385,14 @@ def test_a_manifest_that_is_a_link_to_nowhere_is_damaged_not_missing(workspace: 
     with workspace.writing("train"):
         finish(workspace, "two")
     assert content(workspace) == "two"
+
+
+def test_only_leftovers_of_processes_that_are_gone_are_scraps(workspace: Workspace) -> None:
+    workspace.root.mkdir()
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    left, in_use = (
+        workspace.root / f".report.html.tmp{pid}.html" for pid in (gone.pid, os.getpid()))
+    for path in (left, in_use):
+        path.write_text("half a page")
+    assert workspace.scraps() == [left]
