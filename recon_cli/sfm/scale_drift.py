@@ -4,7 +4,8 @@ A camera that turns in a narrow place ties what lies before it to what comes aft
 show little of either scale. Matches agree then, whatever the scale is: a walk of 30 m was trusted
 whose second half was a third too large. So the information that all observations hold about the
 relative scale is computed, with every camera, every point and the focal length free (the covariance
-of a bundle adjustment, Triggs et al. 2000, sections 6.1 and 9).
+of a bundle adjustment, Triggs et al. 2000, sections 6.1 and 9). Where that is little, the height of
+the cameras above the floor on both sides is the other witness.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, eye, hstack
 from scipy.sparse.linalg import SuperLU, splu
 
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.sfm.floor_heights import SPREAD, compare_heights, measure_heights
 
 # The scale of a stretch is that of its cameras' centres. It spans this share of the extent of all
 # and of the usual depth, and so many cameras: on a shorter one the camera stands still, or turns.
@@ -25,7 +27,8 @@ REACH, DEPTHS, LEAST = 0.2, 0.5, 10
 # Errors of tracks and of the lens are shared by many observations and do not average out: scales
 # were off by 10 to 20 times what independent errors of one pixel's fraction would leave.
 SHARED_ERRORS = 15.0
-MAX_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_verdict.py`
+MAX_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_scale_breaks.py`
+DOUBTFUL = MAX_ERROR / 3  # the floor is looked at from here on
 LOSS_SCALE = 0.5  # of Cauchy's loss, times the mean error, as in `mapper.sharpen`
 _RIDGE = 1e-10  # times the diagonal: position, turn and scale of the whole are free
 _POSE = 6  # unknowns of a camera: its turn, and its centre
@@ -58,16 +61,31 @@ def find_weakest_scale(
               if (stretches := _stretches(information, place)) is not None}
     if not errors:
         return None
+    if max(errors.values()) > DOUBTFUL:
+        heights = measure_heights(model, order)
+        errors = {place: _ask_floor(error, compare_heights(heights, place))
+                  for place, error in errors.items()}
     place = max(errors, key=lambda each: errors[each])
     parts = tuple(order[:place]), tuple(order[place:])
     first_side, second_side = sorted(parts, key=len)
-    return ScaleCut(SHARED_ERRORS * errors[place], order[place - 1], order[place],
+    return ScaleCut(errors[place], order[place - 1], order[place],
                     (first_side, second_side))
 
 
 def is_scale_known(cut: ScaleCut | None) -> bool:
     """Returns whether no relative scale is less certain than MAX_ERROR."""
     return cut is None or cut.error <= MAX_ERROR
+
+
+def _ask_floor(error: float, step: float | None) -> float:
+    """Returns the error of a relative scale once the heights above the floor are known, too.
+
+    Both are taken for normal: what is most likely wrong then, or its deviation if that is more.
+    """
+    if step is None:
+        return error
+    share = error**2 / (error**2 + SPREAD**2)
+    return max(share * abs(step), float(np.sqrt(1 - share)) * error)
 
 
 def _stretches(
@@ -105,9 +123,10 @@ class _Information:
         self._factor, self._variance = _factorise(seen)
 
     def error(self, before: NDArray[np.int64], behind: NDArray[np.int64]) -> float:
-        """Returns the standard deviation of the log of the relative scale of two stretches."""
+        """Returns how well the relative scale of two stretches is known, as `ScaleCut.error`."""
         change = _scale_of(self.centers, behind) - _scale_of(self.centers, before)
-        return float(np.sqrt(max(self._variance * (change @ self._factor.solve(change)), 0.0)))
+        variance = self._variance * float(change @ self._factor.solve(change))
+        return SHARED_ERRORS * float(np.sqrt(max(variance, 0.0)))
 
 
 def _scale_of(centers: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:

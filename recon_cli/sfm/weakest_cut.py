@@ -78,7 +78,7 @@ class OutlierCamera:
         text = f"{self.share:.0%} of its {self.matches} matches agree with where it was placed"
         if self.joined is None:
             return text
-        return f"{text}, but {self.joined:.0%} of what {self.rival} shows, too, is one point in both"
+        return f"{text}, but {self.joined:.0%} of what {self.rival} shows too is one point in both"
 
 
 def find_weakest_cut(

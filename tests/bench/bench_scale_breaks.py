@@ -123,7 +123,7 @@ def scaled(
     moved = {name: motion.transform_camera_world(pose) if row >= place else pose
              for row, (name, pose) in enumerate(poses.items())}
     model = mapper.triangulate(own, build_posed_model(own.database, base, moved))
-    mapper.adjust(model)
+    mapper.refine(own, model)
     return model, own
 
 
