@@ -1,13 +1,14 @@
 """Are breaks of a walk's scale found? `python tests/bench/bench_scale_breaks.py DATA OUT [NAME..]`
 
 DATA is the folder of test data, and OUT that of `bench_verdict`, whose captures are mapped where
-they are not yet. Each good walk is cut where the relative scale of both sides is known least, as it
-is and with only the matches of frames up to 4, 2 and 1 apart left across the cut, as at a turn in a
-narrow place. One side is scaled by 3, 10 and 25%, and all is triangulated and adjusted again. A
-line shows what scale is left (a good one mends itself), how well it is said to be known, the open
-loops, and the verdict. A model is broken from BROKEN on, and good up to SOUND where no match was
-left out; others count as neither. Behind it: of every third capture, which are kept from the
-choice, how many are decided wrongly by the bound that lies in the middle of those of the others.
+they are not yet. Each good walk is cut where the relative scale of both sides is known least: as it
+is, and made a turn in a narrow place by leaving across the cut only matches of frames up to 2
+apart, or of neighbours, and of those the FEW that show what is furthest away. One side is scaled by
+3, 10 and 25%, and all is triangulated and adjusted again, as sfm does. A line shows what scale is
+left (a good one mends itself), how well it is said to be known, the open loops, and the verdict. A
+model is broken from BROKEN on, and good up to SOUND where no match was left out; others count as
+neither. Behind it: of every third capture, which are kept from the choice, how many are decided
+wrongly by the bound that lies in the middle of those of the others.
 
 --walk MODEL DATABASE TRUTH adds a model with its database, whose frames are numbered by the lines
 of TRUTH, camera to world: as mapped, it is good or broken by the scales of its stretches.
@@ -18,9 +19,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,14 +31,16 @@ from pose_errors import similarity
 from verdict_captures import CAPTURES, MODEL, Capture, prepare
 from verdict_variants import ordered_poses
 
-from recon_cli.sfm import database, mapper
+from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import build_posed_model, drop_outliers
 from recon_cli.sfm.scale_drift import MAX_ERROR, find_weakest_scale
 from recon_cli.sfm.verdict import ModelVerdict, examine
 
 FACTORS = (1.03, 1.10, 1.25)
-REACHES = (None, 4, 2, 1)  # frames; None leaves all matches across the cut
+# Across the cut: frames up to so far apart, None for all, and matches of each pair of them.
+FEW = 40
+TIES = ((None, None), (2, None), (2, FEW), (1, FEW), (1, FEW // 2))
 BROKEN, SOUND = 0.10, 0.03  # of a relative scale that is left
 STRETCH = 20  # cameras on either side of a cut that its scale is taken from
 DEFAULT = ("fox", "living", "office", "living_noisy", "office_noisy", "bedroom", "trident",
@@ -92,22 +93,48 @@ def relative_scale(before: Array, after: Array, place: int) -> float:
     return abs(float(np.expm1(abs(np.log(change)))))
 
 
-def drop_pairs(path: Path, order: Sequence[str], place: int, reach: int) -> None:
-    """Deletes the matches of pairs of a database across a place in the order, but of near ones."""
+def thin_ties(
+    path: Path, base: pycolmap.Reconstruction, order: Sequence[str], place: int,
+    ties: tuple[int | None, int | None],
+) -> None:
+    """Deletes matches across a place in the order: of frames far apart, and of what is near."""
+    reach, few = ties
+    if reach is None:
+        return
     rows = {name: row for row, name in enumerate(order)}
-    with closing(sqlite3.connect(path)) as connection, connection:
-        ids = dict(connection.execute("SELECT name, image_id FROM images"))
-        for pair in database.pair_names(path):
-            low, high = sorted(rows.get(name, -1) for name in pair)
-            if low < place <= high and (low < 0 or high - low > reach):
-                first, second = sorted(ids[name] for name in pair)
-                for table in ("matches", "two_view_geometries"):
-                    connection.execute(f"DELETE FROM {table} WHERE pair_id = ?",
-                                       (first * (2**31 - 1) + second,))
+    with pycolmap.Database.open(path) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            pair = pycolmap.pair_id_to_image_pair(number)
+            low, high = sorted(rows.get(names[image], -1) for image in pair)
+            if not low < place <= high:
+                continue
+            opened.delete_two_view_geometry(*pair)
+            opened.delete_matches(*pair)
+            if low < 0 or high - low > reach:
+                continue
+            image = base.find_image_with_name(names[pair[0]])
+            inliers = geometry.inlier_matches
+            if few is not None:
+                inliers = inliers[np.argsort(-depths(base, image, inliers[:, 0]))[:few]]
+            geometry.inlier_matches = inliers
+            opened.write_matches(*pair, inliers)
+            opened.write_two_view_geometry(*pair, geometry)
+
+
+def depths(
+    model: pycolmap.Reconstruction, image: pycolmap.Image, keypoints: NDArray[np.uint32]
+) -> Array:  # [K]
+    """Depths of what keypoints of an image show; 0 where they show no point."""
+    spots = [image.points2D[int(row)] for row in keypoints]
+    return np.array([
+        (image.cam_from_world() * model.point3D(spot.point3D_id).xyz)[2]
+        if spot.has_point3D() else 0.0 for spot in spots])
 
 
 def scaled(
-    job: MappingJob, base: pycolmap.Reconstruction, place: int, factor: float, reach: int | None
+    job: MappingJob, base: pycolmap.Reconstruction, place: int, factor: float,
+    ties: tuple[int | None, int | None],
 ) -> tuple[pycolmap.Reconstruction, MappingJob]:
     """A model whose cameras from a place on are scaled about the first of them, adjusted again."""
     own = dataclasses.replace(job, out=job.out / "scaled")
@@ -116,8 +143,7 @@ def scaled(
     shutil.copyfile(job.database, own.database)
     poses = ordered_poses(job, base)
     names = list(poses)
-    if reach is not None:
-        drop_pairs(own.database, names, place, reach)
+    thin_ties(own.database, base, names, place, ties)
     pivot = poses[names[place]].inverse().translation
     motion = pycolmap.Sim3d(factor, pycolmap.Rotation3d(), (1 - factor) * pivot)
     moved = {name: motion.transform_camera_world(pose) if row >= place else pose
@@ -140,9 +166,9 @@ def rows_of(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
     yield Row(capture.name, "mapped", f"{own.registered}/{own.images}", 0.0, "good", own)
     cut = find_weakest_scale(base, names)
     place = len(names) // 2 if cut is None else names.index(cut.after)
-    for reach in REACHES:
+    for ties in TIES:
         for factor in FACTORS:
-            model, made = scaled(job, base, place, factor, reach)
+            model, made = scaled(job, base, place, factor, ties)
             candidate = drop_outliers(made, mapper.sharpen(model))
             found = {image.name: image.projection_center() for image in map(
                 candidate.model.image, candidate.model.reg_image_ids())}
@@ -151,8 +177,9 @@ def rows_of(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
                 centers[rows], np.array([found[names[row]] for row in rows]),
                 sum(row < place for row in rows))
             label = "broken" if left >= BROKEN else (
-                "good" if left <= SOUND and reach is None else "")
-            what = "all matches" if reach is None else f"up to {reach} apart"
+                "good" if left <= SOUND and ties == TIES[0] else "")
+            what = "all matches" if ties == TIES[0] else (
+                f"up to {ties[0]} apart" + (f", {ties[1]} far" if ties[1] else ""))
             yield Row(capture.name, f"x {factor:g}, {what}", f"{len(rows)}/{len(names)}", left,
                       label, candidate.verdict)
 
