@@ -93,7 +93,8 @@ class Row:
 
 
 HEADS = ("capture", "made", "cameras", "farthest", "displaced", "points", "explained", "overlap",
-         "scale", "loops", "outliers", "parts", "jump", "still", "angle", "error", "s", "label", "verdict", "")
+         "scale", "loops", "outliers", "parts", "jump", "still", "angle", "error", "s", "label",
+         "verdict", "")
 
 
 def reference(capture: Capture, data: Path) -> Centers:
