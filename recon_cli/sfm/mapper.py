@@ -86,6 +86,25 @@ def extend_model(
     return max(models.values(), key=model_size, default=model)
 
 
+def resect(job: MappingJob, model: pycolmap.Reconstruction) -> int:
+    """Adds the images to a model, in place, that its points place; returns how many.
+
+    Nothing else is adjusted. Images are taken in the order of their names.
+    """
+    with pycolmap.Database.open(job.database) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+    options = _options(job)
+    worker = pycolmap.IncrementalMapper(cache)
+    worker.begin_reconstruction(model)
+    placed = 0
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if not image.has_pose and worker.register_next_image(options.mapper, image.image_id):
+            worker.triangulate_image(options.triangulation, image.image_id)
+            placed += 1
+    worker.end_reconstruction(False)
+    return placed
+
+
 def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the models of the global mapper, which places all images at once, adjusted.
 

@@ -5,8 +5,8 @@ from tracks through every frame alone. With these cameras, the skeleton, each pa
 matches can be checked: most agree; some are off by what the cameras drift on a long way, and close
 a loop; the rest look alike but are two places, and are left out.
 
-The cameras of the skeleton are adjusted to the matches. Where that leaves a loop open they are
-found again from all matches that are left.
+The cameras of the skeleton are adjusted to the matches. Where that leaves a loop open they are bent
+until it closes, and adjusted again.
 
 Photos get a skeleton from the coarsest of their features. Matching only what overlaps by it takes
 .4 to .7 of the time of matching all pairs, more of it the fewer photos there are.
@@ -17,7 +17,7 @@ from __future__ import annotations
 import io
 import itertools
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,6 +30,8 @@ from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, is_vouched, publish, vouch
+from recon_cli.sfm.keyframes import choose_keyframes, name_keyframes, side_pairs, track_rows
+from recon_cli.sfm.loop_closure import bend_model
 from recon_cli.sfm.matching import Pair, similar_pairs
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 
@@ -40,6 +42,8 @@ SKELETON, COARSE_SKELETON = "skeleton", "skeleton.coarse"
 # frame. All up to 20 take twice as long; they are for videos that fall apart.
 STEPS, ALL_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
 ENOUGH = 0.9  # share of the frames that a skeleton must hold, else other mappers are tried
+REST_ROUNDS = 2  # adjustments with new points in between once all frames are placed
+BENDS = 2  # times that a model with open loops is bent and fitted again
 # COLMAP uses a pair of images from 15 matches on (TwoViewGeometryOptions.min_num_inliers).
 MIN_MATCHES = 15
 # Tracks count beside features where a pair has fewer matches than this: they are less exact.
@@ -80,9 +84,13 @@ def _read_tracks(job: MappingJob) -> Tracks:
     return Tracks.read(job.tracks)
 
 
-def near_pairs(job: MappingJob, reach: int) -> set[Pair]:
-    """Returns the pairs of frames of one camera that are up to `reach` apart by name."""
-    return {pair for group in job.groups for names in [sorted(group.names)]
+def near_pairs(job: MappingJob, reach: int, among: Collection[str] | None = None) -> set[Pair]:
+    """Returns the pairs of frames of one camera that are up to `reach` apart by name.
+
+    Other names than those in `among` do not count.
+    """
+    inside = set(job.names if among is None else among)
+    return {pair for group in job.groups for names in [sorted(inside.intersection(group.names))]
             for step in range(1, reach + 1) for pair in zip(names, names[step:], strict=False)}
 
 
@@ -143,18 +151,21 @@ def choose_tracked_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
     """Returns the pairs of frames of a video that its tracks show to be worth matching."""
     models = load_skeleton(job, report)
     reach = ALWAYS if len(models) == 1 else matching.SEQUENTIAL_OVERLAP
-    pairs = near_pairs(job, reach).union(*(overlapping_pairs(model) for model in models))
-    return pairs | _unexpected_pairs(job, models, pairs)
+    tracks = _read_tracks(job)
+    names = name_keyframes(tracks)
+    pairs = near_pairs(job, reach, names).union(*(overlapping_pairs(model) for model in models))
+    return side_pairs(tracks) | pairs | _unexpected_pairs(job, models, pairs, names)
 
 
 def _unexpected_pairs(
-    job: MappingJob, models: Sequence[pycolmap.Reconstruction], pairs: Collection[Pair]
+    job: MappingJob, models: Sequence[pycolmap.Reconstruction], pairs: Collection[Pair],
+    names: Sequence[str],
 ) -> set[Pair]:
-    """Returns pairs that look alike, and that by the models have little in common.
+    """Returns pairs of frames that look alike, and that by the models have little in common.
 
     They may close a loop. Others would repeat what the matches of `pairs` say already.
     """
-    alike = similar_pairs(job.database, job.names, seed=job.seed, nearest=SIMILAR, besides=pairs)
+    alike = similar_pairs(job.database, names, seed=job.seed, nearest=SIMILAR, besides=pairs)
     return alike.difference(*(overlapping_pairs(model, WIDEST) for model in models))
 
 
@@ -163,7 +174,7 @@ def choose_coarse_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
     models = _load_models(job, COARSE_SKELETON, lambda: build_coarse_skeleton(job, report))
     pairs = set[Pair]().union(
         *(overlapping_pairs(model, OVERLAPPING_PHOTOS) for model in models))
-    return pairs | _unexpected_pairs(job, models, pairs)
+    return pairs | _unexpected_pairs(job, models, pairs, job.names)
 
 
 def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
@@ -205,14 +216,17 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
     folder = fresh_folder(job.attempts / f"{SKELETON}.mapping")
     linked = replace(job, linked=folder / LINKED)
     tracks = _read_tracks(job)
-    link(linked, images, {}, tracks)
+    keyframes = choose_keyframes(tracks)
+    tracks = tracks.select({row: tracks.names[row] for row in keyframes})
+    rows = range(len(keyframes))
+    link(linked, images, {}, tracks, rows)
     models = mapper.map_incrementally(linked, silent)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
     # without parallax.
     for find_models in (mapper.map_relaxed, mapper.map_globally):
-        if _most(models) >= ENOUGH * len(job.names):
+        if _most(models) >= ENOUGH * len(keyframes):
             break
-        link(linked, images, {}, tracks, steps=ALL_STEPS)
+        link(linked, images, {}, tracks, rows, steps=ALL_STEPS)
         models = max(models, find_models(linked, silent), key=_most)
     shutil.rmtree(folder)
     models.sort(key=mapper.model_size, reverse=True)
@@ -231,21 +245,38 @@ def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconst
     checked = check_pairs(source, list_models(models), geometries)
     usable = {pair: geometry for pair, geometry in geometries.items()
               if pair not in checked.contradicting}
-    if _most(models) < ENOUGH * len(job.names):
-        link(job, source, usable, tracks, steps=ALL_STEPS)
+    keyframes = choose_keyframes(tracks)
+    if _most(models) < ENOUGH * len(keyframes):
+        link(job, source, usable, tracks, keyframes, steps=ALL_STEPS)
         return mapper.map_relaxed(job, report)
-    link(job, source, usable, tracks)
-    fitted = _fit(job, models[0])
-    open_loops = check_pairs(source, list_models([fitted]), usable).drifted
-    if not open_loops:
-        return [fitted]
-    remapped = mapper.map_incrementally(job, report)
-    best = merge_models.best_model(job, remapped)
-    if best is not None and best.verdict.trusted:
-        return [best.model]
-    link(job, source, {pair: geometry for pair, geometry in usable.items()
-                       if pair not in open_loops}, tracks)
-    return [_fit(job, models[0])]
+    link(job, source, usable, tracks, keyframes)
+    return [_place_rest(job, close_loops(job, report, _fit(job, models[0])))]
+
+
+def close_loops(
+    job: MappingJob, report: Reporter, fitted: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction:
+    """Returns a fitted model, bent where loops are open and fitted again to what then agrees.
+
+    Frames that see the same once loops are closed are matched, and `job.linked` is written anew.
+    """
+    source, tracks = replace(job, linked=None), _read_tracks(job)
+    for _ in range(BENDS):
+        bent = bend_model(fitted, read_verified(source.database), seed=job.seed)
+        if bent is None:
+            break
+        met = overlapping_pairs(bent) - overlapping_pairs(fitted, WIDEST)
+        if met - database.pair_names(source.database):
+            matching.match_pairs(source, met, report)
+            database.seal(source.database)
+            report.phase("mapping", len(job.names))
+        geometries = read_verified(source.database)
+        checked = check_pairs(source.database, list_models([bent]), geometries)
+        link(job, source.database, {
+            pair: geometry for pair, geometry in geometries.items()
+            if pair not in checked.contradicting}, tracks, choose_keyframes(tracks))
+        fitted = _fit(job, bent)
+    return fitted
 
 
 def complete_coarse(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
@@ -257,7 +288,7 @@ def complete_coarse(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstr
     if _most(models) < ENOUGH * len(job.names):
         return mapper.map_incrementally(job, report)
     report.phase("mapping", len(job.names))
-    return [_fit(job, models[0])]
+    return [_place_rest(job, _fit(job, models[0]))]
 
 
 def _most(models: Sequence[pycolmap.Reconstruction]) -> int:
@@ -271,7 +302,15 @@ def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconst
     model = mapper.triangulate(
         job, merge_models.build_posed_model(job.database, skeleton, poses), rounds=1)
     mapper.refine(job, model)
-    return mapper.extend_model(job, model) if len(poses) < len(job.names) else model
+    return model
+
+
+def _place_rest(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Returns a model with the frames that it lacks, adjusted: those between keyframes first."""
+    if job.tracks is not None and mapper.resect(job, model):
+        mapper.refine(job, model, REST_ROUNDS)
+    complete = model.num_reg_images() == len(job.names)
+    return model if complete else mapper.extend_model(job, model)
 
 
 def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
@@ -291,18 +330,19 @@ def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
 
 def link(
     job: MappingJob, source: Path, geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
-    tracks: Tracks, *, steps: Sequence[int] = STEPS,
+    tracks: Tracks, keyframes: Sequence[int], *, steps: Sequence[int] = STEPS,
 ) -> None:
     """Writes the database `job.linked`: images and keypoints of another one, and these matches.
 
-    Observations of tracks follow the keypoints of an image. They are matches where features gave
-    few. Other pairs that were matched stay in it without matches: that they should show the same,
+    Observations of tracks follow the keypoints of an image. Where features gave few matches, they
+    tie keyframes, by row, that are so many `steps` of them apart, and others to those beside them.
+    Other pairs that were matched stay in it without matches: that they should show the same,
     and do not, speaks against a model.
     """
     tried = database.pair_names(source)
     database.remove(job.database)
     shutil.copyfile(source, job.database)
-    matched = _match_tracks(tracks, geometries, steps)
+    matched = _match_tracks(tracks, geometries, track_rows(keyframes, steps))
     with pycolmap.Database.open(job.database) as opened:
         opened.clear_matches()
         opened.clear_two_view_geometries()
@@ -330,21 +370,20 @@ def link(
 
 
 def _match_tracks(
-    tracks: Tracks, geometries: Mapping[Pair, pycolmap.TwoViewGeometry], steps: Sequence[int]
+    tracks: Tracks, geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
+    rows: Iterable[tuple[int, int]],
 ) -> dict[Pair, NDArray[np.int64]]:
     """Returns which observations of two images show the same tracks, [M, 2] by row in each."""
     start = np.searchsorted(tracks.image, np.arange(len(tracks.names)))
     matched = {}
-    for step in steps:
-        for first in range(len(tracks.names) - step):
-            second = first + step
-            pair = tracks.names[first], tracks.names[second]
-            known = geometries.get(pair)
-            if known is not None and len(known.inlier_matches) >= FEW_MATCHES:
-                continue
-            rows = np.stack(tracks.matches(first, second), axis=1)
-            if len(rows) >= MIN_MATCHES:
-                matched[pair] = rows - start[[first, second]]
+    for first, second in rows:
+        pair = tracks.names[first], tracks.names[second]
+        known = geometries.get(pair)
+        if known is not None and len(known.inlier_matches) >= FEW_MATCHES:
+            continue
+        shown = np.stack(tracks.matches(first, second), axis=1)
+        if len(shown) >= MIN_MATCHES:
+            matched[pair] = shown - start[[first, second]]
     return matched
 
 
