@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,15 @@ def map_incrementally(job: MappingJob, report: Reporter) -> list[pycolmap.Recons
     return _map(job, report, _options(job))
 
 
-def map_relaxed(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
-    """Returns the models with lower thresholds for the first pair and each further image."""
+def map_relaxed(
+    job: MappingJob, report: Reporter, names: Sequence[str] = ()
+) -> list[pycolmap.Reconstruction]:
+    """Returns the models with lower thresholds for the first pair and each further image.
+
+    `names` are the only images that are mapped, where there are some.
+    """
     options = _options(job)
+    options.image_names = list(names)
     _relax(options)
     return _map(job, report, options)
 

@@ -222,8 +222,9 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
     link(linked, images, {}, tracks, rows)
     models = mapper.map_incrementally(linked, silent)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
-    # without parallax.
-    for find_models in (mapper.map_relaxed, mapper.map_globally):
+    # without parallax. What tracks of a long video leave apart is left to the matches.
+    whole = len(keyframes) == len(job.names)
+    for find_models in (mapper.map_relaxed, mapper.map_globally) if whole else ():
         if _most(models) >= ENOUGH * len(keyframes):
             break
         link(linked, images, {}, tracks, rows, steps=ALL_STEPS)
@@ -246,11 +247,16 @@ def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconst
     usable = {pair: geometry for pair, geometry in geometries.items()
               if pair not in checked.contradicting}
     keyframes = choose_keyframes(tracks)
-    if _most(models) < ENOUGH * len(keyframes):
-        link(job, source, usable, tracks, keyframes, steps=ALL_STEPS)
+    if _most(models) >= ENOUGH * len(keyframes):
+        link(job, source, usable, tracks, keyframes)
+        return [_place_rest(job, close_loops(job, report, _fit(job, models[0])))]
+    link(job, source, usable, tracks, keyframes, steps=ALL_STEPS)
+    if len(keyframes) == len(job.names):
         return mapper.map_relaxed(job, report)
-    link(job, source, usable, tracks, keyframes)
-    return [_place_rest(job, close_loops(job, report, _fit(job, models[0])))]
+    found = mapper.map_relaxed(job, report, [tracks.names[row] for row in keyframes])
+    found.sort(key=mapper.model_size, reverse=True)
+    return [_place_rest(job, close_loops(job, report, model)) if row == 0 else model
+            for row, model in enumerate(found)]
 
 
 def close_loops(

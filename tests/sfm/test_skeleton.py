@@ -416,4 +416,5 @@ def test_what_looks_alike_is_matched_where_the_models_do_not_show_it_to_overlap(
     monkeypatch.setattr(skeleton, "similar_pairs", lambda *_, besides, **__: (
         {(first, last)} | overlap) - set(besides))
     assert skeleton._unexpected_pairs(job, [made.model()], chosen, job.names) == {(first, last)}
-    assert skeleton._unexpected_pairs(job, [], chosen, job.names) == {(first, last)} | overlap - chosen
+    assert skeleton._unexpected_pairs(job, [], chosen, job.names) == (
+        {(first, last)} | overlap - chosen)
