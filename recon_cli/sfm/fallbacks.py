@@ -38,9 +38,6 @@ from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
-# Frames up to which a video whose segments gave no good model is mapped as a whole: of more, that
-# would take longer than all of its segments.
-WHOLE_MAX = 400
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW = 30
 # Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
@@ -110,7 +107,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         joined = Fallback(
             SEGMENTS, f"{count} frames were mapped in {len(job.segments)} segments",
             lambda *_: set(), join_segments.map_joined)
-        if count > WHOLE_MAX and job.tracks is not None:
+        if job.tracks is not None:  # as a whole it would take longer than all of its segments
             return (joined,)
         ways = (joined, *ways)
     return (*ways, Fallback("global", "", lambda *_: set(), mapper.map_globally))

@@ -36,6 +36,7 @@ from recon_cli.sfm.segment_joins import (
 )
 from recon_cli.sfm.segment_points import Segment, describe_segment, find_shared_points
 from recon_cli.sfm.segments import overlap
+from recon_cli.sfm.view_overlap import overlapping_images
 from recon_cli.workspace import atomic
 
 Pair = matching.Pair
@@ -315,7 +316,7 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
         for name in names:
             held[name].add(index)
     owned = [(image, model) for model, names in joined.parts for image in _images(model, names)]
-    return skeleton.overlapping_images(
+    return overlapping_images(
         [image for image, _ in owned], [model for _, model in owned], held,
         most=OVERLAPPING, besides=known)
 

@@ -30,10 +30,17 @@ from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, is_vouched, publish, vouch
-from recon_cli.sfm.keyframes import choose_keyframes, name_keyframes, side_pairs, track_rows
+from recon_cli.sfm.keyframes import (
+    choose_keyframes,
+    name_keyframes,
+    share_tracks,
+    side_pairs,
+    track_rows,
+)
 from recon_cli.sfm.loop_closure import bend_model
 from recon_cli.sfm.matching import Pair, similar_pairs
 from recon_cli.sfm.pair_checks import check_pairs, list_models
+from recon_cli.sfm.view_overlap import WIDEST, overlapping_pairs
 
 LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
 # Models in the folder of the attempts: from tracks, and from the coarsest features.
@@ -50,20 +57,14 @@ MIN_MATCHES = 15
 FEW_MATCHES = 100
 # Share of the neighbours with MIN_MATCHES tracks above which a video hangs together by them.
 CONTINUOUS = 0.5
-# Pairs that the skeleton shows to overlap, per image, spread over the WIDEST from most to least
-# overlap: the closest tell little about depth. Errors of the cameras of two rooms with 10, 8 and 6
-# of them, in cm: .17 and .09, .17 and .10, .20 and .10.
-OVERLAPPING, WIDEST = 8, 60
-# The same of photos, which have no neighbours. 50 frames of each of the rooms as photos: .024 and
-# .045% of the extent with 8, .020 and .034% with 12, .013 and .034% with all pairs.
+# Pairs of photos that overlap, per image: more than of frames, as they have no neighbours. 50
+# frames of each of two rooms as photos: .024 and .045% of the extent with 8, .020 and .034% with
+# 12, .013 and .034% with all pairs.
 OVERLAPPING_PHOTOS = 12
 # Pairs per image that look alike. Of some 240 on the videos of the two rooms 97% overlap by the
 # skeleton, of 314 on a walk round a room 27%; without those the rooms' cameras are as exact.
 SIMILAR = 5
 ALWAYS = 3  # neighbours that are matched in any case
-# Two views overlap as far as a point of one lies in the other, at a like angle and distance.
-MAX_ANGLE_DEG, MAX_RATIO, MIN_OVERLAP = 30.0, 2.0, 0.2
-SAMPLED = 150  # points per image
 # Keypoints of a photo, the coarsest, from which cameras are found first. Of the 1225 pairs of 50
 # photos 914 are verified with 1000, 743 with 600 and 566 with 400, in 17, 10 and 4 CPU s.
 COARSEST = 600
@@ -150,10 +151,14 @@ def _load_models(
 def choose_tracked_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
     """Returns the pairs of frames of a video that its tracks show to be worth matching."""
     models = load_skeleton(job, report)
-    reach = ALWAYS if len(models) == 1 else matching.SEQUENTIAL_OVERLAP
     tracks = _read_tracks(job)
     names = name_keyframes(tracks)
-    pairs = near_pairs(job, reach, names).union(*(overlapping_pairs(model) for model in models))
+    near = near_pairs(job, ALWAYS, names)
+    if len(models) > 1:
+        further = near_pairs(job, matching.SEQUENTIAL_OVERLAP, names)
+        whole = len(names) == len(job.names)
+        near |= further if whole else share_tracks(tracks, further)
+    pairs = near.union(*(overlapping_pairs(model) for model in models))
     return side_pairs(tracks) | pairs | _unexpected_pairs(job, models, pairs, names)
 
 
@@ -412,79 +417,6 @@ def _append_tracks(
         write = opened.update_keypoints if there else opened.write_keypoints
         write(image.image_id, np.concatenate([keypoints, followed]))
     return counts
-
-
-def overlapping_pairs(model: pycolmap.Reconstruction, most: int = OVERLAPPING) -> set[Pair]:
-    """Returns each image of a model with `most` ones whose views have something in common."""
-    images = _images(model)
-    return overlapping_images(images, [model] * len(images), most=most)
-
-
-def overlapping_images(
-    images: Sequence[pycolmap.Image],
-    models: Sequence[pycolmap.Reconstruction],  # that hold the points of each image
-    held: Mapping[str, Collection[int]] | None = None,
-    *, most: int = OVERLAPPING, besides: Collection[Pair] = (),
-) -> set[Pair]:
-    """Returns each image with `most` whose views have something in common, fewer by known pairs.
-
-    Where `held` names the segments that hold each image, only pairs of different ones. Pairs in
-    `besides` are known, by names in order; they are not returned.
-    """
-    order = sorted(range(len(images)), key=lambda index: images[index].name)
-    images = [images[index] for index in order]
-    places = {key: {number: point.xyz for number, point in model.points3D.items()}
-              for key, model in {id(model): model for model in models}.items()}
-    share = _overlap(images, [
-        _sample_points(image, places[id(models[index])])
-        for image, index in zip(images, order, strict=True)])
-    mutual = np.minimum(share, share.T)
-    names, pairs = [image.name for image in images], set()
-    for row, shares in enumerate(mutual):
-        others = [other for other in np.argsort(-shares, kind="stable").tolist()
-                  if shares[other] > MIN_OVERLAP and (
-                      held is None or set(held[names[row]]).isdisjoint(held[names[other]]))]
-        both = [(names[min(row, other)], names[max(row, other)]) for other in others]
-        new = [pair for pair in both if pair not in besides]
-        count = min(max(0, most - (len(both) - len(new))), len(new[:WIDEST]))
-        for place in np.linspace(0, max(len(new[:WIDEST]) - 1, 0), count):
-            pairs.add(new[round(place)])
-    return pairs
-
-
-def _sample_points(
-    image: pycolmap.Image, places: Mapping[int, NDArray[np.float64]]
-) -> NDArray[np.float64]:  # [S, 3]
-    numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
-    step = max(1, len(numbers) // SAMPLED)
-    return np.array([places[number] for number in numbers[::step]]).reshape(-1, 3)
-
-
-def _overlap(
-    images: Sequence[pycolmap.Image], seen: Sequence[NDArray[np.float64]]  # [S, 3] each
-) -> NDArray[np.float64]:  # [N, N]
-    """Returns the share of the points of each image that another one should show, too."""
-    owner = np.repeat(np.arange(len(images)), [len(points) for points in seen])
-    points = np.concatenate([np.zeros((0, 3)), *seen])
-    centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-    rays = points - centers[owner]
-    near = np.linalg.norm(rays, axis=1)
-    share = np.zeros((len(images), len(images)))
-    for column, image in enumerate(images):
-        camera = image.camera
-        local = np.asarray(image.cam_from_world() * points)
-        bounds = np.array([camera.width / camera.focal_length_x,
-                           camera.height / camera.focal_length_y]) / 2
-        inside = (local[:, 2] > 0) & (np.abs(local[:, :2]) < bounds * local[:, 2:]).all(axis=1)
-        rows = np.flatnonzero(inside)  # few of many: a walk leaves most behind
-        others = points[rows] - centers[column]
-        far = np.linalg.norm(others, axis=1)
-        cosines = (rays[rows] * others).sum(axis=1)
-        alike = (cosines > np.cos(np.radians(MAX_ANGLE_DEG)) * near[rows] * far) & (
-            near[rows] < MAX_RATIO * far) & (far < MAX_RATIO * near[rows])
-        share[:, column] = np.bincount(owner[rows[alike]], minlength=len(images))
-    np.fill_diagonal(share, 0)
-    return np.asarray(share / np.maximum(np.bincount(owner, minlength=len(images)), 1)[:, None])
 
 
 def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

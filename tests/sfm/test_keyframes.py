@@ -39,3 +39,9 @@ def test_frames_between_are_tied_to_the_keyframes_beside_them():
     assert set(keyframes.track_rows(rows, (1, 2))) == {
         (0, 3), (3, 4), (4, 6), (0, 4), (3, 6),  # keyframes
         (0, 1), (1, 3), (0, 2), (2, 3), (4, 5), (5, 6)}
+
+
+def test_frames_are_worth_matching_while_tracks_tie_them():
+    tracks = steady(30, 10)
+    first, near, far = (tracks.names[row] for row in (0, 5, 12))
+    assert keyframes.share_tracks(tracks, {(first, near), (first, far)}) == {(first, near)}

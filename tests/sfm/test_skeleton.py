@@ -22,10 +22,9 @@ from recon_cli.sfm.skeleton import (
     is_continuous,
     link,
     near_pairs,
-    overlapping_images,
-    overlapping_pairs,
     read_verified,
 )
+from recon_cli.sfm.view_overlap import WIDEST, overlapping_images, overlapping_pairs
 
 SILENT = Reporter(io.BytesIO())
 
@@ -411,7 +410,7 @@ def test_what_looks_alike_is_matched_where_the_models_do_not_show_it_to_overlap(
     made = walk(12, step=1.0)  # from one end to the other nothing is seen twice
     job = make_photos(tmp_path, made)
     first, last = made.names[0], made.names[-1]
-    overlap = overlapping_pairs(made.model(), skeleton.WIDEST)
+    overlap = overlapping_pairs(made.model(), WIDEST)
     chosen = set(sorted(overlap)[::2])
     monkeypatch.setattr(skeleton, "similar_pairs", lambda *_, besides, **__: (
         {(first, last)} | overlap) - set(besides))
