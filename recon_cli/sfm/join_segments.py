@@ -23,7 +23,7 @@ from recon_cli.scene.covisibility import cut_graph
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm import database, mapper, matching, merge_models, skeleton
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
-from recon_cli.sfm.keyframes import choose_keyframes
+from recon_cli.sfm.keyframes import choose_keyframes, name_keyframes
 from recon_cli.sfm.loop_closure import Node, bend_segments, move_frames
 from recon_cli.sfm.pair_checks import check_pairs, list_views
 from recon_cli.sfm.segment_joins import (
@@ -124,8 +124,11 @@ def match_segments(job: MappingJob, report: Reporter) -> Result:
     """Matches frames of different segments that look alike, besides what segments have matched."""
     collect_matches(job)
     known = _inner_pairs(job.segments)
-    pairs = skeleton.near_pairs(job, skeleton.ALWAYS) | matching.similar_pairs(
-        job.database, job.names, seed=job.seed, nearest=ALIKE, besides=known)
+    near, names = skeleton.near_pairs(job, skeleton.ALWAYS), job.names
+    if job.tracks is not None:  # segments have matched what lies near each other
+        near, names = near - known, name_keyframes(Tracks.read(job.tracks))
+    pairs = near | matching.similar_pairs(
+        job.database, names, seed=job.seed, nearest=ALIKE, besides=known)
     matching.match_pairs(job, pairs, report)
     matching.check_motion(job)
     return matching.count_matches(job)
@@ -315,7 +318,9 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
     for index, names in enumerate(job.segments):
         for name in names:
             held[name].add(index)
-    owned = [(image, model) for model, names in joined.parts for image in _images(model, names)]
+    chosen = held if job.tracks is None else set(name_keyframes(Tracks.read(job.tracks)))
+    owned = [(image, model) for model, names in joined.parts for image in _images(model, names)
+             if image.name in chosen]
     return overlapping_images(
         [image for image, _ in owned], [model for _, model in owned], held,
         most=OVERLAPPING, besides=known)

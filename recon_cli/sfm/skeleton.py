@@ -259,35 +259,47 @@ def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconst
     if len(keyframes) == len(job.names):
         return mapper.map_relaxed(job, report)
     found = mapper.map_relaxed(job, report, [tracks.names[row] for row in keyframes])
-    found.sort(key=mapper.model_size, reverse=True)
-    return [_place_rest(job, close_loops(job, report, model)) if row == 0 else model
-            for row, model in enumerate(found)]
+    if not found:
+        return []
+    largest, *others = sorted(found, key=mapper.model_size, reverse=True)
+    fitted = _fit_where_it_meets(job, report, largest, models)
+    return [_place_rest(job, close_loops(job, report, fitted)), *others]
 
 
 def close_loops(
     job: MappingJob, report: Reporter, fitted: pycolmap.Reconstruction
 ) -> pycolmap.Reconstruction:
-    """Returns a fitted model, bent where loops are open and fitted again to what then agrees.
-
-    Frames that see the same once loops are closed are matched, and `job.linked` is written anew.
-    """
-    source, tracks = replace(job, linked=None), _read_tracks(job)
+    """Returns a fitted model, bent where loops are open and fitted again to what then agrees."""
     for _ in range(BENDS):
-        bent = bend_model(fitted, read_verified(source.database), seed=job.seed)
+        geometries = read_verified(replace(job, linked=None).database)
+        bent = bend_model(fitted, geometries, seed=job.seed)
         if bent is None:
             break
-        met = overlapping_pairs(bent) - overlapping_pairs(fitted, WIDEST)
-        if met - database.pair_names(source.database):
-            matching.match_pairs(source, met, report)
-            database.seal(source.database)
-            report.phase("mapping", len(job.names))
-        geometries = read_verified(source.database)
-        checked = check_pairs(source.database, list_models([bent]), geometries)
-        link(job, source.database, {
-            pair: geometry for pair, geometry in geometries.items()
-            if pair not in checked.contradicting}, tracks, choose_keyframes(tracks))
-        fitted = _fit(job, bent)
+        fitted = _fit_where_it_meets(job, report, bent, [fitted])
     return fitted
+
+
+def _fit_where_it_meets(
+    job: MappingJob, report: Reporter, model: pycolmap.Reconstruction,
+    before: Sequence[pycolmap.Reconstruction],
+) -> pycolmap.Reconstruction:
+    """Returns a model fitted to the matches of frames that overlap by it, but not by those before.
+
+    `job.linked` is written anew with all that does not contradict the model.
+    """
+    source, tracks = replace(job, linked=None), _read_tracks(job)
+    met = overlapping_pairs(model).difference(
+        *(overlapping_pairs(other, WIDEST) for other in before))
+    if met - database.pair_names(source.database):
+        matching.match_pairs(source, met, report)
+        database.seal(source.database)
+        report.phase("mapping", len(job.names))
+    geometries = read_verified(source.database)
+    checked = check_pairs(source.database, list_models([model]), geometries)
+    link(job, source.database, {
+        pair: geometry for pair, geometry in geometries.items()
+        if pair not in checked.contradicting}, tracks, choose_keyframes(tracks))
+    return _fit(job, model)
 
 
 def complete_coarse(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
