@@ -97,6 +97,8 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     ways: tuple[Fallback, ...] = (every, relaxed) if count <= matching.EXHAUSTIVE_MAX else (
         _incremental("retrieval", f"{count} frames are too many to match all pairs at once"),
         relaxed, every)  # lower thresholds take less time than all pairs
+    if len(skeleton.list_keyframes(job)) < count:  # all pairs of so many would take an hour
+        ways = tuple(way for way in ways if way is not every)
     if skeleton.is_continuous(job):
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
@@ -295,4 +297,5 @@ def _incremental(pairs: str, reason: str) -> Fallback:
 _PAIRS: dict[str, Callable[[MappingJob, Reporter], set[matching.Pair]]] = {
     "exhaustive": lambda job, _: matching.exhaustive_pairs(job.names),
     "sequential": lambda job, _: matching.sequential_pairs(job.names),
-    "retrieval": lambda job, _: matching.near_or_similar_pairs(job)}
+    "retrieval": lambda job, _: matching.near_or_similar_pairs(
+        job, skeleton.list_keyframes(job))}

@@ -80,6 +80,11 @@ def is_continuous(job: MappingJob) -> bool:
     return len(tracks.names) == len(job.names) and linked > CONTINUOUS * len(shared)
 
 
+def list_keyframes(job: MappingJob) -> tuple[str, ...]:
+    """Returns the frames that matches are sought between: the keyframes of a video, else all."""
+    return name_keyframes(_read_tracks(job)) if is_continuous(job) else job.names
+
+
 def _read_tracks(job: MappingJob) -> Tracks:
     assert job.tracks is not None
     return Tracks.read(job.tracks)
@@ -189,7 +194,7 @@ def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Re
     copy_coarsest(job.database, coarse.database)
     pairs = matching.exhaustive_pairs(job.names)
     if len(job.names) > matching.EXHAUSTIVE_MAX:
-        pairs = matching.near_or_similar_pairs(job)
+        pairs = matching.near_or_similar_pairs(job, job.names)
     matching.match_pairs(coarse, pairs, report, phase="coarse")
     report.phase("first", len(job.names))
     models = mapper.map_incrementally(coarse, Reporter(io.BytesIO()))
