@@ -59,14 +59,17 @@ class BentSegments:
 def bend_model(
     model: pycolmap.Reconstruction, geometries: Geometries, *, seed: int
 ) -> pycolmap.Reconstruction | None:
-    """Returns a model bent so that its open loops close; None where it has none."""
+    """Returns a model bent so that its open loops close; None where none is open and closes."""
     segment = describe_segment(0, model)
     graph = _Graph([segment], {0: Similarity()})
     loops = graph.find_loops(geometries, seed)
     still = Motions.identity(len(graph.number))
-    if all(np.median(measure_ties(loop.ties, still)) <= 1 for loop in loops):
+    gaping = [loop for loop in loops if np.median(measure_ties(loop.ties, still)) > 1]
+    if not gaping:
         return None
     bent = graph.close([], loops)
+    if not any(loop in bent.loops for loop in gaping):
+        return None
     return move_frames(model, {name: motion for (_, name), motion in bent.motions.items()})
 
 
