@@ -16,7 +16,7 @@ from recon_cli.sfm import mapper
 from recon_cli.sfm.checks import MIN_FRAMES
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import ModelCandidate, drop_outliers
-from recon_cli.sfm.verdict import MAX_LEAP, ModelVerdict, is_aliased, is_broken
+from recon_cli.sfm.verdict import MAX_LEAP, ModelVerdict, has_drifted, is_aliased, is_broken
 
 Names = tuple[str, ...]
 
@@ -80,6 +80,8 @@ def _sides(job: MappingJob, cameras: Collection[str], verdict: ModelVerdict) -> 
         yield from verdict.weakest_cut.sides
     elif is_aliased(verdict.aliasing):
         yield from verdict.aliasing.sides
+    elif has_drifted(verdict) and verdict.scale is not None:
+        yield from verdict.scale.sides
     elif len(verdict.model_parts) > 1:
         yield from verdict.model_parts
     elif leap := next((jump for jump in verdict.jumps if jump.ratio > MAX_LEAP), None):

@@ -7,7 +7,7 @@ one (share of the extent, after the similarity that fits most) and the share of 
 than a twentieth, both against the reference or the good model that it was made from; then what was
 found, and the decision. A model is broken if a camera is off by more than DISPLACED, and good if
 none is off by SOUND and nothing was done to it; others count as neither. Behind it, each bound as
-it comes out of all captures but one, tried on that one.
+it comes out of two thirds of the captures, tried on the third that was kept from the choice.
 
 Name captures behind OUT to run only those; --map only maps.
 """
@@ -80,6 +80,8 @@ class Row:
             *("-" if value is None else f"{value:.3f}" for value in (
                 self.farthest, self.displaced, self.verdict.weakest_cut.share,
                 self.verdict.weakest_cut.explained, self.verdict.aliasing.share)),
+            "-" if self.verdict.scale is None else f"{self.verdict.scale.error:.3f}",
+            str(len(self.verdict.open_loops)),
             str(len(self.verdict.outliers)), str(len(self.verdict.model_parts)), f"{jumps:.0f}",
             f"{self.verdict.still:.2f}", f"{self.angle:.1f}", f"{self.error:.2f}",
             f"{self.seconds:.1f}", self.label or "-",
@@ -91,7 +93,8 @@ class Row:
 
 
 HEADS = ("capture", "made", "cameras", "farthest", "displaced", "points", "explained", "overlap",
-         "outliers", "parts", "jump", "still", "angle", "error", "s", "label", "verdict", "")
+         "scale", "loops", "outliers", "parts", "jump", "still", "angle", "error", "s", "label",
+         "verdict", "")
 
 
 def reference(capture: Capture, data: Path) -> Centers:
@@ -233,17 +236,20 @@ def choose_bounds(rows: Sequence[Row]) -> dict[str, float]:
     return bounds
 
 
-def leave_one_out(rows: Sequence[Row]) -> Iterator[str]:
-    """A line for each capture: the bounds that the others give, and where they are wrong on it."""
+def keep_thirds(rows: Sequence[Row]) -> Iterator[str]:
+    """A line for each third of the captures: the bounds that the others give, and what is wrong."""
+    captures = sorted({row.capture for row in rows})
     errors = 0
-    for capture in sorted({row.capture for row in rows}):
-        bounds = choose_bounds([row for row in rows if row.capture != capture])
-        own = [row for row in rows if row.capture == capture and row.label]
-        wrong = [row.made for row in own if (row.label == "broken") != (row.otherwise or any(
-            row.shares[name] < bound for name, bound in bounds.items()))]
+    for third in range(3):
+        kept = captures[third::3]
+        bounds = choose_bounds([row for row in rows if row.capture not in kept])
+        own = [row for row in rows if row.capture in kept and row.label]
+        wrong = [f"{row.capture} {row.made}" for row in own if (row.label == "broken") != (
+            row.otherwise or any(row.shares[name] < bound for name, bound in bounds.items()))]
         errors += len(wrong)
         told = ", ".join(f"{name} {bound:.3f}" for name, bound in bounds.items())
-        yield f"without {capture}: {told}; {len(wrong)} of {len(own)} wrong {', '.join(wrong)}"
+        yield (f"without {', '.join(kept)}: {told}; {len(wrong)} of {len(own)} wrong "
+               f"{', '.join(wrong)}")
     yield f"{errors} errors"
 
 
@@ -253,7 +259,7 @@ def leave_one_out(rows: Sequence[Row]) -> Iterator[str]:
 @click.argument("names", nargs=-1)
 @click.option("--map", "only_map", is_flag=True, help="Only map the captures.")
 def main(data: Path, out: Path, names: tuple[str, ...], *, only_map: bool) -> None:
-    """Prints the table, the bounds, and what leaving one capture out gives."""
+    """Prints the table, the bounds, and what they decide on captures that were kept from them."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     pycolmap.logging.minloglevel = 2
     rows: list[Row] = []
@@ -276,14 +282,14 @@ def main(data: Path, out: Path, names: tuple[str, ...], *, only_map: bool) -> No
         click.echo(f"{label}: {len(own)} models, {wrong} decided wrongly")
     click.echo("bounds from all captures: " + ", ".join(
         f"{name} {bound:.3f}" for name, bound in choose_bounds(rows).items()))
-    if len({row.capture for row in rows if row.label == "good"}) > 1:
-        for line in leave_one_out(rows):
+    if len({row.capture for row in rows if row.label == "good"}) > 2:
+        for line in keep_thirds(rows):
             click.echo(line)
 
 
 def print_cells(cells: Sequence[str]) -> None:
     """Prints one line of the table."""
-    widths = (17, 21, 8, 9, 10, 7, 10, 8, 9, 6, 5, 6, 6, 6, 5, 7, 8, 5)
+    widths = (17, 21, 8, 9, 10, 7, 10, 8, 6, 6, 9, 6, 5, 6, 6, 6, 5, 7, 8, 5)
     click.echo(" ".join(
         f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)).rstrip())
 
