@@ -38,9 +38,6 @@ from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
-# Frames up to which a video whose segments gave no good model is mapped as a whole: of more, that
-# would take longer than all of its segments.
-WHOLE_MAX = 400
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW = 30
 # Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
@@ -100,6 +97,8 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     ways: tuple[Fallback, ...] = (every, relaxed) if count <= matching.EXHAUSTIVE_MAX else (
         _incremental("retrieval", f"{count} frames are too many to match all pairs at once"),
         relaxed, every)  # lower thresholds take less time than all pairs
+    if len(skeleton.list_keyframes(job)) < count:  # all pairs of so many would take an hour
+        ways = tuple(way for way in ways if way is not every)
     if skeleton.is_continuous(job):
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
@@ -110,7 +109,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         joined = Fallback(
             SEGMENTS, f"{count} frames were mapped in {len(job.segments)} segments",
             lambda *_: set(), join_segments.map_joined)
-        if count > WHOLE_MAX and job.tracks is not None:
+        if job.tracks is not None:  # as a whole it would take longer than all of its segments
             return (joined,)
         ways = (joined, *ways)
     return (*ways, Fallback("global", "", lambda *_: set(), mapper.map_globally))
@@ -298,4 +297,5 @@ def _incremental(pairs: str, reason: str) -> Fallback:
 _PAIRS: dict[str, Callable[[MappingJob, Reporter], set[matching.Pair]]] = {
     "exhaustive": lambda job, _: matching.exhaustive_pairs(job.names),
     "sequential": lambda job, _: matching.sequential_pairs(job.names),
-    "retrieval": lambda job, _: matching.near_or_similar_pairs(job)}
+    "retrieval": lambda job, _: matching.near_or_similar_pairs(
+        job, skeleton.list_keyframes(job))}

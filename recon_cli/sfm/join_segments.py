@@ -20,18 +20,23 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.tracks import Tracks
 from recon_cli.scene.covisibility import cut_graph
+from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm import database, mapper, matching, merge_models, skeleton
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
+from recon_cli.sfm.keyframes import choose_keyframes, name_keyframes
+from recon_cli.sfm.loop_closure import Node, bend_segments, move_frames
 from recon_cli.sfm.pair_checks import check_pairs, list_views
 from recon_cli.sfm.segment_joins import (
+    MAX_TENSION,
     Join,
     Placement,
-    SegmentCameras,
     SharedPoints,
     judge_join,
     place_segments,
 )
+from recon_cli.sfm.segment_points import Segment, describe_segment, find_shared_points
 from recon_cli.sfm.segments import overlap
+from recon_cli.sfm.view_overlap import overlapping_images
 from recon_cli.workspace import atomic
 
 Pair = matching.Pair
@@ -119,8 +124,11 @@ def match_segments(job: MappingJob, report: Reporter) -> Result:
     """Matches frames of different segments that look alike, besides what segments have matched."""
     collect_matches(job)
     known = _inner_pairs(job.segments)
-    pairs = skeleton.near_pairs(job, skeleton.ALWAYS) | matching.similar_pairs(
-        job.database, job.names, seed=job.seed, nearest=ALIKE, besides=known)
+    near, names = skeleton.near_pairs(job, skeleton.ALWAYS), job.names
+    if job.tracks is not None:  # segments have matched what lies near each other
+        near, names = near - known, name_keyframes(Tracks.read(job.tracks))
+    pairs = near | matching.similar_pairs(
+        job.database, names, seed=job.seed, nearest=ALIKE, besides=known)
     matching.match_pairs(job, pairs, report)
     matching.check_motion(job)
     return matching.count_matches(job)
@@ -176,25 +184,6 @@ def _seed_database(job: MappingJob, index: int) -> None:
     database.seal(segment.database)
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """The points of a segment that one of its images shows, K of them."""
-
-    rows: NDArray[np.int64]  # [K], sorted keypoints
-    xy: NDArray[np.float64]  # [K, 2] pixels
-    points: NDArray[np.float64]  # [K, 3], in the segment's frame
-
-
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """A segment that was mapped."""
-
-    index: int
-    model: pycolmap.Reconstruction
-    cameras: SegmentCameras
-    shown: Mapping[str, _Shown]
-
-
 def read_segments(job: MappingJob) -> list[Segment]:
     """Returns the segments that have a model."""
     return [
@@ -203,86 +192,53 @@ def read_segments(job: MappingJob) -> list[Segment]:
         if (job.segment(index) / MODEL_FOLDER / "images.bin").exists()]
 
 
-def describe_segment(index: int, model: pycolmap.Reconstruction) -> Segment:
-    """Returns a model as a segment."""
-    images = sorted((model.image(number) for number in model.reg_image_ids()),
-                    key=lambda image: image.name)
-    places = {number: point.xyz for number, point in model.points3D.items()}
-    shown, depths = {}, []
-    for image in images:
-        seen = [(row, point.xy, places[point.point3D_id])
-                for row, point in enumerate(image.points2D) if point.has_point3D()]
-        points = np.array([xyz for _, _, xyz in seen]).reshape(-1, 3)
-        shown[image.name] = _Shown(
-            np.array([row for row, _, _ in seen], np.int64),
-            np.array([xy for _, xy, _ in seen]).reshape(-1, 2), points)
-        depths.append(np.linalg.norm(points - image.projection_center(), axis=1))
-    cameras = SegmentCameras(
-        tuple(image.name for image in images),
-        np.array([image.projection_center() for image in images]).reshape(-1, 3),
-        np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3),
-        float(np.median(np.concatenate([np.zeros(0), *depths]) if depths else [0.0])))
-    return Segment(index, model, cameras, shown)
+@dataclass(frozen=True, eq=False)
+class SegmentGroup:
+    """Segments that joins hold together, each frame with its motion to a common frame."""
 
+    motions: Mapping[Node, Similarity]
+    refused: tuple[str, ...]  # joins that were not made, in words
 
-def find_shared_points(job: MappingJob, segments: Sequence[Segment]) -> list[SharedPoints]:
-    """Returns the points that two segments have in common, for each two that have some."""
-    parts: dict[tuple[int, int], list[tuple[Pair, NDArray[np.float64], NDArray[np.float64]]]]
-    parts = defaultdict(list)
-    for one, other in itertools.combinations(segments, 2):
-        for name in sorted(one.shown.keys() & other.shown.keys()):
-            ours, theirs = one.shown[name], other.shown[name]
-            # Keypoints of features are the same in both, those of tracks are numbered anew.
-            _, left, right = np.intersect1d(
-                _spots(ours.xy), _spots(theirs.xy), return_indices=True)
-            parts[one.index, other.index].append(
-                ((name, name), ours.points[left], theirs.points[right]))
-    for pair, geometry in skeleton.read_verified(
-            dataclasses.replace(job, linked=None).database).items():
-        holders = [[segment for segment in segments if name in segment.shown] for name in pair]
-        if set(map(id, holders[0])) & set(map(id, holders[1])):
-            continue  # within a segment
-        for one, other in itertools.product(*holders):
-            ours, theirs = one.shown[pair[0]], other.shown[pair[1]]
-            left, right = (_find(shown.rows, geometry.inlier_matches[:, side])
-                           for side, shown in enumerate((ours, theirs)))
-            both = (left >= 0) & (right >= 0)
-            entry = pair, ours.points[left[both]], theirs.points[right[both]]
-            if one.index > other.index:
-                entry = pair[::-1], entry[2], entry[1]
-            parts[min(one.index, other.index), max(one.index, other.index)].append(entry)
-    return [
-        SharedPoints(
-            first, second, np.concatenate([ours for _, ours, _ in entries]),
-            np.concatenate([theirs for _, _, theirs in entries]),
-            np.repeat(np.arange(len(entries)), [len(ours) for _, ours, _ in entries]),
-            tuple(pair for pair, _, _ in entries))
-        for (first, second), entries in sorted(parts.items())]
-
-
-def _spots(xy: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Returns a number for each spot of an image, to a sixteenth of a pixel."""
-    whole = np.round(xy * 16).astype(np.int64)
-    return np.asarray(whole[:, 0] << 32 | whole[:, 1])
-
-
-def _find(rows: NDArray[np.int64], wanted: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Returns where sorted rows hold the wanted ones, [M]; -1 where they do not."""
-    if not len(rows):
-        return np.full(len(wanted), -1)
-    place = np.minimum(np.searchsorted(rows, wanted), len(rows) - 1)
-    return np.where(rows[place] == wanted, place, -1)
+    @property
+    def indices(self) -> list[int]:
+        """The segments, sorted."""
+        return sorted({index for index, _ in self.motions})
 
 
 def join_all(
-    segments: Sequence[Segment], common: Sequence[SharedPoints], *, seed: int
-) -> tuple[list[Join], list[Placement]]:
+    segments: Sequence[Segment], common: Sequence[SharedPoints],
+    walk: Mapping[Pair, pycolmap.TwoViewGeometry] | None, *, seed: int,
+) -> tuple[list[Join], list[SegmentGroup]]:
     """Returns what segments say of each other by their common points, and the groups that follow.
+
+    `walk` are the verified matches of a video, whose segments drift and are bent into each other;
+    None for photos, whose segments stay as they are.
     """
-    by_index = {segment.index: segment.cameras for segment in segments}
-    joins = [judge_join(shared, by_index[shared.first], by_index[shared.second], seed=seed)
+    cameras = {segment.index: segment.cameras for segment in segments}
+    joins = [judge_join(shared, cameras[shared.first], cameras[shared.second], seed=seed)
              for shared in common]
-    return joins, list(place_segments(by_index, joins))
+    if walk is None:
+        return joins, [_place_rigid(segments, placement)
+                       for placement in place_segments(cameras, joins)]
+    while True:
+        groups, torn = [], set()
+        for placement in place_segments(cameras, joins, bending=True):
+            bent = bend_segments(segments, placement.motions, common, walk, seed=seed)
+            groups.append(SegmentGroup(bent.motions, placement.refused))
+            torn |= {pair for pair, tension in bent.tension.items() if tension > MAX_TENSION}
+        if not torn:
+            return joins, groups
+        joins = [dataclasses.replace(
+            join, motion=None, contradictions=(
+                *join.contradictions, "no bending of the two brings their common frames together"))
+            if (join.first, join.second) in torn else join for join in joins]
+
+
+def _place_rigid(segments: Sequence[Segment], placement: Placement) -> SegmentGroup:
+    return SegmentGroup(
+        {(segment.index, name): placement.motions[segment.index] for segment in segments
+         if segment.index in placement.motions for name in segment.cameras.names},
+        placement.refused)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,23 +254,20 @@ class JoinedModel:
                 for model, names in self.parts for image in _images(model, names)}
 
 
-def join_models(segments: Sequence[Segment], placement: Placement) -> JoinedModel:
+def join_models(segments: Sequence[Segment], group: SegmentGroup) -> JoinedModel:
     """Returns the segments of a group, their models copied and moved."""
-    members = [segment for segment in segments if segment.index in placement.motions]
+    members = [segment for segment in segments if segment.index in group.indices]
     owner: dict[str, Segment] = {}
     for segment in members:
         for name, shown in segment.shown.items():
             best = owner.get(name)
             if best is None or len(shown.rows) > len(best.shown[name].rows):
                 owner[name] = segment
-    parts = []
-    for segment in members:
-        model, motion = pycolmap.Reconstruction(segment.model), placement.motions[segment.index]
-        model.transform(pycolmap.Sim3d(
-            motion.scale, pycolmap.Rotation3d(motion.rotation), motion.translation))
-        parts.append((model, frozenset(
-            name for name, which in owner.items() if which is segment)))
-    return JoinedModel(tuple(parts))
+    return JoinedModel(tuple(
+        (move_frames(segment.model, {
+            name: group.motions[segment.index, name] for name in segment.cameras.names}),
+         frozenset(name for name, which in owner.items() if which is segment))
+        for segment in members))
 
 
 def map_joined(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
@@ -324,7 +277,10 @@ def map_joined(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstructio
     """
     largest, *others = _join(job, report)
     source = dataclasses.replace(job, linked=None)
-    return [_fit(job, largest), *(_posed(source, other) for other in others)]
+    fitted = _fit(job, largest)
+    if job.tracks is not None:
+        fitted = skeleton.close_loops(job, report, fitted)
+    return [fitted, *(_posed(source, other) for other in others)]
 
 
 def _join(job: MappingJob, report: Reporter) -> list[JoinedModel]:
@@ -333,18 +289,26 @@ def _join(job: MappingJob, report: Reporter) -> list[JoinedModel]:
     report.phase("joining", len(job.segments))
     collect_matches(source)
     segments = read_segments(job)
-    common = find_shared_points(source, segments)
-    joins, groups = join_all(segments, common, seed=job.seed)
-    known = {(min(pair), max(pair)) for shared in common for pair in shared.pairs}
+    joins, groups, known = _join_by_matches(source, segments)
     others = _overlapping(source, join_models(segments, groups[0]), known)
     if others - database.pair_names(source.database):
         matching.match_pairs(source, others, report)
         database.seal(source.database)
-        joins, groups = join_all(
-            segments, find_shared_points(source, segments), seed=job.seed)
+        joins, groups, _ = _join_by_matches(source, segments)
     report.phase("joining", len(job.segments))
     atomic.write_json(job.out / REPORT, _describe(job, joins, groups))
     return [join_models(segments, group) for group in groups]
+
+
+def _join_by_matches(
+    job: MappingJob, segments: Sequence[Segment]
+) -> tuple[list[Join], list[SegmentGroup], set[Pair]]:
+    """Returns joins and groups by all matches so far, and the pairs that show common points."""
+    geometries = skeleton.read_verified(job.database)
+    common = find_shared_points(segments, geometries)
+    joins, groups = join_all(
+        segments, common, None if job.tracks is None else geometries, seed=job.seed)
+    return joins, groups, {(min(pair), max(pair)) for shared in common for pair in shared.pairs}
 
 
 def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) -> set[Pair]:
@@ -354,8 +318,10 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
     for index, names in enumerate(job.segments):
         for name in names:
             held[name].add(index)
-    owned = [(image, model) for model, names in joined.parts for image in _images(model, names)]
-    return skeleton.overlapping_images(
+    chosen = held if job.tracks is None else set(name_keyframes(Tracks.read(job.tracks)))
+    owned = [(image, model) for model, names in joined.parts for image in _images(model, names)
+             if image.name in chosen]
+    return overlapping_images(
         [image for image, _ in owned], [model for _, model in owned], held,
         most=OVERLAPPING, besides=known)
 
@@ -387,7 +353,8 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
         usable = {pair: geometry for pair, geometry in geometries.items()
                   if pair not in checked.contradicting}
         assert job.tracks is not None
-        skeleton.link(job, source.database, usable, Tracks.read(job.tracks))
+        tracks = Tracks.read(job.tracks)
+        skeleton.link(job, source.database, usable, tracks, choose_keyframes(tracks))
     model = mapper.triangulate(job, _posed(job, joined), rounds=1)
     if model.num_reg_images() < len(job.names):
         model = mapper.extend_model(job, model, rounds=0)
@@ -404,14 +371,15 @@ def read_refused(job: MappingJob) -> list[str]:
 
 
 def _describe(
-    job: MappingJob, joins: Sequence[Join], groups: Sequence[Placement]
+    job: MappingJob, joins: Sequence[Join], groups: Sequence[SegmentGroup]
 ) -> dict[str, object]:
     return {
         "segments": [list(names) for names in job.segments],
-        "groups": [sorted(group.motions) for group in groups],
+        "groups": [group.indices for group in groups],
         "refused": [text for group in groups for text in group.refused],
         "joins": [{
-            "segments": [join.first, join.second], "made": join.holds,
+            "segments": [join.first, join.second],
+            "made": any({join.first, join.second} <= set(group.indices) for group in groups),
             "scale": None if join.motion is None else join.motion.scale,
             "witnesses": join.witnesses, "contradictions": join.contradictions}
             for join in joins]}

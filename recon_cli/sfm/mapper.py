@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,15 @@ def map_incrementally(job: MappingJob, report: Reporter) -> list[pycolmap.Recons
     return _map(job, report, _options(job))
 
 
-def map_relaxed(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
-    """Returns the models with lower thresholds for the first pair and each further image."""
+def map_relaxed(
+    job: MappingJob, report: Reporter, names: Sequence[str] = ()
+) -> list[pycolmap.Reconstruction]:
+    """Returns the models with lower thresholds for the first pair and each further image.
+
+    `names` are the only images that are mapped, where there are some.
+    """
     options = _options(job)
+    options.image_names = list(names)
     _relax(options)
     return _map(job, report, options)
 
@@ -84,6 +90,25 @@ def extend_model(
     shutil.rmtree(start)
     shutil.rmtree(job.attempts / MODELS)
     return max(models.values(), key=model_size, default=model)
+
+
+def resect(job: MappingJob, model: pycolmap.Reconstruction) -> int:
+    """Adds the images to a model, in place, that its points place; returns how many.
+
+    Nothing else is adjusted. Images are taken in the order of their names.
+    """
+    with pycolmap.Database.open(job.database) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+    options = _options(job)
+    worker = pycolmap.IncrementalMapper(cache)
+    worker.begin_reconstruction(model)
+    placed = 0
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if not image.has_pose and worker.register_next_image(options.mapper, image.image_id):
+            worker.triangulate_image(options.triangulation, image.image_id)
+            placed += 1
+    worker.end_reconstruction(False)
+    return placed
 
 
 def map_globally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:

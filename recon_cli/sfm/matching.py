@@ -182,10 +182,11 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(rows / np.where(lengths > 0, lengths, 1), np.float32)
 
 
-def near_or_similar_pairs(job: MappingJob) -> set[Pair]:
-    """Returns the neighbours among the images of each camera, and images that look alike."""
-    near = set().union(*(sequential_pairs(group.names) for group in job.groups))
-    return near | similar_pairs(job.database, job.names, seed=job.seed, besides=near)
+def near_or_similar_pairs(job: MappingJob, names: Collection[str]) -> set[Pair]:
+    """Returns the neighbours among images of each camera, and images that look alike."""
+    near = set().union(*(
+        sequential_pairs(sorted(set(names).intersection(group.names))) for group in job.groups))
+    return near | similar_pairs(job.database, sorted(names), seed=job.seed, besides=near)
 
 
 def match_pairs(

@@ -93,6 +93,11 @@ class Join:
         """Whether the segments can be joined by it."""
         return self.motion is not None and len(self.witnesses) >= 2 and not self.contradictions
 
+    @property
+    def touches(self) -> bool:
+        """Whether points of frames in common show about where the segments lie."""
+        return self.motion is not None and self.frames
+
 
 def judge_join(
     shared: SharedPoints, first: SegmentCameras, second: SegmentCameras, *, seed: int
@@ -205,14 +210,16 @@ class Placement:
 
 
 def place_segments(
-    cameras: Mapping[int, SegmentCameras], joins: Sequence[Join]
+    cameras: Mapping[int, SegmentCameras], joins: Sequence[Join], *, bending: bool = False
 ) -> tuple[Placement, ...]:
     """Returns the groups of segments that joins hold together, most cameras first.
 
     Segments with frames in common are joined first. A loop between two of one group counts where it
-    is off by no more than a way drifts; then all are adjusted to what all joins say.
+    is off by no more than a way drifts; then all are adjusted to what all joins say. Where segments
+    are bent into each other next (`bending`), a motion is enough for those with frames in common,
+    and loops are left to that.
     """
-    order = sorted((join for join in joins if join.holds),
+    order = sorted((join for join in joins if join.holds or (bending and join.touches)),
                    key=lambda join: (not join.frames, -len(join.ours), join.first, join.second))
     group = {index: index for index in cameras}
     tree: list[Join] = []
@@ -225,14 +232,16 @@ def place_segments(
     for root in sorted(set(group.values())):
         members = {index for index, which in group.items() if which == root}
         start = _chain(members, tree)
+        made = {(join.first, join.second) for join in order}
         inner = [join for join in order if join.first in members]
         near = [join for join in inner if join in tree or _is_near(join, start, cameras)]
-        motions, kept = _close_loops(start, near, tree, cameras)
+        motions, kept = (start, near) if bending else _close_loops(start, near, tree, cameras)
         refused = [*(f"the loop between segments {join.first} and {join.second} contradicts the way"
                      for join in inner if join not in kept), *(
             f"segments {join.first} and {join.second} are not joined: " + "; ".join(
                 join.contradictions or ("fewer than two witnesses support it",))
-            for join in joins if not join.holds and join.frames and join.first in members)]
+            for join in joins if (join.first, join.second) not in made and join.frames
+            and join.first in members)]
         placements.append(Placement(motions, tuple(refused)))
     return tuple(sorted(placements, key=lambda each: -sum(
         len(cameras[index].names) for index in each.motions)))

@@ -35,6 +35,7 @@ from recon_cli.executors.executor import (
 from recon_cli.io.tracks import Tracks
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.sfm.job import SPLIT, MappingJob, StepLog
+from recon_cli.sfm.keyframes import choose_keyframes
 from recon_cli.sfm.process import CrashError, run_job
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.layout import disk_errors
@@ -76,6 +77,14 @@ def count_segments(frames: int, asked: str) -> int:
             f"{frames} frames are too few for {asked} segments: each takes {LEAST} or more.",
             hint=f"Give at most --segments {most}.")
     return int(asked)
+
+
+def count_mapped(job: MappingJob) -> int:
+    """Returns how many frames of a job cameras are sought for first: the keyframes of a video."""
+    if job.tracks is None:
+        return len(job.names)
+    tracks = Tracks.read(job.tracks)
+    return len(choose_keyframes(tracks)) if len(tracks.names) == len(job.names) else len(job.names)
 
 
 def expected_minutes(frames: int, threads: int) -> float:

@@ -5,8 +5,8 @@ from tracks through every frame alone. With these cameras, the skeleton, each pa
 matches can be checked: most agree; some are off by what the cameras drift on a long way, and close
 a loop; the rest look alike but are two places, and are left out.
 
-The cameras of the skeleton are adjusted to the matches. Where that leaves a loop open they are
-found again from all matches that are left.
+The cameras of the skeleton are adjusted to the matches. Where that leaves a loop open they are bent
+until it closes, and adjusted again.
 
 Photos get a skeleton from the coarsest of their features. Matching only what overlaps by it takes
 .4 to .7 of the time of matching all pairs, more of it the fewer photos there are.
@@ -17,7 +17,7 @@ from __future__ import annotations
 import io
 import itertools
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,8 +30,17 @@ from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, mapper, matching, merge_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, is_vouched, publish, vouch
+from recon_cli.sfm.keyframes import (
+    choose_keyframes,
+    name_keyframes,
+    share_tracks,
+    side_pairs,
+    track_rows,
+)
+from recon_cli.sfm.loop_closure import bend_model
 from recon_cli.sfm.matching import Pair, similar_pairs
 from recon_cli.sfm.pair_checks import check_pairs, list_models
+from recon_cli.sfm.view_overlap import WIDEST, overlapping_pairs
 
 LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
 # Models in the folder of the attempts: from tracks, and from the coarsest features.
@@ -40,26 +49,22 @@ SKELETON, COARSE_SKELETON = "skeleton", "skeleton.coarse"
 # frame. All up to 20 take twice as long; they are for videos that fall apart.
 STEPS, ALL_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
 ENOUGH = 0.9  # share of the frames that a skeleton must hold, else other mappers are tried
+REST_ROUNDS = 2  # adjustments with new points in between once all frames are placed
+BENDS = 2  # times that a model with open loops is bent and fitted again
 # COLMAP uses a pair of images from 15 matches on (TwoViewGeometryOptions.min_num_inliers).
 MIN_MATCHES = 15
 # Tracks count beside features where a pair has fewer matches than this: they are less exact.
 FEW_MATCHES = 100
 # Share of the neighbours with MIN_MATCHES tracks above which a video hangs together by them.
 CONTINUOUS = 0.5
-# Pairs that the skeleton shows to overlap, per image, spread over the WIDEST from most to least
-# overlap: the closest tell little about depth. Errors of the cameras of two rooms with 10, 8 and 6
-# of them, in cm: .17 and .09, .17 and .10, .20 and .10.
-OVERLAPPING, WIDEST = 8, 60
-# The same of photos, which have no neighbours. 50 frames of each of the rooms as photos: .024 and
-# .045% of the extent with 8, .020 and .034% with 12, .013 and .034% with all pairs.
+# Pairs of photos that overlap, per image: more than of frames, as they have no neighbours. 50
+# frames of each of two rooms as photos: .024 and .045% of the extent with 8, .020 and .034% with
+# 12, .013 and .034% with all pairs.
 OVERLAPPING_PHOTOS = 12
 # Pairs per image that look alike. Of some 240 on the videos of the two rooms 97% overlap by the
 # skeleton, of 314 on a walk round a room 27%; without those the rooms' cameras are as exact.
 SIMILAR = 5
 ALWAYS = 3  # neighbours that are matched in any case
-# Two views overlap as far as a point of one lies in the other, at a like angle and distance.
-MAX_ANGLE_DEG, MAX_RATIO, MIN_OVERLAP = 30.0, 2.0, 0.2
-SAMPLED = 150  # points per image
 # Keypoints of a photo, the coarsest, from which cameras are found first. Of the 1225 pairs of 50
 # photos 914 are verified with 1000, 743 with 600 and 566 with 400, in 17, 10 and 4 CPU s.
 COARSEST = 600
@@ -75,14 +80,23 @@ def is_continuous(job: MappingJob) -> bool:
     return len(tracks.names) == len(job.names) and linked > CONTINUOUS * len(shared)
 
 
+def list_keyframes(job: MappingJob) -> tuple[str, ...]:
+    """Returns the frames that matches are sought between: the keyframes of a video, else all."""
+    return name_keyframes(_read_tracks(job)) if is_continuous(job) else job.names
+
+
 def _read_tracks(job: MappingJob) -> Tracks:
     assert job.tracks is not None
     return Tracks.read(job.tracks)
 
 
-def near_pairs(job: MappingJob, reach: int) -> set[Pair]:
-    """Returns the pairs of frames of one camera that are up to `reach` apart by name."""
-    return {pair for group in job.groups for names in [sorted(group.names)]
+def near_pairs(job: MappingJob, reach: int, among: Collection[str] | None = None) -> set[Pair]:
+    """Returns the pairs of frames of one camera that are up to `reach` apart by name.
+
+    Other names than those in `among` do not count.
+    """
+    inside = set(job.names if among is None else among)
+    return {pair for group in job.groups for names in [sorted(inside.intersection(group.names))]
             for step in range(1, reach + 1) for pair in zip(names, names[step:], strict=False)}
 
 
@@ -142,19 +156,26 @@ def _load_models(
 def choose_tracked_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
     """Returns the pairs of frames of a video that its tracks show to be worth matching."""
     models = load_skeleton(job, report)
-    reach = ALWAYS if len(models) == 1 else matching.SEQUENTIAL_OVERLAP
-    pairs = near_pairs(job, reach).union(*(overlapping_pairs(model) for model in models))
-    return pairs | _unexpected_pairs(job, models, pairs)
+    tracks = _read_tracks(job)
+    names = name_keyframes(tracks)
+    near = near_pairs(job, ALWAYS, names)
+    if len(models) > 1:
+        further = near_pairs(job, matching.SEQUENTIAL_OVERLAP, names)
+        whole = len(names) == len(job.names)
+        near |= further if whole else share_tracks(tracks, further)
+    pairs = near.union(*(overlapping_pairs(model) for model in models))
+    return side_pairs(tracks) | pairs | _unexpected_pairs(job, models, pairs, names)
 
 
 def _unexpected_pairs(
-    job: MappingJob, models: Sequence[pycolmap.Reconstruction], pairs: Collection[Pair]
+    job: MappingJob, models: Sequence[pycolmap.Reconstruction], pairs: Collection[Pair],
+    names: Sequence[str],
 ) -> set[Pair]:
-    """Returns pairs that look alike, and that by the models have little in common.
+    """Returns pairs of frames that look alike, and that by the models have little in common.
 
     They may close a loop. Others would repeat what the matches of `pairs` say already.
     """
-    alike = similar_pairs(job.database, job.names, seed=job.seed, nearest=SIMILAR, besides=pairs)
+    alike = similar_pairs(job.database, names, seed=job.seed, nearest=SIMILAR, besides=pairs)
     return alike.difference(*(overlapping_pairs(model, WIDEST) for model in models))
 
 
@@ -163,7 +184,7 @@ def choose_coarse_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
     models = _load_models(job, COARSE_SKELETON, lambda: build_coarse_skeleton(job, report))
     pairs = set[Pair]().union(
         *(overlapping_pairs(model, OVERLAPPING_PHOTOS) for model in models))
-    return pairs | _unexpected_pairs(job, models, pairs)
+    return pairs | _unexpected_pairs(job, models, pairs, job.names)
 
 
 def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
@@ -173,7 +194,7 @@ def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Re
     copy_coarsest(job.database, coarse.database)
     pairs = matching.exhaustive_pairs(job.names)
     if len(job.names) > matching.EXHAUSTIVE_MAX:
-        pairs = matching.near_or_similar_pairs(job)
+        pairs = matching.near_or_similar_pairs(job, job.names)
     matching.match_pairs(coarse, pairs, report, phase="coarse")
     report.phase("first", len(job.names))
     models = mapper.map_incrementally(coarse, Reporter(io.BytesIO()))
@@ -205,14 +226,18 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
     folder = fresh_folder(job.attempts / f"{SKELETON}.mapping")
     linked = replace(job, linked=folder / LINKED)
     tracks = _read_tracks(job)
-    link(linked, images, {}, tracks)
+    keyframes = choose_keyframes(tracks)
+    tracks = tracks.select({row: tracks.names[row] for row in keyframes})
+    rows = range(len(keyframes))
+    link(linked, images, {}, tracks, rows)
     models = mapper.map_incrementally(linked, silent)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
-    # without parallax.
-    for find_models in (mapper.map_relaxed, mapper.map_globally):
-        if _most(models) >= ENOUGH * len(job.names):
+    # without parallax. What tracks of a long video leave apart is left to the matches.
+    whole = len(keyframes) == len(job.names)
+    for find_models in (mapper.map_relaxed, mapper.map_globally) if whole else ():
+        if _most(models) >= ENOUGH * len(keyframes):
             break
-        link(linked, images, {}, tracks, steps=ALL_STEPS)
+        link(linked, images, {}, tracks, rows, steps=ALL_STEPS)
         models = max(models, find_models(linked, silent), key=_most)
     shutil.rmtree(folder)
     models.sort(key=mapper.model_size, reverse=True)
@@ -231,21 +256,55 @@ def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconst
     checked = check_pairs(source, list_models(models), geometries)
     usable = {pair: geometry for pair, geometry in geometries.items()
               if pair not in checked.contradicting}
-    if _most(models) < ENOUGH * len(job.names):
-        link(job, source, usable, tracks, steps=ALL_STEPS)
+    keyframes = choose_keyframes(tracks)
+    if _most(models) >= ENOUGH * len(keyframes):
+        link(job, source, usable, tracks, keyframes)
+        return [_place_rest(job, close_loops(job, report, _fit(job, models[0])))]
+    link(job, source, usable, tracks, keyframes, steps=ALL_STEPS)
+    if len(keyframes) == len(job.names):
         return mapper.map_relaxed(job, report)
-    link(job, source, usable, tracks)
-    fitted = _fit(job, models[0])
-    open_loops = check_pairs(source, list_models([fitted]), usable).drifted
-    if not open_loops:
-        return [fitted]
-    remapped = mapper.map_incrementally(job, report)
-    best = merge_models.best_model(job, remapped)
-    if best is not None and best.verdict.trusted:
-        return [best.model]
-    link(job, source, {pair: geometry for pair, geometry in usable.items()
-                       if pair not in open_loops}, tracks)
-    return [_fit(job, models[0])]
+    found = mapper.map_relaxed(job, report, [tracks.names[row] for row in keyframes])
+    if not found:
+        return []
+    largest, *others = sorted(found, key=mapper.model_size, reverse=True)
+    fitted = _fit_where_it_meets(job, report, largest, models)
+    return [_place_rest(job, close_loops(job, report, fitted)), *others]
+
+
+def close_loops(
+    job: MappingJob, report: Reporter, fitted: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction:
+    """Returns a fitted model, bent where loops are open and fitted again to what then agrees."""
+    for _ in range(BENDS):
+        geometries = read_verified(replace(job, linked=None).database)
+        bent = bend_model(fitted, geometries, seed=job.seed)
+        if bent is None:
+            break
+        fitted = _fit_where_it_meets(job, report, bent, [fitted])
+    return fitted
+
+
+def _fit_where_it_meets(
+    job: MappingJob, report: Reporter, model: pycolmap.Reconstruction,
+    before: Sequence[pycolmap.Reconstruction],
+) -> pycolmap.Reconstruction:
+    """Returns a model fitted to the matches of frames that overlap by it, but not by those before.
+
+    `job.linked` is written anew with all that does not contradict the model.
+    """
+    source, tracks = replace(job, linked=None), _read_tracks(job)
+    met = overlapping_pairs(model).difference(
+        *(overlapping_pairs(other, WIDEST) for other in before))
+    if met - database.pair_names(source.database):
+        matching.match_pairs(source, met, report)
+        database.seal(source.database)
+        report.phase("mapping", len(job.names))
+    geometries = read_verified(source.database)
+    checked = check_pairs(source.database, list_models([model]), geometries)
+    link(job, source.database, {
+        pair: geometry for pair, geometry in geometries.items()
+        if pair not in checked.contradicting}, tracks, choose_keyframes(tracks))
+    return _fit(job, model)
 
 
 def complete_coarse(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
@@ -257,7 +316,7 @@ def complete_coarse(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstr
     if _most(models) < ENOUGH * len(job.names):
         return mapper.map_incrementally(job, report)
     report.phase("mapping", len(job.names))
-    return [_fit(job, models[0])]
+    return [_place_rest(job, _fit(job, models[0]))]
 
 
 def _most(models: Sequence[pycolmap.Reconstruction]) -> int:
@@ -271,7 +330,15 @@ def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconst
     model = mapper.triangulate(
         job, merge_models.build_posed_model(job.database, skeleton, poses), rounds=1)
     mapper.refine(job, model)
-    return mapper.extend_model(job, model) if len(poses) < len(job.names) else model
+    return model
+
+
+def _place_rest(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Returns a model with the frames that it lacks, adjusted: those between keyframes first."""
+    if job.tracks is not None and mapper.resect(job, model):
+        mapper.refine(job, model, REST_ROUNDS)
+    complete = model.num_reg_images() == len(job.names)
+    return model if complete else mapper.extend_model(job, model)
 
 
 def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
@@ -291,18 +358,19 @@ def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
 
 def link(
     job: MappingJob, source: Path, geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
-    tracks: Tracks, *, steps: Sequence[int] = STEPS,
+    tracks: Tracks, keyframes: Sequence[int], *, steps: Sequence[int] = STEPS,
 ) -> None:
     """Writes the database `job.linked`: images and keypoints of another one, and these matches.
 
-    Observations of tracks follow the keypoints of an image. They are matches where features gave
-    few. Other pairs that were matched stay in it without matches: that they should show the same,
+    Observations of tracks follow the keypoints of an image. Where features gave few matches, they
+    tie keyframes, by row, that are so many `steps` of them apart, and others to those beside them.
+    Other pairs that were matched stay in it without matches: that they should show the same,
     and do not, speaks against a model.
     """
     tried = database.pair_names(source)
     database.remove(job.database)
     shutil.copyfile(source, job.database)
-    matched = _match_tracks(tracks, geometries, steps)
+    matched = _match_tracks(tracks, geometries, track_rows(keyframes, steps))
     with pycolmap.Database.open(job.database) as opened:
         opened.clear_matches()
         opened.clear_two_view_geometries()
@@ -330,21 +398,20 @@ def link(
 
 
 def _match_tracks(
-    tracks: Tracks, geometries: Mapping[Pair, pycolmap.TwoViewGeometry], steps: Sequence[int]
+    tracks: Tracks, geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
+    rows: Iterable[tuple[int, int]],
 ) -> dict[Pair, NDArray[np.int64]]:
     """Returns which observations of two images show the same tracks, [M, 2] by row in each."""
     start = np.searchsorted(tracks.image, np.arange(len(tracks.names)))
     matched = {}
-    for step in steps:
-        for first in range(len(tracks.names) - step):
-            second = first + step
-            pair = tracks.names[first], tracks.names[second]
-            known = geometries.get(pair)
-            if known is not None and len(known.inlier_matches) >= FEW_MATCHES:
-                continue
-            rows = np.stack(tracks.matches(first, second), axis=1)
-            if len(rows) >= MIN_MATCHES:
-                matched[pair] = rows - start[[first, second]]
+    for first, second in rows:
+        pair = tracks.names[first], tracks.names[second]
+        known = geometries.get(pair)
+        if known is not None and len(known.inlier_matches) >= FEW_MATCHES:
+            continue
+        shown = np.stack(tracks.matches(first, second), axis=1)
+        if len(shown) >= MIN_MATCHES:
+            matched[pair] = shown - start[[first, second]]
     return matched
 
 
@@ -367,79 +434,6 @@ def _append_tracks(
         write = opened.update_keypoints if there else opened.write_keypoints
         write(image.image_id, np.concatenate([keypoints, followed]))
     return counts
-
-
-def overlapping_pairs(model: pycolmap.Reconstruction, most: int = OVERLAPPING) -> set[Pair]:
-    """Returns each image of a model with `most` ones whose views have something in common."""
-    images = _images(model)
-    return overlapping_images(images, [model] * len(images), most=most)
-
-
-def overlapping_images(
-    images: Sequence[pycolmap.Image],
-    models: Sequence[pycolmap.Reconstruction],  # that hold the points of each image
-    held: Mapping[str, Collection[int]] | None = None,
-    *, most: int = OVERLAPPING, besides: Collection[Pair] = (),
-) -> set[Pair]:
-    """Returns each image with `most` whose views have something in common, fewer by known pairs.
-
-    Where `held` names the segments that hold each image, only pairs of different ones. Pairs in
-    `besides` are known, by names in order; they are not returned.
-    """
-    order = sorted(range(len(images)), key=lambda index: images[index].name)
-    images = [images[index] for index in order]
-    places = {key: {number: point.xyz for number, point in model.points3D.items()}
-              for key, model in {id(model): model for model in models}.items()}
-    share = _overlap(images, [
-        _sample_points(image, places[id(models[index])])
-        for image, index in zip(images, order, strict=True)])
-    mutual = np.minimum(share, share.T)
-    names, pairs = [image.name for image in images], set()
-    for row, shares in enumerate(mutual):
-        others = [other for other in np.argsort(-shares, kind="stable").tolist()
-                  if shares[other] > MIN_OVERLAP and (
-                      held is None or set(held[names[row]]).isdisjoint(held[names[other]]))]
-        both = [(names[min(row, other)], names[max(row, other)]) for other in others]
-        new = [pair for pair in both if pair not in besides]
-        count = min(max(0, most - (len(both) - len(new))), len(new[:WIDEST]))
-        for place in np.linspace(0, max(len(new[:WIDEST]) - 1, 0), count):
-            pairs.add(new[round(place)])
-    return pairs
-
-
-def _sample_points(
-    image: pycolmap.Image, places: Mapping[int, NDArray[np.float64]]
-) -> NDArray[np.float64]:  # [S, 3]
-    numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
-    step = max(1, len(numbers) // SAMPLED)
-    return np.array([places[number] for number in numbers[::step]]).reshape(-1, 3)
-
-
-def _overlap(
-    images: Sequence[pycolmap.Image], seen: Sequence[NDArray[np.float64]]  # [S, 3] each
-) -> NDArray[np.float64]:  # [N, N]
-    """Returns the share of the points of each image that another one should show, too."""
-    owner = np.repeat(np.arange(len(images)), [len(points) for points in seen])
-    points = np.concatenate([np.zeros((0, 3)), *seen])
-    centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-    rays = points - centers[owner]
-    near = np.linalg.norm(rays, axis=1)
-    share = np.zeros((len(images), len(images)))
-    for column, image in enumerate(images):
-        camera = image.camera
-        local = np.asarray(image.cam_from_world() * points)
-        bounds = np.array([camera.width / camera.focal_length_x,
-                           camera.height / camera.focal_length_y]) / 2
-        inside = (local[:, 2] > 0) & (np.abs(local[:, :2]) < bounds * local[:, 2:]).all(axis=1)
-        rows = np.flatnonzero(inside)  # few of many: a walk leaves most behind
-        others = points[rows] - centers[column]
-        far = np.linalg.norm(others, axis=1)
-        cosines = (rays[rows] * others).sum(axis=1)
-        alike = (cosines > np.cos(np.radians(MAX_ANGLE_DEG)) * near[rows] * far) & (
-            near[rows] < MAX_RATIO * far) & (far < MAX_RATIO * near[rows])
-        share[:, column] = np.bincount(owner[rows[alike]], minlength=len(images))
-    np.fill_diagonal(share, 0)
-    return np.asarray(share / np.maximum(np.bincount(owner, minlength=len(images)), 1)[:, None])
 
 
 def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -71,7 +71,8 @@ def _run_segments(
 ) -> segments.SegmentRuns:
     """Maps a long capture in segments and tells which failed; leaves others as they are."""
     whole = job.known_poses or job.pairs != "auto"
-    count = 1 if whole else segments.count_segments(len(job.names), config.segments)
+    count = 1 if whole else segments.count_segments(
+        segments.count_mapped(job), config.segments)
     if count == 1:
         segments.remove_segments(job)  # of a run with other options
         if config.on == "ray":

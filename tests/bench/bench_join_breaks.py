@@ -25,7 +25,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm.join_segments import MODEL_FOLDER, Segment, describe_segment
+from recon_cli.sfm.join_segments import MODEL_FOLDER
 from recon_cli.sfm.segment_joins import (
     MAX_ERROR,
     SegmentCameras,
@@ -33,6 +33,7 @@ from recon_cli.sfm.segment_joins import (
     camera_residuals,
     judge_join,
 )
+from recon_cli.sfm.segment_points import Segment, describe_segment
 
 BREAKS = {"as it is": (1.0, 0.0), "x 0.8": (0.8, 0.0), "x 0.9": (0.9, 0.0), "x 1.1": (1.1, 0.0),
           "x 1.25": (1.25, 0.0), "x 1.5": (1.5, 0.0), "5 degrees": (1.0, 5.0),

@@ -12,7 +12,7 @@ from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import fallbacks, mapper
+from recon_cli.sfm import fallbacks, keyframes, mapper, skeleton
 from recon_cli.sfm.fallbacks import (
     MapperAttempt,
     best_attempt,
@@ -74,6 +74,20 @@ def test_a_video_begins_with_its_tracks_where_they_link_its_frames(capture):
     # Each track ends before the next frame.
     replace(tracks, track=np.arange(30 * count, dtype=np.int32)).write(video.tracks)
     assert list_fallbacks(video)[0].name == "exhaustive"
+
+
+def test_a_long_video_is_matched_among_its_keyframes(capture, monkeypatch):
+    job, _ = capture
+    monkeypatch.setattr(keyframes, "ALL", 3)
+    count = len(job.names)
+    image = np.repeat(np.arange(count, dtype=np.int32), 100)
+    Tracks(job.names, image, np.tile(np.arange(100, dtype=np.int32), count),
+           np.zeros((100 * count, 2), np.float32)).write(job.out / "tracks.safetensors")
+    video = replace(job, tracks=job.out / "tracks.safetensors")
+    chosen = skeleton.list_keyframes(video)
+    assert 1 < len(chosen) < count
+    assert [fallback.name for fallback in list_fallbacks(video)] == [
+        "tracks", "relaxed", "global"]
 
 
 @pytest.mark.parametrize("pairs", ["exhaustive", "retrieval", "sequential"])
@@ -254,12 +268,9 @@ def interrupt(*_, **__):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(("count", "video", "whole"), [
-    (300, True, True), (500, True, False), (500, False, True)])
-def test_a_long_video_is_not_mapped_as_a_whole_after_its_segments(
-    tmp_path, count, video, whole
-):
-    names = tuple(f"{index:06d}.png" for index in range(count))
+@pytest.mark.parametrize("video", [True, False])
+def test_a_video_is_not_mapped_as_a_whole_after_its_segments(tmp_path, video):
+    names = tuple(f"{index:06d}.png" for index in range(300))
     job, _ = make_capture(tmp_path)
     tracks = tmp_path / "tracks"
     empty = np.zeros(0, np.int32)
@@ -268,5 +279,5 @@ def test_a_long_video_is_not_mapped_as_a_whole_after_its_segments(
                   tracks=tracks if video else None)
     first, *others = list_fallbacks(job)
     assert first.name == "segments"
-    assert first.reason == f"{count} frames were mapped in 2 segments"
-    assert bool(others) == whole
+    assert first.reason == "300 frames were mapped in 2 segments"
+    assert bool(others) != video

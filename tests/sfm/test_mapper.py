@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 from synthetic import center_error, make_capture, part
 
-from recon_cli.sfm import mapper
+from recon_cli.sfm import mapper, merge_models
 from recon_cli.sfm.job import Reporter
 from recon_cli.sfm.mapper import triangulation_angles
 
@@ -82,6 +82,22 @@ def test_a_model_is_extended_without_adjusting_the_whole_again(tmp_path):
     whole = mapper.extend_model(job, part(truth, job.names[:15]), rounds=0)
     assert mapper.list_registered(whole) == list(job.names)
     assert center_error(whole, truth) < 1e-2
+
+
+def test_images_are_placed_by_the_points_of_a_model_that_stays_as_it_is(tmp_path):
+    job, truth = make_capture(tmp_path)
+    held = job.names[:15]
+    model = merge_models.build_posed_model(
+        job.database, truth, {name: truth.find_image_with_name(name).cam_from_world()
+                              for name in held})  # the others are not in it
+    model = mapper.triangulate(job, model, rounds=1)
+    before = {name: model.find_image_with_name(name).cam_from_world().matrix() for name in held}
+    assert mapper.resect(job, model) == 5
+    assert mapper.list_registered(model) == list(job.names)
+    assert center_error(model, truth) < 1e-2
+    for name in held:
+        np.testing.assert_array_equal(
+            model.find_image_with_name(name).cam_from_world().matrix(), before[name])
 
 
 def test_triangulated_points_leave_the_cameras_where_they_are(tmp_path):

@@ -22,10 +22,9 @@ from recon_cli.sfm.skeleton import (
     is_continuous,
     link,
     near_pairs,
-    overlapping_images,
-    overlapping_pairs,
     read_verified,
 )
+from recon_cli.sfm.view_overlap import WIDEST, overlapping_images, overlapping_pairs
 
 SILENT = Reporter(io.BytesIO())
 
@@ -108,6 +107,7 @@ def test_near_frames_are_paired_within_a_camera_alone():
     assert near_pairs(replace_groups(groups), 1) == {("a", "b"), ("b", "c"), ("d", "e")}
     assert near_pairs(replace_groups(groups), 5) == {
         ("a", "b"), ("b", "c"), ("a", "c"), ("d", "e")}
+    assert near_pairs(replace_groups(groups), 1, ("a", "c", "d")) == {("a", "c")}
 
 
 def replace_groups(groups):
@@ -116,6 +116,7 @@ def replace_groups(groups):
 
     job = Job()
     job.groups = groups
+    job.names = [name for group in groups for name in group.names]
     return job
 
 
@@ -174,7 +175,7 @@ def test_observations_of_tracks_follow_the_features_of_an_image(tmp_path):
     job = make_job(tmp_path, made, tracks)
     few = {pair: geometry for pair, geometry in read_verified(job.database).items()
            if pair == (made.names[0], made.names[1])}
-    link(linked(job), job.database, few, tracks)
+    link(linked(job), job.database, few, tracks, range(6))
     with pycolmap.Database.open(job.out / skeleton.LINKED) as opened:
         features = len(made._seen(0)[0])
         keypoints = opened.read_keypoints(1)
@@ -196,7 +197,7 @@ def test_pairs_that_were_matched_in_vain_are_remembered(tmp_path):
     geometries = read_verified(job.database)
     dropped = made.names[0], made.names[4]  # tracks are matched 1, 2, 3, 5, ... apart
     kept = {pair: geometry for pair, geometry in geometries.items() if pair != dropped}
-    link(linked(job), job.database, kept, tracks)
+    link(linked(job), job.database, kept, tracks, range(6))
     assert set(read_verified(linked(job).database)) == set(kept)
     with pycolmap.Database.open(linked(job).database) as opened:
         assert opened.exists_matches(1, 5)
@@ -409,9 +410,10 @@ def test_what_looks_alike_is_matched_where_the_models_do_not_show_it_to_overlap(
     made = walk(12, step=1.0)  # from one end to the other nothing is seen twice
     job = make_photos(tmp_path, made)
     first, last = made.names[0], made.names[-1]
-    overlap = overlapping_pairs(made.model(), skeleton.WIDEST)
+    overlap = overlapping_pairs(made.model(), WIDEST)
     chosen = set(sorted(overlap)[::2])
     monkeypatch.setattr(skeleton, "similar_pairs", lambda *_, besides, **__: (
         {(first, last)} | overlap) - set(besides))
-    assert skeleton._unexpected_pairs(job, [made.model()], chosen) == {(first, last)}
-    assert skeleton._unexpected_pairs(job, [], chosen) == {(first, last)} | overlap - chosen
+    assert skeleton._unexpected_pairs(job, [made.model()], chosen, job.names) == {(first, last)}
+    assert skeleton._unexpected_pairs(job, [], chosen, job.names) == (
+        {(first, last)} | overlap - chosen)
