@@ -12,7 +12,7 @@ from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import fallbacks, mapper
+from recon_cli.sfm import fallbacks, mapper, parts
 from recon_cli.sfm.fallbacks import (
     MapperAttempt,
     best_attempt,
@@ -172,12 +172,13 @@ def test_a_good_capture_stops_at_the_first_attempt(capture):
     assert attempt["reason"] == "20 frames are few enough to match all pairs"
     assert attempt["registered"] == 20
     assert attempt["kept"]
-    assert result["registered"] == list(job.names)
+    part, = result["parts"]
+    assert part["registered"] == list(job.names)
     assert result["models"] == [20]
     assert not job.attempts.exists()
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
-    assert json.loads((job.out / "verdict.json").read_text()) == json.loads(
-        json.dumps(result["verdict"]))
+    assert json.loads((job.model / "verdict.json").read_text()) == json.loads(
+        json.dumps(part["verdict"]))
     assert json.loads(json.dumps(result, allow_nan=False))
 
 
@@ -212,7 +213,7 @@ def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "the model cannot be trusted")
     result = build(job, deadline=0.0)
     assert [bool(attempt["skipped"]) for attempt in result["rungs"]] == [False, True, True]
-    assert result["registered"] == list(job.names)
+    assert result["parts"][0]["registered"] == list(job.names)
 
 
 def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, monkeypatch):
@@ -236,7 +237,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
     owner, name = {
         "match": (fallbacks.database, "pair_names"), "models": (mapper, "map_incrementally"),
         "model": (fallbacks, "write_model"), "note": (StepLog, "finish"),
-        "verdict": (fallbacks.atomic, "write_json"), "publish": (fallbacks, "publish")}[place]
+        "verdict": (parts.atomic, "write_json"), "publish": (parts, "publish")}[place]
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -246,7 +247,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
         build(job)
     assert not (job.model).exists()
     monkeypatch.undo()
-    assert build(job)["registered"] == list(job.names)
+    assert build(job)["parts"][0]["registered"] == list(job.names)
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
 
 
