@@ -100,7 +100,7 @@ def test_the_stretches_that_are_left_out_are_told_with_their_times(caplog):
 
 def test_models_that_are_left_aside_are_told(caplog):
     text = told(caplog, models=(49, 3), apart=(("5.png", "6.png", "7.png"),))
-    assert_facts(text, 49, "kept", 3, "frames", "22.5", "6.png to 7.png")
+    assert_facts(text, "left aside", 3, "frames", "22.5", "6.png to 7.png")
 
 
 def test_frames_without_a_camera_are_told(caplog):
@@ -162,11 +162,13 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted(tmp_path):
         Frame(name, None, "a.mp4", None, held_out=name in ("0.png", "4.png")) for name in names))
     known = summaries.SFM.to_json()
     log = StepLog(tmp_path)
-    log.finish("model", {**known, "registered": names[:3], "left_out": names[3:5], "seconds": 1.0})
+    part = {"registered": names[:3], "points": 9, "lines": []}
+    log.finish("model", {
+        **known, "parts": [part], "left_out": names[3:5], "notes": [], "seconds": 1.0})
     log.finish("sparse", {**known["world"], "seconds": 1.0})
     log.finish("undistorted", {"cameras": [], "seconds": 1.0})
     steps = ("model", "sparse", "undistorted")
-    job = SimpleNamespace(out=tmp_path, steps=steps, segments=())
+    job = SimpleNamespace(out=tmp_path, steps=steps, segments=(), part=1)
     summary = sfm._summary(frames, SegmentRuns(job, {}, {}))
     assert summary.left_out == ("3.png", "4.png")
     assert summary.unregistered == ("3.png", "4.png", "5.png")  # no mapper found a place for 5
