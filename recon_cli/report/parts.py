@@ -158,8 +158,11 @@ def advise(gap: Gap) -> str:
     if not first or not second:
         return (f"Take ten or more photos on the way from where {gap.before.name} was taken to "
                 f"where {gap.after.name} was taken; each shows half of what the one before shows.")
-    where = (f"what was filmed from {first} to {second}" if gap.before.source == gap.after.source
-             else f"the way from {gap.before.source} at {first} to {gap.after.source} at {second}")
+    if gap.before.source != gap.after.source:
+        where = f"the way from {gap.before.source} at {first} to {gap.after.source} at {second}"
+    else:
+        when = f"at {first}" if first == second else f"from {first} to {second}"
+        where = f"what the film shows {when}"
     return (f"Film {where} again: walk slowly from where the left picture was taken to where the "
             "right one was taken, sideways rather than turning on the spot, and keep half of the "
             "view in the picture from one second to the next.")

@@ -31,6 +31,7 @@ from recon_cli.sfm import (
 )
 from recon_cli.sfm.job import MappingJob, Reporter, Result, StepLog, fresh_folder
 from recon_cli.sfm.merge_models import ModelCandidate
+from recon_cli.sfm.time_estimate import format_minutes
 from recon_cli.sfm.trusted_part import cuts_models, deliver_parts
 from recon_cli.sfm.verdict import ModelVerdict, examine
 from recon_cli.sfm.weakest_cut import MIN_AGREEING
@@ -50,6 +51,9 @@ ENOUGH = 0.9
 # How much longer than the longest attempt so far a mapping may take. Relaxed thresholds took 0.8
 # and 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
+# How many times as long as the attempt before it a further one usually takes (1.1 to 2.4 in three
+# captures), and the minutes of one from which on that is told.
+FURTHER, MINUTES_TOLD = 1.5, 0.5
 
 
 @dataclass(frozen=True)
@@ -145,8 +149,9 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
     log = StepLog(job.attempts)
     attempts: list[MapperAttempt] = []
     verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
-    reason = list_fallbacks(job)[0].reason
-    for fallback in list_fallbacks(job):
+    ways = list_fallbacks(job)
+    reason = ways[0].reason
+    for fallback in ways:
         recorded = log.result(fallback.name)
         if recorded:
             attempt = MapperAttempt.from_json(recorded)
@@ -160,6 +165,9 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
             reason = attempt.shortfall
             if not reason:
                 break
+            if fallback is not ways[-1] and attempt.seconds > 60 * MINUTES_TOLD:
+                report.tell(f"another mapper is tried, for about "
+                            f"{format_minutes(FURTHER * attempt.seconds)} more: {reason}")
     return _publish_best(job, attempts, verdicts)
 
 

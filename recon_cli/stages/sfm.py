@@ -19,10 +19,12 @@ from recon_cli.io.tracks import TRACKS
 from recon_cli.sfm import database, parts, process, segments
 from recon_cli.sfm.align_world import parse_place
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.time_estimate import Workload, format_minutes, tell_seconds
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.
 MAX_MINUTES, USUAL_FRAMES, MINUTES_PER_FRAME = 20.0, 100, 0.2
+NEAR_LIMIT = 0.5  # share of the limit from which on it is told, too
 STRETCHES = 8  # of frames without a camera, in a sentence
 
 
@@ -53,13 +55,15 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         max_features=config.max_features, min_registered=config.min_registered,
         accept_weak=config.accept_weak, partial=config.partial, gravity=config.gravity == "auto",
         scale_between=config.scale_between, part=config.part,
-        max_minutes=_time_limit(config, frames, ctx), seed=config.seed, threads=ctx.threads,
+        max_minutes=_time_limit(config, frames), seed=config.seed, threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
         times=_times(frames))
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
+    if not mapped:
+        _tell_time(config, job, ctx)
     runs = segments.SegmentRuns(job, {}, {}) if mapped else _run_segments(config, job, ctx)
     job = runs.job
     process.run_job(
@@ -103,17 +107,28 @@ def _start_executor(
     return start_executor(config.on, job.out, slots=slots, cores=max(1, threads // slots))
 
 
-def _time_limit(config: SfmConfig, frames: FrameList, ctx: StageContext) -> float:
-    """Returns the limit in minutes, and tells in advance how long many images take."""
-    count = len(frames.frames)
-    limit = MAX_MINUTES + MINUTES_PER_FRAME * max(0, count - USUAL_FRAMES)
-    if config.max_minutes is None and count > USUAL_FRAMES:
-        parts = segments.count_segments(count, config.segments)
-        about = max(1, round(segments.expected_minutes(count, ctx.threads)))
-        usual = f" in {parts} segments take about {about} minutes, but" if parts > 1 else ""
-        ctx.notice(f"{count} images{usual} may take up to {limit:.0f} minutes; --max-minutes sets "
-                   "another limit.")
-    return limit if config.max_minutes is None else config.max_minutes
+def _time_limit(config: SfmConfig, frames: FrameList) -> float:
+    """Returns the limit in minutes: as asked for, or by the number of frames."""
+    if config.max_minutes is not None:
+        return config.max_minutes
+    return MAX_MINUTES + MINUTES_PER_FRAME * max(0, len(frames.frames) - USUAL_FRAMES)
+
+
+def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
+    """Tells how long the cameras will take, and the limit where it is near."""
+    if job.known_poses or job.pairs != "auto" or StepLog(job.out).result("features") is not None:
+        return  # as asked for, or partly done
+    count = segments.count_segments(len(job.names), config.segments)
+    largest = max(job.groups, key=lambda group: len(group.names))
+    seconds = tell_seconds(Workload(
+        len(job.names), largest.width * largest.height / 1e6, tracked=job.tracks is not None,
+        segments=count), ctx.threads)
+    if seconds is None:
+        return
+    near = seconds > NEAR_LIMIT * 60 * job.max_minutes
+    limit = f" of the {job.max_minutes:.3g} that --max-minutes allows" if near else ""
+    ctx.notice(f"The cameras of {len(job.names):,} frames will take about "
+               f"{format_minutes(seconds)}{limit}.")
 
 
 def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:

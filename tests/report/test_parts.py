@@ -96,7 +96,7 @@ def test_the_page_shows_each_part_and_the_moment_between_them(in_parts):
     page = page_of(in_parts)
     capture = section(page, "capture")
     assert len(re.findall(r'<figure class="map[^"]*"><figcaption>Part \d', capture)) == 2
-    assert re.search(r"Part 2 <span[^>]*>trained", capture)
+    assert re.search(r"Part 2 <span[^>]*>in use", capture)
     assert "7 of 12 frames, 70 points" in capture
     assert f"recon sfm -w {in_parts} --part</code>" not in capture
     assert f"recon sfm -w {in_parts} --part 1</code>" in capture
