@@ -14,7 +14,16 @@ from typing import Any
 from recon_cli.errors import ConfigError, ManifestError
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import mapper
-from recon_cli.sfm.job import DATABASE, VERDICT, MappingJob, Result, StepLog, fresh_folder, publish
+from recon_cli.sfm.job import (
+    DATABASE,
+    LOG_FILE,
+    VERDICT,
+    MappingJob,
+    Result,
+    StepLog,
+    fresh_folder,
+    publish,
+)
 from recon_cli.sfm.verdict import ModelVerdict
 from recon_cli.workspace import atomic, layout
 from recon_cli.workspace.summaries import SfmSummary
@@ -78,7 +87,8 @@ def take_over(
         return False
     log = StepLog(finished)
     needed = log.files("model")
-    if not known.parts or log.result("model") is None or not set(touched).isdisjoint(needed):
+    intact = set(touched).isdisjoint((*needed, LOG_FILE))
+    if not (known.parts and intact) or log.result("model") is None:
         return False
     if FINISHED in (StepLog(out).result("model") or {}):  # of an interrupted run
         return True
