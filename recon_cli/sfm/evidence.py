@@ -25,6 +25,7 @@ MAX_ERROR = 4.0
 # It is explained by a point seen within this multiple of the model's mean error of it, within these
 # pixels: sharp videos come to .2 and shaken ones to 1. See `tests/bench/bench_verdict.py`.
 USUAL_OFFSET, OFFSETS = 6.0, (2.0, MAX_ERROR)
+CONTRADICTED = 0.5  # a pair of whose matches the poses explain a smaller share contradicts them
 NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
 
 
@@ -45,6 +46,11 @@ class MatchEvidence:
     explained: NDArray[np.int64]  # [P], those that the poses explain; likewise
     traced: NDArray[np.int64]  # [P], matches of which both keypoints show a point of the model
     joined: NDArray[np.int64]  # [P], those of them that show one and the same point
+    positions: NDArray[np.float64]  # [M, 3] of the points
+    depths: NDArray[np.float64]  # [N], usual depth of the points in each image; NaN without any
+    # for pairs, by row, whose matches the poses contradict: the points that both keypoints of a
+    # match show, [K, 2], in the order of the pair's images
+    doubled: Mapping[int, NDArray[np.int64]]
 
     @property
     def placed(self) -> NDArray[np.bool_]:
@@ -99,6 +105,8 @@ def gather_evidence(
             visible[index, column] = True
             shown[index][element.point2D_idx] = column
     traced, joined = _count_joined(shown, pairs, matches)
+    explained = _count_explained(model, placed, keypoints, pairs, matches)
+    positions = np.array([point.xyz for _, point in sorted(model.points3D.items())]).reshape(-1, 3)
     return MatchEvidence(
         names=tuple(names), centers=centers, visible=visible, tried=tried,
         registered=np.isin(np.arange(len(names)), list(placed)),
@@ -106,8 +114,9 @@ def gather_evidence(
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
         agreeing=_count_agreeing(placed, keypoints, pairs, matches),
-        explained=_count_explained(model, placed, keypoints, pairs, matches),
-        traced=traced, joined=joined)
+        explained=explained, traced=traced, joined=joined, positions=positions,
+        depths=_usual_depths(len(names), placed, shown, positions),
+        doubled=_find_doubled(shown, pairs, matches, explained))
 
 
 def _read_verified_pairs(
@@ -238,3 +247,31 @@ def _count_joined(
         traced[pair] = np.count_nonzero(both)
         joined[pair] = np.count_nonzero(both & (ours == theirs))
     return traced, joined
+
+
+def _usual_depths(
+    count: int, placed: Mapping[int, pycolmap.Image], shown: Mapping[int, NDArray[np.int64]],
+    positions: NDArray[np.float64],  # [M, 3]
+) -> NDArray[np.float64]:  # [count]
+    """Returns the median depth of the points that each image shows; NaN where it shows none."""
+    depths = np.full(count, np.nan)
+    for index, image in placed.items():
+        seen = shown[index][shown[index] >= 0]
+        if len(seen):
+            depths[index] = np.median(np.asarray(image.cam_from_world() * positions[seen])[:, 2])
+    return depths
+
+
+def _find_doubled(
+    shown: Mapping[int, NDArray[np.int64]],  # which point each keypoint of an image shows, or -1
+    pairs: Sequence[tuple[int, int]],
+    matches: Sequence[NDArray[np.uint32]],
+    explained: NDArray[np.int64],  # [P]
+) -> dict[int, NDArray[np.int64]]:
+    """Returns the points that the matches of contradicted pairs show, [K, 2], by row of a pair."""
+    doubled = {}
+    for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
+        if first in shown and second in shown and explained[pair] < CONTRADICTED * len(rows):
+            both = np.column_stack([shown[first][rows[:, 0]], shown[second][rows[:, 1]]])
+            doubled[pair] = both[(both >= 0).all(axis=1)]
+    return doubled

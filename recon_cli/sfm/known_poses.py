@@ -103,7 +103,8 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         if share < MIN_AGREEING:
             raise _misfit(share, MIN_AGREEING)
         verdict = examine(
-            model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times)
+            model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times,
+            given=True)
         check_weak_link(verdict, job.accept_weak, given=True)
         notes = []
     parts.write_parts(job, [(model, verdict)])

@@ -78,8 +78,7 @@ def drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandi
     while verdict.outliers and len(
             rejected) + len(verdict.outliers) <= MAX_REJECTED * cameras:
         for item in verdict.outliers:
-            rejected[item.name] = (
-                f"{item.share:.0%} of its {item.matches} matches agree with where it was placed")
+            rejected[item.name] = item.reason
             model.deregister_frame(model.find_image_with_name(item.name).frame_id)
         model = mapper.sharpen(model)
         verdict = _examine(job, model)

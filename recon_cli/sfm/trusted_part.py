@@ -20,14 +20,16 @@ from recon_cli.sfm.verdict import (
     MAX_LEAP,
     ModelVerdict,
     check_weak_link,
+    has_drifted,
     is_aliased,
     is_broken,
 )
 
 Names = tuple[str, ...]
 
-# Frames of a part beside the largest: fewer show too little of a room to be worth a scene.
-LEAST = 20
+# Frames of a part beside the largest, a tenth of the capture within these bounds: 20 are worth a
+# scene, and fewer than 10 cannot tell the principal point (`mapper.MIN_IMAGES_PRINCIPAL`).
+FEWEST, ENOUGH = 10, 20
 _MOST_NAMED = 5  # parts in an error
 
 
@@ -58,23 +60,33 @@ def cuts_models(job: MappingJob) -> bool:
     return job.partial and not job.accept_weak
 
 
+def least_frames(job: MappingJob) -> int:
+    """Returns how many frames a part beside the largest must have."""
+    return min(max(len(job.names) // 10, FEWEST), ENOUGH)
+
+
 def find_parts(
     job: MappingJob, whole: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
 ) -> list[ModelCandidate]:
-    """Returns the largest part that can be trusted, of three cameras or more, and all of LEAST."""
+    """Returns the largest part that can be trusted, of three cameras or more, and others.
+
+    The points of a model that has none are triangulated.
+    """
+    least = least_frames(job)
     parts = list(_cut(job, whole, checks.MIN_FRAMES))
     for other in sorted(others, key=mapper.model_size, reverse=True):
         held = {name for part in parts for name in mapper.list_registered(part.model)}
         names = set(mapper.list_registered(other)) - held
-        if len(names) >= LEAST:
-            parts += _cut(job, drop_outliers(job, _cut_out(other, names)), LEAST)
+        if len(names) >= least:
+            model = other if other.num_points3D() else mapper.triangulate(job, other)
+            parts += _cut(job, drop_outliers(job, _cut_out(model, names)), least)
     parts.sort(key=lambda part: mapper.model_size(part.model), reverse=True)
     return [part for index, part in enumerate(parts)
-            if not index or part.model.num_reg_images() >= LEAST]
+            if not index or part.model.num_reg_images() >= least]
 
 
 def _cut(job: MappingJob, whole: ModelCandidate, least: int) -> Iterator[ModelCandidate]:
-    """Yields the trusted parts of a model, of at least so many cameras, and of LEAST after one."""
+    """Yields the trusted parts of a model: of so many cameras, and others of those it must have."""
     if whole.verdict.trusted:
         yield whole
         return
@@ -88,10 +100,11 @@ def _cut(job: MappingJob, whole: ModelCandidate, least: int) -> Iterator[ModelCa
         part = dataclasses.replace(part, rejected={**rejected, **part.rejected})
         cameras = mapper.list_registered(part.model)
         if not part.verdict.trusted:
-            sides += [(side, part.rejected) for side in _sides(job, cameras, part.verdict)]
+            sides += [(side, part.rejected) for side in _sides(job, cameras, part.verdict)
+                      if len(side) < len(cameras)]
         elif len(cameras) >= least:
             yield part
-            least = max(least, LEAST)
+            least = max(least, least_frames(job))
 
 
 def _check_share(
@@ -119,6 +132,8 @@ def _sides(job: MappingJob, cameras: Collection[str], verdict: ModelVerdict) -> 
         yield from verdict.weakest_cut.sides
     elif is_aliased(verdict.aliasing):
         yield from verdict.aliasing.sides
+    elif has_drifted(verdict) and verdict.scale is not None:
+        yield from verdict.scale.sides
     elif len(verdict.model_parts) > 1:
         yield from verdict.model_parts
     elif leap := next((jump for jump in verdict.jumps if jump.ratio > MAX_LEAP), None):

@@ -2,7 +2,8 @@
 
 The share of registered images and the reprojection error do not see the worst failures: two good
 halves placed wrongly to each other (`weakest_cut`), two places laid over each other
-(`visual_aliasing`), and a text over bare walls (`still_points`).
+(`visual_aliasing`), a walk whose scale changes on its way (`scale_drift`, `open_loops`), and a text
+over bare walls (`still_points`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from recon_cli.errors import SfmError, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
+from recon_cli.sfm.open_loops import OpenLoop, find_open_loops
+from recon_cli.sfm.scale_drift import MAX_ERROR, ScaleCut, find_weakest_scale, is_scale_known
 from recon_cli.sfm.still_points import MAX_STILL, find_still_share
 from recon_cli.sfm.visual_aliasing import VisualAliasing
 from recon_cli.sfm.weakest_cut import (
@@ -103,6 +106,10 @@ class ModelVerdict:
     points: Histogram  # of the model that each camera sees
     neighbours: Histogram  # of each camera, those with which it shares MIN_MATCHES points
     still: float  # share of the points in three or more images that do not move in them
+    # Of a walk: where the relative scale of both sides is known least, between the stretches of an
+    # open loop where there is one; None where nothing tells.
+    scale: ScaleCut | None
+    open_loops: tuple[OpenLoop, ...]  # the one that most points show first
     problems: tuple[str, ...]  # why the model cannot be trusted, a sentence each
 
     @property
@@ -137,6 +144,9 @@ class ModelVerdict:
         if aliasing.share is not None:
             yield (f"Least overlap: two groups of cameras find {aliasing.share:.0%} as much of "
                    "what both should show as cameras of one group do.")
+        if self.scale is not None:
+            yield (f"Scale: what lies on either side of any moment of the walk is known to "
+                   f"{self.scale.error:.1%} or better against the other side.")
 
     def to_json(self) -> dict[str, Any]:
         """Returns JSON values: the fields, some under their older keys, and `trusted`."""
@@ -152,10 +162,13 @@ def examine(
     *,
     sharpness: Mapping[str, float | None] | None = None,  # variance of the Laplacian, where known
     times: Mapping[str, float | None] | None = None,  # seconds in the video, where known
+    given: bool = False,  # the poses are, so that nothing drifts
 ) -> ModelVerdict:
     """Returns the verdict on a finished model, or raises ValueError if its names do not match."""
     evidence = gather_evidence(model, database, names)
-    weakest_cut, outliers = find_weakest_cut(evidence, find_order(evidence, times or {}))
+    order = find_order(evidence, times or {})
+    weakest_cut, outliers = find_weakest_cut(evidence, order)
+    loops, scale = ((), None) if given else _find_drift(model, evidence, order)
     overlap = visual_aliasing.measure_overlap(model, evidence)
     aliasing = visual_aliasing.find_aliasing(evidence, overlap)
     rows = evidence.registered
@@ -172,10 +185,27 @@ def examine(
         keypoints=Histogram.of(evidence.keypoints),
         points=Histogram.of(evidence.points[rows]),
         neighbours=Histogram.of(np.count_nonzero(evidence.shared[rows] >= MIN_MATCHES, axis=1)),
-        still=still,
+        still=still, scale=scale, open_loops=loops,
         problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
-                  *_describe_still(still),
+                  *_describe_drift(loops, scale), *_describe_still(still),
                   *describe_shifted_centres(model, database)))
+
+
+def _find_drift(
+    model: pycolmap.Reconstruction, evidence: MatchEvidence, order: NDArray[np.int64] | None
+) -> tuple[tuple[OpenLoop, ...], ScaleCut | None]:
+    """Returns the loops of a walk that are open, and the cut where its scale is known least."""
+    if order is None:
+        return (), None
+    loops = find_open_loops(evidence, order)
+    walk = [evidence.names[row] for row in order if evidence.points[row]]
+    ends = (loops[0].first, loops[0].second) if loops else None
+    return loops, find_weakest_scale(model, walk, between=ends)
+
+
+def has_drifted(verdict: ModelVerdict) -> bool:
+    """Returns whether the scale or direction of a walk changes on its way, or may do so."""
+    return bool(verdict.open_loops) or not is_scale_known(verdict.scale)
 
 
 def is_broken(cut: WeakestCut) -> bool:
@@ -230,6 +260,23 @@ def _describe_problems(
         f"The camera leaps from {jump.before} to {jump.after}: {jump.ratio:.0f} times as far as "
         f"usual, but at most {MAX_LEAP:.0f} times is possible."
         for jump in jumps if jump.ratio > MAX_LEAP]
+
+
+def _describe_drift(loops: Sequence[OpenLoop], cut: ScaleCut | None) -> list[str]:
+    where = f" between {cut.before} and {cut.after}" if cut else ""
+    if loops:
+        loop = loops[0]
+        return [
+            f"{loop.first} and {loop.second} show one place, as {loop.points} points in "
+            f"{loop.pairs} pairs of images say, but the model has it twice, "
+            f"{abs(loop.scale - 1):.0%} apart in scale and turned by {loop.turn_deg:.0f} degrees: "
+            f"the cameras drift on the way, most likely{where or ' in between'}."]
+    if cut is None or is_scale_known(cut):
+        return []
+    return [
+        f"How large the {len(cut.sides[0])} cameras on one side of the cut{where} are against the "
+        f"{len(cut.sides[1])} others is known to {cut.error:.0%} only, but {MAX_ERROR:.0%} is "
+        "needed: too little that both see shows depth."]
 
 
 def _describe_still(share: float) -> list[str]:

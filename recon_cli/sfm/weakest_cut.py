@@ -69,6 +69,16 @@ class OutlierCamera:
     name: str
     share: float  # of its matches with cameras that are no outliers, those that agree
     matches: int  # with such cameras
+    rival: str = ""  # of those, the one that contradicts it by most matches; empty without any
+    joined: float | None = None  # of what both show, the share that is one point in both
+
+    @property
+    def reason(self) -> str:
+        """What it contradicts, in words."""
+        text = f"{self.share:.0%} of its {self.matches} matches agree with where it was placed"
+        if self.joined is None:
+            return text
+        return f"{text}, but {self.joined:.0%} of what {self.rival} shows, too, is one point in both"
 
 
 def find_weakest_cut(
@@ -85,13 +95,23 @@ def find_weakest_cut(
     while (weakest := _weakest_side(links, inliers, order)) is not None:
         side, strength = weakest
         count = np.count_nonzero(evidence.registered & ~inliers) + np.count_nonzero(side)
-        if strength.holds or count > allowed:
+        if strength.holds or count > allowed or _agrees(links, side, inliers):
             return (_cut(evidence, links, side, inliers, strength),
                     _outliers(evidence, links, inliers))
         inliers &= ~side
     reason = f"no two parts have a pair of images with {MIN_TRACED} matched points between them"
     return (WeakestCut(None, None, reason, ((), ()), 0, 0, 0, 0.0),
             _outliers(evidence, links, inliers))
+
+
+def _agrees(links: _Links, side: Cut, inliers: Cut) -> bool:
+    """Returns whether the cameras of a side stand where most matches with the others say.
+
+    Then they are a part of the walk that does not fit as a whole, and not outliers.
+    """
+    across = np.ix_(side, inliers & ~side)
+    matches = links.matches[across].sum()
+    return bool(matches >= MIN_MATCHES and links.agreeing[across].sum() >= MIN_AGREEING * matches)
 
 
 @dataclass(frozen=True)
@@ -245,8 +265,14 @@ def _finite(value: float) -> float | None:
 
 def _outliers(evidence: MatchEvidence, links: _Links, inliers: Cut) -> tuple[OutlierCamera, ...]:
     outliers = []
+    others = np.flatnonzero(inliers)
     for index in np.flatnonzero(evidence.registered & ~inliers):
-        matches = links.matches[index, inliers].sum()
-        share = links.agreeing[index, inliers].sum() / max(matches, 1.0)
-        outliers.append(OutlierCamera(evidence.names[index], float(share), int(matches)))
+        matches = links.matches[index, others]
+        share = links.agreeing[index, others].sum() / max(matches.sum(), 1.0)
+        wrong = np.where(links.shares[index, others] < MIN_AGREEING, matches, 0)
+        worst = int(others[wrong.argmax()]) if wrong.any() else None
+        outliers.append(OutlierCamera(
+            evidence.names[index], float(share), int(matches.sum()),
+            "" if worst is None else evidence.names[worst],
+            None if worst is None else float(links.shares[index, worst])))
     return tuple(outliers)

@@ -11,7 +11,7 @@ from recon_cli.errors import SfmError
 from recon_cli.sfm import trusted_part
 from recon_cli.sfm.job import CameraGroup, MappingJob
 from recon_cli.sfm.mapper import list_registered
-from recon_cli.sfm.merge_models import ModelCandidate
+from recon_cli.sfm.merge_models import ModelCandidate, build_posed_model
 from recon_cli.sfm.trusted_part import deliver_parts, find_parts
 from recon_cli.sfm.verdict import examine
 
@@ -44,7 +44,7 @@ def held(parts):
 @pytest.fixture
 def small(monkeypatch):
     """Parts of three frames are worth to be delivered."""
-    monkeypatch.setattr(trusted_part, "LEAST", 3)
+    monkeypatch.setattr(trusted_part, "FEWEST", 3)
 
 
 @pytest.mark.usefixtures("small")
@@ -96,6 +96,20 @@ def test_another_model_is_cut_where_it_is_broken(tmp_path):
     whole = replace(whole, model=first, verdict=examine(first, job.database, job.names))
     assert held(find_parts(job, whole, [other])) == [
         made.names[3:10], made.names[10:], made.names[:3]]
+
+
+@pytest.mark.usefixtures("small")
+def test_a_model_without_points_gets_those_that_the_matches_give(tmp_path):
+    made = walk()
+    job, whole = prepare(made, tmp_path)
+    first = cut(whole.model, made.names[:9])
+    whole = replace(whole, model=first, verdict=examine(first, job.database, job.names))
+    other = build_posed_model(job.database, None, dict(zip(
+        made.names[9:], made.poses[9:], strict=True)))
+    assert not other.num_points3D()
+    _, part = find_parts(job, whole, [other])
+    assert held([part]) == [made.names[9:]]
+    assert part.model.num_points3D() > 500
 
 
 def test_parts_that_are_too_small_together_are_refused_with_their_size(tmp_path):

@@ -185,8 +185,8 @@ def test_the_keys_of_a_verdict_on_disk_stay(tmp_path):
     value = json.loads(json.dumps(verdict_on(broken_walk(), tmp_path).to_json(), allow_nan=False))
     assert list(value) == [
         "images", "registered", "model_parts", "match_parts", "weak_link", "fold", "astray",
-        "unregistered", "jumps", "keypoints", "points", "neighbours", "still", "problems",
-        "trusted"]
+        "unregistered", "jumps", "keypoints", "points", "neighbours", "still", "scale",
+        "open_loops", "problems", "trusted"]
     assert value["trusted"] is False
 
 

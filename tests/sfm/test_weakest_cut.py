@@ -24,7 +24,8 @@ def evidence(share, *, matches=lambda first, second: 300 // (second - first)) ->
         names=NAMES, registered=np.ones(COUNT, bool), centers=np.zeros((COUNT, 3)),
         keypoints=np.full(COUNT, 1000), visible=np.ones((COUNT, 50), bool),
         tried=np.ones((COUNT, COUNT), bool), pairs=np.array(pairs), matches=counts,
-        agreeing=joined, explained=joined, traced=counts, joined=joined)
+        agreeing=joined, explained=joined, traced=counts, joined=joined,
+        positions=np.zeros((50, 3)), depths=np.ones(COUNT), doubled={})
 
 
 def halves(across: float):

@@ -1,0 +1,116 @@
+"""Loops of a walk that a model leaves open: two stretches show one place, and the model has two.
+
+Where a walk comes back, frames far apart in time match. If the cameras have drifted, these matches
+contradict the model, and the mapper drops them: it stays wrong though it was told. Such matches
+agree with each other on one motion, which brings the two copies of the place together. Places that
+only look alike give such a motion as well, but it is larger than what a way drifts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.io.colmap_library import pycolmap
+from recon_cli.sfm.evidence import MatchEvidence
+
+NEAR = 10  # images; pairs whose ends are nearer than this in the walk belong to one loop
+# Points that agree on one motion, and their share of all that the pairs show in two copies.
+MIN_POINTS, MIN_SHARE = 30, 0.5
+# Share of the points that are in one place already above which the loop is closed.
+CLOSED = 0.2
+MAX_ERROR = 0.03  # between equal points, as a share of the usual depth; see `merge_models`
+MAX_TRIALS = 2000
+# What a way may drift; see `pair_checks`.
+MAX_DRIFT_DEG, MAX_DRIFT = 15.0, 0.2
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Two stretches of a walk that show the same place, which the model has twice."""
+
+    first: str  # an image of the earlier stretch
+    second: str  # the image of the later one that it has most matches with
+    pairs: int  # of images, whose matches contradict the model
+    points: int  # that agree on one motion
+    scale: float  # of that motion, from the later stretch to the earlier one
+    turn_deg: float
+    shift: float  # how far it moves the points, as a share of the way between the stretches
+
+
+def find_open_loops(
+    evidence: MatchEvidence, order: NDArray[np.int64] | None, *, seed: int = 0
+) -> tuple[OpenLoop, ...]:
+    """Returns the loops that a model leaves open; none where the images' order is not known.
+
+    `order` are the images with a camera as they were taken.
+    """
+    if order is None:
+        return ()
+    place = np.full(len(evidence.names), -1)
+    place[order] = np.arange(len(order))
+    loops = [_judge(evidence, place, order, rows, seed)
+             for rows in _groups(evidence, place)]
+    return tuple(sorted((loop for loop in loops if loop is not None),
+                        key=lambda loop: -loop.points))
+
+
+def _groups(evidence: MatchEvidence, place: NDArray[np.int64]) -> Iterator[list[int]]:
+    """Yields pairs, by row, that contradict the model and lie beside each other, the best first."""
+    left = sorted(evidence.doubled, key=lambda row: (-int(evidence.matches[row]), row))
+    while left:
+        ends = np.sort(place[evidence.pairs[left]], axis=1)
+        near = (np.abs(ends - ends[0]) <= NEAR).all(axis=1)
+        group = [row for row, close in zip(left, near, strict=True) if close]
+        left = [row for row, close in zip(left, near, strict=True) if not close]
+        firsts, seconds = ends[near].T
+        if len(set(firsts)) > 1 and len(set(seconds)) > 1:  # one blurred image proves nothing
+            yield group
+
+
+def _judge(
+    evidence: MatchEvidence, place: NDArray[np.int64], order: NDArray[np.int64],
+    rows: Sequence[int], seed: int,
+) -> OpenLoop | None:
+    """Returns the loop that some pairs leave open; None if they agree on nothing, or it is closed.
+    """
+    later, earlier = _shown_points(evidence, place, rows)
+    if len(later) < MIN_POINTS:
+        return None
+    first, second = sorted(evidence.pairs[rows[0]], key=lambda image: place[image])
+    depth = float(evidence.depths[first])
+    options = pycolmap.RANSACOptions()
+    options.max_error = MAX_ERROR * depth
+    options.max_num_trials = MAX_TRIALS
+    options.random_seed = seed
+    found = pycolmap.estimate_sim3d_robust(later, earlier, options)
+    if found is None or found["num_inliers"] < max(MIN_POINTS, MIN_SHARE * len(later)):
+        return None
+    apart = np.linalg.norm(later - earlier, axis=1)
+    if np.count_nonzero(apart <= options.max_error) > CLOSED * found["num_inliers"]:
+        return None
+    motion = found["tgt_from_src"]
+    turn = float(np.degrees(motion.rotation.angle()))
+    path = evidence.centers[order[place[first]:place[second] + 1]]
+    way = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    shift = float(np.median(apart)) / max(way, 1e-12)
+    if turn > MAX_DRIFT_DEG or shift > MAX_DRIFT:
+        return None
+    return OpenLoop(evidence.names[first], evidence.names[second], len(rows),
+                    int(found["num_inliers"]), float(motion.scale), turn, shift)
+
+
+def _shown_points(
+    evidence: MatchEvidence, place: NDArray[np.int64], rows: Collection[int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # [K, 3], [K, 3]
+    """Returns the points that matching keypoints show, of the later and the earlier image."""
+    shown: set[tuple[int, int]] = set()
+    for row in rows:
+        points = evidence.doubled[row]
+        first, second = place[evidence.pairs[row]]
+        shown |= set(map(tuple, (points if first > second else points[:, ::-1]).tolist()))
+    both = np.array(sorted(shown), np.int64).reshape(-1, 2)
+    return evidence.positions[both[:, 0]], evidence.positions[both[:, 1]]

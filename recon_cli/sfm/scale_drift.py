@@ -1,0 +1,202 @@
+"""How well the scale of one stretch of a walk is known against that of the next.
+
+A camera that turns in a narrow place ties what lies before it to what comes after by points that
+show little of either scale. Matches agree then, whatever the scale is: a walk of 30 m was trusted
+whose second half was a third too large. So the information that all observations hold about the
+relative scale is computed, with every camera, every point and the focal length free (the covariance
+of a bundle adjustment, Triggs et al. 2000, sections 6.1 and 9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, eye, hstack
+from scipy.sparse.linalg import SuperLU, splu
+
+from recon_cli.io.colmap_library import pycolmap
+
+# The scale of a stretch is that of its cameras' centres. It spans this share of the extent of all
+# and of the usual depth, and so many cameras: on a shorter one the camera stands still, or turns.
+REACH, DEPTHS, LEAST = 0.2, 0.5, 10
+# Errors of tracks and of the lens are shared by many observations and do not average out: scales
+# were off by 10 to 20 times what independent errors of one pixel's fraction would leave.
+SHARED_ERRORS = 15.0
+MAX_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_verdict.py`
+LOSS_SCALE = 0.5  # of Cauchy's loss, times the mean error, as in `mapper.sharpen`
+_RIDGE = 1e-10  # times the diagonal: position, turn and scale of the whole are free
+_POSE = 6  # unknowns of a camera: its turn, and its centre
+
+
+@dataclass(frozen=True)
+class ScaleCut:
+    """Where the relative scale of what lies before and after is known least."""
+
+    error: float  # of the relative scale, as a share; one standard deviation
+    before: str  # the last image before the cut
+    after: str  # the first one behind it
+    sides: tuple[tuple[str, ...], tuple[str, ...]]  # names of the images, the smaller side first
+
+
+def find_weakest_scale(
+    model: pycolmap.Reconstruction, order: Sequence[str], *,
+    between: tuple[str, str] | None = None,
+) -> ScaleCut | None:
+    """Returns the cut of a walk across which the relative scale is known least.
+
+    `order` are names of images with a camera as they were taken; `between` limits the cuts to those
+    between two of them. None where no stretch before a cut and none behind it is long enough.
+    """
+    if len(order) < 2 * LEAST:
+        return None
+    information = _Information(model, order)
+    first, last = (0, len(order)) if between is None else sorted(map(list(order).index, between))
+    errors = {place: information.error(*stretches) for place in range(first + 1, last + 1)
+              if (stretches := _stretches(information, place)) is not None}
+    if not errors:
+        return None
+    place = max(errors, key=lambda each: errors[each])
+    parts = tuple(order[:place]), tuple(order[place:])
+    first_side, second_side = sorted(parts, key=len)
+    return ScaleCut(SHARED_ERRORS * errors[place], order[place - 1], order[place],
+                    (first_side, second_side))
+
+
+def is_scale_known(cut: ScaleCut | None) -> bool:
+    """Returns whether no relative scale is less certain than MAX_ERROR."""
+    return cut is None or cut.error <= MAX_ERROR
+
+
+def _stretches(
+    information: _Information, place: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+    """Returns the cameras of the stretch before a place in the walk and of that behind it."""
+    centers = information.centers
+    before = _count_until(centers[:place][::-1], information.reach)
+    behind = _count_until(centers[place:], information.reach)
+    if before is None or behind is None:
+        return None
+    return np.arange(place - before, place), np.arange(place, place + behind)
+
+
+def _count_until(centers: NDArray[np.float64], need: float) -> int | None:
+    """Returns how many of the cameras [F, 3], from the first on, span a box of a diagonal `need`.
+
+    None where all of them span less, or they are fewer than LEAST.
+    """
+    low, high = np.minimum.accumulate(centers), np.maximum.accumulate(centers)
+    wide = np.flatnonzero(np.linalg.norm(high - low, axis=1) >= need)
+    if not len(wide) or len(centers) < LEAST:
+        return None
+    return max(int(wide[0]) + 1, LEAST)
+
+
+class _Information:
+    """What the observations of a model say about its cameras, all points being free."""
+
+    def __init__(self, model: pycolmap.Reconstruction, order: Sequence[str]) -> None:
+        seen = _Observations(model, order)
+        self.centers = seen.centers
+        self.reach = max(  # of a stretch, the diagonal of the box around its cameras
+            REACH * float(np.linalg.norm(np.ptp(seen.centers, axis=0))), DEPTHS * seen.depth)
+        self._factor, self._variance = _factorise(seen)
+
+    def error(self, before: NDArray[np.int64], behind: NDArray[np.int64]) -> float:
+        """Returns the standard deviation of the log of the relative scale of two stretches."""
+        change = _scale_of(self.centers, behind) - _scale_of(self.centers, before)
+        return float(np.sqrt(max(self._variance * (change @ self._factor.solve(change)), 0.0)))
+
+
+def _scale_of(centers: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Returns how the log of the scale of some cameras changes with each unknown, [U].
+
+    The scale is that of the similarity that fits their centres best.
+    """
+    change = np.zeros((len(centers), _POSE))
+    arms = centers[rows] - centers[rows].mean(axis=0)
+    change[rows, 3:] = arms / (arms**2).sum()
+    return np.append(change.ravel(), 0.0)
+
+
+class _Observations:
+    """O observations of P points by F images, in the images' order, with their derivatives."""
+
+    def __init__(self, model: pycolmap.Reconstruction, order: Sequence[str]) -> None:
+        images = [model.find_image_with_name(name) for name in order]
+        self.centers = np.array([image.projection_center() for image in images])  # [F, 3]
+        rotations = np.array([image.cam_from_world().rotation.matrix() for image in images])
+        rows, numbers, places, focals = [], [], [], []
+        for row, image in enumerate(images):
+            spots = [spot for spot in image.points2D if spot.has_point3D()]
+            rows.append(np.full(len(spots), row))
+            numbers += [spot.point3D_id for spot in spots]
+            pixels = np.array([spot.xy for spot in spots]).reshape(-1, 2)
+            places.append(np.asarray(image.camera.cam_from_img(pixels)).reshape(-1, 2))
+            focals.append(np.full(len(spots), image.camera.mean_focal_length()))
+        known, point = np.unique(np.array(numbers, np.int64), return_inverse=True)
+        points = np.array([model.point3D(int(number)).xyz for number in known]).reshape(-1, 3)
+        self.image, self.point, self.points = np.concatenate(rows), point, len(known)
+        self._derive(rotations[self.image], points[point] - self.centers[self.image],
+                     np.concatenate(places), np.concatenate(focals)[:, None])
+
+    def _derive(
+        self, rotations: NDArray[np.float64], rays: NDArray[np.float64],
+        places: NDArray[np.float64], focal: NDArray[np.float64],
+    ) -> None:
+        """Sets errors [O, 2] in pixels and their derivatives, weighted by the loss.
+
+        By the camera's turn and centre [O, 2, 6], the point [O, 2, 3], the log of the focal length.
+        """
+        x, y, z = local = np.einsum("oij,oj->oi", rotations, rays).T
+        self.depth = float(np.median(z)) if len(z) else 0.0  # usual depth of the points
+        z = np.where(np.abs(z) > 1e-9, z, 1e-9)
+        found = np.stack([x / z, y / z], axis=1)
+        by_local = np.zeros((len(rays), 2, 3))
+        by_local[:, 0, 0] = by_local[:, 1, 1] = focal[:, 0] / z
+        by_local[:, :, 2] = -focal * found / z[:, None]
+        turn = np.cross(local.T[:, None], np.eye(3)[None]).transpose(0, 2, 1)
+        by_point = by_local @ rotations
+        errors = focal * (found - places)
+        sizes = np.linalg.norm(errors, axis=1)
+        scale = LOSS_SCALE * max(float(sizes.mean()), 1e-9)
+        weights = 1 / (1 + (sizes / scale) ** 2)
+        root = np.sqrt(weights)[:, None, None]
+        self.by_camera = root * np.concatenate([-by_local @ turn, -by_point], axis=2)
+        self.by_point, self.by_focal = root * by_point, root * (focal * found)[:, :, None]
+        free = 2 * len(rays) - _POSE * len(self.centers) - 3 * self.points
+        self.variance = float(weights @ sizes**2) / max(free, 1)  # pixels squared
+
+
+def _factorise(seen: _Observations) -> tuple[SuperLU, float]:
+    """Returns the factors of the normal equations of the cameras, and the variance of an error."""
+    count, points = len(seen.centers), seen.points
+    cameras = hstack([
+        _blocks(seen.by_camera, seen.image, count),
+        csr_matrix(seen.by_focal.reshape(-1, 1))], format="csr")
+    places = _blocks(seen.by_point, seen.point, points)
+    own = np.zeros((points, 3, 3))
+    np.add.at(own, seen.point, np.einsum("oki,okj->oij", seen.by_point, seen.by_point))
+    own += 1e-12 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
+    inverse = bsr_matrix((np.linalg.inv(own), np.arange(points), np.arange(points + 1)),
+                         shape=(3 * points, 3 * points)).tocsr()
+    both = (cameras.T @ places).tocsr()
+    reduced = csc_matrix(cameras.T @ cameras - both @ inverse @ both.T)
+    ridge = _RIDGE * eye(reduced.shape[0], format="csc").multiply(
+        np.maximum(reduced.diagonal(), 1e-300))
+    return splu(csc_matrix(reduced + ridge), permc_spec="MMD_AT_PLUS_A",
+                options={"SymmetricMode": True}), seen.variance
+
+
+def _blocks(
+    derivatives: NDArray[np.float64],  # [O, 2, K]
+    owner: NDArray[np.int64],  # [O], whose unknowns they are
+    count: int,
+) -> csr_matrix:  # [2 O, K count]
+    size = derivatives.shape[2]
+    rows = np.repeat(np.arange(2 * len(owner)), size)
+    columns = np.repeat(size * owner, 2 * size) + np.tile(np.arange(size), 2 * len(owner))
+    return csr_matrix((derivatives.ravel(), (rows, columns)),
+                      shape=(2 * len(owner), size * count))

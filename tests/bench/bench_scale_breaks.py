@@ -1,0 +1,221 @@
+"""Are breaks of a walk's scale found? `python tests/bench/bench_scale_breaks.py DATA OUT [NAME..]`
+
+DATA is the folder of test data, and OUT that of `bench_verdict`, whose captures are mapped where
+they are not yet. Each good walk is cut where the relative scale of both sides is known least, as it
+is and with only the matches of frames up to 4, 2 and 1 apart left across the cut, as at a turn in a
+narrow place. One side is scaled by 3, 10 and 25%, and all is triangulated and adjusted again. A
+line shows what scale is left (a good one mends itself), how well it is said to be known, the open
+loops, and the verdict. A model is broken from BROKEN on, and good up to SOUND where no match was
+left out; others count as neither. Behind it: of every third capture, which are kept from the
+choice, how many are decided wrongly by the bound that lies in the middle of those of the others.
+
+--walk MODEL DATABASE TRUTH adds a model with its database, whose frames are numbered by the lines
+of TRUTH, camera to world: as mapped, it is good or broken by the scales of its stretches.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from pose_errors import similarity
+from verdict_captures import CAPTURES, MODEL, Capture, prepare
+from verdict_variants import ordered_poses
+
+from recon_cli.sfm import database, mapper
+from recon_cli.sfm.job import MappingJob
+from recon_cli.sfm.merge_models import build_posed_model, drop_outliers
+from recon_cli.sfm.scale_drift import MAX_ERROR, find_weakest_scale
+from recon_cli.sfm.verdict import ModelVerdict, examine
+
+FACTORS = (1.03, 1.10, 1.25)
+REACHES = (None, 4, 2, 1)  # frames; None leaves all matches across the cut
+BROKEN, SOUND = 0.10, 0.03  # of a relative scale that is left
+STRETCH = 20  # cameras on either side of a cut that its scale is taken from
+DEFAULT = ("fox", "living", "office", "living_noisy", "office_noisy", "bedroom", "trident",
+           "kitchen_walk", "study_walk", "dining_walk", "loop")
+HEADS = ("capture", "made", "cameras", "scale left", "known to", "loops", "label", "verdict", "")
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A model and what was found about it."""
+
+    capture: str
+    made: str
+    cameras: str
+    left: float  # of the relative scale, as a share
+    label: str
+    verdict: ModelVerdict
+
+    @property
+    def error(self) -> float:
+        """How well the scale is said to be known; 0 where nothing tells."""
+        return 0.0 if self.verdict.scale is None else self.verdict.scale.error
+
+    @property
+    def otherwise(self) -> bool:
+        """Whether anything but how well the scale is known speaks against the model."""
+        return len(self.verdict.problems) > (not self.verdict.open_loops and self.error > MAX_ERROR)
+
+    def is_wrong(self, bound: float) -> bool:
+        """Whether it is decided wrongly by a bound of the error."""
+        refused = self.otherwise or self.error > bound
+        return {"good": refused, "broken": not refused}.get(self.label, False)
+
+    def line(self) -> str:
+        """Its line of the table."""
+        cells = (self.capture, self.made, self.cameras, f"{self.left:.3f}", f"{self.error:.3f}",
+                 str(len(self.verdict.open_loops)), self.label or "-",
+                 "trusted" if self.verdict.trusted else "refused",
+                 "WRONG" if self.is_wrong(MAX_ERROR) else "")
+        return f"| {' | '.join(cells)} |"
+
+
+def relative_scale(before: Array, after: Array, place: int) -> float:
+    """How the scale behind a place changed against that before it, as a share; both [F, 3]."""
+    def scale(rows: slice) -> float:
+        return similarity(before[rows], after[rows])[0]
+
+    change = scale(slice(place, place + STRETCH)) / scale(slice(max(0, place - STRETCH), place))
+    return abs(float(np.expm1(abs(np.log(change)))))
+
+
+def drop_pairs(path: Path, order: Sequence[str], place: int, reach: int) -> None:
+    """Deletes the matches of pairs of a database across a place in the order, but of near ones."""
+    rows = {name: row for row, name in enumerate(order)}
+    with closing(sqlite3.connect(path)) as connection, connection:
+        ids = dict(connection.execute("SELECT name, image_id FROM images"))
+        for pair in database.pair_names(path):
+            low, high = sorted(rows.get(name, -1) for name in pair)
+            if low < place <= high and (low < 0 or high - low > reach):
+                first, second = sorted(ids[name] for name in pair)
+                for table in ("matches", "two_view_geometries"):
+                    connection.execute(f"DELETE FROM {table} WHERE pair_id = ?",
+                                       (first * (2**31 - 1) + second,))
+
+
+def scaled(
+    job: MappingJob, base: pycolmap.Reconstruction, place: int, factor: float, reach: int | None
+) -> tuple[pycolmap.Reconstruction, MappingJob]:
+    """A model whose cameras from a place on are scaled about the first of them, adjusted again."""
+    own = dataclasses.replace(job, out=job.out / "scaled")
+    shutil.rmtree(own.out, ignore_errors=True)
+    own.attempts.mkdir(parents=True)
+    shutil.copyfile(job.database, own.database)
+    poses = ordered_poses(job, base)
+    names = list(poses)
+    if reach is not None:
+        drop_pairs(own.database, names, place, reach)
+    pivot = poses[names[place]].inverse().translation
+    motion = pycolmap.Sim3d(factor, pycolmap.Rotation3d(), (1 - factor) * pivot)
+    moved = {name: motion.transform_camera_world(pose) if row >= place else pose
+             for row, (name, pose) in enumerate(poses.items())}
+    model = mapper.triangulate(own, build_posed_model(own.database, base, moved))
+    mapper.adjust(model)
+    return model, own
+
+
+def rows_of(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
+    """The lines of a capture."""
+    job = prepare(capture, data, out)
+    if not (job.out / "mapped0").exists() or (job.out / MODEL).read_text("utf-8") == "[]":
+        return
+    base = mapper.sharpen(pycolmap.Reconstruction(job.out / "mapped0"))
+    poses = ordered_poses(job, base)
+    names = list(poses)
+    centers = np.array([pose.inverse().translation for pose in poses.values()])
+    own = examine(base, job.database, job.names, times=job.times)
+    yield Row(capture.name, "mapped", f"{own.registered}/{own.images}", 0.0, "good", own)
+    cut = find_weakest_scale(base, names)
+    place = len(names) // 2 if cut is None else names.index(cut.after)
+    for reach in REACHES:
+        for factor in FACTORS:
+            model, made = scaled(job, base, place, factor, reach)
+            candidate = drop_outliers(made, mapper.sharpen(model))
+            found = {image.name: image.projection_center() for image in map(
+                candidate.model.image, candidate.model.reg_image_ids())}
+            rows = [row for row, name in enumerate(names) if name in found]
+            left = relative_scale(
+                centers[rows], np.array([found[names[row]] for row in rows]),
+                sum(row < place for row in rows))
+            label = "broken" if left >= BROKEN else (
+                "good" if left <= SOUND and reach is None else "")
+            what = "all matches" if reach is None else f"up to {reach} apart"
+            yield Row(capture.name, f"x {factor:g}, {what}", f"{len(rows)}/{len(names)}", left,
+                      label, candidate.verdict)
+
+
+def walk_row(model_folder: Path, path: Path, truth: Path) -> Row:
+    """The line of a model as it was mapped, judged by the scales of its stretches."""
+    model = pycolmap.Reconstruction(model_folder)
+    with pycolmap.Database.open(path) as opened:
+        names = sorted(image.name for image in opened.read_all_images())
+    verdict = examine(model, path, names)
+    held = sorted(model.image(number).name for number in model.reg_image_ids())
+    centers = np.array([model.find_image_with_name(name).projection_center() for name in held])
+    known = np.loadtxt(truth).reshape(-1, 4, 4)[[int(Path(name).stem) for name in held], :3, 3]
+    scales = [similarity(centers[start:start + STRETCH], known[start:start + STRETCH])[0]
+              for start in range(0, len(held) - STRETCH, STRETCH // 2)]
+    left = float(np.quantile(scales, 0.9) / np.quantile(scales, 0.1)) - 1
+    label = "broken" if left >= BROKEN else "good"
+    return Row(model_folder.parent.name, "as mapped", f"{len(held)}/{len(names)}", left, label,
+               verdict)
+
+
+def held_out(rows: Sequence[Row]) -> Iterator[str]:
+    """What a bound from two thirds of the captures decides on the others, in turn."""
+    captures = sorted({row.capture for row in rows})
+    for third in range(3):
+        kept = set(captures[third::3])
+        others = [row for row in rows if row.capture not in kept and not row.otherwise]
+        most = max((row.error for row in others if row.label == "good"), default=0.0)
+        least = min((row.error for row in others if row.label == "broken" and row.error > most),
+                    default=2 * MAX_ERROR)
+        bound = (most + least) / 2
+        own = [row for row in rows if row.capture in kept and row.label]
+        wrong = [f"{row.capture} {row.made}" for row in own if row.is_wrong(bound)]
+        yield (f"without {', '.join(sorted(kept))}: bound {bound:.3f}; {len(wrong)} of {len(own)} "
+               f"wrong {'; '.join(wrong)}")
+
+
+@click.command()
+@click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("out", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("names", nargs=-1)
+@click.option("--walk", nargs=3, multiple=True, type=click.Path(exists=True, path_type=Path))
+def main(data: Path, out: Path, names: tuple[str, ...], walk: tuple[tuple[Path, ...], ...]) -> None:
+    """Prints the table, and what bounds from some captures decide on others."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    pycolmap.logging.minloglevel = 2
+    click.echo(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
+    rows = []
+    for paths in walk:
+        rows.append(walk_row(*paths))
+        click.echo(rows[-1].line())
+    for capture in CAPTURES:
+        if capture.name in (names or DEFAULT):
+            for row in rows_of(capture, data, out):
+                rows.append(row)
+                click.echo(row.line())
+    for label in ("good", "broken"):
+        own = [row for row in rows if row.label == label]
+        wrong = sum(row.is_wrong(MAX_ERROR) for row in own)
+        click.echo(f"{label}: {len(own)} models, {wrong} decided wrongly")
+    for line in held_out(rows):
+        click.echo(line)
+
+
+if __name__ == "__main__":
+    main()
