@@ -79,7 +79,8 @@ def find_parts(
         names = set(mapper.list_registered(other)) - held
         if len(names) >= least:
             model = other if other.num_points3D() else mapper.triangulate(job, other)
-            parts += _cut(job, drop_outliers(job, _cut_out(model, names)), least)
+            part = drop_outliers(job, mapper.sharpen(_cut_out(model, names)))
+            parts += _cut(job, part, least)
     parts.sort(key=lambda part: mapper.model_size(part.model), reverse=True)
     return [part for index, part in enumerate(parts)
             if not index or part.model.num_reg_images() >= least]
