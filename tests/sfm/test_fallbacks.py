@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 import pytest
+from facts import assert_facts
 from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
@@ -20,7 +21,7 @@ from recon_cli.sfm.fallbacks import (
     reachable,
     shortfall,
 )
-from recon_cli.sfm.job import CameraGroup, Reporter, StepLog
+from recon_cli.sfm.job import CameraGroup, Reporter, StepLog, parse
 from recon_cli.sfm.merge_models import ModelCandidate
 
 NAMES = tuple(f"{index:06d}.png" for index in range(60))
@@ -195,6 +196,31 @@ def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
         ("exhaustive", "20 frames are few enough to match all pairs", False),
         ("relaxed", "no model was found", False),
         ("global", "no model was found", True)]
+
+
+def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
+    job, _ = capture
+    monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    monkeypatch.setattr(fallbacks, "MINUTES_TOLD", -1)
+    stream = io.BytesIO()
+    fallbacks.build_model(job, Reporter(stream), deadline=math.inf)
+    told = [event for line in stream.getvalue().splitlines()
+            if isinstance(event := parse(line), str)]
+    assert len(told) == 1
+    assert_facts(told[0], "another mapper", "minutes more", "no model was found")
+
+
+def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypatch):
+    job, truth = capture
+    monkeypatch.setattr(mapper, "map_incrementally", lambda *_: [
+        part(truth, job.names[:10]), part(truth, job.names[10:])])
+    monkeypatch.setattr(fallbacks.merge_models, "merge", lambda *_: None)
+    monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "")
+    result = build(job)
+    assert sorted(each["registered"] for each in result["parts"]) == [
+        list(job.names[:10]), list(job.names[10:])]
+    assert result["apart"] == []
+    assert sorted(path.name for path in job.parts.iterdir()) == ["1", "2"]
 
 
 def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
