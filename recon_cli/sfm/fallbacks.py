@@ -286,7 +286,7 @@ def _publish_best(
                   for part in delivered],
         "poses": None, "models": [len(chosen.registered), *chosen.models[1:]],
         "apart": [names for names in apart if len(names) >= checks.MIN_FRAMES],
-        "broken": "" if verdict.trusted or job.accept_weak else verdict.problems[0],
+        "broken": [] if job.accept_weak else list(verdict.problems),
         "left_out": sorted(set(chosen.registered) - held),
         "notes": join_segments.read_refused(job),
         "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}

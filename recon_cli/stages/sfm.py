@@ -169,8 +169,7 @@ def _summary(frames: FrameList, runs: segments.SegmentRuns) -> SfmSummary:
         **model, **part, "frames": len(frames.frames), "registered": len(part["registered"]),
         "part": job.part if len(model["parts"]) > 1 else None, "parts": [
             {"names": each["registered"], "points": each["points"]} for each in model["parts"]],
-        "lines": [*([model["broken"]] if model.get("broken") else []), *part["lines"],
-                  *model["notes"]],
+        "lines": [*model.get("broken", [])[:1], *part["lines"], *model["notes"]],
         "unregistered": unregistered,
         "unregistered_held_out": [name for name in unregistered if name in held_out],
         "world": results["sparse"], "cameras": results["undistorted"]["cameras"],

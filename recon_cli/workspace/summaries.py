@@ -236,7 +236,7 @@ class SfmSummary(JsonRecord):
     left_out: tuple[str, ...] = ()  # names of the frames whose camera is in no part
     parts: tuple[PartSummary, ...] = ()  # the largest first; none in results of older versions
     part: int | None = None  # the number of the one that is placed; None where there is only one
-    broken: str = ""  # why the model was cut, a sentence; empty where it was not
+    broken: tuple[str, ...] = ()  # why the model was cut, sentences; none where it was not
     segments: int = 1  # that were mapped apart and joined; 1 for a capture mapped as a whole
     cpu_seconds: Mapping[str, float] | None = None  # by step; those of segments together
 

@@ -83,7 +83,7 @@ def in_parts(finished, tmp_path, monkeypatch):
         shutil.copytree(sparse, made / "sfm" / copy, dirs_exist_ok=True)
     monkeypatch.setitem(prepared, "folder", made)
     monkeypatch.setitem(summaries, "sfm", replace(
-        SFM, part=2, broken="The model is broken.", parts=(
+        SFM, part=2, broken=("The model is broken.",), parts=(
             PartSummary(names=tuple(names[:7]), points=70),
             PartSummary(names=tuple(names[8:]), points=40))))
     video = tmp_path / "room.mp4"
