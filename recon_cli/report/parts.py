@@ -26,6 +26,7 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.workspace.summaries import PartSummary, SfmSummary
 
 _MOST = 12  # parts on the page
+MARGIN = 2.0  # seconds to film before and after a moment, so that the new film ties to both parts
 _THUMB_SIDE, _THUMB_QUALITY = 360, 75
 _HINT = "Run `recon sfm --again`."
 
@@ -161,8 +162,8 @@ def advise(gap: Gap) -> str:
     if gap.before.source != gap.after.source:
         where = f"the way from {gap.before.source} at {first} to {gap.after.source} at {second}"
     else:
-        when = f"at {first}" if first == second else f"from {first} to {second}"
-        where = f"what the film shows {when}"
+        start, end = _format_time(gap.before, -MARGIN), _format_time(gap.after, MARGIN)
+        where = f"what the film shows from {start} to {end}"
     return (f"Film {where} again: walk slowly from where the left picture was taken to where the "
             "right one was taken, sideways rather than turning on the spot, and keep half of the "
             "view in the picture from one second to the next.")
@@ -187,9 +188,9 @@ def describe_time(
     return f"{text} ({seconds:.0f} s of the film)"
 
 
-def _format_time(frame: Frame) -> str:
-    """Returns minutes and seconds of a frame in its film; empty for a photo."""
+def _format_time(frame: Frame, later: float = 0.0) -> str:
+    """Returns minutes and seconds of a frame in its film, or later; empty for a photo."""
     if frame.time_seconds is None:
         return ""
-    minutes, seconds = divmod(int(frame.time_seconds + 0.5), 60)
+    minutes, seconds = divmod(int(max(0.0, frame.time_seconds + later) + 0.5), 60)
     return f"{minutes}:{seconds:02d}"

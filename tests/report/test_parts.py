@@ -58,7 +58,7 @@ def test_between_two_films_is_the_last_choice():
 
 def test_what_to_film_is_said_with_its_time():
     gap, = find_moments(film(60), parts(range(36), range(38, 60)))
-    assert_facts(advise(gap), "1:10", "1:16", "slowly", "half of the view")
+    assert_facts(advise(gap), "1:08", "1:18", "slowly", "half of the view")
     gap, = find_moments([*film(3), *film(3, source="b.mp4", start=3)], parts(range(3), range(3, 6)))
     assert_facts(advise(gap), "a.mp4 at 0:04", "b.mp4 at 0:00")
     gap, = find_moments(film(9, seconds=None), parts(range(4), range(6, 9)))
