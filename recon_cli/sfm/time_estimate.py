@@ -30,25 +30,27 @@ class Workload:
     megapixels: float  # of a frame
     tracked: bool  # the frames are those of a walk, linked by tracks
     segments: int = 1  # that are mapped apart
+    keyframes: int | None = None  # of a walk, that matches are sought between; None: all frames
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds of one core for a frame."""
+    """Seconds of one core for a frame, or where that is said for a keyframe."""
 
-    walk: float  # to find, match and undistort the features of a walk's frame
+    walk: float  # to find and undistort the features of a walk's frame, and to place it
     walk_megapixel: float  # the same, for each megapixel of it
-    walk_mapping: float  # to map it; of one core, whatever their number
-    photo: float  # the same three of photos
+    keyframe: float  # to match a keyframe
+    walk_mapping: float  # to map a keyframe; of one core, whatever their number
+    photo: float  # to find, match and undistort the features of a photo
     photo_megapixel: float
     photo_mapping: float
     split: float  # to match it with all that look alike, where photos are cut into segments
     join: float  # to join segments; of one core
 
 
-# Fitted to the seconds of two idle cores in docs/benchmarks.md and docs/scaling.md.
+# Fitted to the seconds of two idle cores and of long walks in docs/benchmarks.md.
 COSTS = Costs(
-    walk=0.46, walk_megapixel=0.48, walk_mapping=0.15,
+    walk=0.12, walk_megapixel=0.48, keyframe=0.34, walk_mapping=0.15,
     photo=0.28, photo_megapixel=0.38, photo_mapping=0.17, split=1.0, join=0.2)
 OVERLAP = 1 / 6  # of a segment's frames, which are mapped in the next one as well
 
@@ -58,8 +60,11 @@ def list_work(work: Workload) -> dict[str, tuple[float, bool]]:
     kind = "walk" if work.tracked else "photo"
     apart = work.segments > 1
     frames = work.frames * (1 + OVERLAP) if apart else float(work.frames)
+    mapped = frames * (work.keyframes or work.frames) / work.frames
     items = {kind: (frames, True), f"{kind}_megapixel": (frames * work.megapixels, True),
-             f"{kind}_mapping": (frames, apart)}
+             f"{kind}_mapping": (mapped, apart)}
+    if work.tracked:
+        items["keyframe"] = (mapped, True)
     if apart:
         items["join"] = (float(work.frames), False)
         if not work.tracked:

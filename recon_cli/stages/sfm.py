@@ -119,11 +119,12 @@ def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
     """Tells how long the cameras will take, and the limit where it is near."""
     if job.known_poses or job.pairs != "auto" or StepLog(job.out).result("features") is not None:
         return  # as asked for, or partly done
-    count = segments.count_segments(len(job.names), config.segments)
+    mapped = segments.count_mapped(job)
+    count = segments.count_segments(mapped, config.segments)
     largest = max(job.groups, key=lambda group: len(group.names))
     seconds = tell_seconds(Workload(
         len(job.names), largest.width * largest.height / 1e6, tracked=job.tracks is not None,
-        segments=count), ctx.threads)
+        segments=count, keyframes=mapped), ctx.threads)
     if seconds is None:
         return
     near = seconds > NEAR_LIMIT * 60 * job.max_minutes

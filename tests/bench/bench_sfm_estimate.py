@@ -23,14 +23,16 @@ import click
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, ManifestError
 from recon_cli.io.records import read_frame_list
-from recon_cli.io.tracks import TRACKS
+from recon_cli.io.tracks import TRACKS, Tracks
+from recon_cli.sfm.keyframes import choose_keyframes
 from recon_cli.sfm.time_estimate import COSTS, Costs, Workload, expected_seconds, list_work
 from recon_cli.workspace.summaries import SfmSummary
 
-HEADINGS = ("workspace", "frames", "MP", "kind", "segments", "told, CPU s", "took", "told / took",
-            "told, s on 2 cores", "s of the clock", "later mappers")
+HEADINGS = (
+    "workspace", "frames", "keyframes", "MP", "kind", "segments", "told, CPU s", "took",
+    "told / took", "told, s on 2 cores", "s of the clock", "later mappers")
 TOLERANCE = 1 / 3  # of what it took
 STAY = 0.1  # how strongly costs keep their values in a fit
 
@@ -61,15 +63,17 @@ def read_row(workspace: Path) -> Row | None:
     try:
         manifest = json.loads((workspace / "sfm" / "manifest.json").read_text(encoding="utf-8"))
         frames = read_frame_list(workspace / "ingest")
-    except (OSError, FormatError):
+        summary = SfmSummary.from_json(manifest["summary"])
+    except (OSError, FormatError, ManifestError):  # unfinished, or of another version
         return None
-    summary = SfmSummary.from_json(manifest["summary"])
     if summary.poses or not summary.cpu_seconds or not summary.rungs:
         return None
     group = max(frames.groups, key=lambda each: each.width * each.height)
+    tracks = workspace / "ingest" / TRACKS
     work = Workload(
-        summary.frames, group.width * group.height / 1e6,
-        tracked=(workspace / "ingest" / TRACKS).exists(), segments=summary.segments)
+        summary.frames, group.width * group.height / 1e6, tracked=tracks.exists(),
+        segments=summary.segments,
+        keyframes=len(choose_keyframes(Tracks.read(tracks))) if tracks.exists() else None)
     return Row(
         workspace.name, work, sum(summary.cpu_seconds.values()), manifest["seconds"],
         tuple(rung.name for rung in summary.rungs[1:] if not rung.skipped))
@@ -97,11 +101,11 @@ def main(workspaces: tuple[Path, ...], fitting: bool) -> None:
     if not rows:
         raise click.ClickException("none of these workspaces holds a mapped sfm with its times")
     click.echo("| " + " | ".join(HEADINGS) + " |")
-    click.echo("|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---|")
+    click.echo("|---|---:|---:|---:|---|---:|---:|---:|---:|---:|---:|---|")
     for row in rows:
         work = row.work
         click.echo("| " + " | ".join((
-            row.name, str(work.frames), f"{work.megapixels:.2f}",
+            row.name, str(work.frames), str(work.keyframes or ""), f"{work.megapixels:.2f}",
             "walk" if work.tracked else "photos", str(work.segments), f"{told(work):.0f}",
             f"{row.cpu_seconds:.0f}", f"{row.ratio:.2f}", f"{expected_seconds(work, 2):.0f}",
             f"{row.seconds:.0f}", ", ".join(row.later))) + " |")

@@ -16,34 +16,45 @@ from recon_cli.sfm.time_estimate import (
     tell_seconds,
 )
 
-ONES = Costs(walk=1, walk_megapixel=1, walk_mapping=1, photo=10, photo_megapixel=10,
+ONES = Costs(walk=1, walk_megapixel=1, keyframe=1, walk_mapping=1, photo=10, photo_megapixel=10,
              photo_mapping=10, split=100, join=1000)
 
 
 def test_a_walk_pays_for_its_frames_and_pixels_on_all_cores_and_for_its_mapping_on_one():
     work = Workload(60, 2.0, tracked=True)
-    assert expected_seconds(work, 1, costs=ONES) == 60 * (1 + 2 + 1)
-    assert expected_seconds(work, 4, costs=ONES) == 60 * (3 / 4 + 1)
+    assert expected_seconds(work, 1, costs=ONES) == 60 * (1 + 2 + 1 + 1)
+    assert expected_seconds(work, 4, costs=ONES) == 60 * (4 / 4 + 1)
+
+
+def test_a_walk_of_few_keyframes_is_mapped_in_less_time():
+    work = Workload(60, 2.0, tracked=True, keyframes=20)
+    assert expected_seconds(work, 1, costs=ONES) == 60 * 3 + 20 * 2
 
 
 def test_segments_are_mapped_at_once_and_joined_on_one_core():
     work = Workload(60, 2.0, tracked=True, segments=3)
-    assert expected_seconds(work, 4, costs=ONES) == pytest.approx(70 * 4 / 4 + 60 * 1000)
+    assert expected_seconds(work, 4, costs=ONES) == pytest.approx(70 * 5 / 4 + 60 * 1000)
     photos = Workload(60, 2.0, tracked=False, segments=3)
     assert expected_seconds(photos, 4, costs=ONES) == pytest.approx(
         70 * 40 / 4 + 60 * 100 / 4 + 60 * 1000)
 
 
-# Seconds of two idle cores in docs/benchmarks.md and docs/scaling.md.
-@pytest.mark.parametrize(("frames", "megapixels", "tracked", "segments", "took"), [
-    (76, 0.204, True, 1, 35), (75, 0.204, True, 1, 30), (100, 0.92, True, 1, 60),
-    (100, 0.518, True, 1, 74), (52, 0.309, True, 1, 26), (90, 0.41, True, 1, 43),
-    (30, 0.307, True, 1, 12), (50, 2.07, False, 1, 35), (70, 2.07, False, 1, 47),
-    (97, 2.76, False, 1, 71), (170, 0.48, False, 1, 68), (300, 0.23, True, 3, 153),
-    (613, 0.23, True, 5, 379), (1200, 0.23, True, 10, 898)])
-def test_what_captures_took_is_told_within_a_third(frames, megapixels, tracked, segments, took):
-    told = expected_seconds(Workload(frames, megapixels, tracked, segments), 2, costs=COSTS)
+# Seconds of two idle cores in docs/benchmarks.md.
+@pytest.mark.parametrize(("frames", "megapixels", "tracked", "took"), [
+    (76, 0.204, True, 35), (75, 0.204, True, 30), (100, 0.92, True, 60), (100, 0.518, True, 74),
+    (52, 0.309, True, 26), (90, 0.41, True, 43), (30, 0.307, True, 12), (50, 2.07, False, 35),
+    (70, 2.07, False, 47), (97, 2.76, False, 71), (170, 0.48, False, 68)])
+def test_what_captures_took_is_told_within_a_third(frames, megapixels, tracked, took):
+    told = expected_seconds(Workload(frames, megapixels, tracked), 2, costs=COSTS)
     assert told == pytest.approx(took, rel=1 / 3)
+
+
+# CPU seconds of long walks (docs/benchmarks.md).
+@pytest.mark.parametrize(("frames", "keyframes", "megapixels", "took"), [
+    (360, 184, 0.194, 133), (270, 57, 0.41, 89), (400, 85, 0.92, 232), (300, 73, 0.23, 110)])
+def test_what_long_walks_took_is_told_within_a_third(frames, keyframes, megapixels, took):
+    work = Workload(frames, megapixels, tracked=True, keyframes=keyframes)
+    assert expected_seconds(work, 1, costs=COSTS) == pytest.approx(took, rel=1 / 3)
 
 
 def test_a_machine_is_measured_in_a_fraction_of_a_second():

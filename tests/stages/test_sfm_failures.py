@@ -53,7 +53,7 @@ def told_times(tmp_path, monkeypatch, *, frames=300, minutes=58.4, slowness=1.0,
     names = tuple(f"{index:06d}.png" for index in range(frames))
     job = SimpleNamespace(**{
         "out": tmp_path, "names": names, "groups": (CameraGroup(names, 640, 360),), "pairs": "auto",
-        "known_poses": False, "tracks": tmp_path, "max_minutes": minutes, **changes})
+        "known_poses": False, "tracks": None, "max_minutes": minutes, **changes})
     sfm._tell_time(SfmConfig(), job, SimpleNamespace(notice=notices.append, threads=2))
     return notices
 
