@@ -7,7 +7,6 @@ import os
 import sys
 
 from recon_cli import signals
-from recon_cli.lazy import load
 from recon_cli.processes import CHILD, end_with_parent, protect_children
 
 
@@ -20,7 +19,9 @@ def main() -> int:
             protect_children()
             if isinstance(sys.stdout, io.TextIOWrapper):  # a file name need not be UTF-8
                 sys.stdout.reconfigure(errors="backslashreplace")
-            code: int = load("recon_cli.cli.main")()
+            from recon_cli import cli
+
+            code = cli.main()
         except KeyboardInterrupt as error:  # while modules were imported
             sys.stderr.write(f"{signals.describe_end(error)}\n")
             code = signals.exit_code(error)

@@ -117,7 +117,7 @@ def _leave_idle() -> None:
 
 @dataclass(frozen=True)
 class EarlierResult:
-    """The finished result that a stage replaces, of one that keeps what it does not write again."""
+    """The finished result that a stage replaces, where it keeps files of it or goes on from it."""
 
     folder: Path
     summary: Mapping[str, Any]  # that the stage returned then; empty where that is not known
@@ -135,7 +135,7 @@ class StageInputs:
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
     continues: Path | None = None  # finished result of the stage itself that the run goes on from
     digests: Mapping[str, str] = field(default_factory=dict)  # of what each of `folders` holds
-    earlier: EarlierResult | None = None  # only of stages that add to it
+    earlier: EarlierResult | None = None  # that the stage adds to or goes on from, if any
     again: bool = False  # files that are up to date are written again as well
 
 

@@ -12,7 +12,6 @@ from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.errors import ReconstructionError, WorkspaceError
-from recon_cli.lazy import load
 from recon_cli.pipeline.batch import CaptureResult, name_captures, run_batch
 from recon_cli.progress import TqdmProgress, format_duration, hide_bars
 from recon_cli.workspace.layout import disk_errors, hold_lock
@@ -78,8 +77,10 @@ def batch(
                 _report)
         finally:
             executor.close()
-    page = load("recon_cli.report.batch_page.write_batch_page")(results, out)
-    click.echo(load("recon_cli.report.batch_page.batch_text")(results))
+    from recon_cli.report.batch_page import batch_text, write_batch_page
+
+    page = write_batch_page(results, out)
+    click.echo(batch_text(results))
     click.echo(f"The page of this table is {page}")
     failed = [result.capture for result in results if not result.succeeded]
     if failed:

@@ -15,7 +15,6 @@ from recon_cli.commands.options import Call, Command, Decorator, pass_call
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.experiments.outputs import OutputFiles
-from recon_cli.lazy import load
 from recon_cli.progress import TqdmProgress
 
 _FILE = options.PathType(dir_okay=False)
@@ -32,7 +31,8 @@ class SceneOptions:
 
     def fields(self, call: Call, *, validation: float | None = None) -> dict[str, Any]:
         """Returns the fields of an ExperimentRequest; `validation` as of `runner.base_config`."""
-        base_config = load("recon_cli.experiments.runner.base_config")
+        from recon_cli.experiments.runner import base_config
+
         return {
             "scenes": self.paths, "settings": call.assigned,
             "compute": settings.build(ComputeConfig, call.settings),
@@ -132,10 +132,10 @@ def bench(ctx: click.Context, call: Call, /, outputs: OutputFiles, **typed: Any)
         _refuse_own_options(ctx)
         return
     compute = settings.build(ComputeConfig, call.settings)
-    request = load("recon_cli.experiments.rasterizer_benchmark.BenchRequest")
-    run = load("recon_cli.experiments.rasterizer_benchmark.run")
+    from recon_cli.experiments.rasterizer_benchmark import BenchRequest, run
+
     click.echo(run(
-        request(**typed, outputs=outputs, device=compute.device, threads=compute.threads),
+        BenchRequest(**typed, outputs=outputs, device=compute.device, threads=compute.threads),
         TqdmProgress()))
 
 
@@ -175,11 +175,11 @@ def train(call: Call, /, scenes: SceneOptions, recipes: tuple[str, ...], **typed
     Trains every recipe on every SCENE and writes curves of PSNR and SSIM on validation views
     against seconds, with the count and the size of the .ply.
     """
-    parse = load("recon_cli.experiments.variants.parse_recipes")
-    request = load("recon_cli.experiments.recipe_benchmark.RecipeRequest")
-    run = load("recon_cli.experiments.recipe_benchmark.run")
-    variants = parse(recipes or ("reference,budget",))
-    click.echo(run(request(**scenes.fields(call), **typed, recipes=variants), TqdmProgress()))
+    from recon_cli.experiments.recipe_benchmark import RecipeRequest, run
+    from recon_cli.experiments.variants import parse_recipes
+
+    variants = parse_recipes(recipes or ("reference,budget",))
+    click.echo(run(RecipeRequest(**scenes.fields(call), **typed, recipes=variants), TqdmProgress()))
 
 
 bench.add_command(train)
@@ -208,7 +208,7 @@ def study(call: Call, /, scenes: SceneOptions, **typed: Any) -> None:
     Trains 3DGS, 3DGS with the paper's prune, ours and ours pruned on every SCENE, at equal steps
     and at equal seconds, and scores them on held-out views, with intervals over the seeds.
     """
-    request = load("recon_cli.experiments.study.StudyRequest")
-    run = load("recon_cli.experiments.study.run")
+    from recon_cli.experiments.study import StudyRequest, run
+
     # nothing looks at validation views here, so all but the test views are trained on
-    click.echo(run(request(**scenes.fields(call, validation=0.0), **typed), TqdmProgress()))
+    click.echo(run(StudyRequest(**scenes.fields(call, validation=0.0), **typed), TqdmProgress()))

@@ -16,7 +16,6 @@ import psutil
 from recon_cli import machine
 from recon_cli.commands import options
 from recon_cli.commands.options import Call, pass_call, verb
-from recon_cli.lazy import load
 
 if TYPE_CHECKING:  # they import torch
     from recon_cli.render.registry import BackendStatus
@@ -52,21 +51,25 @@ class Findings:
 
 def examine(workspace: Path) -> Findings:
     """Returns what this machine has, and `workspace`, which need not exist."""
-    cuda = load("torch.cuda")
+    import torch
+
+    from recon_cli.render import registry
+
+    cuda = torch.cuda
     root = workspace.absolute()
     place = next(path for path in (root, *root.parents) if path.exists())
     memory = psutil.virtual_memory()
     return Findings(
         versions=machine.versions(),
         device=cuda.get_device_name() if cuda.is_available() else "cpu",
-        backends=load("recon_cli.render.registry.available_backends")(),
+        backends=registry.available_backends(),
         cores=machine.usable_threads(),
         memory_total_bytes=memory.total,
         memory_free_bytes=memory.available,
         disk_free_bytes=shutil.disk_usage(place).free,
         workspace=str(root),
         writable=place.is_dir() and os.access(place, os.W_OK | os.X_OK),
-        self_check=load("recon_cli.render.registry.cuda_verdict")(),
+        self_check=registry.cuda_verdict(),
     )
 
 

@@ -10,7 +10,6 @@ from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TRAINING, RenderRequest
-from recon_cli.lazy import load
 
 
 def _outputs(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[str, ...]:
@@ -88,5 +87,6 @@ def render(call: Call, /, path: str | None, views: tuple[str, ...], **request: A
         raise click.UsageError("--path and --views exclude each other.")
     # the other options are fields of the request
     checked = RenderRequest(path=path or TRAINING, views=views, **request)
-    job = open_job(call)
-    click.echo(load("recon_cli.flythrough.run.render_frames")(checked, job))
+    from recon_cli.flythrough.run import render_frames
+
+    click.echo(render_frames(checked, open_job(call)))

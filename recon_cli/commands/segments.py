@@ -8,11 +8,12 @@ import click
 
 from recon_cli.commands import options
 from recon_cli.commands.options import verb
-from recon_cli.lazy import load
 
 
 @verb("map-segment")
 @click.argument("job", type=options.PathType(exists=True, dir_okay=False))
 def map_segment(job: Path) -> None:
     """Map one segment of a capture, as JOB says."""
-    load("recon_cli.sfm.segments.map_segment")(job)
+    from recon_cli.sfm import segments
+
+    segments.map_segment(job)

@@ -24,7 +24,6 @@ from recon_cli.config.stages import (
     SfmConfig,
     TrainConfig,
 )
-from recon_cli.lazy import load
 from recon_cli.stages import IMPORT, STAGES
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
@@ -61,7 +60,8 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 def denoise(call: Call, compare: bool) -> None:
     """Filter noisy frames and pass the others through."""
     if compare:
-        compare_filters = load("recon_cli.experiments.filter_comparison.compare_filters")
+        from recon_cli.experiments.filter_comparison import compare_filters
+
         click.echo(compare_filters(*open_job_with(call, DenoiseConfig)))
         return
     run_stages(call, "denoise", ["denoise"])
@@ -150,7 +150,8 @@ def _parse_ratios(_ctx: click.Context, parameter: click.Parameter, text: str) ->
 def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
     """Remove the least important Gaussians and fine-tune the rest."""
     if sweep:
-        run_sweep = load("recon_cli.experiments.sweep.run_sweep")
+        from recon_cli.experiments.sweep import run_sweep
+
         click.echo(run_sweep(*open_job_with(call, PruneConfig), ratios))
         return
     run_stages(call, "prune", ["prune"])
@@ -176,11 +177,13 @@ def evaluate(call: Call, items: tuple[Path, ...], seeds: int | None, form: str) 
     if items and seeds:
         raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
     if seeds:
-        score_seeds = load("recon_cli.experiments.seeds.score_seeds")
+        from recon_cli.experiments.seeds import score_seeds
+
         click.echo(score_seeds(*open_job_with(call, EvaluateConfig), seeds).text(form))
         return
     if items:
-        compare = load("recon_cli.commands.compare_scores.compare")
+        from recon_cli.commands.compare_scores import compare
+
         click.echo(compare(
             lambda path: open_job_with(dataclasses.replace(call, workspace=path), EvaluateConfig),
             call.workspace, items, form))

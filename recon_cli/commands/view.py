@@ -17,7 +17,6 @@ from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.context import TrainCallback
 from recon_cli.errors import ExitCode, InputError
-from recon_cli.lazy import load
 from recon_cli.signals import exit_code
 from recon_cli.workspace.layout import Workspace
 
@@ -50,17 +49,21 @@ def view(
     workspace = _workspace(call, item)
     if item is not None and workspace is None and model != "auto":
         raise click.UsageError("--model has no effect on a file.")
+    from recon_cli.viewer.content import PhotoPairs, load_file, load_workspace
+    from recon_cli.viewer.server import serve_scene
+    from recon_cli.viewer.trust_tint import TrustTint
+
     trust = None
     if workspace is None:
-        content, photos = load("recon_cli.viewer.content.load_file")(item), None
+        assert item is not None, "the workspace of the call is one"
+        content, photos = load_file(item), None
     else:
         call.workspace = workspace
         job = open_job(call)
-        content = load("recon_cli.viewer.content.load_workspace")(job, model)
-        photos = load("recon_cli.viewer.content.PhotoPairs")(job, content.max_size)
+        content = load_workspace(job, model)
+        photos = PhotoPairs(job, content.max_size)
         # an import without views has no trust
-        trust = load("recon_cli.viewer.trust_tint.TrustTint")(job) if content.views else None
-    serve_scene = load("recon_cli.viewer.server.serve_scene")
+        trust = TrustTint(job) if content.views else None
     try:
         with serve_scene(content, photos, host, port, trust) as (_, address):
             click.echo(f"The scene is at {address} (Ctrl-C ends it)")
@@ -76,10 +79,11 @@ def view(
 @contextmanager
 def show_training(call: Call) -> Iterator[TrainCallback]:
     """Yields a callback that shows a training in the browser, on this machine alone."""
-    start_server = load("recon_cli.viewer.server.start_server")
-    host = load("recon_cli.viewer.server.HOST")
-    with start_server(host, None, label="recon train") as (server, address):
-        live = load("recon_cli.viewer.live.LiveView")(server, Workspace(call.workspace))
+    from recon_cli.viewer.live import LiveView
+    from recon_cli.viewer.server import HOST, start_server
+
+    with start_server(HOST, None, label="recon train") as (server, address):
+        live = LiveView(server, Workspace(call.workspace))
         click.echo(f"The training can be watched at {address}")
         try:
             yield live

@@ -13,7 +13,6 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job, summary_text
 from recon_cli.commands.options import Call, pass_call, verb
-from recon_cli.lazy import load
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, StageStatus, free_space
 from recon_cli.progress import format_duration, format_megabytes
@@ -111,5 +110,6 @@ def report(call: Call, out: Path | None) -> None:
     It is one file that any browser opens without a network. No stage is run; the report names what
     is missing or stale, with the command to type.
     """
-    job = open_job(call)
-    click.echo(load("recon_cli.report.build.write_report")(job, out))
+    from recon_cli.report.build import write_report
+
+    click.echo(write_report(open_job(call), out))

@@ -92,13 +92,17 @@ class SfmConfig(StageConfig):
         3000, "Maximum SIFT keypoints per image; the coarsest are kept.", unit="keypoints",
         minimum=100)
     min_registered: float = option(
-        0.5, "Fail if a smaller share of the images is registered.", unit="share",
+        0.5, "Fail if a smaller share of the images is registered, in all trusted parts together.",
+        unit="share",
         minimum=0.0, maximum=1.0)
     accept_weak: bool = option(
         False, "Continue even if parts of the model are weakly connected.", hashed=False)
     partial: bool = option(
-        True, "Keep the largest part of a broken model that can be trusted on its own, if it has "
-        "--min-registered of the images.", hashed=False)
+        True, "Cut a broken model, and keep the parts that can be trusted on their own.",
+        hashed=False)
+    part: int = option(
+        1, "Part to use of a capture that has several; 1 is the largest. Another one needs no new "
+        "mapping.", metavar="K", minimum=1)
     seed: int = option(0, "Random seed of the mapper.", minimum=0)
     gravity: str = option(
         "auto", "Turn the world so that z is up and the floor is at 0, if cameras and points show "

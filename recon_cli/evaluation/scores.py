@@ -112,7 +112,7 @@ class Metrics(JsonRecord):
         trained = "" if self.training_views is None else (
             f"trained on {self.training_views} of {self.frames} frames; ")
         left_out, held_out = len(self.unregistered), len(self.unregistered_test)
-        return (f"{trained}{left_out} frames left out, as they have no camera that can be trusted, "
+        return (f"{trained}{left_out} frames left out, as they have no camera in this model, "
                 f"{held_out or 'none'} of them held out{' and so not scored' * bool(held_out)}")
 
     def label(self, model: str) -> str:

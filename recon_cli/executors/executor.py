@@ -21,7 +21,6 @@ from filelock import FileLock, Timeout
 
 from recon_cli import machine
 from recon_cli.errors import ExitCode
-from recon_cli.lazy import load
 from recon_cli.processes import CHILD, start_module
 from recon_cli.progress import Bar
 from recon_cli.workspace.layout import LOCK
@@ -164,7 +163,9 @@ def start_executor(
         WorkspaceError: a machine of it does not see `folder` or one of `inputs`.
     """
     if place == "ray":
-        executor = load("recon_cli.executors.ray_executor.RayExecutor").connect(
+        from recon_cli.executors.ray_executor import RayExecutor
+
+        executor = RayExecutor.connect(
             cores=cores, gpu=gpu, slots=slots, folder=folder.absolute(),
             inputs=[path.absolute() for path in inputs])
         return executor, executor.cores

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-import shutil
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +32,7 @@ from recon_cli.workspace.export_record import (
     max_loss_db,
     owns,
 )
+from recon_cli.workspace.layout import link_or_copy
 from recon_cli.workspace.manifest import NAME as MANIFEST
 
 _CHANGED, _MISSING = "it was changed by hand", "some of its files are missing"
@@ -149,7 +149,7 @@ def keep_files(
             own_files.append(target.relative_to(out).as_posix())
         elif os.path.lexists(target) or not any(owns(one, name) for one in kept):
             continue  # replaced, or left of a format that is
-        _link_or_copy(path, target)
+        link_or_copy(path, target)
     return KeptFiles(kept, tuple(own_files), renamed)
 
 
@@ -177,11 +177,3 @@ def _free_name(out: Path, name: str) -> Path:
     free = (path.with_name(f"{stem}.kept{number if number > 1 else ''}{dot}{suffix}")
             for number in itertools.count(1))
     return next(one for one in free if not os.path.lexists(one))
-
-
-def _link_or_copy(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target, follow_symlinks=False)
-    except OSError:  # not every file system has hard links, nor do they lead to another one
-        shutil.copy2(source, target, follow_symlinks=False)

@@ -30,7 +30,6 @@ from recon_cli.io.posed import (
     is_file,
     resolve_inside,
 )
-from recon_cli.lazy import load
 from recon_cli.scene.camera import Camera, Lens
 from recon_cli.workspace.atomic import read_json, write_json
 
@@ -325,7 +324,9 @@ def _read_points(
     if not is_file(path):
         return None, None, (f"its points {name} are missing",)
     # Late, for it imports torch, which nothing else here needs.
-    points, colors = load("recon_cli.io.ply.read_ply_points")(path)
+    from recon_cli.io.ply import read_ply_points
+
+    points, colors = read_ply_points(path)
     if colors is None:
         return points, np.full(points.shape, 128, np.uint8), (f"its points {name} have no colours",)
     return points, colors, ()

@@ -286,4 +286,4 @@ class _Writer:
         return self._summary(
             "sfm", frames=len(self._names), registered=len(self._names), points=count,
             unregistered=[], unregistered_held_out=[], left_out=[], apart=[], rejected={},
-            models=[len(self._names)], lines=[])
+            parts=[], part=1, models=[len(self._names)], lines=[])

@@ -95,7 +95,7 @@ def run_stage(
         tuple(Path(source.path) for source in sources),
         workspace.folder(row.name) if key.continues else None,
         {name: digest for name, digest in key.upstream.items() if digest},
-        _find_earlier(workspace, row) if row.adds else None, again)
+        _find_earlier(workspace, row, key, again=again), again)
     if row.adds:  # unfinished work may hold links to the files of the last result
         workspace.discard(row.name)
     logger.debug("%s: running with %s", row.name, config)
@@ -119,14 +119,20 @@ def run_stage(
     return manifest
 
 
-def _find_earlier(workspace: Workspace, row: Stage) -> EarlierResult | None:
-    """Returns the result that a stage adds to; what it held is not known by a damaged manifest."""
+def _find_earlier(
+    workspace: Workspace, row: Stage, key: ResultKey, *, again: bool
+) -> EarlierResult | None:
+    """Returns the result that a stage adds to, or goes on from as only late options differ.
+
+    What a result held that is added to is not known by a damaged manifest.
+    """
     folder = workspace.folder(row.name)
     try:
         finished = workspace.manifest(row.name)
     except ManifestError:
-        return EarlierResult(folder, {})
-    if finished is None:
+        return EarlierResult(folder, {}) if row.adds else None
+    if finished is None or not (row.adds or (row.late and not again and (
+            _without(finished.key, row.late) == _without(key, row.late)))):
         return None
     present = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")
                if path.is_symlink() or not path.is_dir()}
@@ -137,6 +143,12 @@ def _find_earlier(workspace: Workspace, row: Stage) -> EarlierResult | None:
         folder, finished.run.summary, frozenset(changed),
         frozenset(finished.outputs.keys() - present.keys()),
         frozenset(present.keys() - finished.outputs.keys() - {MANIFEST}))
+
+
+def _without(key: ResultKey, options: Sequence[str]) -> str:
+    """Returns the fingerprint of a key without some of its options."""
+    return dataclasses.replace(key, config={
+        name: value for name, value in key.config.items() if name not in options}).fingerprint
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from recon_cli.report.gallery import (
     legend_stops,
 )
 from recon_cli.report.headline import build_headline, format_facts
+from recon_cli.report.parts import read_parts
 from recon_cli.report.records import LABELS, build_scores, read_metrics
 from recon_cli.report.room import read_room
 from recon_cli.report.stage_status import (
@@ -119,12 +120,14 @@ def _template_values(
         "name": root.resolve().name, "stages": stages,
         "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"),
         "headline": build_headline(stages, metrics), "capture": read_capture(stages),
+        "parts": read_parts(stages),
         "trust": read_trust(stages),
         "curves": draw_training_curves(stages, metrics),
         "decisions": read_decisions(stages["train"]), "damaged": damaged,
         "scores": build_scores(metrics) if metrics and metrics.models else None,
         "sweep": draw_prune_curve(root, stages), "rounds": draw_rounds(stages["prune"]),
         "sweep_command": f"recon prune --sweep -w {shlex.quote(str(root))}",
+        "part_command": f"recon sfm -w {shlex.quote(str(root))} --part",
         "provenance": read_provenance(stages), "labels": LABELS,
         "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),
         "longest": max(run.seconds for run in runs),

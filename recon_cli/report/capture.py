@@ -46,7 +46,7 @@ _NEXT_COLOR, _NEXT_SIZE = 6, 9.0  # of the marks where to film next, pixels
 _BAR = 0.25  # of the width that the scale bar takes at most
 # (color, mark) of the page's charts; green and blue are those of the contact sheet
 PARTS = {"training": (2, "circle"), "validation": (5, "square"), "held out": (0, "diamond")}
-MISSING = {"left out": (1, "plus"), "lost": (3, "cross")}
+MISSING = {"other part": (4, "triangle"), "left out": (1, "plus"), "lost": (3, "cross")}
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,9 @@ def read_capture(stages: StageReports) -> Capture:
     by_name = {view.name: part for part, views in by_part(scene).items()
                for view in views} if scene else {
         frame.name: "held out" if frame.held_out else "training" for frame in frames}
-    missing = dict.fromkeys(left_out, "left out")
+    missing = {
+        **{name: "other part" for part in (sfm.parts if sfm else ()) for name in part.names},
+        **dict.fromkeys(left_out, "left out")}
     parts = [by_name.get(frame.name, missing.get(frame.name, "lost")) for frame in frames]
     return Capture(
         tuple(sheets), more, tuple(overlays), tuple(thumbs), plan, notes,
@@ -146,7 +148,7 @@ def _draw_plan(
 def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
     """Returns one bar for each frame in order; held-out and lost frames are taller."""
     step, bars = WIDTH / len(frames), []
-    heights = {"training": 14, "validation": 20, "held out": 28, "left out": 28, "lost": 28}
+    heights = {"training": 14, "validation": 20}  # others are taller
     for i, (frame, part) in enumerate(zip(frames, parts, strict=True)):
         color = {**PARTS, **MISSING}[part][0]
         time = "" if frame.time_seconds is None else f", {frame.time_seconds:g} s"
@@ -154,7 +156,7 @@ def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
             '<rect class="part c{}{}" x="{:.2f}" y="{}" width="{:.2f}" height="{}">'
             "<title>{}</title></rect>").format(
                 color, " hollow" if part in MISSING else "", i * step,
-                _STRIP_HEIGHT - heights[part], max(0.6, 0.8 * step), heights[part],
+                _STRIP_HEIGHT - heights.get(part, 28), max(0.6, 0.8 * step), heights.get(part, 28),
                 f"{frame.name} ({part}{time})"))
     return Markup(
         '<svg class="strip" viewBox="0 0 {} {}" preserveAspectRatio="none" role="img" '
@@ -166,6 +168,7 @@ def _draw_legend(parts: Sequence[str]) -> Markup:
     counts = Counter(parts)
     texts = {"training": "training", "validation": "validation (never trained on, steers progress)",
              "held out": "held out (only scored)", "lost": "without a camera",
+             "other part": "in another part of the capture",
              "left out": "left out, with a camera that is not trusted"}
     marks = {**PARTS, **MISSING}
     return Markup('<ul class="legend">{}</ul>').format(Markup("").join(

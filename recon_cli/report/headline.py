@@ -74,7 +74,8 @@ def judge_poses(sfm: StageReport) -> PosesVerdict:
     count = f"{summary.registered:,} of {summary.frames:,} frames have a camera"
     left_out = len(summary.left_out)
     # the first line repeats the verdict, except where it says why only a part is kept
-    repeated = 1 if summary.verdict is not None and not left_out else 0
+    cut = bool(summary.broken) or left_out > 0
+    repeated = 1 if summary.verdict is not None and not cut else 0
     lines = (*summary.lines[repeated:], *(f"{name} was removed from the model: {reason}."
                                           for name, reason in summary.rejected.items()))
     if summary.apart:
@@ -86,6 +87,10 @@ def judge_poses(sfm: StageReport) -> PosesVerdict:
         return PosesVerdict("unknown", f"{count}{whose}.", lines)
     if not summary.trusted:
         return PosesVerdict("warn", f"The camera poses cannot be trusted, although {count}.", lines)
+    if summary.part is not None:
+        return PosesVerdict("warn", (
+            f"The capture is in {len(summary.parts)} parts, see Capture. This is part "
+            f"{summary.part}, whose camera poses can be trusted: {count}."), lines)
     if left_out:
         return PosesVerdict("warn", (
             f"Only a part of the capture is kept, whose camera poses can be trusted: {count}; "
@@ -102,7 +107,9 @@ def _build_tiles(stages: StageReports, metrics: Metrics | None) -> Iterator[Tile
     cameras = sfm.read_summary(SfmSummary)
     share = (f"{cameras.registered / cameras.frames:.0%} of the frames"
              if cameras and cameras.frames else "")
-    if cameras and cameras.left_out:
+    if cameras and cameras.part is not None:
+        share += f", part {cameras.part} of {len(cameras.parts)}"
+    elif cameras and cameras.left_out:
         share += f", {len(cameras.left_out):,} left out"
     yield _stage_tile(
         sfm, "registered", f"{cameras.registered:,}" if cameras else _LACKING, share)

@@ -69,9 +69,14 @@ def check_registered(
         "of them (--pairs exhaustive), or accept a part of the room with a lower --min-registered.")
 
 
+def shows_depth(median_angle_deg: float) -> bool:
+    """Returns whether the points are seen from places far enough apart."""
+    return median_angle_deg >= MIN_ANGLE_DEG
+
+
 def check_parallax(median_angle_deg: float) -> None:
     """Raises SfmError when the points are seen from nearly one place, so that depth is unsure."""
-    if median_angle_deg < MIN_ANGLE_DEG:
+    if not shows_depth(median_angle_deg):
         raise SfmError(
             f"The camera did not move enough: half of the points are seen at angles below "
             f"{median_angle_deg:.1f} degrees, but {MIN_ANGLE_DEG:g} are needed.",

@@ -26,17 +26,19 @@ from recon_cli.sfm import (
     mapper,
     matching,
     merge_models,
+    parts,
     skeleton,
 )
-from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, StepLog, fresh_folder, publish
+from recon_cli.sfm.job import MappingJob, Reporter, Result, StepLog, fresh_folder
 from recon_cli.sfm.merge_models import ModelCandidate
-from recon_cli.sfm.trusted_part import keep_trusted_part
-from recon_cli.sfm.verdict import ModelVerdict, check_weak_link, examine
+from recon_cli.sfm.time_estimate import format_minutes
+from recon_cli.sfm.trusted_part import cuts_models, deliver_parts
+from recon_cli.sfm.verdict import ModelVerdict, examine
 from recon_cli.sfm.weakest_cut import MIN_AGREEING
-from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
+OTHERS = "others"  # in the folder of an attempt: its models that hold other frames, by number
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW = 30
@@ -46,6 +48,9 @@ ENOUGH = 0.9
 # How much longer than the longest attempt so far a mapping may take. Relaxed thresholds took 0.8
 # and 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
+# How many times as long as the attempt before it a further one usually takes (1.1 to 2.4 in three
+# captures), and the minutes of one from which on that is told.
+FURTHER, MINUTES_TOLD = 1.5, 0.5
 
 
 @dataclass(frozen=True)
@@ -143,8 +148,9 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
     log = StepLog(job.attempts)
     attempts: list[MapperAttempt] = []
     verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
-    reason = list_fallbacks(job)[0].reason
-    for fallback in list_fallbacks(job):
+    ways = list_fallbacks(job)
+    reason = ways[0].reason
+    for fallback in ways:
         recorded = log.result(fallback.name)
         if recorded:
             attempt = MapperAttempt.from_json(recorded)
@@ -158,6 +164,9 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
             reason = attempt.shortfall
             if not reason:
                 break
+            if fallback is not ways[-1] and attempt.seconds > 60 * MINUTES_TOLD:
+                report.tell(f"another mapper is tried, for about "
+                            f"{format_minutes(FURTHER * attempt.seconds)} more: {reason}")
     return _publish_best(job, attempts, verdicts)
 
 
@@ -180,9 +189,9 @@ def shortfall(candidate: ModelCandidate, reach: Collection[str]) -> str:
     held = candidate.model.num_reg_images()
     if held < ENOUGH * len(reach):
         return f"only {held} of {len(reach)} frames that can be placed got a camera"
-    parts = [part for part in candidate.apart if set(part).intersection(reach)]
-    if parts:
-        return f"the capture fell into {1 + len(parts)} models"
+    apart = [names for names in candidate.apart if set(names).intersection(reach)]
+    if apart:
+        return f"the capture fell into {1 + len(apart)} models"
     if not candidate.verdict.trusted:
         return " ".join(candidate.verdict.problems)
     return ""
@@ -230,8 +239,10 @@ def _try_fallback(
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
         return MapperAttempt(fallback.name, reason, seconds), None
-    (folder / "model").mkdir()
-    write_model(candidate.model, folder / "model")
+    for name, model in {
+            "model": candidate.model,
+            **{f"{OTHERS}/{k}": other for k, other in enumerate(candidate.others)}}.items():
+        write_model(model, fresh_folder(folder / name))
     attempt = MapperAttempt(
         fallback.name, reason, seconds, "", tuple(mapper.list_registered(candidate.model)),
         shortfall(candidate, reachable(job, candidate)), candidate.apart, candidate.rejected,
@@ -243,11 +254,12 @@ def _try_fallback(
 def _publish_best(
     job: MappingJob, attempts: Sequence[MapperAttempt], verdicts: Mapping[str, ModelVerdict]
 ) -> Result:
-    """Publishes the best model, if it passes the checks, and returns the result of the step."""
+    """Publishes the parts of the best model, and returns the result of the step."""
     chosen = best_attempt(attempts)
     registered = chosen.registered if chosen else ()
+    placed = registered + sum(chosen.apart, ()) if chosen and cuts_models(job) else registered
     try:
-        checks.check_registered(job.names, registered, job.min_registered)
+        checks.check_registered(job.names, placed, job.min_registered)
     except SfmError as error:
         counts = ", ".join(
             f"{attempt.name} was skipped for lack of time" if attempt.skipped else
@@ -257,29 +269,25 @@ def _publish_best(
                        hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
     job = _linked_job(job, chosen.name)
-    model = pycolmap.Reconstruction(job.attempts / chosen.name / "model")
+    folder = job.attempts / chosen.name
+    model = pycolmap.Reconstruction(folder / "model")
     verdict = verdicts.get(chosen.name) or examine(
         model, job.database, job.names, sharpness=job.sharpness, times=job.times)
-    part = keep_trusted_part(job, model, verdict)
-    if part is not None:
-        model, verdict = part.candidate.model, part.candidate.verdict
-    described = mapper.describe_model(model)
-    checks.check_parallax(described["median_triangulation_angle_deg"])
-    check_weak_link(verdict, job.accept_weak)
-    atomic.write_json(job.out / VERDICT, verdict.to_json())
-    folder = fresh_folder(job.attempts / "sharp")
-    write_model(model, folder)
-    publish(folder, job.model)
+    delivered = deliver_parts(
+        job, ModelCandidate(model, verdict, chosen.apart, chosen.rejected),
+        [pycolmap.Reconstruction(folder / OTHERS / str(k)) for k in range(len(chosen.apart))])
+    parts.write_parts(job, [(part.model, part.verdict) for part in delivered])
     shutil.rmtree(job.attempts)
+    held = {name for part in delivered for name in mapper.list_registered(part.model)}
+    apart = [sorted(set(names) - held) for names in chosen.apart]
     return {
-        **described, "poses": None,
-        "models": [len(described["registered"]), *chosen.models[1:]],
-        "apart": [list(names) for names in chosen.apart],
-        "left_out": [] if part is None else list(part.left_out),
-        "rejected": {**chosen.rejected, **({} if part is None else part.candidate.rejected)},
-        "verdict": verdict.to_json(),
-        "lines": [*([] if part is None else [part.sentence]), *verdict.lines(),
-                  *join_segments.read_refused(job)],
+        "parts": [parts.describe_part(part.model, part.verdict, held=held, rejected=part.rejected)
+                  for part in delivered],
+        "poses": None, "models": [len(chosen.registered), *chosen.models[1:]],
+        "apart": [names for names in apart if len(names) >= checks.MIN_FRAMES],
+        "broken": [] if job.accept_weak else list(verdict.problems),
+        "left_out": sorted(set(chosen.registered) - held),
+        "notes": join_segments.read_refused(job),
         "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}
 
 

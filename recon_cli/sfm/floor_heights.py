@@ -19,9 +19,9 @@ WINDOW = 20  # images that are looked at together, and half of them further on a
 CONE_DEG = 8.0  # between the floor's normal and what is up for all cameras
 # Images on either side of a cut whose heights are compared, and how many must know theirs.
 NEAR, LEAST = 60, 10
-# Steps of the log of that height on good walks, as a standard deviation (.02 to .07 on six); a
-# larger one than the other is to another surface, such as a table.
-SPREAD, MAX_STEP = 0.07, 0.4
+# Steps of the log of that height on good walks, as a standard deviation: .02 to .07 on eight, .05
+# by their squares. One larger than the other is to another surface, such as a table.
+SPREAD, MAX_STEP = 0.05, 0.4
 
 
 def measure_heights(

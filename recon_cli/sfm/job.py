@@ -23,6 +23,7 @@ from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.journal import crc32
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
+DATABASE = "database.db"  # in the stage's folder: COLMAP's, of features and matches
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 POLL_SECONDS = 0.25  # between looks at what native code has done
 CLIP_SECONDS = 1e6  # from the start of a clip to that of the next, in the times of a job
@@ -75,6 +76,7 @@ class MappingJob:
     # names of the frames of each segment that was mapped apart, in folders of `segments`
     segments: tuple[tuple[str, ...], ...] = ()
     split: int = 0  # segments to cut the view graph into; none where 0
+    part: int = 1  # of the capture, which is placed; 1 is the largest
     last: str = STEPS[-1]  # the last step to take
 
     @property
@@ -85,12 +87,17 @@ class MappingJob:
     @property
     def database(self) -> Path:
         """COLMAP's database of features and matches."""
-        return self.linked or self.out / "database.db"
+        return self.linked or self.out / DATABASE
+
+    @property
+    def parts(self) -> Path:
+        """The models of the parts of the capture by number, in the mapper's own frame."""
+        return self.out / "parts"
 
     @property
     def model(self) -> Path:
-        """The model in the mapper's own frame."""
-        return self.out / "model"
+        """The model of the largest part."""
+        return self.parts / "1"
 
     @property
     def attempts(self) -> Path:
@@ -201,6 +208,22 @@ class StepLog:
         for name in _ORDER[_ORDER.index(step):]:
             self._steps.pop(name, None)
         self._write()
+
+    def files(self, step: str) -> list[str]:
+        """Returns the names of the files of a finished step; none if it is not finished."""
+        return list(self._steps.get(step, {}).get("files", ()))
+
+    def hand_on(self, out: Path, last: str, facts: Result) -> None:
+        """Writes the steps up to `last` into another folder, whose files are there.
+
+        The result of the last one gets `facts` besides.
+        """
+        names = [name for name in _ORDER[:_ORDER.index(last) + 1] if name in self._steps]
+        other = StepLog(out)
+        other._steps = {name: self._steps[name] for name in names}
+        entry = self._steps[last]
+        other._steps[last] = {**entry, "result": {**entry["result"], **facts}}
+        other._write()
 
     def _write(self) -> None:
         atomic.write_json(

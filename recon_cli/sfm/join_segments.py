@@ -42,7 +42,7 @@ from recon_cli.workspace import atomic
 Pair = matching.Pair
 
 REPORT = "segments.json"  # in the stage's folder: what the segments and their joins said
-MODEL_FOLDER = "model"
+MODEL_FOLDER = "parts/1"
 # Frames of other segments that each is matched with because they look alike: enough to find loops,
 # whose frames are matched with more of each other once the segments lie beside each other.
 ALIKE = 2

@@ -18,14 +18,13 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from recon_cli.errors import SfmError
-from recon_cli.io.colmap_library import pycolmap, write_model
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.records import KnownPoses, read_poses
-from recon_cli.sfm import checks, database, features, mapper, matching
+from recon_cli.sfm import checks, database, features, mapper, matching, parts
 from recon_cli.sfm.evidence import gather_evidence
-from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish
+from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
 from recon_cli.sfm.merge_models import build_posed_model
 from recon_cli.sfm.verdict import check_weak_link, examine
-from recon_cli.workspace import atomic
 
 NEAREST = 20  # cameras that each one is matched with, as in `matching.similar_pairs`
 # Axes further apart share little: the wider side of a phone's picture spans 65 to 80 degrees.
@@ -91,7 +90,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         check = spot_check(job, known.viewmats)
         if not check.fits:
             raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
-        lines = [check.describe()]
+        notes = [check.describe()]
     else:
         posed = build_posed_model(job.database, None, _rigid(known.viewmats, known.viewmats))
         model = mapper.triangulate(job, posed, refine_intrinsics=bool(_uncalibrated_cameras(job)))
@@ -107,16 +106,12 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
             model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times,
             given=True)
         check_weak_link(verdict, job.accept_weak, given=True)
-        atomic.write_json(job.out / VERDICT, verdict.to_json())
-        lines = verdict.lines()
-    folder = fresh_folder(job.out / "model.partial")
-    write_model(model, folder)
-    publish(folder, job.model)
+        notes = []
+    parts.write_parts(job, [(model, verdict)])
     shutil.rmtree(job.attempts, ignore_errors=True)
     return {
-        **mapper.describe_model(model), "models": [model.num_reg_images()], "apart": [],
-        "rejected": {}, "rungs": [], "verdict": verdict.to_json() if verdict else None,
-        "lines": lines,
+        "parts": [parts.describe_part(model, verdict)], "notes": notes,
+        "models": [model.num_reg_images()], "apart": [], "rungs": [],
         "poses": {"use": job.pose_use, "metric": known.metric, **movement}}
 
 

@@ -39,6 +39,7 @@ class ModelCandidate:
     verdict: ModelVerdict
     apart: tuple[tuple[str, ...], ...]  # frames that only other models hold
     rejected: Mapping[str, str]  # why frames were taken out, by name
+    others: tuple[pycolmap.Reconstruction, ...] = ()  # the models that hold `apart`
 
 
 def best_model(
@@ -61,7 +62,10 @@ def best_model(
         larger = merged.model.num_reg_images() > best.model.num_reg_images()
         if larger and (merged.verdict.trusted or not best.verdict.trusted):
             best = merged
-    return ModelCandidate(best.model, best.verdict, _list_apart(best, others), best.rejected)
+    apart = _list_apart(best, others)
+    return ModelCandidate(
+        best.model, best.verdict, tuple(names for names, _ in apart), best.rejected,
+        tuple(model for _, model in apart))
 
 
 def drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandidate:
@@ -87,15 +91,15 @@ def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> ModelVerdict:
 
 def _list_apart(
     best: ModelCandidate, others: Sequence[pycolmap.Reconstruction]
-) -> tuple[tuple[str, ...], ...]:
-    """Returns the frames of other models that no model before them holds, three or more."""
+) -> list[tuple[tuple[str, ...], pycolmap.Reconstruction]]:
+    """Returns models with three or more frames that no model before them holds, and those."""
     held, parts = {*mapper.list_registered(best.model), *best.rejected}, []
     for other in others:
         new = sorted(set(mapper.list_registered(other)) - held)
         held.update(new)
         if len(new) >= MIN_FRAMES:
-            parts.append(tuple(new))
-    return tuple(parts)
+            parts.append((tuple(new), other))
+    return parts
 
 
 def merge(

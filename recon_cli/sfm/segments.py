@@ -47,9 +47,6 @@ MOST_WHOLE = 200  # frames up to which a capture is mapped as one
 # more on what they share, longer ones are fewer jobs.
 LENGTH, OVERLAP = 150, 25
 LEAST = 10  # frames of a segment
-# Of one core for a frame, in its segments and in the join, between those measured on two machines
-# with walks of 640x360 pixels: docs/scaling.md.
-SEGMENT_SECONDS, JOIN_SECONDS = 1.0, 0.5
 TRIES = 2  # of a mapping process that is killed, perhaps for want of memory beside others
 COMMAND = "map-segment"  # of recon, which takes JOB
 # in the folder of a segment: what to do, how much of it is done, and what the command printed
@@ -85,12 +82,6 @@ def count_mapped(job: MappingJob) -> int:
         return len(job.names)
     tracks = Tracks.read(job.tracks)
     return len(choose_keyframes(tracks)) if len(tracks.names) == len(job.names) else len(job.names)
-
-
-def expected_minutes(frames: int, threads: int) -> float:
-    """Returns about how long sfm takes for so many frames; the join keeps to one thread."""
-    at_once = min(threads, count_segments(frames, "auto"))
-    return frames * (SEGMENT_SECONDS / at_once + JOIN_SECONDS) / 60
 
 
 def overlap(frames: int, count: int) -> int:

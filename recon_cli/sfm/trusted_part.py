@@ -1,77 +1,130 @@
-"""The part of a broken model that can be trusted on its own.
+"""The parts of a capture that can be trusted on their own.
 
-A mapper goes wrong in few places, and what lies on either side of one is usually right. So the
-model is cut where the verdict finds it broken, each side is adjusted and examined by itself, and
-cut again where it is broken too.
+A mapper goes wrong in few places, and what lies on either side of one is usually right. So a model
+is cut where the verdict finds it broken, each side is adjusted and examined by itself, and cut
+again where it is broken too. A capture that fell into several models is in parts as well. Nothing
+is known of how one part lies to another, nor of the ratio of their scales.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm import mapper
-from recon_cli.sfm.checks import MIN_FRAMES
+from recon_cli.sfm import checks, mapper
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import ModelCandidate, drop_outliers
-from recon_cli.sfm.verdict import MAX_LEAP, ModelVerdict, has_drifted, is_aliased, is_broken
+from recon_cli.sfm.verdict import (
+    MAX_LEAP,
+    ModelVerdict,
+    check_weak_link,
+    has_drifted,
+    is_aliased,
+    is_broken,
+)
 
 Names = tuple[str, ...]
 
-
-@dataclass(frozen=True, eq=False)
-class TrustedPart:
-    """What is kept of a broken model."""
-
-    candidate: ModelCandidate
-    left_out: Names  # the frames that had a camera in the whole model
-    sentence: str  # what was broken, and what is kept
+# Frames of a part beside the largest, a tenth of the capture within these bounds: 20 are worth a
+# scene, and fewer than 10 cannot tell the principal point (`mapper.MIN_IMAGES_PRINCIPAL`).
+FEWEST, ENOUGH = 10, 20
+_MOST_NAMED = 5  # parts in an error
 
 
-def keep_trusted_part(
-    job: MappingJob, model: pycolmap.Reconstruction, verdict: ModelVerdict
-) -> TrustedPart | None:
-    """Returns the part of an untrusted model to keep; None if it is trusted or must stay whole.
+def deliver_parts(
+    job: MappingJob, whole: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
+) -> list[ModelCandidate]:
+    """Returns the parts of a capture that can be trusted, the largest first.
 
-    SfmError if no part that can be trusted has --min-registered of the frames.
+    `others` are models beside the `whole` one. --accept-weak and --no-partial keep that as it is.
+    SfmError if the parts hold less than --min-registered of the frames together, or show them from
+    nearly one place.
     """
-    if not job.partial or job.accept_weak or verdict.trusted:
-        return None
-    part = find_trusted_part(job, model, verdict)
-    kept = [] if part is None else mapper.list_registered(part.model)
-    if part is None or len(kept) < job.min_registered * len(job.names):
-        raise SfmError(
-            f"{verdict.problems[0]} The largest part that can be trusted on its own has "
-            f"{len(kept)} of {len(job.names)} frames, but --min-registered asks for "
-            f"{job.min_registered:.0%}.",
-            hint="Use more frames between the two parts (`recon ingest --frames N`), match all of "
-            "them (--pairs exhaustive), accept the part with a lower --min-registered, or keep the "
-            "whole as it is with --accept-weak.")
-    left_out = tuple(sorted(set(mapper.list_registered(model)).difference(kept)))
-    return TrustedPart(part, left_out, (
-        f"{verdict.problems[0]} The largest part that can be trusted on its own is kept, "
-        f"{len(kept)} of {len(job.names)} frames."))
+    parts = [whole]
+    if cuts_models(job):
+        found = find_parts(job, whole, others)
+        parts = [part for part in found if checks.shows_depth(_angle(part))] or found[:1]
+        _check_share(job, whole.verdict, parts)
+    checks.check_registered(
+        job.names, [name for part in parts for name in mapper.list_registered(part.model)],
+        job.min_registered)
+    checks.check_parallax(_angle(parts[0]))
+    check_weak_link(parts[0].verdict, job.accept_weak)
+    return parts
 
 
-def find_trusted_part(
-    job: MappingJob, model: pycolmap.Reconstruction, verdict: ModelVerdict
-) -> ModelCandidate | None:
-    """Returns the largest part of a model, at least three cameras, that can be trusted."""
-    best, least = None, MIN_FRAMES
-    sides = list(_sides(job, mapper.list_registered(model), verdict))
+def cuts_models(job: MappingJob) -> bool:
+    """Returns whether a job takes parts of what the mapper found, rather than the largest model."""
+    return job.partial and not job.accept_weak
+
+
+def least_frames(job: MappingJob) -> int:
+    """Returns how many frames a part beside the largest must have."""
+    return min(max(len(job.names) // 10, FEWEST), ENOUGH)
+
+
+def find_parts(
+    job: MappingJob, whole: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
+) -> list[ModelCandidate]:
+    """Returns the largest part that can be trusted, of three cameras or more, and others.
+
+    The points of a model that has none are triangulated.
+    """
+    least = least_frames(job)
+    parts = list(_cut(job, whole, checks.MIN_FRAMES))
+    for other in sorted(others, key=mapper.model_size, reverse=True):
+        held = {name for part in parts for name in mapper.list_registered(part.model)}
+        names = set(mapper.list_registered(other)) - held
+        if len(names) >= least:
+            model = other if other.num_points3D() else mapper.triangulate(job, other)
+            part = drop_outliers(job, mapper.sharpen(_cut_out(model, names)))
+            parts += _cut(job, part, least)
+    parts.sort(key=lambda part: mapper.model_size(part.model), reverse=True)
+    return [part for index, part in enumerate(parts)
+            if not index or part.model.num_reg_images() >= least]
+
+
+def _cut(job: MappingJob, whole: ModelCandidate, least: int) -> Iterator[ModelCandidate]:
+    """Yields the trusted parts of a model: of so many cameras, and others of those it must have."""
+    if whole.verdict.trusted:
+        yield whole
+        return
+    sides = [(names, whole.rejected) for names in _sides(
+        job, mapper.list_registered(whole.model), whole.verdict)]
     while sides:
-        names = sides.pop()
+        names, rejected = sides.pop(max(range(len(sides)), key=lambda i: len(sides[i][0])))
         if len(names) < least:
             continue
-        part = drop_outliers(job, _cut_out(model, names))
+        part = drop_outliers(job, _cut_out(whole.model, names))
+        part = dataclasses.replace(part, rejected={**rejected, **part.rejected})
         cameras = mapper.list_registered(part.model)
         if not part.verdict.trusted:
-            sides += _sides(job, cameras, part.verdict)
+            sides += [(side, part.rejected) for side in _sides(job, cameras, part.verdict)
+                      if len(side) < len(cameras)]
         elif len(cameras) >= least:
-            best, least = part, len(cameras) + 1
-    return best
+            yield part
+            least = max(least, least_frames(job))
+
+
+def _check_share(
+    job: MappingJob, verdict: ModelVerdict, parts: Sequence[ModelCandidate]
+) -> None:
+    """Raises SfmError if the parts of a broken capture hold too few frames together."""
+    held = [mapper.list_registered(part.model) for part in parts]
+    count = sum(map(len, held))
+    broken = bool(verdict.problems) or len(parts) > 1
+    if parts and (count >= job.min_registered * len(job.names) or not broken):
+        return
+    named = "; ".join(f"{len(names)} ({names[0]} to {names[-1]})" for names in held[:_MOST_NAMED])
+    raise SfmError(
+        f"{verdict.problems[0] if verdict.problems else 'The capture fell apart.'} The parts that "
+        f"can be trusted on their own hold {count} of {len(job.names)} frames together"
+        f"{f', {named}' if named else ''}, but --min-registered asks for {job.min_registered:.0%}.",
+        hint="Use more frames between the parts (`recon ingest --frames N`), match all of "
+        "them (--pairs exhaustive), accept the parts with a lower --min-registered, or keep the "
+        "largest model as it is with --accept-weak.")
 
 
 def _sides(job: MappingJob, cameras: Collection[str], verdict: ModelVerdict) -> Iterator[Names]:
@@ -100,3 +153,8 @@ def _cut_out(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap
             part.deregister_frame(image.frame_id)
     mapper.adjust(part)
     return part
+
+
+def _angle(part: ModelCandidate) -> float:
+    """Returns the median of the widest angles that points are seen at, degrees."""
+    return float(mapper.describe_model(part.model)["median_triangulation_angle_deg"])

@@ -22,7 +22,8 @@ from recon_cli.io.images import read_png, write_png
 from recon_cli.io.records import read_poses
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.align_world import ScaleBetween, world_transform
-from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder, publish
+from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish
+from recon_cli.sfm.parts import check_part
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import WorldSummary
 
@@ -30,12 +31,14 @@ IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 
 
 def place_model(job: MappingJob) -> Result:
-    """Writes the mapper's model, moved into the world frame, into out/sparse.
+    """Writes the model of the job's part, moved into the world frame, into out/sparse.
 
     The axes of a data set with poses are left as they are. Returns a `WorldSummary` as JSON values;
-    ConfigError if a place of --scale-between is unknown.
+    ConfigError if the part, or a place of --scale-between, is unknown.
     """
-    model = pycolmap.Reconstruction(job.model)
+    check_part(job)
+    part = job.parts / str(job.part)
+    model = pycolmap.Reconstruction(part)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
@@ -51,6 +54,8 @@ def place_model(job: MappingJob) -> Result:
     publish(folder, job.out / "sparse")
     summary = world.summary().to_json()
     atomic.write_json(job.out / WorldSummary.FILE, summary)
+    if (part / VERDICT).exists():
+        atomic.write_json(job.out / VERDICT, atomic.read_json(part / VERDICT))
     return summary
 
 

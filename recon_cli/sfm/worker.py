@@ -45,9 +45,9 @@ from recon_cli.workspace.summaries import WorldSummary
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
-_FOLDERS = ("model", "sparse", "undistorted")  # steps that write a folder of their name
-# Files that a step writes besides.
-_BESIDES = {"model": (VERDICT, join_segments.REPORT), "sparse": (WorldSummary.FILE,)}
+# The folders that steps write, and files besides.
+_FOLDERS = {"model": "parts", "sparse": "sparse", "undistorted": "undistorted"}
+_BESIDES = {"model": (join_segments.REPORT,), "sparse": (WorldSummary.FILE, VERDICT)}
 
 
 def work(job: MappingJob, report: Reporter) -> None:
@@ -65,8 +65,8 @@ def work(job: MappingJob, report: Reporter) -> None:
         "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)
     rematch = _forget_damaged(job, log, report)
-    done = job.last == STEPS[-1] and all(log.result(step) is not None for step in job.steps)
-    if "features" in job.steps and not done:  # else nothing reads it any more
+    mapped = job.last == STEPS[-1] and log.result("model") is not None
+    if "features" in job.steps and not mapped:  # else nothing reads it any more
         _prepare_database(job, log, report, rematch=rematch)
     for step in job.steps:
         if log.result(step) is not None:
@@ -80,8 +80,8 @@ def work(job: MappingJob, report: Reporter) -> None:
         result["cpu_seconds"] = round(time.process_time() - cpu, 2)
         if step in ("features", "matches"):
             database.seal(job.database)
-        log.finish(step, result, job.out / step if step in _FOLDERS else None,
-                   _BESIDES.get(step, ()))
+        folder = job.out / _FOLDERS[step] if step in _FOLDERS else None
+        log.finish(step, result, folder, _BESIDES.get(step, ()))
 
 
 def _forget_damaged(job: MappingJob, log: StepLog, report: Reporter) -> bool:

@@ -54,6 +54,9 @@ class Stage:
     takes: str = ""  # input from the user, as in usage; empty for stages that only read others
     spares: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
     adds: bool = False  # it keeps the files of its last result that it does not write again
+    # options that decide its last steps alone: where they are all that differs, it is given its
+    # last result to go on from
+    late: tuple[str, ...] = ()
 
 
 STAGES: tuple[Stage, ...] = (
@@ -63,8 +66,8 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 3, True,
           "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json", "model/*"),
-          own_digests=True),
+          ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json"),
+          own_digests=True, late=("part", "gravity", "scale_between")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 5, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,

@@ -15,10 +15,12 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import InputError
 from recon_cli.io import records as store
 from recon_cli.io.foreign import FOREIGN, find_foreign
+from recon_cli.io.images import fit_size
 from recon_cli.io.layouts import recognise, refuse_incomplete
 from recon_cli.io.records import FrameList
 from recon_cli.io.tracks import TRACKS
-from recon_cli.sfm.segments import MOST_WHOLE, expected_minutes
+from recon_cli.sfm.segments import MOST_WHOLE, count_segments
+from recon_cli.sfm.time_estimate import Workload, format_minutes, tell_seconds
 from recon_cli.workspace.summaries import IngestSummary
 
 MIN_TRAINED = 2  # one view holds no depth
@@ -109,7 +111,9 @@ def _ingest(
     scans = [from_video.scan(config, path, out / f"{prefix}{from_video.SCAN}", ctx)
              for path, prefix in videos]
     numbers = from_video.frame_counts(config, scans)
-    _tell_many(config, sum(numbers), ctx)
+    pixels = max((fit_size(each.scan.width, each.scan.height, config.max_size) for each in scans),
+                 default=(0, 0))
+    _tell_many(config, sum(numbers), pixels, ctx)
     counts = dict(zip(
         (prefix for _, prefix in videos), zip(scans, numbers, strict=True), strict=True))
     ingested = []
@@ -122,13 +126,17 @@ def _ingest(
     return ingested
 
 
-def _tell_many(config: IngestConfig, frames: int, ctx: StageContext) -> None:
+def _tell_many(
+    config: IngestConfig, frames: int, pixels: tuple[int, int], ctx: StageContext
+) -> None:
     """Says how many frames a long video gets, and how long their cameras will take to find."""
     if frames > MOST_WHOLE:
         way = "" if config.frames else " for the way of the camera"
-        minutes = max(1, round(expected_minutes(frames, ctx.threads)))
-        ctx.notice(f"{frames:,} frames are chosen{way}; recon sfm will take about {minutes} "
-                   "minutes for them. --max-frames limits their number.")
+        work = Workload(frames, pixels[0] * pixels[1] / 1e6, tracked=True,
+                        segments=count_segments(frames, "auto"))
+        seconds = tell_seconds(work, ctx.threads)
+        takes = f"; recon sfm will take about {format_minutes(seconds)} for them" if seconds else ""
+        ctx.notice(f"{frames:,} frames are chosen{way}{takes}. --max-frames limits their number.")
 
 
 def _tell_foreign(video: Path, ctx: StageContext) -> None:

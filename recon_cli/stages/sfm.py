@@ -16,13 +16,15 @@ from recon_cli.executors.executor import Executor, start_executor
 from recon_cli.io import records as store
 from recon_cli.io.records import POSES, FrameList, describe_stretches, read_poses
 from recon_cli.io.tracks import TRACKS
-from recon_cli.sfm import database, process, segments
+from recon_cli.sfm import database, parts, process, segments
 from recon_cli.sfm.align_world import parse_place
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.time_estimate import Workload, format_minutes, tell_seconds
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.
 MAX_MINUTES, USUAL_FRAMES, MINUTES_PER_FRAME = 20.0, 100, 0.2
+NEAR_LIMIT = 0.5  # share of the limit from which on it is told, too
 STRETCHES = 8  # of frames without a camera, in a sentence
 
 
@@ -30,14 +32,19 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     """Writes sparse/ and undistorted/{images,denoised,sparse} into `out`.
 
     The database and finished steps in `out` are kept; the model does not depend on the threads.
+    The parts of the capture are those of an earlier result, where that differs in late options.
 
     Raises:
         SfmError: there are too few cameras, an untrusted model, no time left, or a dead process.
+        ConfigError: the capture has no such part.
         FormatError: the folders of ingest or denoise do not hold what they promise.
     """
     ingest, denoise = inputs.folders["ingest"].resolve(), inputs.folders["denoise"].resolve()
     frames = store.read_frame_list(ingest)
     poses, tracks = ingest / POSES, ingest / TRACKS
+    earlier = inputs.earlier
+    mapped = earlier is not None and parts.take_over(
+        earlier.folder, earlier.summary, earlier.changed | earlier.missing, out)
     job = MappingJob(
         frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER, out=out.resolve(),
         groups=_groups(frames),
@@ -47,15 +54,17 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         tracks=tracks if tracks.exists() else None, pairs=config.pairs,
         max_features=config.max_features, min_registered=config.min_registered,
         accept_weak=config.accept_weak, partial=config.partial, gravity=config.gravity == "auto",
-        scale_between=config.scale_between, max_minutes=_time_limit(config, frames, ctx),
-        seed=config.seed, threads=ctx.threads,
+        scale_between=config.scale_between, part=config.part,
+        max_minutes=_time_limit(config, frames), seed=config.seed, threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
         times=_times(frames))
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
-    runs = _run_segments(config, job, ctx)
+    if not mapped:
+        _tell_time(config, job, ctx)
+    runs = segments.SegmentRuns(job, {}, {}) if mapped else _run_segments(config, job, ctx)
     job = runs.job
     process.run_job(
         job, progress=ctx.progress, record=ctx.record, on_idle=ctx.on_idle)
@@ -80,7 +89,7 @@ def _run_segments(
                        "segments run on Ray (--segments).")
         return segments.SegmentRuns(job, {}, {})
     runs = segments.map_segments(
-        job, count, lambda parts: _start_executor(config, job, parts, ctx.threads),
+        job, count, lambda count: _start_executor(config, job, count, ctx.threads),
         progress=ctx.progress, record=ctx.record)
     for index, reason in runs.failed.items():
         names = runs.job.segments[index]
@@ -89,27 +98,38 @@ def _run_segments(
 
 
 def _start_executor(
-    config: SfmConfig, job: MappingJob, parts: int, threads: int
+    config: SfmConfig, job: MappingJob, count: int, threads: int
 ) -> tuple[Executor, int]:
     """Returns what maps segments, and the threads of each: on this machine they share `threads`."""
     if config.on == "ray":
         return start_executor(
             config.on, job.out, inputs=[job.frames, job.denoised], slots=config.jobs, gpu=False)
-    slots = min(config.jobs or threads, parts)
+    slots = min(config.jobs or threads, count)
     return start_executor(config.on, job.out, slots=slots, cores=max(1, threads // slots))
 
 
-def _time_limit(config: SfmConfig, frames: FrameList, ctx: StageContext) -> float:
-    """Returns the limit in minutes, and tells in advance how long many images take."""
-    count = len(frames.frames)
-    limit = MAX_MINUTES + MINUTES_PER_FRAME * max(0, count - USUAL_FRAMES)
-    if config.max_minutes is None and count > USUAL_FRAMES:
-        parts = segments.count_segments(count, config.segments)
-        about = max(1, round(segments.expected_minutes(count, ctx.threads)))
-        usual = f" in {parts} segments take about {about} minutes, but" if parts > 1 else ""
-        ctx.notice(f"{count} images{usual} may take up to {limit:.0f} minutes; --max-minutes sets "
-                   "another limit.")
-    return limit if config.max_minutes is None else config.max_minutes
+def _time_limit(config: SfmConfig, frames: FrameList) -> float:
+    """Returns the limit in minutes: as asked for, or by the number of frames."""
+    if config.max_minutes is not None:
+        return config.max_minutes
+    return MAX_MINUTES + MINUTES_PER_FRAME * max(0, len(frames.frames) - USUAL_FRAMES)
+
+
+def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
+    """Tells how long the cameras will take, and the limit where it is near."""
+    if job.known_poses or job.pairs != "auto" or StepLog(job.out).result("features") is not None:
+        return  # as asked for, or partly done
+    count = segments.count_segments(len(job.names), config.segments)
+    largest = max(job.groups, key=lambda group: len(group.names))
+    seconds = tell_seconds(Workload(
+        len(job.names), largest.width * largest.height / 1e6, tracked=job.tracks is not None,
+        segments=count), ctx.threads)
+    if seconds is None:
+        return
+    near = seconds > NEAR_LIMIT * 60 * job.max_minutes
+    limit = f" of the {job.max_minutes:.3g} that --max-minutes allows" if near else ""
+    ctx.notice(f"The cameras of {len(job.names):,} frames will take about "
+               f"{format_minutes(seconds)}{limit}.")
 
 
 def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:
@@ -143,24 +163,30 @@ def _summary(frames: FrameList, runs: segments.SegmentRuns) -> SfmSummary:
         assert result is not None, f"the mapping process ended without {step}"
         results[step] = result
     model = results["model"]
-    unregistered = sorted({frame.name for frame in frames.frames} - set(model["registered"]))
+    part, finished = model["parts"][job.part - 1], model.get(parts.FINISHED, {})
+    unregistered = sorted({frame.name for frame in frames.frames} - set(part["registered"]))
     held_out = {frame.name for frame in frames.frames if frame.held_out}
     return SfmSummary.from_json({
-        **model, "frames": len(frames.frames), "registered": len(model["registered"]),
+        **model, **part, "frames": len(frames.frames), "registered": len(part["registered"]),
+        "part": job.part if len(model["parts"]) > 1 else None, "parts": [
+            {"names": each["registered"], "points": each["points"]} for each in model["parts"]],
+        "lines": [*model.get("broken", [])[:1], *part["lines"], *model["notes"]],
         "unregistered": unregistered,
         "unregistered_held_out": [name for name in unregistered if name in held_out],
         "world": results["sparse"], "cameras": results["undistorted"]["cameras"],
-        "segments": max(1, len(job.segments)),
+        "segments": finished.get("segments", max(1, len(job.segments))),
         "seconds": {step: result["seconds"] for step, result in results.items()},
         "cpu_seconds": {
             **{f"{step} of segments": seconds for step, seconds in runs.cpu_seconds.items()},
+            **finished.get("cpu_seconds", {}),
             **{step: result.get("cpu_seconds", 0.0) for step, result in results.items()}}})
 
 
 def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
     """Says what was tried, which frames have no camera and which models were left aside."""
     for sentence in (*_attempts(summary.rungs), *summary.lines, *_movement(summary.poses),
-                     *_describe_left_out(summary, frames), *summary.world.sentences):
+                     *_describe_parts(summary, frames), *_describe_left_out(summary, frames),
+                     *summary.world.sentences):
         ctx.notice(sentence)
 
 
@@ -184,24 +210,39 @@ def _movement(poses: PosesSummary | None) -> Iterator[str]:
                f"{poses.turned_median_deg:.2f} degrees (at most {poses.turned_max_deg:.2f}).")
 
 
+def _describe_parts(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
+    """Yields sentences on the parts of a capture that has several, and on how to take another."""
+    if len(summary.parts) < 2:
+        return
+    yield (f"The capture has {len(summary.parts)} parts that can be trusted, each by itself; "
+           f"this is part {summary.part}, and the others are left out.")
+    for number, part in enumerate(summary.parts, 1):
+        yield (f"Part {number} has {len(part.names)} of {summary.frames} frames: "
+               f"{_stretches(frames, part.names)}.")
+    other = 2 if summary.part == 1 else 1
+    yield (f"`recon sfm --part {other}` takes part {other}, without mapping again; `recon report` "
+           "shows what to film to join them.")
+
+
 def _describe_left_out(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
     """Yields sentences on frames without a camera and on models that were left aside."""
-    def stretches(names: Collection[str]) -> str:
-        return list_names(describe_stretches(frames.frames, names), STRETCHES)
-
     missing, held_out = summary.unregistered, summary.unregistered_held_out
     if summary.left_out:
         yield (f"{len(summary.left_out)} frames are left out with the rest of the model: "
-               f"{stretches(summary.left_out)}.")
+               f"{_stretches(frames, summary.left_out)}.")
     for name, reason in summary.rejected.items():
         yield f"{name} was taken out of the model: {reason}."
     if missing and not summary.lines:  # the verdict names them, and why
         yield (f"{len(missing)} of {summary.frames} frames have no camera and are left out: "
-               f"{stretches(missing)}.")
+               f"{_stretches(frames, missing)}.")
     if held_out:
         yield (f"{len(held_out)} frames without a camera were held out and so cannot be scored: "
                f"{list_names(held_out)}.")
     if summary.apart:
-        parts = "; ".join(f"{len(part)} frames ({stretches(part)})" for part in summary.apart)
-        yield (f"The capture fell apart: the largest model, of {summary.models[0]} frames, is "
-               f"kept; left aside are {parts}.")
+        apart = "; ".join(
+            f"{len(names)} frames ({_stretches(frames, names)})" for names in summary.apart)
+        yield f"The capture fell apart: left aside are smaller models, of {apart}."
+
+
+def _stretches(frames: FrameList, names: Collection[str]) -> str:
+    return list_names(describe_stretches(frames.frames, names), STRETCHES)

@@ -337,6 +337,15 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Makes `target` another name of a file, or a copy where a file system has no hard links."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:  # not every file system has hard links, nor do they lead to another one
+        shutil.copy2(source, target, follow_symlinks=False)
+
+
 def move(source: Path, target: Path) -> None:
     """Renames a folder to where nothing is, also to another file system: whole or not at all."""
     try:

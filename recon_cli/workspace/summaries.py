@@ -204,8 +204,16 @@ class WorldSummary(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PartSummary(JsonRecord):
+    """A part of a capture that can be trusted by itself, in sfm/parts."""
+
+    names: tuple[str, ...]  # of its frames
+    points: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class SfmSummary(JsonRecord):
-    """The cameras that sfm found, and how far they can be trusted."""
+    """The cameras that sfm found, and how far they can be trusted; of one part of the capture."""
 
     frames: int  # of ingest
     registered: int  # frames with a camera
@@ -225,7 +233,10 @@ class SfmSummary(JsonRecord):
     unregistered_held_out: tuple[str, ...]  # those of them that are held out
     world: WorldSummary
     cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
-    left_out: tuple[str, ...] = ()  # names of the frames whose part of the model is not trusted
+    left_out: tuple[str, ...] = ()  # names of the frames whose camera is in no part
+    parts: tuple[PartSummary, ...] = ()  # the largest first; none in results of older versions
+    part: int | None = None  # the number of the one that is placed; None where there is only one
+    broken: tuple[str, ...] = ()  # why the model was cut, sentences; none where it was not
     segments: int = 1  # that were mapped apart and joined; 1 for a capture mapped as a whole
     cpu_seconds: Mapping[str, float] | None = None  # by step; those of segments together
 
@@ -235,7 +246,8 @@ class SfmSummary(JsonRecord):
         The options are not hashed, so that a refused run can go on with other ones.
         """
         forbids = options["accept_weak"] or not options["partial"]
-        reasons = ["it keeps a part of a broken model"] * bool(self.left_out and forbids)
+        cut = bool(self.broken or self.left_out)
+        reasons = ["it keeps a part of a broken model"] * (cut and forbids)
         asked = str(options.get("segments", "auto"))
         if asked != "auto" and self.segments != (1 if asked == "off" else int(asked)):
             reasons.append(f"it was mapped in {self.segments} segments")

@@ -17,6 +17,7 @@ of TRUTH, camera to world: as mapped, it is good or broken by the scales of its 
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
@@ -40,11 +41,11 @@ from recon_cli.sfm.verdict import ModelVerdict, examine
 FACTORS = (1.03, 1.10, 1.25)
 # Across the cut: frames up to so far apart, None for all, and matches of each pair of them.
 FEW = 40
-TIES = ((None, None), (2, None), (2, FEW), (1, FEW), (1, FEW // 2))
+TIES = ((None, None), (2, None), (1, FEW), (1, FEW // 2))
 BROKEN, SOUND = 0.10, 0.03  # of a relative scale that is left
 STRETCH = 20  # cameras on either side of a cut that its scale is taken from
-DEFAULT = ("fox", "living", "office", "living_noisy", "office_noisy", "bedroom", "trident",
-           "kitchen_walk", "study_walk", "dining_walk", "loop")
+DEFAULT = ("fox", "living", "office", "living_noisy", "office_noisy", "study_walk",
+           "lobby_walk", "loop")
 HEADS = ("capture", "made", "cameras", "scale left", "known to", "loops", "label", "verdict", "")
 Array = NDArray[np.float64]
 
@@ -58,17 +59,20 @@ class Row:
     cameras: str
     left: float  # of the relative scale, as a share
     label: str
-    verdict: ModelVerdict
+    error: float  # how well the scale is said to be known; 0 where nothing tells
+    loops: int  # that are open
+    trusted: bool
+    otherwise: bool  # anything but how well the scale is known speaks against the model
 
-    @property
-    def error(self) -> float:
-        """How well the scale is said to be known; 0 where nothing tells."""
-        return 0.0 if self.verdict.scale is None else self.verdict.scale.error
-
-    @property
-    def otherwise(self) -> bool:
-        """Whether anything but how well the scale is known speaks against the model."""
-        return len(self.verdict.problems) > (not self.verdict.open_loops and self.error > MAX_ERROR)
+    @classmethod
+    def from_verdict(
+        cls, capture: str, made: str, cameras: str, left: float, label: str, verdict: ModelVerdict
+    ) -> Row:
+        """The row of a model."""
+        error = 0.0 if verdict.scale is None else verdict.scale.error
+        by_scale = not verdict.open_loops and error > MAX_ERROR
+        return cls(capture, made, cameras, left, label, error, len(verdict.open_loops),
+                   verdict.trusted, len(verdict.problems) > by_scale)
 
     def is_wrong(self, bound: float) -> bool:
         """Whether it is decided wrongly by a bound of the error."""
@@ -78,8 +82,7 @@ class Row:
     def line(self) -> str:
         """Its line of the table."""
         cells = (self.capture, self.made, self.cameras, f"{self.left:.3f}", f"{self.error:.3f}",
-                 str(len(self.verdict.open_loops)), self.label or "-",
-                 "trusted" if self.verdict.trusted else "refused",
+                 str(self.loops), self.label or "-", "trusted" if self.trusted else "refused",
                  "WRONG" if self.is_wrong(MAX_ERROR) else "")
         return f"| {' | '.join(cells)} |"
 
@@ -163,7 +166,8 @@ def rows_of(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
     names = list(poses)
     centers = np.array([pose.inverse().translation for pose in poses.values()])
     own = examine(base, job.database, job.names, times=job.times)
-    yield Row(capture.name, "mapped", f"{own.registered}/{own.images}", 0.0, "good", own)
+    yield Row.from_verdict(
+        capture.name, "mapped", f"{own.registered}/{own.images}", 0.0, "good", own)
     cut = find_weakest_scale(base, names)
     place = len(names) // 2 if cut is None else names.index(cut.after)
     for ties in TIES:
@@ -180,8 +184,22 @@ def rows_of(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
                 "good" if left <= SOUND and ties == TIES[0] else "")
             what = "all matches" if ties == TIES[0] else (
                 f"up to {ties[0]} apart" + (f", {ties[1]} far" if ties[1] else ""))
-            yield Row(capture.name, f"x {factor:g}, {what}", f"{len(rows)}/{len(names)}", left,
-                      label, candidate.verdict)
+            yield Row.from_verdict(
+                capture.name, f"x {factor:g}, {what}", f"{len(rows)}/{len(names)}", left, label,
+                candidate.verdict)
+
+
+def read_or_make(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
+    """The lines of a capture, from its folder where an earlier run has left them."""
+    kept = out / capture.name / "scale_breaks.json"
+    if kept.exists():
+        yield from (Row(**row) for row in json.loads(kept.read_text(encoding="utf-8")))
+        return
+    rows = []
+    for row in rows_of(capture, data, out):
+        rows.append(row)
+        yield row
+    kept.write_text(json.dumps([dataclasses.asdict(row) for row in rows]), encoding="utf-8")
 
 
 def walk_row(model_folder: Path, path: Path, truth: Path) -> Row:
@@ -197,8 +215,8 @@ def walk_row(model_folder: Path, path: Path, truth: Path) -> Row:
               for start in range(0, len(held) - STRETCH, STRETCH // 2)]
     left = float(np.quantile(scales, 0.9) / np.quantile(scales, 0.1)) - 1
     label = "broken" if left >= BROKEN else "good"
-    return Row(model_folder.parent.name, "as mapped", f"{len(held)}/{len(names)}", left, label,
-               verdict)
+    return Row.from_verdict(model_folder.resolve().name, "as mapped", f"{len(held)}/{len(names)}",
+                            left, label, verdict)
 
 
 def held_out(rows: Sequence[Row]) -> Iterator[str]:
@@ -233,7 +251,7 @@ def main(data: Path, out: Path, names: tuple[str, ...], walk: tuple[tuple[Path, 
         click.echo(rows[-1].line())
     for capture in CAPTURES:
         if capture.name in (names or DEFAULT):
-            for row in rows_of(capture, data, out):
+            for row in read_or_make(capture, data, out):
                 rows.append(row)
                 click.echo(row.line())
     for label in ("good", "broken"):

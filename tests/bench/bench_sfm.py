@@ -71,7 +71,7 @@ def compared(rows: Mapping[int, Mapping[str, object]]) -> str:
 
 def draw(path: Path, label: str, rows: Mapping[int, Mapping[str, object]]) -> None:
     """Draws seconds against the median error of the centres."""
-    from matplotlib import pyplot  # noqa: PLC0415 - an extra
+    from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
     seconds = [float(str(row["seconds, all"])) for row in rows.values()]

@@ -87,7 +87,7 @@ CHANGES: dict[str, Change] = {
 _PLACES = (*STAGES, ".partial", ".partial/train", ".partial/train.json", ".partial/eval", ".old",
            ".old/train", ".old/junk", ".lock", ".lock.json", "recon.log", "recon.toml", "render",
            "report.html", "blocks", "seeds", "seeds/1", "ingest/frames", "sfm/undistorted",
-           "sfm/model", "train/manifest.json", "recon.toml", "render/test")
+           "sfm/parts/1", "train/manifest.json", "recon.toml", "render/test")
 
 
 def structure(case: Case) -> Verdict:
@@ -142,11 +142,11 @@ def _judge(case: Case, workspace: Path, verb: str, words: tuple[str, ...], top: 
 
 
 _NAMES = (
-    "{outside}/thesis.db", "../../outside/thesis.db", "../../outside/photos", "model/../../../"
-    "outside/photos", "model/../../../outside/thesis.db", "log.jsonl/../../../outside/thesis.db",
+    "{outside}/thesis.db", "../../outside/thesis.db", "../../outside/photos", "parts/../../../"
+    "outside/photos", "parts/../../../outside/thesis.db", "log.jsonl/../../../outside/thesis.db",
     "../train/splats.ply", "..", ".", "", "/", "a" * 300, "b/" * 3000 + "c", "\udcff.png",
-    "nul\0byte", "manifest.json", "~/x", "frames/../../../outside/photos/a.jpg", "model//{outside}",
-    "model/link")
+    "nul\0byte", "manifest.json", "~/x", "frames/../../../outside/photos/a.jpg", "parts//{outside}",
+    "parts/link")
 
 
 def manifest_names(case: Case) -> Verdict:
@@ -156,8 +156,8 @@ def manifest_names(case: Case) -> Verdict:
     removed = case.rng.random() < 0.6
     stage = "sfm" if removed else str(case.rng.choice(STAGES))
     name = str(case.pick(_NAMES)).replace("{outside}", str(outside))
-    if name == "model/link":
-        (workspace / "sfm" / "model" / "link").symlink_to(outside)
+    if name == "parts/link":
+        (workspace / "sfm" / "parts" / "link").symlink_to(outside)
     how = "new" if removed else case.rng.choice(("new", "renamed", "stage", "source"))
 
     def change(content: dict[str, object]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import fake_stages
 import pytest
 from facts import assert_facts
-from fake_stages import STEPS, bring, job_at, stale
+from fake_stages import STEPS, bring, job_at, seen, stale
 
 from recon_cli.commands.workspace import status_table
 from recon_cli.config.settings import Settings
@@ -232,3 +232,24 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
     assert manifest
     assert manifest.run.seconds > unfinished.seconds
     assert stale(job) == {}
+
+
+def test_a_stage_is_given_its_last_result_where_only_late_options_differ(job):
+    assert bring(job, "sfm", changes={"sfm": {"part": 2}}) == ["sfm"]
+    earlier = seen["sfm"].earlier
+    assert earlier.folder == job.workspace.folder("sfm")
+    assert earlier.summary["steps"] == STEPS
+    bring(job, "sfm", changes={"sfm": {"part": 2, "gravity": "off"}})
+    assert seen["sfm"].earlier is not None
+    bring(job, "sfm", changes={"sfm": {"part": 2, "seed": 5}})
+    assert seen["sfm"].earlier is None
+    bring(job, "sfm", changes={"sfm": {"part": 3, "seed": 5}}, again=True)
+    assert seen["sfm"].earlier is None
+
+
+def test_another_part_makes_stale_what_comes_behind_and_the_same_one_nothing(job):
+    assert stale(job) == {}
+    bring(job, "sfm", changes={"sfm": {"part": 2}})
+    assert list(stale(job)) == ["train", "prune", "evaluate", "export"]
+    assert stale(job_at(job.workspace.root, {"sfm": {"part": 1}}))["sfm"] == (
+        "sfm.part changed: 2 -> 1",)

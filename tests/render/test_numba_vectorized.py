@@ -92,7 +92,7 @@ def host_features(cpu_features):
 
 @pytest.fixture
 def cpu_features():
-    from llvmlite.binding import get_host_cpu_features  # noqa: PLC0415 (not needed to collect)
+    from llvmlite.binding import get_host_cpu_features
 
     return get_host_cpu_features()
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 import pytest
+from facts import assert_facts
 from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import fallbacks, keyframes, mapper, skeleton
+from recon_cli.sfm import fallbacks, keyframes, mapper, parts, skeleton
 from recon_cli.sfm.fallbacks import (
     MapperAttempt,
     best_attempt,
@@ -20,7 +21,7 @@ from recon_cli.sfm.fallbacks import (
     reachable,
     shortfall,
 )
-from recon_cli.sfm.job import CameraGroup, Reporter, StepLog
+from recon_cli.sfm.job import CameraGroup, Reporter, StepLog, parse
 from recon_cli.sfm.merge_models import ModelCandidate
 
 NAMES = tuple(f"{index:06d}.png" for index in range(60))
@@ -186,12 +187,13 @@ def test_a_good_capture_stops_at_the_first_attempt(capture):
     assert attempt["reason"] == "20 frames are few enough to match all pairs"
     assert attempt["registered"] == 20
     assert attempt["kept"]
-    assert result["registered"] == list(job.names)
+    part, = result["parts"]
+    assert part["registered"] == list(job.names)
     assert result["models"] == [20]
     assert not job.attempts.exists()
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
-    assert json.loads((job.out / "verdict.json").read_text()) == json.loads(
-        json.dumps(result["verdict"]))
+    assert json.loads((job.model / "verdict.json").read_text()) == json.loads(
+        json.dumps(part["verdict"]))
     assert json.loads(json.dumps(result, allow_nan=False))
 
 
@@ -210,6 +212,31 @@ def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
         ("global", "no model was found", True)]
 
 
+def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
+    job, _ = capture
+    monkeypatch.setattr(mapper, "map_incrementally", nothing)
+    monkeypatch.setattr(fallbacks, "MINUTES_TOLD", -1)
+    stream = io.BytesIO()
+    fallbacks.build_model(job, Reporter(stream), deadline=math.inf)
+    told = [event for line in stream.getvalue().splitlines()
+            if isinstance(event := parse(line), str)]
+    assert len(told) == 1
+    assert_facts(told[0], "another mapper", "minutes more", "no model was found")
+
+
+def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypatch):
+    job, truth = capture
+    monkeypatch.setattr(mapper, "map_incrementally", lambda *_: [
+        part(truth, job.names[:10]), part(truth, job.names[10:])])
+    monkeypatch.setattr(fallbacks.merge_models, "merge", lambda *_: None)
+    monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "")
+    result = build(job)
+    assert sorted(each["registered"] for each in result["parts"]) == [
+        list(job.names[:10]), list(job.names[10:])]
+    assert result["apart"] == []
+    assert sorted(path.name for path in job.parts.iterdir()) == ["1", "2"]
+
+
 def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
@@ -226,7 +253,7 @@ def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "the model cannot be trusted")
     result = build(job, deadline=0.0)
     assert [bool(attempt["skipped"]) for attempt in result["rungs"]] == [False, True, True]
-    assert result["registered"] == list(job.names)
+    assert result["parts"][0]["registered"] == list(job.names)
 
 
 def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, monkeypatch):
@@ -250,7 +277,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
     owner, name = {
         "match": (fallbacks.database, "pair_names"), "models": (mapper, "map_incrementally"),
         "model": (fallbacks, "write_model"), "note": (StepLog, "finish"),
-        "verdict": (fallbacks.atomic, "write_json"), "publish": (fallbacks, "publish")}[place]
+        "verdict": (parts.atomic, "write_json"), "publish": (parts, "publish")}[place]
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -260,7 +287,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
         build(job)
     assert not (job.model).exists()
     monkeypatch.undo()
-    assert build(job)["registered"] == list(job.names)
+    assert build(job)["parts"][0]["registered"] == list(job.names)
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
 
 

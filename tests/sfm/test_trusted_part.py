@@ -1,20 +1,23 @@
-"""What is kept of models that are broken in a known place."""
+"""What is delivered of models that are broken in a known place, and of several models."""
 
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from made_model import broken_walk, doubled_place, moved, walk
 
 from recon_cli.errors import SfmError
+from recon_cli.sfm import trusted_part
 from recon_cli.sfm.job import CameraGroup, MappingJob
 from recon_cli.sfm.mapper import list_registered
-from recon_cli.sfm.trusted_part import find_trusted_part, keep_trusted_part
+from recon_cli.sfm.merge_models import ModelCandidate, build_posed_model
+from recon_cli.sfm.trusted_part import deliver_parts, find_parts
 from recon_cli.sfm.verdict import examine
 
 
 def prepare(made, folder, **changes):
-    """Returns the job, the model and the verdict on it."""
+    """Returns the job, and the model with the verdict on it."""
     made.write_database(folder / "database.db")
     job = MappingJob(
         frames=folder, denoised=folder, out=folder, groups=(CameraGroup(made.names, 600, 400),),
@@ -22,62 +25,132 @@ def prepare(made, folder, **changes):
         max_features=2000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
         scale_between=None, max_minutes=5.0, seed=0, threads=1, sharpness={}, times={})
     job, model = replace(job, **changes), made.model()
-    return job, model, examine(model, job.database, job.names)
+    return job, ModelCandidate(model, examine(model, job.database, job.names), (), {})
 
 
-def test_of_a_broken_walk_the_longer_side_is_kept(tmp_path):
+def cut(model, names):
+    """A copy of a model with some images alone."""
+    part = pycolmap.Reconstruction(model)
+    for index in list(part.reg_image_ids()):
+        if part.image(index).name not in names:
+            part.deregister_frame(part.image(index).frame_id)
+    return part
+
+
+def held(parts):
+    return [list_registered(part.model) for part in parts]
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Parts of three frames are worth to be delivered."""
+    monkeypatch.setattr(trusted_part, "FEWEST", 3)
+
+
+@pytest.mark.usefixtures("small")
+def test_of_a_broken_walk_both_sides_are_delivered_the_longer_first(tmp_path):
     made = broken_walk(at=10)
-    job, model, verdict = prepare(made, tmp_path)
-    part = keep_trusted_part(job, model, verdict)
-    assert part is not None
-    assert list_registered(part.candidate.model) == list(made.names[:10])
-    assert part.candidate.verdict.trusted
-    assert part.left_out == tuple(made.names[10:])
-    for fact in ("broken", "10 of 16 frames"):
-        assert fact in part.sentence
-    assert len(list_registered(model)) == 16  # the model itself is left alone
-    # The cameras of the part stand as in truth, up to the scale.
-    steps, truth = (np.linalg.norm(np.diff(centers, axis=0), axis=1) for centers in (
-        [part.candidate.model.find_image_with_name(name).projection_center()
-         for name in made.names[:10]],
-        [pose.inverse().translation for pose in made.poses[:10]]))
-    np.testing.assert_allclose(steps / steps.mean(), truth / truth.mean(), rtol=1e-3)
+    job, whole = prepare(made, tmp_path)
+    longer, shorter = deliver_parts(job, whole)
+    assert held([longer, shorter]) == [list(made.names[:10]), list(made.names[10:])]
+    assert longer.verdict.trusted
+    assert shorter.verdict.trusted
+    assert len(list_registered(whole.model)) == 16  # the model itself is left alone
+    # The cameras of each part stand as in truth, up to the scale.
+    for part, inside in ((longer, slice(10)), (shorter, slice(10, 16))):
+        steps, truth = (np.linalg.norm(np.diff(centers, axis=0), axis=1) for centers in (
+            [part.model.find_image_with_name(name).projection_center()
+             for name in made.names[inside]],
+            [pose.inverse().translation for pose in made.poses[inside]]))
+        np.testing.assert_allclose(steps / steps.mean(), truth / truth.mean(), rtol=1e-3)
 
 
-def test_of_two_places_laid_over_each_other_one_is_kept(tmp_path):
+def test_a_part_of_few_frames_is_delivered_only_as_the_largest(tmp_path):
+    made = broken_walk(at=10)
+    job, whole = prepare(made, tmp_path)
+    assert held(deliver_parts(job, whole)) == [list(made.names[:10])]
+
+
+@pytest.mark.usefixtures("small")
+def test_two_places_laid_over_each_other_are_two_parts(tmp_path):
     made = doubled_place()
-    job, model, verdict = prepare(made, tmp_path)
-    part = keep_trusted_part(job, model, verdict)
-    assert part is not None
-    assert set(list_registered(part.candidate.model)) in (
-        set(made.names[:6]), set(made.names[6:]))
+    job, whole = prepare(made, tmp_path)
+    assert sorted(held(deliver_parts(job, whole))) == [made.names[:6], made.names[6:]]
 
 
-def test_a_part_that_is_too_small_is_refused_with_its_size(tmp_path):
-    job, model, verdict = prepare(broken_walk(at=10), tmp_path, min_registered=0.7)
-    with pytest.raises(SfmError, match="has 10 of 16 frames") as refused:
-        keep_trusted_part(job, model, verdict)
+@pytest.mark.usefixtures("small")
+def test_other_models_of_the_mapper_are_parts_without_what_a_larger_one_holds(tmp_path):
+    made = walk()
+    job, whole = prepare(made, tmp_path)
+    first, other, few = (cut(whole.model, made.names[start:end])
+                         for start, end in ((0, 9), (7, 16), (13, 16)))
+    whole = replace(whole, model=first, verdict=examine(first, job.database, job.names))
+    assert held(deliver_parts(job, whole, [few, other])) == [made.names[:9], made.names[9:]]
+
+
+@pytest.mark.usefixtures("small")
+def test_another_model_is_cut_where_it_is_broken(tmp_path):
+    made = broken_walk(at=10)
+    job, whole = prepare(made, tmp_path)
+    first, other = cut(whole.model, made.names[:3]), cut(whole.model, made.names[3:])
+    whole = replace(whole, model=first, verdict=examine(first, job.database, job.names))
+    assert held(find_parts(job, whole, [other])) == [
+        made.names[3:10], made.names[10:], made.names[:3]]
+
+
+@pytest.mark.usefixtures("small")
+def test_a_model_without_points_gets_those_that_the_matches_give(tmp_path):
+    made = walk()
+    job, whole = prepare(made, tmp_path)
+    first = cut(whole.model, made.names[:9])
+    whole = replace(whole, model=first, verdict=examine(first, job.database, job.names))
+    other = build_posed_model(job.database, None, dict(zip(
+        made.names[9:], made.poses[9:], strict=True)))
+    assert not other.num_points3D()
+    _, part = find_parts(job, whole, [other])
+    assert held([part]) == [made.names[9:]]
+    assert part.model.num_points3D() > 500
+
+
+def test_parts_that_are_too_small_together_are_refused_with_their_size(tmp_path):
+    job, whole = prepare(broken_walk(at=10), tmp_path, min_registered=0.7)
+    with pytest.raises(SfmError, match=r"hold 10 of 16 frames together, 10 \(000000") as refused:
+        deliver_parts(job, whole)
     assert "--min-registered" in refused.value.hint
+
+
+@pytest.mark.usefixtures("small")
+def test_parts_count_together(tmp_path):
+    job, whole = prepare(broken_walk(at=10), tmp_path, min_registered=0.7)
+    assert len(deliver_parts(job, whole)) == 2
+
+
+def test_a_broken_model_that_shall_not_be_cut_is_refused(tmp_path):
+    job, whole = prepare(broken_walk(at=10), tmp_path, partial=False)
+    with pytest.raises(SfmError, match="broken"):
+        deliver_parts(job, whole)
 
 
 @pytest.mark.parametrize("changes", [{"partial": False}, {"accept_weak": True}])
 def test_a_model_that_shall_stay_whole_is_not_cut(tmp_path, changes):
-    job, model, verdict = prepare(broken_walk(at=10), tmp_path, **changes)
-    assert keep_trusted_part(job, model, verdict) is None
+    made = broken_walk(at=10) if "accept_weak" in changes else walk()
+    job, whole = prepare(made, tmp_path, **changes)
+    part, = deliver_parts(job, whole, [whole.model])
+    assert part is whole
 
 
 def test_a_sound_model_is_not_cut(tmp_path):
-    job, model, verdict = prepare(walk(), tmp_path)
-    assert keep_trusted_part(job, model, verdict) is None
+    job, whole = prepare(walk(), tmp_path)
+    assert deliver_parts(job, whole) == [whole]
 
 
+@pytest.mark.usefixtures("small")
 def test_a_model_broken_twice_is_cut_twice(tmp_path):
     made = walk(
         motions={**dict.fromkeys(range(3, 11), moved(1, 2, 0, degrees=20)),
                  **dict.fromkeys(range(11, 16), moved(-2, 3, 1, degrees=-20))},
         landmark=lambda image, point: (
             point if point < 60 else ((image >= 3) + (image >= 11), point)))
-    job, model, verdict = prepare(made, tmp_path)
-    part = find_trusted_part(job, model, verdict)
-    assert part is not None
-    assert list_registered(part.model) == list(made.names[3:11])
+    job, whole = prepare(made, tmp_path)
+    assert held(find_parts(job, whole)) == [
+        made.names[3:11], made.names[11:], made.names[:3]]

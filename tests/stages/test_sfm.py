@@ -146,7 +146,7 @@ def test_undistortion_keeps_pixels_and_has_no_blank_border(mapped):
 def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
     out, _, _ = mapped
     assert sorted(path.name for path in out.iterdir()) == [
-        "database.db", "log.txt", "model", "sparse", "steps.json", "undistorted", "verdict.json",
+        "database.db", "log.txt", "parts", "sparse", "steps.json", "undistorted", "verdict.json",
         "world.json"]
     assert sorted(path.name for path in (out / "undistorted").iterdir()) == [
         "denoised", "images", "sparse"]

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,8 +13,8 @@ from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, SfmError
 from recon_cli.io.records import Frame, FrameList, Group
-from recon_cli.sfm import database
-from recon_cli.sfm.job import StepLog
+from recon_cli.sfm import database, time_estimate
+from recon_cli.sfm.job import CameraGroup, StepLog
 from recon_cli.sfm.segments import SegmentRuns
 from recon_cli.stages import sfm
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary
@@ -39,14 +40,46 @@ def test_a_camera_that_turns_on_the_spot_is_not_taken_for_a_success(tmp_path, pa
 
 @pytest.mark.parametrize(("count", "given", "limit"), [
     (75, None, 20), (100, None, 20), (292, None, 58.4), (292, 5.0, 5.0)])
-def test_the_time_limit_follows_the_frames_and_is_told_in_advance(count, given, limit):
-    notices = []
+def test_the_time_limit_follows_the_frames(count, given, limit):
     frames = FrameList("photos", (Group("a", 9, 9),), tuple(
         Frame(f"{index:06d}.png", None, "a", None, held_out=False) for index in range(count)))
-    ctx = SimpleNamespace(notice=notices.append, threads=2)
-    assert sfm._time_limit(SfmConfig(max_minutes=given), frames, ctx) == pytest.approx(limit)
-    assert len(notices) == (limit > 20)
-    assert all("up to 58 minutes" in notice for notice in notices)
+    assert sfm._time_limit(SfmConfig(max_minutes=given), frames) == pytest.approx(limit)
+
+
+def told_times(tmp_path, monkeypatch, *, frames=300, minutes=58.4, slowness=1.0, **changes):
+    """What is said before a capture is mapped, on a machine that is so many times as slow."""
+    monkeypatch.setattr(time_estimate, "measure_slowness", lambda _: slowness)
+    notices = []
+    names = tuple(f"{index:06d}.png" for index in range(frames))
+    job = SimpleNamespace(**{
+        "out": tmp_path, "names": names, "groups": (CameraGroup(names, 640, 360),), "pairs": "auto",
+        "known_poses": False, "tracks": tmp_path, "max_minutes": minutes, **changes})
+    sfm._tell_time(SfmConfig(), job, SimpleNamespace(notice=notices.append, threads=2))
+    return notices
+
+
+def test_one_time_is_told_before_a_capture_is_mapped(tmp_path, monkeypatch):
+    notice, = told_times(tmp_path, monkeypatch)
+    assert_facts(notice, "300 frames", "minutes")
+    assert "--max-minutes" not in notice
+    assert len(re.findall(r"\d+(?:\.\d+)?", notice)) == 2  # the frames, and one time
+
+
+def test_the_limit_is_told_where_it_is_near(tmp_path, monkeypatch):
+    notice, = told_times(tmp_path, monkeypatch, minutes=4.0)
+    assert_facts(notice, "4", "--max-minutes")
+
+
+def test_a_slow_machine_is_told_more(tmp_path, monkeypatch):
+    times = [float(re.search(r"about ([\d.]+) minute", notice)[1]) for slowness in (1.0, 4.0)
+             for notice in told_times(tmp_path, monkeypatch, slowness=slowness)]
+    assert times[1] == pytest.approx(4 * times[0], rel=0.05)
+
+
+@pytest.mark.parametrize("changes", [
+    {"frames": 40}, {"known_poses": True}, {"pairs": "exhaustive"}])
+def test_what_is_short_or_not_known_is_not_told(tmp_path, monkeypatch, changes):
+    assert told_times(tmp_path, monkeypatch, **changes) == []
 
 
 def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):
@@ -100,7 +133,7 @@ def test_the_stretches_that_are_left_out_are_told_with_their_times(caplog):
 
 def test_models_that_are_left_aside_are_told(caplog):
     text = told(caplog, models=(49, 3), apart=(("5.png", "6.png", "7.png"),))
-    assert_facts(text, 49, "kept", 3, "frames", "22.5", "6.png to 7.png")
+    assert_facts(text, "left aside", 3, "frames", "22.5", "6.png to 7.png")
 
 
 def test_frames_without_a_camera_are_told(caplog):
@@ -162,11 +195,13 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted(tmp_path):
         Frame(name, None, "a.mp4", None, held_out=name in ("0.png", "4.png")) for name in names))
     known = summaries.SFM.to_json()
     log = StepLog(tmp_path)
-    log.finish("model", {**known, "registered": names[:3], "left_out": names[3:5], "seconds": 1.0})
+    part = {"registered": names[:3], "points": 9, "lines": []}
+    log.finish("model", {
+        **known, "parts": [part], "left_out": names[3:5], "notes": [], "seconds": 1.0})
     log.finish("sparse", {**known["world"], "seconds": 1.0})
     log.finish("undistorted", {"cameras": [], "seconds": 1.0})
     steps = ("model", "sparse", "undistorted")
-    job = SimpleNamespace(out=tmp_path, steps=steps, segments=())
+    job = SimpleNamespace(out=tmp_path, steps=steps, segments=(), part=1)
     summary = sfm._summary(frames, SegmentRuns(job, {}, {}))
     assert summary.left_out == ("3.png", "4.png")
     assert summary.unregistered == ("3.png", "4.png", "5.png")  # no mapper found a place for 5

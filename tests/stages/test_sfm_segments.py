@@ -111,12 +111,12 @@ def test_a_killed_segment_is_mapped_again_and_a_killed_run_goes_on(mapped, room,
     while not (noted(out / "segments" / "0", "model") and noted(out / "segments" / "1", "model")):
         assert parent.poll() is None, "the run ended with its killed segment"
         time.sleep(0.02)
-    kept = (out / "segments" / "0" / "model" / "images.bin").stat().st_mtime_ns
+    kept = (out / "segments" / "0" / "parts" / "1" / "images.bin").stat().st_mtime_ns
     children = psutil.Process(parent.pid).children(recursive=True)
     parent.kill()
     parent.wait()
     psutil.wait_procs(children, timeout=20)
-    assert (out / "segments" / "0" / "model" / "images.bin").stat().st_mtime_ns == kept
+    assert (out / "segments" / "0" / "parts" / "1" / "images.bin").stat().st_mtime_ns == kept
     summary = run(room, out, max_features=FEATURES, segments="2")
     assert summary.registered == COUNT
     for name in ("cameras.bin", "images.bin", "points3D.bin"):

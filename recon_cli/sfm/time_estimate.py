@@ -1,0 +1,114 @@
+"""How long finding the cameras takes, told before it starts.
+
+It follows from the frames, their size and the way they go, and from how fast this machine is right
+now: a piece of work of the same kind, for a fraction of a second on all threads. That a model falls
+short, so that another mapper is tried, cannot be known before; it is told when it happens.
+`tests/bench/bench_sfm_estimate.py` compares with what finished workspaces took, and fits `COSTS`.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+
+import cv2
+import numpy as np
+
+# Seconds of the piece of work on the machine of `COSTS`, on a core that has nothing else to do.
+PIECE_SECONDS = 0.015
+TRIES = 15
+BLURS = (1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
+LEAST_TOLD = 60.0  # seconds that are worth a notice
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What is known of a capture before it is mapped."""
+
+    frames: int
+    megapixels: float  # of a frame
+    tracked: bool  # the frames are those of a walk, linked by tracks
+    segments: int = 1  # that are mapped apart
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Seconds of one core for a frame."""
+
+    walk: float  # to find, match and undistort the features of a walk's frame
+    walk_megapixel: float  # the same, for each megapixel of it
+    walk_mapping: float  # to map it; of one core, whatever their number
+    photo: float  # the same three of photos
+    photo_megapixel: float
+    photo_mapping: float
+    split: float  # to match it with all that look alike, where photos are cut into segments
+    join: float  # to join segments; of one core
+
+
+# Fitted to the seconds of two idle cores in docs/benchmarks.md and docs/scaling.md.
+COSTS = Costs(
+    walk=0.46, walk_megapixel=0.48, walk_mapping=0.15,
+    photo=0.28, photo_megapixel=0.38, photo_mapping=0.17, split=1.0, join=0.2)
+OVERLAP = 1 / 6  # of a segment's frames, which are mapped in the next one as well
+
+
+def list_work(work: Workload) -> dict[str, tuple[float, bool]]:
+    """Returns how often each of `Costs` is paid, and whether all cores share it."""
+    kind = "walk" if work.tracked else "photo"
+    apart = work.segments > 1
+    frames = work.frames * (1 + OVERLAP) if apart else float(work.frames)
+    items = {kind: (frames, True), f"{kind}_megapixel": (frames * work.megapixels, True),
+             f"{kind}_mapping": (frames, apart)}
+    if apart:
+        items["join"] = (float(work.frames), False)
+        if not work.tracked:
+            items["split"] = (float(work.frames), True)
+    return items
+
+
+def expected_seconds(
+    work: Workload, threads: int, *, costs: Costs = COSTS, slowness: float = 1.0
+) -> float:
+    """Returns about how long it takes; `slowness` multiplies the seconds of the machine of COSTS.
+    """
+    prices: dict[str, float] = asdict(costs)
+    return slowness * sum(
+        count * prices[name] / (threads if shared else 1)
+        for name, (count, shared) in list_work(work).items())
+
+
+def measure_slowness(threads: int) -> float:
+    """Returns how many times as long this machine takes now as that of COSTS, on all threads."""
+    image = np.random.default_rng(0).random((480, 640), np.float32)
+
+    def take(_: int) -> float:
+        start = time.monotonic()
+        for sigma in BLURS:  # as for the octaves of features
+            cv2.GaussianBlur(image, (0, 0), sigma)
+        np.sort(image.ravel())
+        return time.monotonic() - start
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            seconds = list(pool.map(take, range(TRIES * threads)))
+    finally:
+        cv2.setNumThreads(before)
+    return float(np.mean(seconds)) / PIECE_SECONDS
+
+
+def format_minutes(seconds: float) -> str:
+    """Returns a time that is known to a third, in minutes."""
+    minutes = seconds / 60
+    text = f"{minutes:,.0f}" if minutes >= 9.95 else f"{minutes:.1f}".removesuffix(".0")
+    return f"{text} minute{'s' if text != '1' else ''}"
+
+
+def tell_seconds(work: Workload, threads: int) -> float | None:
+    """Returns the seconds that are told in advance; None where they are too few to be told."""
+    seconds = expected_seconds(work, threads)
+    if seconds > LEAST_TOLD / 2:  # else the measure is not worth its time
+        seconds *= measure_slowness(threads)
+    return seconds if seconds >= LEAST_TOLD else None

@@ -1,0 +1,65 @@
+"""The time of sfm that is told: the costs of each kind of capture, and how fast a machine is."""
+
+import time
+
+import pytest
+
+from recon_cli.sfm import time_estimate
+from recon_cli.sfm.time_estimate import (
+    COSTS,
+    PIECE_SECONDS,
+    Costs,
+    Workload,
+    expected_seconds,
+    format_minutes,
+    measure_slowness,
+    tell_seconds,
+)
+
+ONES = Costs(walk=1, walk_megapixel=1, walk_mapping=1, photo=10, photo_megapixel=10,
+             photo_mapping=10, split=100, join=1000)
+
+
+def test_a_walk_pays_for_its_frames_and_pixels_on_all_cores_and_for_its_mapping_on_one():
+    work = Workload(60, 2.0, tracked=True)
+    assert expected_seconds(work, 1, costs=ONES) == 60 * (1 + 2 + 1)
+    assert expected_seconds(work, 4, costs=ONES) == 60 * (3 / 4 + 1)
+
+
+def test_segments_are_mapped_at_once_and_joined_on_one_core():
+    work = Workload(60, 2.0, tracked=True, segments=3)
+    assert expected_seconds(work, 4, costs=ONES) == pytest.approx(70 * 4 / 4 + 60 * 1000)
+    photos = Workload(60, 2.0, tracked=False, segments=3)
+    assert expected_seconds(photos, 4, costs=ONES) == pytest.approx(
+        70 * 40 / 4 + 60 * 100 / 4 + 60 * 1000)
+
+
+# Seconds of two idle cores in docs/benchmarks.md and docs/scaling.md.
+@pytest.mark.parametrize(("frames", "megapixels", "tracked", "segments", "took"), [
+    (76, 0.204, True, 1, 35), (75, 0.204, True, 1, 30), (100, 0.92, True, 1, 60),
+    (100, 0.518, True, 1, 74), (52, 0.309, True, 1, 26), (90, 0.41, True, 1, 43),
+    (30, 0.307, True, 1, 12), (50, 2.07, False, 1, 35), (70, 2.07, False, 1, 47),
+    (97, 2.76, False, 1, 71), (170, 0.48, False, 1, 68), (300, 0.23, True, 3, 153),
+    (613, 0.23, True, 5, 379), (1200, 0.23, True, 10, 898)])
+def test_what_captures_took_is_told_within_a_third(frames, megapixels, tracked, segments, took):
+    told = expected_seconds(Workload(frames, megapixels, tracked, segments), 2, costs=COSTS)
+    assert told == pytest.approx(took, rel=1 / 3)
+
+
+def test_a_machine_is_measured_in_a_fraction_of_a_second():
+    start = time.process_time()
+    slowness = measure_slowness(2)
+    assert time.process_time() - start < 100 * PIECE_SECONDS * time_estimate.TRIES
+    assert 0.05 < slowness < 1000
+
+
+def test_a_short_capture_is_told_nothing_and_not_measured(monkeypatch):
+    monkeypatch.setattr(time_estimate, "measure_slowness", None)
+    assert tell_seconds(Workload(20, 0.2, tracked=True), 2) is None
+
+
+@pytest.mark.parametrize(("seconds", "text"), [
+    (60, "1 minute"), (75, "1.2 minutes"), (596, "9.9 minutes"), (598, "10 minutes"),
+    (7000, "117 minutes")])
+def test_minutes_are_told_as_well_as_they_are_known(seconds, text):
+    assert format_minutes(seconds) == text

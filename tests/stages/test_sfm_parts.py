@@ -1,0 +1,160 @@
+"""A capture in two parts: the larger is placed, and the other taken without mapping again."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from facts import assert_facts
+from made_model import MadeModel, along, wall
+from sfm_inputs import write_inputs
+
+from recon_cli.config.stages import SfmConfig
+from recon_cli.context import EarlierResult, StageContext, StageInputs
+from recon_cli.errors import ConfigError, SfmError
+from recon_cli.io.colmap import read_images
+from recon_cli.sfm import database
+from recon_cli.sfm.job import StepLog
+from recon_cli.stages import sfm
+from recon_cli.workspace.summaries import SfmSummary
+
+# Two walks along two walls that have nothing in common.
+LARGE, SMALL = 24, 20
+MADE = MadeModel(
+    np.concatenate([wall(-4, 16, count=900), wall(96, 114, count=900, seed=1)]),
+    along([*np.arange(LARGE) * 0.5, *(np.arange(SMALL) * 0.5 + 100)]))
+PARTS = (tuple(MADE.names[:LARGE]), tuple(MADE.names[LARGE:]))
+HELD_OUT = ["000000.png", "000030.png", "000040.png"]
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """The folders of ingest and denoise; the pictures show nothing."""
+    images = {name: np.full((400, 600, 3), 90, np.uint8) for name in MADE.names}
+    return write_inputs(tmp_path_factory.mktemp("base"), images, fps=2, held_out=HELD_OUT)
+
+
+def matched(out):
+    """Leaves what a run leaves that was killed after it had matched the frames."""
+    out.mkdir(parents=True)
+    database.seal(MADE.write_database(out / "database.db"))
+    log = StepLog(out)
+    for step in ("features", "matches"):
+        log.finish(step, {"rows": 0, "seconds": 3.0, "cpu_seconds": 2.0})
+    return out
+
+
+def run(base, out, *, earlier=None, **options):
+    """Runs the stage on what is there; all pairs are matched."""
+    out.mkdir(exist_ok=True)
+    inputs = StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"}, earlier=earlier)
+    return sfm.run(SfmConfig(pairs="exhaustive", **options), inputs, out, StageContext(threads=1))
+
+
+def result_of(mapped, **changes):
+    out, summary = mapped
+    return EarlierResult(out, summary.to_json(), **changes)
+
+
+@pytest.fixture(scope="module")
+def mapped(base, tmp_path_factory):
+    """(folder, summary) of a finished result."""
+    out = matched(tmp_path_factory.mktemp("mapped") / "out")
+    return out, run(base, out)
+
+
+def placed(out):
+    return tuple(name for name, *_ in read_images(out / "sparse" / "images.bin"))
+
+
+def test_the_largest_part_is_placed_and_the_other_one_is_kept(mapped):
+    out, summary = mapped
+    assert tuple(part.names for part in summary.parts) == PARTS
+    assert summary.part == 1
+    assert summary.registered == LARGE
+    assert placed(out) == PARTS[0]
+    assert sorted(path.name for path in (out / "parts").iterdir()) == ["1", "2"]
+    assert {tuple(name for name, *_ in read_images(out / "parts" / number / "images.bin"))
+            for number in "12"} == set(PARTS)
+    assert summary.unregistered == PARTS[1]
+    assert summary.unregistered_held_out == ("000030.png", "000040.png")
+    assert not summary.apart
+    assert not summary.left_out
+    assert summary.trusted
+    assert SfmSummary.from_json(json.loads(json.dumps(summary.to_json()))) == summary
+
+
+def test_the_other_part_is_taken_without_mapping_again(mapped, base, tmp_path):
+    out, summary = mapped
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    taken = run(base, tmp_path / "out", earlier=result_of(mapped), part=2)
+    assert placed(tmp_path / "out") == PARTS[1]
+    assert taken.part == 2
+    assert taken.parts == summary.parts
+    assert taken.registered == SMALL
+    assert taken.unregistered == PARTS[0]
+    assert taken.unregistered_held_out == ("000000.png",)
+    assert {step: taken.seconds[step] for step in ("features", "matches", "model")} == {
+        step: summary.seconds[step] for step in ("features", "matches", "model")}
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    assert verdict["registered"] == SMALL
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    # and back again: the bytes of the first run
+    again = run(base, tmp_path / "back", earlier=result_of((tmp_path / "out", taken)))
+    assert again == replace(summary, seconds=again.seconds, cpu_seconds=again.cpu_seconds,
+                            world=again.world)
+    for folder in ("parts", "sparse", "undistorted"):
+        for path in (out / folder).rglob("*.bin"):
+            assert (tmp_path / "back" / path.relative_to(out)).read_bytes() == path.read_bytes()
+
+
+def test_axes_are_chosen_anew_without_mapping_again(mapped, base, tmp_path):
+    taken = run(base, tmp_path / "out", earlier=result_of(mapped), gravity="off")
+    assert taken.seconds["model"] == mapped[1].seconds["model"]
+    assert not taken.world.evidence.up_found
+
+
+def test_a_part_that_there_is_not_is_refused_with_those_that_there_are(mapped, base, tmp_path):
+    with pytest.raises(ConfigError) as refused:
+        run(base, tmp_path / "out", earlier=result_of(mapped), part=3)
+    assert_facts(refused.value.message, "part is 3", f"1 of {LARGE}", f"2 of {SMALL}")
+    assert "recon sfm --part 2" in refused.value.hint
+
+
+def test_a_run_that_was_killed_while_it_took_the_parts_takes_them_again(mapped, base, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copytree(mapped[0] / "parts" / "1", out / "parts" / "1")  # no log yet
+    assert run(base, out, earlier=result_of(mapped), part=2).part == 2
+    assert placed(out) == PARTS[1]
+    (out / "undistorted" / "sparse" / "images.bin").unlink()  # and once it was placed
+    inode = (out / "sparse" / "images.bin").stat().st_ino
+    run(base, out, earlier=result_of(mapped), part=2)
+    assert (out / "undistorted" / "sparse" / "images.bin").exists()
+    assert (out / "sparse" / "images.bin").stat().st_ino == inode
+
+
+@pytest.mark.parametrize("lost", [
+    {"changed": frozenset({"parts/2/points3D.bin"})}, {"missing": frozenset({"parts/1/rigs.bin"})},
+    {"changed": frozenset({"steps.json"})}])
+def test_parts_that_were_changed_are_not_taken(mapped, base, tmp_path, lost):
+    out = matched(tmp_path / "out")
+    taken = run(base, out, earlier=result_of(mapped, **lost), part=2)  # maps by itself
+    assert taken.seconds["model"] != mapped[1].seconds["model"]
+    assert placed(out) == PARTS[1]
+
+
+def test_parts_that_hold_too_few_frames_together_are_refused(base, tmp_path):
+    assert len(run(base, matched(tmp_path / "few"), min_registered=1.0).parts) == 2
+    with pytest.raises(SfmError, match=f"Only {LARGE} of {LARGE + SMALL} frames"):
+        run(base, matched(tmp_path / "whole"), min_registered=0.6, partial=False)
+
+
+def test_the_notices_name_each_part_and_how_to_take_another_one(mapped, base, tmp_path, caplog):
+    run(base, tmp_path / "out", earlier=result_of(mapped), part=2)
+    for facts in (("2 parts", "this is part 2"), ("recon sfm --part 1", "recon report"),
+                  ("Part 1", f"{LARGE} of 44 frames", "000000.png to 000023.png (0.0 to 11.5 s)"),
+                  ("Part 2", f"{SMALL} of 44 frames", "000024.png to 000043.png")):
+        assert_facts(caplog.text, *facts)
+    assert "000001.png has no camera" not in caplog.text  # it has one in the other part
