@@ -25,8 +25,9 @@ from recon_cli.sfm.floor_heights import SPREAD, compare_heights, measure_heights
 # and of the usual depth, and so many cameras: on a shorter one the camera stands still, or turns.
 REACH, DEPTHS, LEAST = 0.2, 0.5, 10
 # Errors of tracks and of the lens are shared by many observations and do not average out: scales
-# were off by 10 to 20 times what independent errors of one pixel's fraction would leave.
-SHARED_ERRORS = 15.0
+# were off by up to 20 times what independent errors would leave on a walk with a cheap lens, and by
+# about as much as that in rendered rooms.
+SHARED_ERRORS = 10.0
 MAX_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_scale_breaks.py`
 DOUBTFUL = MAX_ERROR / 3  # the floor is looked at from here on
 LOSS_SCALE = 0.5  # of Cauchy's loss, times the mean error, as in `mapper.sharpen`
