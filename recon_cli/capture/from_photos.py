@@ -47,8 +47,8 @@ from recon_cli.workspace import atomic
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
 SEQUENCE = "sequence.json"  # which photos follow each other, for the next run; beside a scan
-# Frames that somebody has picked from a video are worth more than the motion between them says: so
-# many are kept of any folder, as all pairs of them are matched in minutes.
+# Frames that are kept of any folder, however little the camera moves: somebody may have picked
+# them, and all pairs of so many are matched in minutes.
 MIN_KEPT = 100
 Record = tuple[FrameCandidate, ...]  # what became of every photo, in order
 
@@ -206,9 +206,9 @@ def _choose_followed(
     config: IngestConfig, source: _PhotoSource, sequence: PhotoSequence, ctx: IngestContext
 ) -> tuple[dict[int, FrameCandidate], Tracks]:
     """Returns what becomes of the photos of a sequence, by place, and the tracks through them."""
-    video = judge(config, source.path, sequence.scan, ctx, least=config.frames or MIN_KEPT)
     count = config.frames or frame_selection.automatic_count(
-        video.lengths, most=config.max_frames, least=MIN_KEPT)
+        frame_selection.path_length(sequence.scan.motion), most=config.max_frames, least=MIN_KEPT)
+    video = judge(config, source.path, sequence.scan, ctx, least=count)
     chosen = frame_selection.choose_frames(
         video.lengths, video.scan.sharpness, video.distinct, count,
         bridges=video.judgement.bridges)
