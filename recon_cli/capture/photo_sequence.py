@@ -36,6 +36,9 @@ from recon_cli.workspace import atomic
 # all photos of a sequence. .94 to 1 of them do in every third and fifth frame of six walks, .56 in
 # photos of lockers in the order of their names, .03 to .20 in any order.
 FOLLOWED, SEQUENCE_SHARE = 0.1, 0.8
+# The same of photos that a camera has named. It is .7 in the median of photos that were taken in
+# small steps around a table, .85 to .95 in all frames of a video.
+CAMERA_FOLLOWED = 0.8
 # Photos in a row that may belong to another scene; more are a walk of their own.
 MOST_ASTRAY = 3
 FEW_SHARE = 0.1  # of the photos: at most so many are looked at as out of place
@@ -116,7 +119,7 @@ def list_runs(photos: Sequence[Photo]) -> list[list[int]]:
     """Returns the photos whose names may be in the order in which they were taken, by place.
 
     Those of a run are of one camera and folder, and their names differ in numbers alone. So few
-    that none would be left out are no run, nor are those that were taken one by one.
+    that none would be left out are no run, nor are those that were taken more than a second apart.
     """
     camera = {photo.name: index for index, group in enumerate(group_photos(photos))
               for photo in group.photos}
@@ -126,18 +129,23 @@ def list_runs(photos: Sequence[Photo]) -> list[list[int]]:
         if "#" in pattern and not photo.is_raw:
             home = str(PurePosixPath(photo.name).parent)
             runs.setdefault((home, pattern, camera[photo.name]), []).append(place)
-    return [run for run in runs.values()
-            if len(run) > MIN_AUTOMATIC and not _taken_singly([photos[place] for place in run])]
+    return [run for run in runs.values() if len(run) > MIN_AUTOMATIC and (
+        _usual_seconds([photos[place] for place in run]) or 0) <= MAX_SECONDS]
 
 
-def _taken_singly(photos: Sequence[Photo]) -> bool:
-    """Returns whether photos were taken more than a second apart, or are named by a camera."""
+def _usual_seconds(photos: Sequence[Photo]) -> float | None:
+    """Returns the time from one photo to the next; None where most do not say when they are of."""
     times = [time for photo in photos if (time := _read_time(photo)) is not None]
-    if 2 * len(times) > len(photos):
-        gaps = [abs((after - before).total_seconds()) / SPAN
-                for before, after in zip(times, times[SPAN:], strict=False)]
-        return float(np.median(gaps)) > MAX_SECONDS
-    return all(_CAMERA_NAME.fullmatch(photo.path.stem) for photo in photos)
+    if 2 * len(times) <= len(photos):
+        return None
+    return float(np.median([abs((after - before).total_seconds()) / SPAN
+                            for before, after in zip(times, times[SPAN:], strict=False)]))
+
+
+def _least_followed(photos: Sequence[Photo]) -> float:
+    """Returns the share of its corners that one photo must share with the next."""
+    by_camera = all(_CAMERA_NAME.fullmatch(photo.path.stem) for photo in photos)
+    return CAMERA_FOLLOWED if by_camera and _usual_seconds(photos) is None else FOLLOWED
 
 
 def _read_time(photo: Photo) -> datetime | None:
@@ -167,7 +175,8 @@ def _scan_run(
             with suppress(InputError):  # it is named when it is to be stored
                 yield place, read(place)
 
-    measured = measure_sequence(grays(run), len(run), step=bar.advance)
+    least = _least_followed([photos[place] for place in run])
+    measured = measure_sequence(grays(run), len(run), least=least, step=bar.advance)
     if measured is None:
         return None
     astray = [measured.places[index] for index in measured.list_astray()]
@@ -175,7 +184,8 @@ def _scan_run(
     strangers = find_strangers(astray, others, read) if others else []
     if strangers:
         measured = measure_sequence(
-            grays([place for place in measured.places if place not in strangers]), len(run))
+            grays([place for place in measured.places if place not in strangers]), len(run),
+            least=least)
         assert measured is not None, "a sequence is one without what interrupts it"
     photo = photos[measured.places[0]]
     return PhotoSequence(
@@ -185,7 +195,8 @@ def _scan_run(
 class MeasuredPhotos:
     """What is measured of gray photos, one after the other, as of the frames of a video."""
 
-    def __init__(self) -> None:
+    def __init__(self, least: float = FOLLOWED) -> None:
+        self._least = least
         self.places: list[int] = []
         self.follows: list[bool] = []  # whether a photo shows what the one before shows
         self._meter, self._tracker = MotionMeter(), Tracker()
@@ -197,7 +208,7 @@ class MeasuredPhotos:
         self._tracker.advance(gray)
         if before is not None:
             shared = np.intersect1d(before, self._tracker.corners[0], assume_unique=True)
-            self.follows.append(bool(len(before)) and len(shared) >= FOLLOWED * len(before))
+            self.follows.append(bool(len(before)) and len(shared) >= self._least * len(before))
         self.places.append(place)
         self._rows.append(
             (measure_sharpness(gray), self._meter.advance(gray), measure_exposure(gray)))
@@ -225,13 +236,14 @@ class MeasuredPhotos:
 
 def measure_sequence(
     grays: Iterator[tuple[int, NDArray[np.uint8]]], count: int,
-    *, step: Callable[[], object] = lambda: None,
+    *, least: float = FOLLOWED, step: Callable[[], object] = lambda: None,
 ) -> MeasuredPhotos | None:
     """Returns the measures of up to `count` gray photos if they follow each other, else None.
 
-    It stops reading as soon as too many do not; `step` is called for each.
+    Neighbours share at least the share `least` of their corners. It stops reading as soon as too
+    many do not; `step` is called for each.
     """
-    measured = MeasuredPhotos()
+    measured = MeasuredPhotos(least)
     for place, gray in grays:
         step()
         measured.add(place, gray)
