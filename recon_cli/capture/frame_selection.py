@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
@@ -117,12 +117,19 @@ def judge_frames(
     exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
     whole: NDArray[np.bool_],  # [F], False for damaged frames
     share: float,
+    least: int = 0,
 ) -> Judgement:
-    """Returns which frames may be chosen; they reach `share` of the sharpness around them."""
+    """Returns which frames may be chosen: those that reach `share` of the sharpness around them.
+
+    Blurred ones are used to close gaps, and where there are fewer than `least` otherwise.
+    """
     sharp, exposed = sharp_frames(sharpness, share), well_exposed(exposures)
     filled = has_content(exposures)
     good, possible = sharp & exposed & filled, whole & filled
     usable = bridge_gaps(lengths, sharpness, good, possible)
+    blurred = np.flatnonzero(possible & exposed & ~usable)
+    sharpest = np.argsort(-sharpness[blurred], kind="stable")
+    usable[blurred[sharpest[:max(0, least - int(usable.sum()))]]] = True
     reasons = np.select(
         [usable, ~whole, ~(exposed & filled)], ["", Reason.DAMAGED, Reason.CLIPPED], Reason.BLURRED)
     refused = tuple(Reason(reason) if reason else None for reason in reasons.tolist())
@@ -200,9 +207,11 @@ def path_length(motion: NDArray[np.float64]) -> NDArray[np.float64]:  # [F]
     return np.cumsum(steps)
 
 
-def automatic_count(lengths: NDArray[np.float64], *, most: int) -> int:
+def automatic_count(
+    lengths: NDArray[np.float64], *, most: int, least: int = MIN_AUTOMATIC
+) -> int:
     """Returns how many frames to choose from a path: one each `FRAME_SPACING`, within bounds."""
-    return int(min(most, max(MIN_AUTOMATIC, np.ceil(lengths[-1] / FRAME_SPACING))))
+    return int(min(most, max(least, np.ceil(lengths[-1] / FRAME_SPACING))))
 
 
 def choose_frames(
@@ -340,6 +349,36 @@ def choose_photos(
     return tuple(candidates)
 
 
+def choose_beside(
+    chosen: Mapping[int, PhotoMeasures | None], beside: Mapping[int, PhotoMeasures | None],
+    sources: Sequence[str], names: Sequence[str],
+) -> dict[int, FrameCandidate]:
+    """Returns, by place, what becomes of photos that lie beside the chosen ones of a sequence.
+
+    They are kept, except those that cannot be read, show nothing, or show what a kept one shows.
+    """
+    kept = {place: photo.signature for place, photo in chosen.items() if photo is not None}
+    candidates = {}
+    for place, photo in beside.items():
+        reason, like = Reason.KEPT, None
+        if photo is None:
+            reason = Reason.DAMAGED
+        elif not has_content(np.array([photo.exposure]))[0]:
+            reason = Reason.CLIPPED
+        else:
+            distances = {other: float(np.linalg.norm(photo.signature - signature))
+                         for other, signature in kept.items()}
+            like = next((other for other, distance in distances.items()
+                         if distance < SAME_VIEW), None)
+            reason = Reason.KEPT if like is None else Reason.DUPLICATE
+        if photo is not None and reason is Reason.KEPT:
+            kept[place] = photo.signature
+        candidates[place] = FrameCandidate(
+            sources[place], place, reason, None if photo is None else round(photo.sharpness, 2),
+            names[place] if reason is Reason.KEPT else None, like)
+    return candidates
+
+
 def find_duplicates(
     signatures: NDArray[np.float32],  # [F, SIDE * SIDE]
     sharpness: NDArray[np.float64],  # [F]
@@ -359,12 +398,16 @@ def find_duplicates(
     return dict(sorted(redundant.items()))
 
 
-def describe_dropped(candidates: Sequence[FrameCandidate]) -> list[str]:
-    """Returns notices about photos that could be read but are left out."""
+def describe_dropped(
+    candidates: Sequence[FrameCandidate], among: Sequence[FrameCandidate] | None = None
+) -> list[str]:
+    """Returns notices about photos, of all or `among` some, that could be read but are left out."""
+    dropped = candidates if among is None else among
+    source_of = {candidate.index: candidate.source for candidate in candidates}
     alike = [
-        f"{photo.source} (like {candidates[photo.like].source})" for photo in candidates
+        f"{photo.source} (like {source_of[photo.like]})" for photo in dropped
         if photo.reason is Reason.DUPLICATE and photo.like is not None]
-    empty = [photo.source for photo in candidates if photo.reason is Reason.CLIPPED]
+    empty = [photo.source for photo in dropped if photo.reason is Reason.CLIPPED]
     return [
         f"{len(names)} photos are left out because {reason}: {list_names(names, NAMED)}."
         for names, reason in ((alike, "others show the same"),

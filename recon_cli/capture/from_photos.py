@@ -1,6 +1,7 @@
 """Frames of photos: all that can be read and show a view of their own.
 
-Photos that are plainly the frames of a video are chosen like those, in `photo_sequence`.
+Photos that follow each other are chosen like the frames of a video, by `photo_sequence`, and get
+tracks; those that show nothing of what the others show are set aside.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_selection import FrameCandidate, Reason
-from recon_cli.capture.from_video import report_reduced
+from recon_cli.capture.from_video import judge, report_reduced, report_short
 from recon_cli.capture.images import WHITE, Photo, describe_white, find_white, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
-from recon_cli.capture.photo_sequence import PhotoSequence, choose_from_sequence, find_sequence
+from recon_cli.capture.photo_sequence import PhotoSequence, find_odd, find_sequence
 from recon_cli.capture.photo_tree import find_photo_files
 from recon_cli.capture.photos import (
     PhotoFolder,
@@ -41,10 +42,14 @@ from recon_cli.io.foreign import find_foreign, find_lists
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
 from recon_cli.io.mask_files import mask_folders
 from recon_cli.io.records import Frame, Group
+from recon_cli.io.tracks import Tracks
 from recon_cli.workspace import atomic
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
-SCAN = "scan.json"  # the measures of photos that are frames of a video, for the next run
+SEQUENCE = "sequence.json"  # which photos follow each other, for the next run; beside a scan
+# Frames that are kept of any folder, however little the camera moves: somebody may have picked
+# them, and all pairs of so many are matched in minutes.
+MIN_KEPT = 100
 Record = tuple[FrameCandidate, ...]  # what became of every photo, in order
 
 
@@ -61,38 +66,70 @@ def ingest(
     check_count(path, folder.photos, folder.broken)
     plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _drop_raw_twins(folder.photos, plan, ctx)
+    white = _find_white(photos, ctx)
+    photos, sequence, strangers = _find_sequence(
+        photos, out / f"{prefix}{SEQUENCE}", ctx, white=white)
     masks = _find_masks(paths, home, photos, ctx)
     stems = make_frame_names([photo.path.stem for photo in photos])
     source = _PhotoSource(path, tuple(photos), tuple(f"{prefix}{stem}" for stem in stems),
-                          masks.by_photo, plan, folder.broken, _find_white(photos, ctx))
-    sequence = find_sequence(
-        config, photos, out / f"{prefix}{SCAN}", ctx, white=source.white)
-    record, broken = (_take_all(source, config, out, ctx) if sequence is None
-                      else _take_from_sequence(source, sequence, config, out, ctx))
-    sheet = _make_sheet(source, record, broken, out)
-    frame_of = {photos[candidate.index]: candidate.name for candidate in record
+                          masks.by_photo, plan, folder.broken, white)
+    taken = (_take_all(source, config, out, ctx) if sequence is None
+             else _take_from_sequence(source, sequence, config, out, ctx))
+    sheet = _make_sheet(source, taken.record, taken.broken, out)
+    of_frame = {photos[candidate.index]: candidate for candidate in taken.record
                 if candidate.name is not None}
-    groups = group_photos(list(frame_of))
+    groups = group_photos(list(of_frame))
     for notice in group_notices(groups):
         ctx.notice(notice)
     for width, height in dict.fromkeys((group.first.width, group.first.height) for group in groups):
         report_reduced(width, height, config.max_size, ctx)
-    # of a video's frames it is no news that most are dropped
-    dropped = {candidate.source for candidate in record
-               if candidate.name is None and sequence is None}
-    count = len(photos) + len(folder.broken)
+    count = len(photos) + len(strangers) + len(folder.broken)
+    frames = tuple(sorted((
+        Frame(str(of_frame[photo].name), None, photo.name, taken.sharpness.get(photo.name),
+              held_out=False, group=index,
+              masked=(out / store.MASKS / str(of_frame[photo].name)).exists())
+        for index, group in enumerate(groups) for photo in group.photos),
+        key=lambda frame: frame.name))
     return IngestedSource(
-        "photos",
-        _frame_groups(groups, path, config.max_size),
-        tuple(sorted((
-            Frame(frame_of[photo], None, photo.name, None, held_out=False, group=index,
-                  masked=(out / store.MASKS / frame_of[photo]).exists())
-            for index, group in enumerate(groups) for photo in group.photos),
-            key=lambda frame: frame.name)),
-        declared=count, decoded=count - len(broken), lost=len(broken),
-        blurred=0 if sequence is None else sum(
-            candidate.reason in (Reason.BLURRED, Reason.CLIPPED) for candidate in record),
-        skipped=tuple(sorted(dropped | broken.keys())), selection=Selection(record, sheet, prefix))
+        "photos", _frame_groups(groups, path, config.max_size), frames,
+        declared=count, decoded=count - len(taken.broken), lost=len(taken.broken),
+        blurred=sum(candidate.reason in (Reason.BLURRED, Reason.CLIPPED)
+                    and candidate.source in taken.sharpness for candidate in taken.record),
+        skipped=tuple(sorted({*taken.dropped, *taken.broken, *strangers})),
+        selection=Selection(taken.record, sheet, prefix),
+        tracks=_visible_tracks(taken, frames, out))
+
+
+def _find_sequence(
+    photos: Sequence[Photo], record: Path, ctx: IngestContext, *, white: int
+) -> tuple[list[Photo], PhotoSequence | None, list[str]]:
+    """Returns the photos without strangers, those that follow each other, and the strangers."""
+    sequence = find_sequence(photos, record, ctx, white=white)
+    strangers = [] if sequence is None else [photos[place].name for place in sequence.strangers]
+    strangers += [photos[place].name for place in find_odd(
+        photos, () if sequence is None else (*sequence.places, *sequence.strangers), white=white)]
+    if not strangers:
+        return list(photos), sequence, []
+    ctx.notice(
+        f"{len(strangers)} photos are set aside, because they show nothing that the others show: "
+        f"{list_names(strangers, frame_selection.NAMED)}.")
+    kept = [place for place, photo in enumerate(photos) if photo.name not in strangers]
+    return ([photos[place] for place in kept],
+            None if sequence is None else sequence.among(kept), strangers)
+
+
+def _visible_tracks(taken: _TakenPhotos, frames: Sequence[Frame], out: Path) -> Tracks | None:
+    """Returns the tracks through the frames, without what their masks hide."""
+    tracks = taken.tracks
+    if tracks is None:
+        return None
+    visible = np.ones(len(tracks.image), np.bool_)
+    images = {name: image for image, name in enumerate(tracks.names)}
+    for frame in frames:
+        if frame.masked and frame.name in images:
+            hidden = read_png(out / store.MASKS / frame.name)[..., 0] == 0
+            visible &= (tracks.image != images[frame.name]) | ~tracks.inside(hidden)
+    return tracks.where(visible)
 
 
 @dataclass(frozen=True)
@@ -108,10 +145,21 @@ class _PhotoSource:
     white: int  # the brightest value of those with 16 bits
 
 
+@dataclass(frozen=True)
+class _TakenPhotos:
+    """What became of the photos of a folder."""
+
+    record: Record
+    broken: Mapping[str, str]  # why some cannot be read, by file name
+    dropped: frozenset[str]  # that show nothing, or the same as others; of a sequence it is no news
+    tracks: Tracks | None = None  # through the photos that follow each other, by their frames
+    sharpness: Mapping[str, float] = field(default_factory=dict)  # of these, by file name
+
+
 def _take_all(
     source: _PhotoSource, config: IngestConfig, out: Path, ctx: IngestContext
-) -> tuple[Record, dict[str, str]]:
-    """Writes all photos; returns which are kept, and why some are broken, by file name."""
+) -> _TakenPhotos:
+    """Writes all photos; returns which are kept, and why some are broken."""
     measures, unreadable = _write_photos(source, range(len(source.photos)), out, config, ctx)
     broken = {**source.broken, **unreadable}
     check_count(
@@ -121,26 +169,65 @@ def _take_all(
         source.path.name, [photo.name for photo in source.photos], source.names, measures)
     for text in frame_selection.describe_dropped(record):
         ctx.notice(text)
-    return record, broken
+    return _TakenPhotos(record, broken, frozenset(
+        candidate.source for candidate in record if candidate.name is None))
 
 
 def _take_from_sequence(
     source: _PhotoSource, sequence: PhotoSequence, config: IngestConfig, out: Path,
     ctx: IngestContext,
-) -> tuple[Record, dict[str, str]]:
-    """Writes the frames that are chosen from a video's; returns the same as `_take_all`."""
-    record = choose_from_sequence(
-        config, source.path.name, source.photos, source.names, sequence, ctx)
-    chosen = [candidate.index for candidate in record if candidate.name is not None]
-    _, unreadable = _write_photos(source, chosen, out, config, ctx)
-    broken = {**source.broken, **unreadable, **{
-        source.photos[index].name: reason for index, reason in sequence.broken.items()}}
-    check_count(source.path, [source.photos[index] for index in chosen
-                              if source.photos[index].name not in unreadable], broken)
+) -> _TakenPhotos:
+    """Writes the photos that are chosen from a sequence as from a video, and all beside it."""
+    followed, tracks = _choose_followed(config, source, sequence, ctx)
+    rest = sorted(set(range(len(source.photos))) - followed.keys())
+    chosen = sorted(place for place, candidate in followed.items() if candidate.name is not None)
+    measures, unreadable = _write_photos(source, [*chosen, *rest], out, config, ctx)
+    broken = {**source.broken, **unreadable}
+    check_count(source.path, [source.photos[place] for place in (*chosen, *rest)
+                              if source.photos[place].name not in broken], broken)
     _report_broken(broken, ctx)
-    return tuple(
+    beside = frame_selection.choose_beside(
+        dict(zip(chosen, measures, strict=False)),
+        dict(zip(rest, measures[len(chosen):], strict=True)),
+        [photo.name for photo in source.photos], source.names)
+    record = tuple(
         replace(candidate, reason=Reason.DAMAGED, name=None) if candidate.source in unreadable
-        else candidate for candidate in record), broken
+        else candidate for _, candidate in sorted({**followed, **beside}.items()))
+    dropped = [beside[place] for place in rest if beside[place].name is None]
+    for text in frame_selection.describe_dropped(record, dropped):
+        ctx.notice(text)
+    return _TakenPhotos(
+        record, broken, frozenset(candidate.source for candidate in dropped),
+        tracks, {candidate.source: candidate.sharpness for candidate in followed.values()
+                 if candidate.sharpness is not None})
+
+
+def _choose_followed(
+    config: IngestConfig, source: _PhotoSource, sequence: PhotoSequence, ctx: IngestContext
+) -> tuple[dict[int, FrameCandidate], Tracks]:
+    """Returns what becomes of the photos of a sequence, by place, and the tracks through them."""
+    count = config.frames or frame_selection.automatic_count(
+        frame_selection.path_length(sequence.scan.motion), most=config.max_frames, least=MIN_KEPT)
+    video = judge(config, source.path, sequence.scan, ctx, least=count)
+    chosen = frame_selection.choose_frames(
+        video.lengths, video.scan.sharpness, video.distinct, count,
+        bridges=video.judgement.bridges)
+    report_short(video, len(chosen), config.frames, ctx)
+    names = {int(index): source.names[sequence.places[index]] for index in chosen}
+    if len(names) < len(sequence.places):
+        ctx.notice(
+            f"The photos in {source.path.name} follow each other like the frames of a video: "
+            f"{len(names)} of {len(sequence.places)} are chosen by their sharpness and the "
+            "camera's motion; --frames sets another number.")
+    candidates = frame_selection.video_candidates(
+        source.path.name, video.scan.sharpness, video.judgement.refused, video.lengths, names,
+        standing=video.standing)
+    places = sequence.places
+    return {places[candidate.index]: replace(
+        candidate, source=source.photos[places[candidate.index]].name,
+        index=places[candidate.index],
+        like=None if candidate.like is None else places[candidate.like])
+        for candidate in candidates}, video.scan.tracks.select(names)
 
 
 def _report_broken(broken: Mapping[str, str], ctx: IngestContext) -> None:

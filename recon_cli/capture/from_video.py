@@ -65,6 +65,16 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     for notice in scan.notices:
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
+    return judge(config, path, scan, ctx)
+
+
+def judge(
+    config: IngestConfig, path: Path, scan: Scan, ctx: IngestContext, *, least: int = 0
+) -> ScannedVideo:
+    """Returns what a scan says of its frames; InputError if they show nothing, or no motion.
+
+    Where fewer than `least` are sharp, the sharpest of the others may be chosen, too.
+    """
     check_exposure(path.name, scan.exposure[scan.whole], least=frame_selection.MIN_FRAMES)
     whole = int(scan.whole.sum())
     clipped = whole - int(well_exposed(scan.exposure[scan.whole]).sum())
@@ -77,7 +87,7 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
         ctx.notice(warning)
     lengths = frame_selection.path_length(scan.motion)
     judgement = frame_selection.judge_frames(
-        lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness)
+        lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness, least)
     tracks = scan.tracks if scan.overlay is None else scan.tracks.outside(scan.overlay)
     return ScannedVideo(path, scan, lengths, judgement, pick_representatives(
         find_stills(tracks, scan.width, scan.height), scan.sharpness, judgement.usable,
@@ -128,7 +138,7 @@ def ingest(
     path, scan, judgement = source.path, source.scan, source.judgement
     chosen = frame_selection.choose_frames(
         source.lengths, scan.sharpness, source.distinct, count, bridges=judgement.bridges)
-    _report_short(source, len(chosen), None if config.frames is None else count, ctx)
+    report_short(source, len(chosen), None if config.frames is None else count, ctx)
     report_reduced(scan.width, scan.height, config.max_size, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
     record = frame_selection.video_candidates(
@@ -173,7 +183,7 @@ def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
         ctx.notice(f"{path.name} declares {scan.declared} frames but holds {decoded}.")
 
 
-def _report_short(
+def report_short(
     source: ScannedVideo, chosen: int, requested: int | None, ctx: IngestContext
 ) -> None:
     """Says why fewer frames were chosen than requested; refuses too few."""
@@ -192,7 +202,7 @@ def _report_short(
     if requested is None or chosen == requested:
         return
     if whole < requested:
-        ctx.notice(f"{requested} frames were requested, but the video has {whole}.")
+        ctx.notice(f"{requested} frames were requested, but {source.path.name} has {whole}.")
     if distinct < usable:
         ctx.notice(
             f"Only {distinct} of {usable} frames show different pictures, and all of those are "

@@ -27,6 +27,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from recon_cli.capture.colour_profile import to_srgb
 from recon_cli.capture.xmp import is_panorama, read_xmp
 from recon_cli.errors import InputError
+from recon_cli.io.images import fit_size
 
 RAW_SUFFIXES = frozenset({
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".iiq", ".kdc", ".mef",
@@ -60,6 +61,7 @@ SENSOR_MM = (2.0, 70.0)
 
 
 WHITE = 65535
+GRAY_SIZE = 960  # pixels of the longer side, at least, at which measures are taken
 # Those of sensors with 8, 10, 12 and 14 bits, whose values are stored in 16 as they are.
 NARROW = (255, 1023, 4095, 16383)
 
@@ -133,6 +135,25 @@ def read_photo(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
     rgb = _on_black(_decode(photo.path, upright=True, white=white))
     check_size(photo, rgb)
     return rgb
+
+
+def read_gray(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
+    """Returns the gray values of a photo, upright.
+
+    They may be reduced, to `GRAY_SIZE` pixels or more on the longer side.
+    JPEG decodes to gray and to a fraction of its size in a quarter of the time.
+    """
+    try:
+        with open_image(photo.path) as image:
+            image.draft("L", fit_size(*image.size, GRAY_SIZE))
+            if (image.mode in ("L", "RGB") and not photo.wide
+                    and not image.has_transparency_data):
+                gray = image.convert("L")
+                turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
+                return np.array(gray if turn is None else gray.transpose(turn))
+    except BROKEN as error:
+        raise unreadable_error(photo.path, error) from error
+    return np.asarray(cv2.cvtColor(read_photo(photo, white), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def read_alpha(photo: Photo) -> NDArray[np.uint8] | None:

@@ -61,7 +61,7 @@ class IngestedSource:
     splits: bool = False  # the source itself says which frames are held out
     poses: KnownPoses | None = None  # by the names of the frames
     selection: Selection | None = None  # None where all frames are used
-    tracks: Tracks | None = None  # through the frames of a video
+    tracks: Tracks | None = None  # through frames that follow each other
 
 
 def merge_sources(parts: Sequence[IngestedSource]) -> IngestedSource:

@@ -1,144 +1,161 @@
-"""Photos that are plainly the frames of a video: how they are told, and which of them are chosen.
+"""Photos that follow each other, such as the frames of a video that somebody has dumped.
 
-A folder that holds every frame of a walk shows each view twenty times over. It is thinned by the
-measures and functions of videos. What is left out here: frames that somebody has thinned already,
-and sets of photos, which are few because each was taken on purpose.
+Names say in which order they may have been taken, and the pictures whether they were: where nearly
+all neighbours show the same corners, the photos are a walk, whatever its steps. It is scanned and
+thinned by the means of videos. Photos that were taken one by one, on purpose, are left as they are.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags
 
-from recon_cli.capture import frame_selection
-from recon_cli.capture.frame_measures import (
-    SHARPNESS_SIZE,
-    MotionMeter,
-    check_exposure,
-    measure_exposure,
-    measure_sharpness,
-)
-from recon_cli.capture.images import BROKEN, WHITE, Photo, open_image, read_photo, unreadable_error
+from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
+from recon_cli.capture.frame_selection import MIN_AUTOMATIC
+from recon_cli.capture.images import BROKEN, WHITE, Photo, open_image, read_gray
 from recon_cli.capture.ingested_source import IngestContext
 from recon_cli.capture.photos import group_photos
-from recon_cli.config.stages import IngestConfig
+from recon_cli.capture.scan import Scan
+from recon_cli.capture.strangers import find_strangers
+from recon_cli.capture.tracker import Tracker
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.images import fit_size
+from recon_cli.io.tracks import merge_tracks
+from recon_cli.progress import Bar
 from recon_cli.workspace import atomic
 
-# Two neighbours are near where the view shifts by at most MAX_STEP widths and MIN_FOLLOWED of the
-# corners are found again. In dumps of 11 walks 94 to 100% of the neighbours are near, in four photo
-# sets 1 to 47%, among a drone's photos, two a second, 77%.
-MAX_STEP, MIN_FOLLOWED, NEAR_SHARE = 0.05, 0.75, 0.88
-MANY = 100  # no more are thinned unasked: all pairs of them are matched in minutes
-# Numbers of the names that follow at the usual step: all in a dump, .67 of frames that were picked.
-REGULAR_SHARE = 0.95
-MAX_SECONDS = 1.0  # median time between neighbours by EXIF, which counts whole seconds
-_NUMBER = re.compile(r"(.*?)(\d+)(\D*)")  # the last number of a name
+# A photo follows another where it still shows this share of the other's corners, and so do nearly
+# all photos of a sequence. .94 to 1 of them do in every third and fifth frame of six walks, .56 in
+# photos of lockers in the order of their names, .03 to .20 in any order.
+FOLLOWED, SEQUENCE_SHARE = 0.1, 0.8
+# The same of photos that a camera has named. It is .7 in the median of photos that were taken in
+# small steps around a table, .85 to .95 in all frames of a video.
+CAMERA_FOLLOWED = 0.8
+# Photos in a row that may belong to another scene; more are a walk of their own.
+MOST_ASTRAY = 3
+FEW_SHARE = 0.1  # of the photos: at most so many are looked at as out of place
+# Time from one photo to the next: the median over a few photos, as EXIF and many names count whole
+# seconds.
+MAX_SECONDS, SPAN = 1.0, 5
+_NUMBER = re.compile(r"\d+")
+# Names that cameras give to single photos (JEITA CP-3461, DCF): four characters and a number.
+_CAMERA_NAME = re.compile(r"(?=.{0,3}[A-Z_])[A-Z0-9_]{4}\d{4}")
+_MOMENT = re.compile(r"(?<!\d)(\d{8})[-_]?(\d{6})(?:[-_.]?(\d{3}))?(?!\d)")
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoSequence:
-    """The measures of F photos that are the frames of a video, in order."""
+    """The photos of a folder that are sequences, one after the other."""
 
-    motion: NDArray[np.float64]  # [F], `MotionMeter.advance`
-    sharpness: NDArray[np.float64]  # [F], `measure_sharpness`
-    exposure: NDArray[np.float64]  # [F, 3], rows of `measure_exposure`
-    broken: Mapping[int, str]  # why a photo cannot be read, by index
+    places: tuple[int, ...]  # [F], of the photos that follow each other, among all of the folder
+    scan: Scan  # of these
+    strangers: tuple[int, ...]  # photos in between that show something else, by place
 
-    @property
-    def whole(self) -> NDArray[np.bool_]:  # [F]
-        """Which photos could be read."""
-        return np.array([index not in self.broken for index in range(len(self.motion))])
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns the measures as JSON values; NaN becomes null."""
-        return {
-            "motion": [None if np.isnan(step) else step for step in self.motion.tolist()],
-            "sharpness": self.sharpness.tolist(), "exposure": self.exposure.tolist(),
-            "broken": {str(index): reason for index, reason in self.broken.items()}}
+    def write(self, record: Path, photos: Sequence[Photo]) -> None:
+        """Writes the scan beside a record that says which photos it is of."""
+        self.scan.write(_scan_file(record))
+        atomic.write_json(record, {
+            "photos": [photo.name for photo in photos], "places": self.places,
+            "strangers": self.strangers})
 
     @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> PhotoSequence:
-        """Returns the measures that `to_json` wrote."""
-        return cls(
-            np.array(value["motion"], np.float64), np.array(value["sharpness"], np.float64),
-            np.array(value["exposure"], np.float64).reshape(-1, 3),
-            {int(index): reason for index, reason in value["broken"].items()})
+    def read(cls, record: Path, photos: Sequence[Photo]) -> PhotoSequence | None:
+        """Returns what `write` wrote; None where it is missing, damaged or of other photos."""
+        if not record.exists():
+            return None
+        try:
+            value = atomic.read_json(record, dict)
+            if value["photos"] != [photo.name for photo in photos]:
+                return None
+            scan = Scan.read(_scan_file(record))
+            known = cls(
+                tuple(map(int, value["places"])), scan, tuple(map(int, value["strangers"])))
+        except (AttributeError, KeyError, TypeError, ValueError, OSError, FormatError):
+            return None
+        return known if len(known.places) == len(scan.whole) else None
+
+    def among(self, kept: Sequence[int]) -> PhotoSequence:
+        """Returns the sequence among fewer photos, which hold all of it, given by place."""
+        now = {place: index for index, place in enumerate(kept)}
+        return replace(self, places=tuple(now[place] for place in self.places), strangers=())
+
+
+def _scan_file(record: Path) -> Path:
+    return record.with_name(record.name.replace("sequence", "scan"))
 
 
 def find_sequence(
-    config: IngestConfig, photos: Sequence[Photo], record: Path, ctx: IngestContext, *,
-    white: int = WHITE,
+    photos: Sequence[Photo], record: Path, ctx: IngestContext, *, white: int = WHITE
 ) -> PhotoSequence | None:
-    """Returns the measures of photos that are frames of a video and more than are wanted, or None.
+    """Returns the scan of those photos that follow each other; None where none do.
 
-    `record` keeps the measures for the next run; `white` is that of photos with 16 bits.
+    `record` keeps it for the next run; `white` is that of photos with 16 bits.
     """
-    most = config.frames or MANY
-    if len(photos) <= most or not looks_numbered(photos):
-        return None
-    known = _read_record(record, len(photos))
+    known = PhotoSequence.read(record, photos)
     if known is not None:
         return known
-    with ctx.progress.bar("scan", len(photos), unit="photo") as bar:
-        def read() -> Iterator[NDArray[np.uint8] | InputError]:
-            for photo in photos:
-                bar.advance()
-                try:
-                    yield _read_gray(photo, white)
-                except InputError as error:
-                    yield error
-
-        sequence = measure_sequence(read(), len(photos))
-    if sequence is not None:
-        atomic.write_json(record, sequence.to_json())
+    runs = list_runs(photos)
+    parts: list[PhotoSequence] = []
+    if runs:
+        with ctx.progress.bar("scan", sum(map(len, runs)), unit="photo") as bar:
+            found = (_scan_run(photos, run, white, bar) for run in runs)
+            parts = [part for part in found if part is not None]
+    if not parts:
+        return None
+    sequence = _join(parts)
+    sequence.write(record, photos)
     return sequence
 
 
-def _read_record(record: Path, count: int) -> PhotoSequence | None:
-    """Returns the measures that an earlier run left; None where they are missing or damaged."""
-    if not record.exists():
+def list_runs(photos: Sequence[Photo]) -> list[list[int]]:
+    """Returns the photos whose names may be in the order in which they were taken, by place.
+
+    Those of a run are of one camera and folder, and their names differ in numbers alone. So few
+    that none would be left out are no run, nor are those that were taken more than a second apart.
+    """
+    camera = {photo.name: index for index, group in enumerate(group_photos(photos))
+              for photo in group.photos}
+    runs: dict[tuple[str, str, int], list[int]] = {}
+    for place, photo in enumerate(photos):
+        pattern = _NUMBER.sub("#", photo.path.stem)
+        if "#" in pattern and not photo.is_raw:
+            home = str(PurePosixPath(photo.name).parent)
+            runs.setdefault((home, pattern, camera[photo.name]), []).append(place)
+    return [run for run in runs.values() if len(run) > MIN_AUTOMATIC and (
+        _usual_seconds([photos[place] for place in run]) or 0) <= MAX_SECONDS]
+
+
+def _usual_seconds(photos: Sequence[Photo]) -> float | None:
+    """Returns the time from one photo to the next; None where most do not say when they are of."""
+    times = [time for photo in photos if (time := _read_time(photo)) is not None]
+    if 2 * len(times) <= len(photos):
         return None
+    return float(np.median([abs((after - before).total_seconds()) / SPAN
+                            for before, after in zip(times, times[SPAN:], strict=False)]))
+
+
+def _least_followed(photos: Sequence[Photo]) -> float:
+    """Returns the share of its corners that one photo must share with the next."""
+    by_camera = all(_CAMERA_NAME.fullmatch(photo.path.stem) for photo in photos)
+    return CAMERA_FOLLOWED if by_camera and _usual_seconds(photos) is None else FOLLOWED
+
+
+def _read_time(photo: Photo) -> datetime | None:
+    """Returns when a photo was taken, by its name, else by EXIF; None where neither says it."""
+    moment = _MOMENT.search(photo.path.stem)
     try:
-        known = PhotoSequence.from_json(atomic.read_json(record, dict))
-    except (AttributeError, KeyError, TypeError, ValueError, FormatError):
-        return None
-    lengths = {len(known.motion), len(known.sharpness), len(known.exposure)}
-    return known if lengths == {count} else None
-
-
-def looks_numbered(photos: Sequence[Photo]) -> bool:
-    """Returns whether photos are of one camera, numbered evenly, and not seconds apart by EXIF."""
-    if len(photos) < 2 or any(photo.is_raw for photo in photos) or len(group_photos(photos)) > 1:
-        return False
-    names = [_NUMBER.fullmatch(photo.path.stem) for photo in photos]
-    if len({name and (name[1], name[3]) for name in names}) > 1 or names[0] is None:
-        return False
-    steps = np.diff([int(name[2]) for name in names if name])
-    (_, usual), = Counter(steps.tolist()).most_common(1)
-    if usual < REGULAR_SHARE * len(steps):
-        return False
-    times = [time for photo in photos if (time := _read_time(photo.path)) is not None]
-    gaps = [abs((after - before).total_seconds()) for before, after in pairwise(times)]
-    return not gaps or float(np.median(gaps)) <= MAX_SECONDS
-
-
-def _read_time(path: Path) -> datetime | None:
-    """Returns when a photo was taken according to EXIF; None where that is not said."""
-    try:
-        with open_image(path) as image:
+        if moment is not None:
+            date, time, part = moment.groups()
+            return datetime.strptime(f"{date}{time}{part or '000'}", "%Y%m%d%H%M%S%f")
+        with open_image(photo.path) as image:
             detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
         return datetime.strptime(
             str(detail.get(ExifTags.Base.DateTimeOriginal)), "%Y:%m:%d %H:%M:%S")
@@ -146,89 +163,135 @@ def _read_time(path: Path) -> datetime | None:
         return None
 
 
-def _read_gray(photo: Photo, white: int) -> NDArray[np.uint8]:
-    """Returns the gray values of a photo, upright but perhaps mirrored or on its head.
+def _scan_run(
+    photos: Sequence[Photo], run: Sequence[int], white: int, bar: Bar
+) -> PhotoSequence | None:
+    """Returns the scan of a run, without photos that show something else; None if it is none."""
+    def read(place: int) -> NDArray[np.uint8]:
+        return read_gray(photos[place], white)
 
-    JPEG decodes to gray and to a fraction of its size in a quarter of the time.
-    """
-    try:
-        with open_image(photo.path) as image:
-            image.draft("L", fit_size(*image.size, SHARPNESS_SIZE))
-            plain = (image.mode in ("L", "RGB") and not photo.wide
-                     and not image.has_transparency_data)
-            gray = np.array(image.convert("L")) if plain else None
-    except BROKEN as error:
-        raise unreadable_error(photo.path, error) from error
-    if gray is None:
-        return np.asarray(cv2.cvtColor(read_photo(photo, white), cv2.COLOR_RGB2GRAY), np.uint8)
-    turned = (gray.shape[1] < gray.shape[0]) != (photo.width < photo.height)
-    return np.ascontiguousarray(gray.T) if turned else gray
+    def grays(places: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        for place in places:
+            with suppress(InputError):  # it is named when it is to be stored
+                yield place, read(place)
+
+    least = _least_followed([photos[place] for place in run])
+    measured = measure_sequence(grays(run), len(run), least=least, step=bar.advance)
+    if measured is None:
+        return None
+    astray = [measured.places[index] for index in measured.list_astray()]
+    others = sorted(set(measured.places) - set(astray))
+    strangers = find_strangers(astray, others, read) if others else []
+    if strangers:
+        measured = measure_sequence(
+            grays([place for place in measured.places if place not in strangers]), len(run),
+            least=least)
+        assert measured is not None, "a sequence is one without what interrupts it"
+    photo = photos[measured.places[0]]
+    return PhotoSequence(
+        tuple(measured.places), measured.scan(photo.width, photo.height), tuple(strangers))
+
+
+class MeasuredPhotos:
+    """What is measured of gray photos, one after the other, as of the frames of a video."""
+
+    def __init__(self, least: float = FOLLOWED) -> None:
+        self._least = least
+        self.places: list[int] = []
+        self.follows: list[bool] = []  # whether a photo shows what the one before shows
+        self._meter, self._tracker = MotionMeter(), Tracker()
+        self._rows: list[tuple[float, float, tuple[float, float, float]]] = []
+
+    def add(self, place: int, gray: NDArray[np.uint8]) -> None:
+        """Measures the next photo, [H, W]; all are of one size."""
+        before = self._tracker.corners[0] if self.places else None
+        self._tracker.advance(gray)
+        if before is not None:
+            shared = np.intersect1d(before, self._tracker.corners[0], assume_unique=True)
+            self.follows.append(bool(len(before)) and len(shared) >= self._least * len(before))
+        self.places.append(place)
+        self._rows.append(
+            (measure_sharpness(gray), self._meter.advance(gray), measure_exposure(gray)))
+
+    def list_astray(self) -> list[int]:
+        """Returns the photos, a few in a row at most, that follow no other and that none follows.
+
+        They are given as indices of `places`.
+        """
+        starts = [0, *(index + 1 for index, follows in enumerate(self.follows) if not follows)]
+        ends = [*starts[1:], len(self.places)]
+        return [index for start, end in zip(starts, ends, strict=True)
+                if end - start <= MOST_ASTRAY for index in range(start, end)]
+
+    def scan(self, width: int, height: int) -> Scan:
+        """Returns the measures as the scan of a video of upright frames of this size."""
+        sharpness, motion, exposure = zip(*self._rows, strict=True)
+        count = len(self.places)
+        return Scan(
+            width=width, height=height, declared=count, gaps=0,
+            sharpness=np.array(sharpness, np.float64), motion=np.array(motion, np.float64),
+            exposure=np.round(exposure, 4), seconds=(None,) * count,
+            whole=np.ones(count, np.bool_), tracks=self._tracker.tracks(), overlay=None, notices=())
 
 
 def measure_sequence(
-    grays: Iterator[NDArray[np.uint8] | InputError], count: int
-) -> PhotoSequence | None:
-    """Returns the measures of `count` gray photos if they are frames of a video, else None.
+    grays: Iterator[tuple[int, NDArray[np.uint8]]], count: int,
+    *, least: float = FOLLOWED, step: Callable[[], object] = lambda: None,
+) -> MeasuredPhotos | None:
+    """Returns the measures of up to `count` gray photos if they follow each other, else None.
 
-    It stops reading as soon as too many neighbours lie too far apart.
+    Neighbours share at least the share `least` of their corners. It stops reading as soon as too
+    many do not; `step` is called for each.
     """
-    meter = MotionMeter()
-    motion, sharpness, exposure = (np.zeros(shape) for shape in (count, count, (count, 3)))
-    broken: dict[int, str] = {}
-    before: NDArray[np.uint8] | None = None
-    far = 0  # photos that are not near the one before
-    for index, gray in enumerate(grays):
-        if isinstance(gray, InputError):
-            broken[index] = gray.message
-            far += 1
-        else:
-            motion[index] = meter.advance(gray)
-            sharpness[index], exposure[index] = measure_sharpness(gray), measure_exposure(gray)
-            far += before is not None and not _are_near(before, gray)
-            before = gray
-        if far > (1 - NEAR_SHARE) * count:
+    measured = MeasuredPhotos(least)
+    for place, gray in grays:
+        step()
+        measured.add(place, gray)
+        if measured.follows.count(False) > (1 - SEQUENCE_SHARE) * count:
             return None
-    return PhotoSequence(motion, sharpness, exposure, broken)
+    steps = measured.follows
+    return measured if steps and sum(steps) >= SEQUENCE_SHARE * len(steps) else None
 
 
-def _are_near(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> bool:
-    """Returns whether two gray pictures may be frames of a video that follow each other."""
-    meter = MotionMeter()
-    meter.advance(before)
-    return meter.advance(after) <= MAX_STEP and meter.followed >= MIN_FOLLOWED  # NaN is far
+def _join(parts: Sequence[PhotoSequence]) -> PhotoSequence:
+    """Returns sequences as one; nothing is followed from one to the next."""
+    scans = [part.scan for part in parts]
+    count = sum(len(part.places) for part in parts)
+    scan = Scan(
+        width=scans[0].width, height=scans[0].height, declared=count, gaps=0,
+        sharpness=np.concatenate([scan.sharpness for scan in scans]),
+        motion=np.concatenate([scan.motion for scan in scans]),
+        exposure=np.concatenate([scan.exposure for scan in scans]), seconds=(None,) * count,
+        whole=np.ones(count, np.bool_), tracks=merge_tracks([scan.tracks for scan in scans]),
+        overlay=None, notices=())
+    return PhotoSequence(
+        tuple(place for part in parts for place in part.places), scan,
+        tuple(place for part in parts for place in part.strangers))
 
 
-def choose_from_sequence(
-    config: IngestConfig, folder: str, photos: Sequence[Photo], names: Sequence[str],
-    sequence: PhotoSequence, ctx: IngestContext,
-) -> tuple[frame_selection.FrameCandidate, ...]:
-    """Returns which photos are kept under which names, as from a video, and says how many.
+def find_odd(
+    photos: Sequence[Photo], followed: Collection[int], *, white: int = WHITE
+) -> list[int]:
+    """Returns the photos that look out of place and show nothing that the others show, by place.
 
-    InputError if too few show anything, or the camera does not move.
+    Out of place are few that no sequence holds; without one, few of another size, without EXIF.
     """
-    whole = sequence.whole
-    check_exposure(folder, sequence.exposure[whole], least=frame_selection.MIN_FRAMES,
-                   unit="photos")
-    warning = frame_selection.check_motion(folder, sequence.motion)
-    if warning:
-        ctx.notice(warning)
-    lengths = frame_selection.path_length(sequence.motion)
-    judgement = frame_selection.judge_frames(
-        lengths, sequence.sharpness, sequence.exposure, whole, config.sharpness)
-    count = config.frames or frame_selection.automatic_count(lengths, most=config.max_frames)
-    chosen = frame_selection.choose_frames(
-        lengths, sequence.sharpness, judgement.usable, count, bridges=judgement.bridges)
-    if len(chosen) < frame_selection.MIN_FRAMES:
-        raise InputError(
-            f"Only {len(chosen)} of the {len(photos)} photos in {folder} are sharp, but at least "
-            f"{frame_selection.MIN_FRAMES} are needed.", hint="Lower --sharpness.")
-    ctx.notice(
-        f"The photos in {folder} are the frames of a video: {len(chosen)} of {len(photos)} are "
-        f"chosen by their sharpness and the camera's motion; --frames {len(photos)} keeps all.")
-    candidates = frame_selection.video_candidates(
-        folder, sequence.sharpness, judgement.refused, lengths,
-        {int(index): names[index] for index in chosen})
-    return tuple(
-        replace(candidate, source=photo.name,
-                sharpness=None if candidate.index in sequence.broken else candidate.sharpness)
-        for candidate, photo in zip(candidates, photos, strict=True))
+    odd = set(range(len(photos))) - set(followed) if followed else _odd_sizes(photos)
+    if not odd or len(odd) > FEW_SHARE * len(photos) or any(photo.is_raw for photo in photos):
+        return []
+    others = [place for place in range(len(photos)) if place not in odd]
+
+    def read(place: int) -> NDArray[np.uint8] | None:
+        with suppress(InputError):  # it is named when it is to be stored
+            return read_gray(photos[place], white)
+        return None
+
+    return find_strangers(odd, others, read)
+
+
+def _odd_sizes(photos: Sequence[Photo]) -> set[int]:
+    """Returns the photos without EXIF that are not of the usual size, upright or on its side."""
+    sizes = [tuple(sorted((photo.width, photo.height))) for photo in photos]
+    (usual, _), = Counter(sizes).most_common(1)
+    return {place for place, (photo, size) in enumerate(zip(photos, sizes, strict=True))
+            if size != usual and not photo.has_exif}

@@ -45,9 +45,16 @@ class Tracks:
 
     def outside(self, area: NDArray[np.bool_]) -> Tracks:  # [h, w], at any size
         """Returns the tracks without their observations in an area that all images share."""
+        return self.where(~self.inside(area))
+
+    def inside(self, area: NDArray[np.bool_]) -> NDArray[np.bool_]:  # [h, w], at any size; [O]
+        """Returns which observations lie in an area of their images."""
         size = np.array(area.shape[::-1])
         x, y = np.clip((self.xy * size).astype(int), 0, size - 1).T
-        rows = ~area[y, x]
+        return np.asarray(area[y, x])
+
+    def where(self, rows: NDArray[np.bool_]) -> Tracks:  # [O]
+        """Returns the tracks with these observations alone."""
         return Tracks(self.names, self.image[rows], self.track[rows], self.xy[rows])
 
     def matches(self, first: int, second: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -84,7 +84,7 @@ def _check_split(
     if not held and config.holdout != "none":
         ctx.notice(f"--holdout {config.holdout} holds out none of {left} frames, so that nothing "
                    "can be scored.")
-    if config.frames is not None and source.kind == "photos" and (
+    if config.frames is not None and source.kind == "photos" and source.tracks is None and (
             len(source.frames) > config.frames):
         ctx.notice("--frames has no effect on photos that are no frames of a video: all are used.")
 

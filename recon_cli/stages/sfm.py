@@ -15,7 +15,7 @@ from recon_cli.errors import FormatError, list_names
 from recon_cli.executors.executor import Executor, start_executor
 from recon_cli.io import records as store
 from recon_cli.io.records import POSES, FrameList, describe_stretches, read_poses
-from recon_cli.io.tracks import TRACKS
+from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.sfm import database, parts, process, segments
 from recon_cli.sfm.align_world import parse_place
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
@@ -58,7 +58,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         max_minutes=_time_limit(config, frames), seed=config.seed, threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
-        times=_times(frames))
+        times=_times(frames, tracks))
     _check_frames(job)
     for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
@@ -141,10 +141,21 @@ def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:
         for index, group in enumerate(frames.groups))
 
 
-def _times(frames: FrameList) -> dict[str, float]:
-    """Returns the seconds of video frames; one clip follows another after a gap of any length."""
-    return {frame.name: frame.time_seconds + CLIP_SECONDS * frame.group for frame in frames.frames
-            if frame.time_seconds is not None}
+def _times(frames: FrameList, tracks: Path) -> dict[str, float]:
+    """Returns the seconds of video frames; one clip follows another after a gap of any length.
+
+    Photos that follow each other, which only their tracks say, get their place in the order.
+    """
+    times = {frame.name: frame.time_seconds + CLIP_SECONDS * frame.group
+             for frame in frames.frames if frame.time_seconds is not None}
+    if times or not tracks.exists():
+        return times
+    followed = Tracks.read(tracks)
+    clip = 0
+    for place, name in enumerate(followed.names):
+        clip += place > 0 and not len(followed.matches(place - 1, place)[0])
+        times[name] = place + CLIP_SECONDS * clip
+    return times
 
 
 def _check_frames(job: MappingJob) -> None:

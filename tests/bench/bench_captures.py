@@ -8,6 +8,7 @@ to run only those, or files and folders that are not in DATA.
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import subprocess
@@ -21,13 +22,18 @@ import cv2
 import numpy as np
 import pycolmap
 from damaged_videos import CHANGES, bare, damaged, still, turning
+from PIL import Image
 from pose_errors import Poses, compare, model_poses, reference_poses
 from scipy.spatial.transform import Rotation
+
+from recon_cli.capture.decoded_picture import Gap
+from recon_cli.capture.video import decode
 
 HEADINGS = (
     "capture", "chosen", "registered", "left out", "way", "reprojection px", "centre RMSE",
     "centre median / max",
-    "rotation median / max", "weak link", "explained", "fold", "sfm s", "MB", "ended with")
+    "rotation median / max", "weak link", "explained", "fold", "sfm s", "sfm CPU s", "MB",
+    "ended with")
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,27 @@ def lockers(data: Path, out: Path) -> Poses:
     listed = json.loads((out / "ws" / "ingest" / "frames.json").read_text(encoding="utf-8"))
     return {frame["name"]: poses[frame["source"]] for frame in listed["frames"]
             if frame["source"] in poses}
+
+
+def dumped(path: str, stride: int) -> Callable[[Path, Path], Path]:
+    """Each `stride`-th frame of a video as a folder of JPEGs, 0001.jpg and so on."""
+    def write(data: Path, out: Path) -> Path:
+        folder = out / "photos"
+        folder.mkdir(parents=True, exist_ok=True)
+        pictures = (item for item in decode(data / path, threads=1) if not isinstance(item, Gap))
+        for number, picture in enumerate(itertools.islice(pictures, 0, None, stride), 1):
+            Image.fromarray(picture.rgb()).save(folder / f"{number:04d}.jpg", quality=95)
+        return folder
+    return write
+
+
+def every(truth: Callable[[Path, Path], Poses], stride: int) -> Callable[[Path, Path], Poses]:
+    """The poses of a video by the names of the frames that `dumped` takes from it."""
+    def read(data: Path, out: Path) -> Poses:
+        poses = truth(data, out)
+        return {f"{place // stride + 1:04d}.png": pose for name, pose in poses.items()
+                if (place := int(name[:6])) % stride == 0}
+    return read
 
 
 def noisy_fox(data: Path, out: Path) -> Path:
@@ -180,6 +207,15 @@ CAPTURES = {
     **{f"bedroom, {what}": Capture(damaged("video_bedroom/room.mp4", change))
        for what, change in CHANGES.items() if change not in (still, bare)},
     "turning on the spot": Capture(turning),
+    **{f"{name}, frame in {stride}": Capture(
+        dumped(path, stride), None if truth is None else every(truth, stride),
+        metric=truth is rpy)
+       for name, path, truth in (
+           ("living room loop", "walks/living_room_loop/video.mp4", None),
+           ("trident", "walks/trident_desk/video.mp4", trident),
+           ("house entry", "video_house_entry/video.mp4", None),
+           ("fr1 rpy", "walks/tum_fr1_rpy/video.mp4", rpy))
+       for stride in (3, 5)},
 }
 
 
@@ -214,6 +250,7 @@ def measured(name: str, data: Path, out: Path) -> list[str]:
         f"{summary['reprojection_error_px']:.2f}", *cells,
         share(verdict["weak_link"]["share"]), share(verdict["weak_link"]["explained"]),
         share(verdict["fold"]["share"]), f"{manifest['seconds']:.0f}",
+        f"{sum(summary['cpu_seconds'].values()):.0f}",
         f"{manifest['peak_memory_bytes'] / 1e6:.0f}",
         "trusted" if verdict["trusted"] else "; ".join(verdict["problems"])]
 

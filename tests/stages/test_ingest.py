@@ -80,7 +80,7 @@ def test_as_many_frames_as_asked_for_are_taken(video, tmp_path, notices):
 
 def test_asking_for_more_frames_than_there_are_is_noticed(video, tmp_path, notices):
     assert take(video, tmp_path / "out", config=IngestConfig(frames=50)).frames == 40
-    assert notices() == ["50 frames were requested, but the video has 40."]
+    assert notices() == ["50 frames were requested, but walk.mp4 has 40."]
 
 
 def test_asking_for_more_frames_than_are_sharp_is_noticed(tmp_path, notices):

