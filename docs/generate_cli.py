@@ -17,7 +17,7 @@ from recon_cli.commands.options import HELP_ALL
 
 PATH = Path(__file__).parent / "cli.md"
 WIDTH = 90  # columns of a help text
-SHARED_FROM = 3  # commands that have an option in the same words; from here on it stands at the top
+SHARED_FROM = 4  # commands that have an option in the same words; from here on it stands at the top
 INTRODUCTION = """\
 # The command line
 
