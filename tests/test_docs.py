@@ -52,6 +52,28 @@ def test_the_design_names_every_module_of_the_package():
             assert path.name in page, f"docs/design.md does not mention {path.name}"
 
 
+@pytest.mark.parametrize("name", ["design.md", "tour.md"])
+def test_every_path_that_the_page_names_exists(name):
+    page = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:[\w.]+/)*[\w.]+(?:/|\.py|\.j2|\.md))`", page):
+        assert path.startswith((".partial", "build")) or any(
+            (root / path).exists() for root in (ROOT, ROOT / "recon_cli", ROOT / "tests")), path
+
+
+def test_a_page_by_hand_has_at_most_2500_words():
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name == "cli.md" or len(page.read_text(encoding="utf-8").split()) <= 2500, page
+
+
+@pytest.mark.integration
+def test_the_manual_builds_as_a_site_without_a_link_that_leads_nowhere(tmp_path):
+    pytest.importorskip("mkdocs", reason="mkdocs comes with the extra `dev`")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "site" / "filming.html").is_file()
+
 
 @pytest.mark.integration
 def test_the_batch_example_goes_on_after_a_failure_and_says_so(tmp_path, sample_video):
