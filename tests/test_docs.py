@@ -52,12 +52,41 @@ def test_the_design_names_every_module_of_the_package():
             assert path.name in page, f"docs/design.md does not mention {path.name}"
 
 
+@pytest.mark.parametrize("name", ["design.md", "tour.md"])
+def test_every_path_that_the_page_names_exists(name):
+    page = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:[\w.]+/)*[\w.]+(?:/|\.py|\.j2|\.md))`", page):
+        assert path.startswith((".partial", "build")) or any(
+            (root / path).exists() for root in (ROOT, ROOT / "recon_cli", ROOT / "tests")), path
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "CONTRIBUTING.md"],
+                         ids=lambda page: page.name)
+def test_every_script_that_a_page_types_exists(page):
+    for path in re.findall(r"\b(tests/[\w/]+\.py)", page.read_text(encoding="utf-8")):
+        assert (ROOT / path).is_file(), f"{page.name} types {path}"
+
+
+def test_a_page_by_hand_has_at_most_2500_words():
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name == "cli.md" or len(page.read_text(encoding="utf-8").split()) <= 2500, page
+
 
 @pytest.mark.integration
-def test_the_batch_example_goes_on_after_a_failure_and_says_so(tmp_path, sample_video):
+def test_the_manual_builds_as_a_site_without_a_link_that_leads_nowhere(tmp_path):
+    pytest.importorskip("mkdocs", reason="mkdocs comes with the extra `dev`")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "site" / "filming.html").is_file()
+
+
+@pytest.mark.integration
+def test_the_batch_example_continues_after_a_failure_and_says_so(tmp_path, sample_video):
     videos, results = tmp_path / "videos", tmp_path / "results"
     videos.mkdir()
-    (videos / "a_broken.mp4").write_text("this is no video")
+    (videos / "a_broken.mp4").write_text("this is not a video")
     (videos / "b_room.mp4").write_bytes(sample_video.read_bytes())
     environment = {
         **os.environ, "OMP_NUM_THREADS": "1",

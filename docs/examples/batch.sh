@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Reconstructs every video of a folder, each in a workspace of its own, and goes on after a failure.
+# Reconstructs every video of a folder, each in a workspace of its own, and continues after a failure.
 #
 #   docs/examples/batch.sh VIDEOS RESULTS [OPTION...]
 #
 # The options after the two folders go to `recon run`, for example: --set train.iterations=1000
-# A second call takes up where the first one stopped. Exits with 1 if any video failed.
+# A second call continues where the first one stopped. Exits with 1 if any video failed.
 set -uo pipefail
 
 if [ $# -lt 2 ]; then

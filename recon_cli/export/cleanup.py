@@ -45,7 +45,7 @@ _APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
 _BULK = 0.9  # of the scene lies within its radius
 _EDGE = 0.005  # of the scene lies beyond each side of its box
 _VISIBLE = 1 / 255  # fainter ones are not rendered, and touch nothing
-# Measurements behind these constants: docs/cleanup.md.
+# Measurements behind these constants: tests/bench/notes/scenes.md.
 _WEIGHT = 0.01  # alpha T; below, a view does not show it. RadSplat's threshold for high quality
 _FEW = 2  # views
 _IN_FRONT = 0.5  # of the depth of what is behind

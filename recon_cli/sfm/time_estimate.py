@@ -48,7 +48,7 @@ class Costs:
     join: float  # to join segments; of one core
 
 
-# Fitted to the seconds of two idle cores and of long walks in docs/benchmarks.md.
+# Fitted to the seconds of two idle cores and of long walks in tests/bench/notes/cameras.md.
 COSTS = Costs(
     walk=0.12, walk_megapixel=0.48, keyframe=0.34, walk_mapping=0.15,
     photo=0.28, photo_megapixel=0.38, photo_mapping=0.17, split=1.0, join=0.2)

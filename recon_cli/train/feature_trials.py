@@ -276,7 +276,7 @@ class _Bench:
             train, _ = scene.twins()
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         # Far content seemed worth up to 1 dB less where a run so short replaced Gaussians, too; in
-        # runs of full length it is worth as much as without (docs/training.md).
+        # runs of full length it is worth as much as without (tests/bench/notes/training.md).
         recipe = Schedule(config).recipe
         recipe = dataclasses.replace(recipe, levels=(), replaced_at_once=0.0,
                                      means_rate=_FURTHER * recipe.means_rate)

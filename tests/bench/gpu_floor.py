@@ -23,7 +23,7 @@ E instances, T tiles, P pixels and Q pairs of a Gaussian and a pixel:
 Q counts all 256 pixels of a tile for every instance up to the last one that any of them shows: what
 anybody must look at who composites by tiles. What the forward pass keeps for the backward is no
 part of the floor. How many of these pairs contribute is told beside.
-Operations are counted as for CPUs (docs/bench.md, docs/rasterizer.md), a multiply-add as two; where
+Operations are counted as for CPUs (tests/bench/notes/rasterizers.md), a multiply-add as two; where
 only bytes stand above, operations are fewer. Three of four steps leave the harmonics as they are
 and take a fourth of adam's time.
 """

@@ -39,7 +39,7 @@ def test_segments_are_mapped_at_once_and_joined_on_one_core():
         70 * 40 / 4 + 60 * 100 / 4 + 60 * 1000)
 
 
-# Seconds of two idle cores in docs/benchmarks.md.
+# Seconds of two idle cores in tests/bench/notes/cameras.md.
 @pytest.mark.parametrize(("frames", "megapixels", "tracked", "took"), [
     (76, 0.204, True, 35), (75, 0.204, True, 30), (100, 0.92, True, 60), (100, 0.518, True, 74),
     (52, 0.309, True, 26), (90, 0.41, True, 43), (30, 0.307, True, 12), (50, 2.07, False, 35),
@@ -49,7 +49,7 @@ def test_what_captures_took_is_told_within_a_third(frames, megapixels, tracked, 
     assert told == pytest.approx(took, rel=1 / 3)
 
 
-# CPU seconds of long walks (docs/benchmarks.md).
+# CPU seconds of long walks (tests/bench/notes/cameras.md).
 @pytest.mark.parametrize(("frames", "keyframes", "megapixels", "took"), [
     (360, 184, 0.194, 133), (270, 57, 0.41, 89), (400, 85, 0.92, 232), (300, 73, 0.23, 110)])
 def test_what_long_walks_took_is_told_within_a_third(frames, keyframes, megapixels, took):
