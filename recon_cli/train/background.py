@@ -43,7 +43,7 @@ _FACING = 5  # directions that must be free in a view that sees some of it; 50 s
 _MISSED, _BEFORE, _SIDES_DEG = 0.25, 0.9, 10.0
 _FILL_DEGREES = 12.0  # directions this close to a far one become far: frames and trees hide some
 # Of gaps between points, in the reduced images. Set beforehand, and held against views in the
-# middle of stretches that were taken away (tests/bench/notes/training.md); cells of .1 gained as much.
+# middle of stretches that were taken away (tests/bench/notes/training.md); .1 gained as much.
 _GAP_GRID = 4  # pixels from one place that is looked at to the next
 _NEIGHBOURS = 12  # points whose median depth a gap has
 _GAP_CELL = 0.06  # of the median depth of all gaps: places within are one

@@ -66,8 +66,8 @@ class Quality:
     max_size: int  # longest side of a training image in pixels
 
 
-# A draft takes 11 to 15 CPU seconds of one thread on living, office and fox (tests/bench/notes/training.md,
-# "Budgets of a training"); the others follow from what steps of their size and count take.
+# A draft takes 11 to 15 CPU seconds of one thread on living, office and fox
+# (tests/bench/notes/training.md); the others follow from what steps of their size and count take.
 QUALITIES = {"draft": Quality(1500, 400), "normal": Quality(2400, 600), "high": Quality(8000, 800)}
 
 
@@ -136,7 +136,7 @@ def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
     the square root of the steps, as a new Gaussian must still find its place. No more than an
     eighth of the detail of all views: what few views see fits each of them and nothing between. On
     living and office, doubling the cap gave .5 to 1.3 dB for 15 to 30% more time
-    (tests/bench/notes/training.md, "The cap of the count").
+    (tests/bench/notes/training.md).
     """
     if asked.max_gaussians is not None:
         return asked.max_gaussians

@@ -1,4 +1,4 @@
-"""What the floors in tests/bench/notes/rasterizers.md are made of: `python tests/bench/bench_floor.py`.
+"""What the floors in notes/rasterizers.md are made of: `python tests/bench/bench_floor.py`.
 
 Prints, for the room of `recon bench`, how many Gaussians are seen in how many instances, how many
 pairs contribute, what the buffers of a training step take, and what one core copies.
