@@ -193,9 +193,6 @@ class TrainConfig(StageConfig):
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
         choices=("auto", "on", "off"))
-    poses: str = option(
-        "auto", "Refine the training cameras; auto: if a trial improves validation PSNR.",
-        choices=("auto", "on", "off"))
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -261,7 +258,7 @@ class RunConfig(TrainConfig):
                  "densify_scale", "min_opacity", "means_rate", "quats_rate", "scales_rate",
                  "opacities_rate", "sh_rate")
         return self.densify == "reference" and all(
-            getattr(self, part) == "off" for part in ("far", "stereo", "exposure", "poses")) and (
+            getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 
 

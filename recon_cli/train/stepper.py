@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,14 +28,12 @@ class _BatchResult:
 
     loss: NDArray[np.float64]  # [B]
     visible: NDArray[np.float64]  # [B] 1 where the view saw a Gaussian
-    turn: NDArray[np.float64]  # [B, 6] gradients of the cameras
     gain: NDArray[np.float64]  # [B, 3] gradients of the log-gains
 
     @staticmethod
     def zeros(views: int) -> _BatchResult:
         """Returns the result of no view."""
-        return _BatchResult(
-            np.zeros(views), np.zeros(views), np.zeros((views, 6)), np.zeros((views, 3)))
+        return _BatchResult(np.zeros(views), np.zeros(views), np.zeros((views, 3)))
 
 
 class Stepper:
@@ -77,7 +75,8 @@ class Stepper:
         gathered = state.gathered if not several else DensificationStats.zeros(
             len(state.splats), self._task.device)
         for place in range(ranks.rank, len(batch), ranks.count):
-            view = self._view(batch[place], iteration)
+            view = self._task.pyramid.view(
+                batch[place], self._task.schedule.level(iteration))
             statistics = self._look(view, batch[place], place, result, iteration)
             if statistics is None:
                 continue
@@ -97,12 +96,6 @@ class Stepper:
             state.gathered.join(gathered)
         return result
 
-    def _view(self, index: int, iteration: int) -> TrainView:
-        view = self._task.pyramid.view(index, self._task.schedule.level(iteration))
-        if self._state.poses is None:
-            return view
-        return replace(view, camera=self._state.poses.camera(index, view.camera))
-
     def _look(
         self, view: TrainView, index: int, place: int, result: _BatchResult, iteration: int
     ) -> Statistics | None:
@@ -115,7 +108,7 @@ class Stepper:
             details=schedule.gathers(iteration) and self._strategy.variance,
             scores=importance is not None and importance.weighs,
             loo=importance is not None and importance.leaves_out,
-            harmonics=schedule.moves_sh(iteration) or state.poses is not None)
+            harmonics=schedule.moves_sh(iteration))
         result.loss[place], statistics = self._compute(
             state.optimizer, view, options,
             None if state.exposure is None else state.exposure.gain(index))
@@ -124,8 +117,6 @@ class Stepper:
         result.visible[place] = 1
         if importance is not None:
             importance.add(statistics)
-        if state.poses is not None:
-            result.turn[place] = self._compute.camera_gradient(state.optimizer, view.camera, degree)
         if state.exposure is not None:
             result.gain[place] = self._compute.log_gain_gradient
         return statistics
@@ -136,8 +127,6 @@ class Stepper:
         for place, index in enumerate(batch):
             if not result.visible[place]:
                 continue
-            if state.poses is not None:
-                state.poses.step(index, result.turn[place], schedule.share(iteration))
             if state.exposure is not None:
                 state.exposure.step(index, result.gain[place], schedule.share(iteration))
         state.optimizer.step(

@@ -30,7 +30,6 @@ class Task:
     device: torch.device  # where the tensors live
     nearness: float | None = None  # `Scene.nearness`; None where there are no points
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
-    camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
     stereo: StereoPoints | None = None  # of the training views; None where they are not known
     ranks: ProcessGroup = SINGLE_PROCESS  # this process among those that take the steps together

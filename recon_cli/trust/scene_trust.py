@@ -184,11 +184,11 @@ def measure_trust(
 
     `max_size` is the longest side in pixels at which errors are compared.
     """
-    gains, refined = config.exposure == "on", config.poses == "on"
+    gains = config.exposure == "on"
     support = measure_support(
         splats, _in_turn(evenly_spread(scene.train, MAX_VIEWS), max_size, ctx.threads),
-        sh_degree=config.sh_degree, backend=ctx.backend, gains=gains, compare=not refined,
-        on_view=on_view, digest=digest_of(splats))
+        sh_degree=config.sh_degree, backend=ctx.backend, gains=gains, on_view=on_view,
+        digest=digest_of(splats))
     validation = load_reference_views(evenly_spread(scene.validation, _CALIBRATION), max_size)
     train = [] if validation else load_reference_views(
         evenly_spread(scene.train, _CALIBRATION), max_size)

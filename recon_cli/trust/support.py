@@ -154,13 +154,12 @@ def _directions(means: Tensor, place: NDArray[np.float64]) -> tuple[Tensor, Tens
 
 def measure_support(
     splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str,
-    gains: bool = False, compare: bool = True, on_view: Callable[[], None] = lambda: None,
+    gains: bool = False, on_view: Callable[[], None] = lambda: None,
     digest: str = "",
 ) -> Support:
     """Returns what training views show of the Gaussians, by one forward pass over them.
 
-    `gains` compares after the best gain per channel, as where exposures were trained. Without
-    `compare`, where cameras were refined and photos do not fit them, residuals are all alike.
+    `gains` compares after the best gain per channel, as where exposures were trained.
     """
     device = splats.means.device
     weights = torch.zeros(len(splats), dtype=torch.float64, device=device)
@@ -175,7 +174,7 @@ def measure_support(
         statistics = output.statistics
         rows = torch.nonzero(statistics.blend_max >= CARRIES)[:, 0]
         shown.append(rows)
-        if compare and len(rows):
+        if len(rows):
             error, counts = error_image(output.rgb.cpu().numpy(), view, gains=gains)
             # the mean over the pixels around that count
             blurred = cv2.blur(error * counts, (_BLUR, _BLUR)) / np.maximum(

@@ -137,7 +137,7 @@ def open_capture(workspace: Path, max_size: int, iterations: int, *, removed: bo
     low, high = min(names), max(names)
     aside = stretch[1::3] if removed else ()
     config = RunConfig(iterations=iterations, max_size=max_size, max_gaussians=30_000, sh_degree=1,
-                       images="original", far="off", exposure="off", poses="off")
+                       images="original", far="off", exposure="off")
     return Capture(
         replace(scene, train=tuple(view for view in every if view.name not in names),
                 # a validation view in the stretch would show what is missing

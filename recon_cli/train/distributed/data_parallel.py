@@ -215,7 +215,7 @@ def pack_fit(fit: Fit) -> dict[str, NDArray[Any]]:
         "config": dataclasses.asdict(schedule.config), "recovery": recovery,
         "continues_at": continues_at,
         "extent": task.extent, "nearness": task.nearness, "backend": task.backend,
-        "device": task.device.type, "camera_error": task.camera_error, "threads": fit.threads,
+        "device": task.device.type, "threads": fit.threads,
         "scores": importance and [importance.weighs, importance.leaves_out],
         "cameras": [{name: getattr(view.camera, name) for name in _LENS} for view in views]}
     arrays: dict[str, NDArray[Any]] = {
@@ -246,8 +246,7 @@ def unpack_fit(arrays: dict[str, NDArray[Any]], ranks: ProcessGroup) -> Fit:
         schedule = RecoverySchedule(config, first=first, until=until)
     task = Task(
         list(ranks.views), [], schedule, said["extent"], said["backend"],
-        torch.device(said["device"]), nearness=said["nearness"],
-        camera_error=said["camera_error"], ranks=ranks)
+        torch.device(said["device"]), nearness=said["nearness"], ranks=ranks)
     with tempfile.TemporaryDirectory() as folder:
         arrays["state"].tofile(Path(folder) / _STATE)
         state = restore_state(Path(folder) / _STATE, task)
