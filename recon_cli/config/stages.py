@@ -169,7 +169,7 @@ class TrainConfig(StageConfig):
         None, "Optimization steps; more than those of a finished run go on from its end.",
         minimum=1, automatic="by --quality")
     batch_views: int = option(
-        1, "Views per step and process; their mean gradient is used.", unit="views", minimum=1,
+        1, "Views per step; their mean gradient is used.", unit="views", minimum=1,
         expert=True)
     max_size: int | None = option(
         None, "Longest image side.", unit="pixels", minimum=16,

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon_cli.context import ProcessGroup
 from recon_cli.render import Statistics, render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -65,13 +64,6 @@ class Importance:
             self.blend_max = torch.maximum(self.blend_max, statistics.blend_max.double())
         if self.leaves_out:
             self.loo += statistics.loo
-
-    def over(self, ranks: ProcessGroup) -> None:
-        """Reduces the sums over the processes that train together."""
-        views = torch.tensor([self.views])
-        ranks.add([views, self.hits, self.blend_sum, self.loo])
-        ranks.all_reduce_max(self.blend_max)
-        self.views = int(views)
 
     def score(
         self, name: str, splats: Splats, *, beta: float, generator: torch.Generator

@@ -12,7 +12,6 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.context import ProcessGroup
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.render import Statistics
 from recon_cli.scene.backdrop import Backdrop
@@ -57,11 +56,6 @@ class DensificationStats:
         self.pull += torch.stack((across * (width / 2), down * (height / 2)), -1).norm(dim=-1)
         self.count += statistics.radii > 0
         self.radius = torch.maximum(self.radius, statistics.radii)
-
-    def over(self, ranks: ProcessGroup) -> None:
-        """Reduces the statistics over the processes that train together."""
-        ranks.add([self.pull, self.count, self.variance])
-        ranks.all_reduce_max(self.radius)
 
     def times(self, factor: Tensor) -> DensificationStats:
         """Returns all of it times a factor, a number on the device."""

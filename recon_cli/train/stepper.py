@@ -37,7 +37,7 @@ class _BatchResult:
 
 
 class Stepper:
-    """Takes the steps of a call of `fit.fit`; `importance` gets scores of this process's views."""
+    """Takes the steps of a call of `fit.fit`; `importance` gets the scores of their views."""
 
     def __init__(self, state: TrainState, task: Task, importance: Importance | None) -> None:
         self._state, self._task, self._importance = state, task, importance
@@ -66,18 +66,17 @@ class Stepper:
         return loss
 
     def _gather(self, batch: list[int], iteration: int) -> _BatchResult:
-        """Looks at this process's share of the views and leaves their mean gradient."""
-        state, ranks = self._state, self._task.ranks
-        moves_sh = self._task.schedule.moves_sh(iteration)
-        result, gathers = _BatchResult.zeros(len(batch)), self._task.schedule.gathers(iteration)
-        several = len(batch) > 1 or not ranks.alone
-        # in a sum of its own, so that who looked at which view changes no bit
+        """Looks at the views and leaves their mean gradient."""
+        state, task = self._state, self._task
+        moves_sh = task.schedule.moves_sh(iteration)
+        result, gathers = _BatchResult.zeros(len(batch)), task.schedule.gathers(iteration)
+        several = len(batch) > 1
+        # added in a sum of its own: one by one would round otherwise
         gathered = state.gathered if not several else DensificationStats.zeros(
-            len(state.splats), self._task.device)
-        for place in range(ranks.rank, len(batch), ranks.count):
-            view = self._task.pyramid.view(
-                batch[place], self._task.schedule.level(iteration))
-            statistics = self._look(view, batch[place], place, result, iteration)
+            len(state.splats), task.device)
+        for place, index in enumerate(batch):
+            view = task.pyramid.view(index, task.schedule.level(iteration))
+            statistics = self._look(view, index, place, result, iteration)
             if statistics is None:
                 continue
             if gathers:
@@ -87,13 +86,9 @@ class Stepper:
             if several:
                 state.optimizer.accumulate(1 / len(batch), sh_rest=moves_sh)
         if several:
-            ranks.add(state.optimizer.take_accumulated(sh_rest=moves_sh))
-        if not ranks.alone:
-            ranks.add([torch.from_numpy(values) for values in vars(result).values()])
+            state.optimizer.take_accumulated(sh_rest=moves_sh)
             if gathers:
-                gathered.over(ranks)
-        if several and gathers:
-            state.gathered.join(gathered)
+                state.gathered.join(gathered)
         return result
 
     def _look(

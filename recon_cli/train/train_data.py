@@ -238,7 +238,7 @@ def _free_bytes(ctx: StageContext) -> int:
 
 def _host_bytes(ctx: StageContext) -> int:
     """Returns the memory beside the CPU that this process may take."""
-    free = free_memory_bytes() // ctx.ranks.local
+    free = free_memory_bytes()
     return free if ctx.max_memory_bytes is None else min(free, ctx.max_memory_bytes)
 
 

@@ -343,7 +343,6 @@ class TrainSummary(JsonRecord):
     skipped_steps: int  # the loss was not finite
     estimated_seconds: float
     calibration_seconds: float
-    processes: int | None = None  # None for one
     cuda_peak_bytes: int
 
 
