@@ -316,7 +316,7 @@ class EvaluateConfig(StageConfig):
         None, "Longest side of rendered and scored views.", unit="pixels", minimum=16,
         automatic="as in training")
     trust: bool = option(
-        True, "Measure where the scene can be trusted, and suggest where to film next.")
+        True, "Measure where the scene can be trusted, and list what is poorly seen.")
 
 
 PLAN = "plan.svg"

@@ -174,7 +174,7 @@ def run(
         exported, folder, evaluation.config, evaluation.scene, evaluation.held_out,
         config.max_size or evaluation.config.max_size, evaluation.import_record,
         WorldSummary.read(inputs.folders["sfm"])), out, ctx) if config.trust else None
-    return EvaluateSummary(**means, film_next=tuple(trust.lines()) if trust else None)
+    return EvaluateSummary(**means, poorly_seen=tuple(trust.lines()) if trust else None)
 
 
 def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> _Evaluation:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -92,26 +92,6 @@ class Support:
         nearer = torch.log(nearest / distance).clamp(0, _MAX_NEARER)
         return Sight(torch.arccos(cosine.clamp(-1, 1)),
                      torch.where(torch.isinf(nearest), torch.zeros_like(nearer), nearer))
-
-    def with_view(self, rows: Tensor, center: NDArray[np.float64]) -> Support:
-        """Returns what there would be with one more view that shows `rows`."""
-        count = self.count.clone()
-        count[rows] += 1
-        return Support((*self.rows, rows), np.vstack([self.centers, center]), self.residual, count,
-                       self.digest)
-
-    def select(self, rows: Tensor) -> Support:
-        """Returns the support of the Gaussians at `rows` [K], in that order."""
-        at = torch.full((len(self.residual),), -1, dtype=torch.int64, device=rows.device)
-        at[rows] = torch.arange(len(rows), device=rows.device)
-        shown = (at[view] for view in self.rows)
-        return Support(tuple(view[view >= 0] for view in shown), self.centers, self.residual[rows],
-                       self.count[rows])
-
-    def thinned(self, most: int) -> Support:
-        """Returns the rays of at most so many of the views, evenly spread; counts stay."""
-        step = max(1, -(-len(self.rows) // most))
-        return replace(self, rows=self.rows[::step], centers=self.centers[::step])
 
     def save(self, path: Path) -> None:
         """Writes the support as safetensors, whole or not at all."""

@@ -389,7 +389,7 @@ class EvaluateSummary(JsonRecord):
     pruned_gaussians: int | None = None
     base_gain_psnr_db: float | None = None  # after the best gain of each view, with --exposure
     pruned_gain_psnr_db: float | None = None
-    film_next: tuple[str, ...] | None = None  # where to film next, a line each; docs/trust.md
+    poorly_seen: tuple[str, ...] | None = None  # largest regions, a line each; docs/trust.md
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -167,9 +167,8 @@ def test_trust_is_measured_checked_on_held_out_views_and_drawn(inputs, tmp_path)
     splats = read_ply(inputs.folders["prune"] / "splats.ply")
     assert Trust.load(out, "pruned", digest_of(splats), 0).support.count.shape == (len(splats),)
     assert Trust.load(out, "base", digest_of(splats), 0) is None  # of other Gaussians
-    # twelve cameras that all look the same way over no floor
-    assert len(summary.film_next) == 1
-    assert "up is not known" in summary.film_next[0]
+    assert len(summary.poorly_seen) == len(record.poorly_seen)
+    assert all(line.startswith("poorly seen (") for line in summary.poorly_seen)
 
 
 def test_held_out_views_calibrate_nothing(inputs, tmp_path):
@@ -189,7 +188,7 @@ def test_held_out_views_calibrate_nothing(inputs, tmp_path):
 
 def test_without_trust_nothing_of_it_is_written(inputs, tmp_path):
     summary = run(evaluate, EvaluateConfig(trust=False), without(inputs, "prune"), tmp_path / "out")
-    assert summary.film_next is None
+    assert summary.poorly_seen is None
     assert not (tmp_path / "out" / "trust").exists()
     assert TrustRecord.read(tmp_path / "out") is None
 
