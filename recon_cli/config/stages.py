@@ -215,9 +215,6 @@ class TrainConfig(StageConfig):
     densify_gradient: float = option(
         2e-4, "With reference: clone or split where the mean gradient of the projected mean is "
         "larger.", unit="NDC", minimum=0.0, expert=True)
-    densify_scale: float = option(
-        0.01, "With reference: split above this scale, clone below.", unit="x extent", minimum=0.0,
-        expert=True)
     min_opacity: float = option(
         0.005, "Delete Gaussians below this opacity.", minimum=0.0, maximum=1.0, expert=True)
     mid: float = option(
@@ -255,14 +252,14 @@ class RunConfig(TrainConfig):
     def is_reference(self) -> bool:
         """Whether this is the recipe of 3DGS (Kerbl et al. 2023), whatever the steps and images."""
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
-                 "densify_scale", "min_opacity", "means_rate", "quats_rate", "scales_rate",
-                 "opacities_rate", "sh_rate")
+                 "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
+                 "sh_rate")
         return self.densify == "reference" and all(
             getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 
 
-# Those that beat a random choice, and the paper's; `train.importance` knows more. docs/pruning.md
+# Those that beat a random choice, and the paper's. docs/pruning.md
 PRUNE_SCORES = ("loo", "blend_max", "paper")
 
 
