@@ -17,7 +17,6 @@ from recon_cli.commands import console, hints
 from recon_cli.commands.options import Call
 from recon_cli.errors import ExitCode, ReconError, ReconstructionError
 from recon_cli.lazy import load
-from recon_cli.train.distributed import launch
 from recon_cli.workspace import disk
 
 MAX_WIDTH = 100  # columns of a help text on a wide terminal
@@ -113,10 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     handler = console.show_log(detailed=lambda: call.verbose, complete=complete)
     try:
         with signals.raising():
-            if launch.follows():
-                return launch.follow()
-            with launch.leading() as call.ranks:
-                code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
+            code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
             return code if isinstance(code, int) else ExitCode.DONE
     except (Exception, KeyboardInterrupt) as raised:
         error = raised.__cause__ or raised if isinstance(raised, _PastClick) else raised

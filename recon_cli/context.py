@@ -11,11 +11,8 @@ from typing import TYPE_CHECKING, Any
 from recon_cli.progress import NullProgress, Progress
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from recon_cli.scene.camera import Camera
     from recon_cli.scene.splats import Splats
-    from recon_cli.scene.train_view import TrainView
 
 
 @dataclass(frozen=True)
@@ -53,55 +50,6 @@ class TrainCallback:
     def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
         """Returns whether `on_step` must be called after this step; else the host may run ahead."""
         return False
-
-
-@dataclass(eq=False)
-class ProcessGroup:
-    """This process among those that train together; by itself there is but one."""
-
-    rank: int = 0  # of this process, 0 to count - 1. The first one leads: it writes and decides
-    count: int = 1  # of the processes
-    local: int = 1  # how many of them share this machine
-    lacks_gpu: bool = False  # some have a GPU of their own, and some have none
-    # the training views that all of them hold by now
-    views: Sequence[TrainView] = field(default=(), repr=False)
-
-    @property
-    def leads(self) -> bool:
-        """Whether this process writes and decides."""
-        return self.rank == 0
-
-    @property
-    def alone(self) -> bool:
-        """Whether there is nobody else."""
-        return self.count == 1
-
-    def most_of(self, views: int) -> int:
-        """Returns the most views that one process looks at in a step of so many."""
-        return -(-views // self.count)
-
-    def threads_of(self, cores: int) -> int:
-        """Returns this process's share of the cores of its machine, at least one."""
-        return max(1, cores // self.local)
-
-    def add(self, tensors: Sequence[Tensor]) -> None:
-        """Replaces tensors by their sums over all processes, the same bits in each."""
-
-    def all_reduce_max(self, tensor: Tensor) -> None:
-        """Replaces the values of a tensor by the greatest of all processes."""
-
-    def broadcast_int(self, number: int) -> int:
-        """Returns the number that the leader gives; the others' own does not matter."""
-        return number
-
-    def broadcast(self, tensor: Tensor) -> None:
-        """Replaces the values of a tensor by those of the leader's."""
-
-    def leave(self) -> None:
-        """Ends the connection: whoever waits for this process hears that it is gone."""
-
-
-SINGLE_PROCESS = ProcessGroup()
 
 
 logger = logging.getLogger("recon")
@@ -152,7 +100,6 @@ class StageContext:
     # called where the stage keeps to one core, of another process, from now on
     on_idle: Callable[[], None] = _leave_idle
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
-    ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
     max_memory_bytes: int | None = None  # that a stage may take; None: what is free
     scratch: Path | None = None  # folder for files without a name; None: the system's
 
@@ -160,10 +107,3 @@ class StageContext:
         """Tells the user one line that must not be missed; unprintable characters are escaped."""
         logger.warning("%s", "".join(
             one if one.isprintable() else repr(one)[1:-1] for one in text))
-
-    def notice_idle(self, views: int) -> None:
-        """Tells the user where steps of so many views leave processes without one."""
-        idle = self.ranks.count - views
-        if idle > 0:
-            self.notice(f"{idle} of the {self.ranks.count} processes have nothing to do: a step "
-                        f"takes --batch-views {views}")

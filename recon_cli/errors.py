@@ -72,10 +72,6 @@ class TrainingError(ReconstructionError):
     """Training diverged or has nothing to fit, or not enough memory."""
 
 
-class LostError(TrainingError):
-    """Another process of a distributed training ended."""
-
-
 class BackendError(ReconError):
     """The rasterizer or device that was asked for is not available."""
 

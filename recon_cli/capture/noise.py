@@ -11,8 +11,6 @@ at its best strength; time relative to bilateral (tests/bench/bench_denoise.py):
     none              34.2 1.00   28.2 1.00   24.7  .99   22.3  .99    0
     joint, 4          40.2 1.00   36.5  .99   34.3  .98   32.7  .97   4.5
     bilateral, 4      39.9  .99   35.8  .97   33.2  .94   31.3  .92   1
-    guided, 1.5       39.3  .99   34.5  .96   31.5  .93   29.5  .90   2.6
-    non-local means   37.6 1.00   33.7  .98   31.7  .94   30.4  .89   35
 
 joint is the default.
 """

@@ -45,8 +45,6 @@ def train_in_blocks(call: Call, asked: str, place: str, jobs: int | None) -> boo
     job, config = open_job_with(call, TrainConfig)
     if asked == "off" or (asked == "auto" and not _is_large(job)):
         return False
-    if not call.ranks.alone:
-        raise click.UsageError("torchrun trains one model on several GPUs: give --blocks off.")
     refuse_missing_backend(job, [MERGE.name])
     if not call.again:
         refuse_to_replace(dataclasses.replace(job, table=_TABLE), "train --blocks", [MERGE.name])

@@ -12,7 +12,7 @@ import click
 from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
-from recon_cli.config.stages import ComputeConfig, TrainConfig
+from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import TrainCallback
 from recon_cli.executors.executor import Executor, start_executor
 from recon_cli.pipeline import plan
@@ -38,8 +38,7 @@ def run_stages(
     """
     table = table or STAGES
     file_settings = explicit_settings(call)
-    values = layers.merge(
-        [base or {}, file_settings, _of_all_processes(call, file_settings), forced or {}])
+    values = layers.merge([base or {}, file_settings, call.settings, forced or {}])
     rows = [row for row in table if row.name in stages]
     configs = {layers.section_of(row.config): layers.build(row.config, values) for row in rows}
     compute = layers.build(ComputeConfig, values)
@@ -48,7 +47,7 @@ def run_stages(
         return
     job = Job(
         Workspace(call.workspace), file_settings, compute, TqdmProgress(), report_outcome, table,
-        callbacks, call.ranks)
+        callbacks)
     start = Start.IMPORTED if call.from_import else Start.AUTO
     targets = [
         Target(row.name, config, sources if row.takes else (),
@@ -57,18 +56,6 @@ def run_stages(
     plan.run(job, verb, targets, again=call.again)
     if "evaluate" in stages:
         click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
-
-
-def _of_all_processes(call: Call, file_settings: Settings) -> Settings:
-    """Returns the settings that were typed, with the views that all processes together take.
-
-    `--batch-views` counts those of one process; files, --set and the record count those of a step.
-    """
-    typed = call.settings.get("train", {}).get("batch_views")
-    if typed is None and "batch_views" not in file_settings.get("train", {}):
-        typed = TrainConfig.batch_views
-    total = {} if typed is None else {"batch_views": typed * call.ranks.count}
-    return layers.merge([call.settings, {"train": total}])
 
 
 def open_job(call: Call) -> Job:
@@ -81,9 +68,7 @@ def open_job_with(call: Call, kind: type[C]) -> tuple[Job, C]:
     file_settings = explicit_settings(call)
     values = layers.merge([file_settings, call.settings])
     compute = layers.build(ComputeConfig, values)
-    job = Job(
-        Workspace(call.workspace), file_settings, compute, TqdmProgress(), table=STAGES,
-        ranks=call.ranks)
+    job = Job(Workspace(call.workspace), file_settings, compute, TqdmProgress(), table=STAGES)
     return job, layers.build(kind, values)
 
 

@@ -27,7 +27,6 @@ from recon_cli.config.settings import (
     section_of,
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
-from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 from recon_cli.executors.executor import CORES
 from recon_cli.workspace.paths import refuse_special
 
@@ -53,8 +52,6 @@ class Call:
     print_config: bool = False
     settings: Settings = field(default_factory=dict)  # given as options of their own
     assigned: Settings = field(default_factory=dict)  # given by --set
-    # The processes that train together, which this one leads; nobody types it.
-    ranks: ProcessGroup = SINGLE_PROCESS
 
 
 pass_call = click.make_pass_decorator(Call, ensure=True)

@@ -45,7 +45,7 @@ def status(call: Call, as_json: bool) -> None:
     click.echo(status_table(stages))
     for stage in stages:
         if stage.state == "fresh":
-            for line in stage.summary.get("film_next") or ():
+            for line in stage.summary.get("poorly_seen") or ():
                 click.echo(line)
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)

@@ -115,7 +115,8 @@ def _check_names(section: str, names: Iterable[str], *, where: str) -> None:
         if name not in known:
             raise ConfigError(
                 f"{where} sets {section}.{name}, which does not exist.",
-                hint=_suggest(name, known, f"Options of [{section}]:"))
+                hint=f"{_suggest(name, known, f'Options of [{section}]:')} "
+                "An option of an earlier version may be gone: leave it out.")
 
 
 def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> None:

@@ -173,7 +173,7 @@ class TrainConfig(StageConfig):
         None, "Optimization steps; more than those of a finished run go on from its end.",
         minimum=1, automatic="by --quality")
     batch_views: int = option(
-        1, "Views per step and process; their mean gradient is used.", unit="views", minimum=1,
+        1, "Views per step; their mean gradient is used.", unit="views", minimum=1,
         expert=True)
     max_size: int | None = option(
         None, "Longest image side.", unit="pixels", minimum=16,
@@ -197,9 +197,6 @@ class TrainConfig(StageConfig):
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
         choices=("auto", "on", "off"))
-    poses: str = option(
-        "auto", "Refine the training cameras; auto: if a trial improves validation PSNR.",
-        choices=("auto", "on", "off"))
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -222,9 +219,6 @@ class TrainConfig(StageConfig):
     densify_gradient: float = option(
         2e-4, "With reference: clone or split where the mean gradient of the projected mean is "
         "larger.", unit="NDC", minimum=0.0, expert=True)
-    densify_scale: float = option(
-        0.01, "With reference: split above this scale, clone below.", unit="x extent", minimum=0.0,
-        expert=True)
     min_opacity: float = option(
         0.005, "Delete Gaussians below this opacity.", minimum=0.0, maximum=1.0, expert=True)
     mid: float = option(
@@ -262,14 +256,14 @@ class RunConfig(TrainConfig):
     def is_reference(self) -> bool:
         """Whether this is the recipe of 3DGS (Kerbl et al. 2023), whatever the steps and images."""
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
-                 "densify_scale", "min_opacity", "means_rate", "quats_rate", "scales_rate",
-                 "opacities_rate", "sh_rate")
+                 "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
+                 "sh_rate")
         return self.densify == "reference" and all(
-            getattr(self, part) == "off" for part in ("far", "stereo", "exposure", "poses")) and (
+            getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 
 
-# Those that beat a random choice, and the paper's; `train.importance` knows more. docs/pruning.md
+# Those that beat a random choice, and the paper's. docs/pruning.md
 PRUNE_SCORES = ("loo", "blend_max", "paper")
 
 
@@ -323,7 +317,7 @@ class EvaluateConfig(StageConfig):
         None, "Longest side of rendered and scored views.", unit="pixels", minimum=16,
         automatic="as in training")
     trust: bool = option(
-        True, "Measure where the scene can be trusted, and suggest where to film next.")
+        True, "Measure where the scene can be trusted, and list what is poorly seen.")
 
 
 PLAN = "plan.svg"

@@ -54,11 +54,6 @@ class FilterVariant:
         """A name that no other variant has."""
         return f"{self.filter} {self.strength:g}"
 
-    @property
-    def offered(self) -> bool:
-        """Whether `recon denoise --filter` accepts it."""
-        return self.filter == "none" or self.filter in FILTERS
-
 
 @dataclass(frozen=True)
 class FilterScore:
@@ -66,29 +61,16 @@ class FilterScore:
 
     filter: str
     strength: float
-    offered: bool
     noise_255: float  # standard deviation of the added noise
     psnr_db: float  # against the frame without it
     edges_kept: float  # see `edges_kept`
     seconds_per_megapixel: float  # of the filter, on this machine
 
 
-def _guided(rgb: Pixels, noise: float) -> Pixels:
-    return np.asarray(cv2.ximgproc.guidedFilter(rgb, rgb, 2, (1.5 * noise) ** 2), np.uint8)
-
-
-def _non_local_means(rgb: Pixels, noise: float) -> Pixels:
-    return np.asarray(
-        cv2.fastNlMeansDenoisingColored(rgb, None, 0.8 * noise, 0.8 * noise, 5, 15), np.uint8)
-
-
 VARIANTS = (
     FilterVariant("none", 0.0, lambda rgb, _noise: rgb),
     *(FilterVariant(name, strength, partial(function, strength=strength))
-      for name, function in FILTERS.items() for strength in STRENGTHS),
-    # not offered, each at the strength that was best on fox and the rendered rooms
-    FilterVariant("guided", 1.5, _guided),
-    FilterVariant("non-local means", 0.8, _non_local_means))
+      for name, function in FILTERS.items() for strength in STRENGTHS))
 
 
 def compare_filters(job: Job, config: DenoiseConfig) -> str:
@@ -166,7 +148,7 @@ def score_filters(
         for level, of_level in zip(levels, values, strict=True):
             psnr_db, edges, seconds = of_level.T
             scores.append(FilterScore(
-                variant.filter, variant.strength, variant.offered, level, float(np.mean(psnr_db)),
+                variant.filter, variant.strength, level, float(np.mean(psnr_db)),
                 float(np.mean(edges)),
                 0.0 if variant.filter == "none" else float(sum(seconds)) / megapixels))
     return tuple(scores)
@@ -201,11 +183,11 @@ def _slopes(image: Pixels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def best(scores: Sequence[FilterScore], level: float) -> FilterScore:
-    """Returns the best of the filters on offer, or none, at the level nearest to `level`."""
+    """Returns the best of the filters, or none, at the level nearest to `level`."""
     near = min((score.noise_255 for score in scores), key=lambda noise: abs(noise - level))
     usable = [
         score for score in scores
-        if score.noise_255 == near and score.offered
+        if score.noise_255 == near
         and score.edges_kept >= _score_of_none(scores, near).edges_kept - _MAX_EDGE_LOSS]
     return max(usable, key=lambda score: score.psnr_db)
 
@@ -226,7 +208,7 @@ def _table(scores: Sequence[FilterScore]) -> str:
         own = scores[first:first + len(levels)]
         name, strength = own[0].filter, own[0].strength
         rows.append((
-            name if own[0].offered else f"({name})", f"{strength:g}" if strength else "-",
+            name, f"{strength:g}" if strength else "-",
             *(f"{score.psnr_db:.1f} {score.edges_kept:4.0%}" for score in own),
             f"{sum(score.seconds_per_megapixel for score in own) / len(own):.2f}"))
     return Table(

@@ -1,6 +1,7 @@
 """`recon prune --sweep`: quality after pruning by every score to every ratio, with controls.
 
-The controls remove nothing: one takes as many steps, the others as many seconds. sweep.json and
+One control removes at random. The others remove nothing: one takes as many steps, the others as
+many seconds. sweep.json and
 sweep.svg lie in the workspace beside the stages, so that no stage becomes stale.
 """
 
@@ -13,7 +14,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from recon_cli.config.stages import PruneConfig
+from recon_cli.config.stages import PRUNE_SCORES, PruneConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.evaluation.reference_views import mean_score
@@ -24,7 +25,7 @@ from recon_cli.pipeline import execute, plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.stages import stage
 from recon_cli.train.fit import fit
-from recon_cli.train.importance import SCORES, Importance
+from recon_cli.train.importance import RANDOM, Importance
 from recon_cli.train.prune_loop import PruneRun, prune_loop, remaining
 from recon_cli.train.prune_run import PruneSource, load_prune_source
 from recon_cli.train.state import TrainState
@@ -33,6 +34,7 @@ from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 
 PICTURE = "sweep.svg"
+SCORES = (*PRUNE_SCORES, RANDOM)
 _WARM_STEPS = 10  # before anything is timed: the first steps load kernels and make buffers
 
 

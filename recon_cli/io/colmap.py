@@ -67,8 +67,7 @@ def read_scene(
     if not views or not len(points):
         raise model_error(sparse, f"{len(views)} views and {len(points)} points", _HINT)
     missing = sorted(held_out - {view.name for view in views})
-    error = mean_point_error(sparse / "points3D.bin")
-    return Scene(train, chosen, test, tuple(missing), points, colors, error, sparse=sparse)
+    return Scene(train, chosen, test, tuple(missing), points, colors, sparse=sparse)
 
 
 def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
@@ -125,12 +124,6 @@ def read_points(path: Path, *, hint: str = _HINT) -> tuple[NDArray[np.float64], 
     if not np.isfinite(positions).all():
         raise model_error(path, "a point that is not finite", hint)
     return positions, np.array([row[4:7] for row in rows], np.uint8).reshape(-1, 3)
-
-
-def mean_point_error(path: Path) -> float | None:
-    """Returns the mean reprojection error of a points3D.bin in pixels, None if no point has any."""
-    errors = [float(row[7]) for row in _read_point_rows(path, _HINT) if row[7] > 0]
-    return float(np.mean(errors)) if errors else None
 
 
 def read_visibility(sparse: Path) -> dict[str, NDArray[np.int64]]:

@@ -17,15 +17,8 @@ from recon_cli import machine
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.context import (
-    SINGLE_PROCESS,
-    EarlierResult,
-    ProcessGroup,
-    StageContext,
-    StageInputs,
-    TrainCallback,
-)
-from recon_cli.errors import BackendError, ConfigError, ManifestError, ReconError
+from recon_cli.context import EarlierResult, StageContext, StageInputs, TrainCallback
+from recon_cli.errors import ConfigError, ManifestError, ReconError
 from recon_cli.lazy import load
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
@@ -63,7 +56,6 @@ class Job:
     table: Sequence[Stage] = STAGES
     # called while Gaussians are trained; they do not affect the result
     callbacks: tuple[TrainCallback, ...] = ()
-    ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
     asked: tuple[str, ...] = ()  # the stages that run, where that is known
 
     def inspect(self) -> WorkspaceCheck:
@@ -245,37 +237,30 @@ def _recorder(
 def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:
     """Returns the context of a stage, with device and threads set up."""
     if row.renders:
-        context = render_context(job.compute, job.progress, job.ranks)
+        context = render_context(job.compute, job.progress)
         return dataclasses.replace(
             context, record=record, callbacks=job.callbacks, scratch=job.workspace.partial(""))
     threads = job.compute.threads or machine.usable_threads()
     return StageContext(progress=job.progress, threads=threads, record=record)
 
 
-def render_context(
-    compute: ComputeConfig, progress: Progress, ranks: ProcessGroup = SINGLE_PROCESS
-) -> StageContext:
-    """Returns where to train and render, once ready; each of `ranks` takes its share of cores.
+def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:
+    """Returns where to train and render, once ready.
 
     Raises:
         BackendError: what was asked for is not available.
     """
-    threads = compute.threads or ranks.threads_of(machine.usable_threads())
-    backend, device = _resolve_backend(compute, ranks)
+    threads = compute.threads or machine.usable_threads()
+    backend, device = _resolve_backend(compute)
     load("recon_cli.render.registry.use_threads")(backend, threads)
     _prepare_kernels(progress, backend)
     most = None if compute.max_memory is None else int(compute.max_memory * 1e9)
-    return StageContext(progress, device, backend, threads, ranks=ranks, max_memory_bytes=most)
+    return StageContext(progress, device, backend, threads, max_memory_bytes=most)
 
 
-def _resolve_backend(compute: ComputeConfig, ranks: ProcessGroup) -> tuple[str, str]:
-    """Returns (backend, device); raises BackendError where a process lacks them."""
+def _resolve_backend(compute: ComputeConfig) -> tuple[str, str]:
+    """Returns (backend, device); raises BackendError where they are missing."""
     backend, device = load("recon_cli.render.registry.resolve")(compute.backend, compute.device)
-    if device == "cuda" and ranks.lacks_gpu:
-        raise BackendError(
-            f"{ranks.count} processes were started, but some of them have no GPU of their own.",
-            hint="Give torchrun as many processes a machine as it has GPUs (--nproc-per-node gpu), "
-            "or train with --device cpu.")
     return backend, device
 
 
@@ -294,6 +279,5 @@ def _prepare_kernels(progress: Progress, backend: str) -> None:
 def refuse_missing_backend(job: Job, stages: Sequence[str]) -> None:
     """Raises BackendError where one of `stages` renders with a named backend that is missing."""
     named = (job.compute.device, job.compute.backend) != ("auto", "auto")
-    uncertain = named or job.ranks.lacks_gpu
-    if uncertain and any(row.renders for row in job.table if row.name in stages):
-        _resolve_backend(job.compute, job.ranks)
+    if named and any(row.renders for row in job.table if row.name in stages):
+        _resolve_backend(job.compute)

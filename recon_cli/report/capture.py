@@ -25,10 +25,10 @@ from recon_cli.io.records import FOLDER, Frame, describe_stretches, read_frame_l
 from recon_cli.report.chart import draw_mark, legend_item
 from recon_cli.report.gallery import data_uri, encode_sheet
 from recon_cli.report.stage_status import StageReports
-from recon_cli.report.trust_section import read_suggestions
+from recon_cli.report.trust_section import read_regions
 from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene, View
-from recon_cli.trust.film_next import Suggestion
+from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.workspace.summaries import SfmSummary
 
 _SHEETS = 4  # contact sheets on the page; a capture may have many sources
@@ -42,7 +42,7 @@ _CELL = 2  # pixels of the plan in a cell of the density image
 _PERCENTILES = (2.0, 98.0)  # of the points that fit in; outliers may lie far away
 _GRAY = 128  # of the points: visible on white and on black
 _MANY_CAMERAS = 150  # from which on marks are smaller
-_NEXT_COLOR, _NEXT_SIZE = 6, 9.0  # of the marks where to film next, pixels
+_REGION_COLOR, _REGION_SIZE = 6, 9.0  # of the marks of poorly seen regions, pixels
 _BAR = 0.25  # of the width that the scale bar takes at most
 # (color, mark) of the page's charts; green and blue are those of the contact sheet
 PARTS = {"training": (2, "circle"), "validation": (5, "square"), "held out": (0, "diamond")}
@@ -96,7 +96,7 @@ def read_capture(stages: StageReports) -> Capture:
             damaged.append(f"The plan is not shown: {error}")
     sfm = stages["sfm"].read_summary(SfmSummary)
     left_out = sfm.left_out if sfm else ()
-    plan, notes = _draw_plan(scene, sfm, read_suggestions(stages)) if scene else (None, ())
+    plan, notes = _draw_plan(scene, sfm, read_regions(stages)) if scene else (None, ())
     by_name = {view.name: part for part, views in by_part(scene).items()
                for view in views} if scene else {
         frame.name: "held out" if frame.held_out else "training" for frame in frames}
@@ -129,7 +129,7 @@ def _read_scene(stages: StageReports, frames: Sequence[Frame]) -> Scene:
 
 
 def _draw_plan(
-    scene: Scene, sfm: SfmSummary | None, suggestions: Sequence[Suggestion]
+    scene: Scene, sfm: SfmSummary | None, regions: Sequence[PoorlySeenRegion]
 ) -> tuple[Markup, tuple[str, ...]]:
     """Returns the floor plan and notes on it."""
     metres = sfm is not None and sfm.world.evidence.metres
@@ -140,9 +140,9 @@ def _draw_plan(
     if not metres:
         notes.append("The scale is arbitrary, so there is no scale bar; "
                      "recon sfm --scale-between A B METRES sets it.")
-    if suggestions:
-        notes.append("Numbers are where to film next, as listed under Trust.")
-    return draw_plan(scene, axes, metres=metres, suggestions=suggestions), tuple(notes)
+    if regions:
+        notes.append("Numbers are poorly seen regions, as listed under Trust.")
+    return draw_plan(scene, axes, metres=metres, regions=regions), tuple(notes)
 
 
 def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
@@ -199,22 +199,22 @@ def find_axes(scene: Scene, *, z_up: bool) -> PlanAxes:
 
 
 def draw_plan(
-    scene: Scene, axes: PlanAxes, *, metres: bool, suggestions: Sequence[Suggestion] = ()
+    scene: Scene, axes: PlanAxes, *, metres: bool, regions: Sequence[PoorlySeenRegion] = ()
 ) -> Markup:
     """Returns the plan as SVG, with a scale bar if one world unit is a metre (`metres`).
 
-    `suggestions` of where to film next are numbered from 1.
+    Poorly seen `regions` are circles of their size, numbered from 1.
     """
     parts = by_part(scene)
     centers = np.stack([view.camera.center for views in parts.values() for view in views])
     points, places = scene.points @ axes.axes.T, centers @ axes.axes.T
-    eyes = np.array([each.position for each in suggestions]).reshape(-1, 3) @ axes.axes.T
-    layout = _fit_layout(points, np.vstack([places, eyes]))
+    middles = np.array([each.position for each in regions]).reshape(-1, 3) @ axes.axes.T
+    layout = _fit_layout(points, np.vstack([places, middles]))
     size = 3.0 if len(centers) > _MANY_CAMERAS else 4.5
     marks = [_draw_camera(view, axes, layout, part, size)
              for part, views in parts.items() for view in views]
-    marks += [_draw_suggestion(number, each, axes, layout)
-              for number, each in enumerate(suggestions, 1)]
+    marks += [_draw_region(number, each, axes, layout)
+              for number, each in enumerate(regions, 1)]
     bar = _draw_scale_bar(layout) if metres else Markup("")
     return Markup(
         '<svg class="plan" viewBox="0 0 {} {}" role="img" '
@@ -282,18 +282,15 @@ def _draw_camera(view: View, axes: PlanAxes, layout: _PlanLayout, part: str, siz
     return line + draw_mark(shape, x, y, radius, color, f"{view.name} ({part})")
 
 
-def _draw_suggestion(
-    number: int, each: Suggestion, axes: PlanAxes, layout: _PlanLayout
+def _draw_region(
+    number: int, each: PoorlySeenRegion, axes: PlanAxes, layout: _PlanLayout
 ) -> Markup:
     x, y = map(float, layout.at(axes.axes @ np.array(each.position)))
-    ahead = axes.axes @ np.array(each.forward)
-    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
     return Markup(
-        '<path class="line c{}" d="M{},{}l{},{}"/>{}<text class="next" x="{}" y="{}" '
-        'text-anchor="middle">{}</text>').format(
-            _NEXT_COLOR, round(x, 1), round(y, 1), round(2.6 * _NEXT_SIZE * float(ahead[0]), 1),
-            round(-2.6 * _NEXT_SIZE * float(ahead[1]), 1),
-            draw_mark("circle", x, y, _NEXT_SIZE, _NEXT_COLOR, f"film next: {each.reason}"),
+        '<circle class="line c{}" cx="{}" cy="{}" r="{}"/>{}'
+        '<text class="next" x="{}" y="{}" text-anchor="middle">{}</text>').format(
+            _REGION_COLOR, round(x, 1), round(y, 1), round(each.size / 2 * layout.scale, 1),
+            draw_mark("circle", x, y, _REGION_SIZE, _REGION_COLOR, f"poorly seen: {each.cause}"),
             round(x, 1), round(y + 4, 1), number)
 
 

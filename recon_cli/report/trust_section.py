@@ -1,4 +1,4 @@
-"""The section on trust: the surface, agreement with held-out views, where to film next."""
+"""The section on trust: the surface, agreement with held-out views, poorly seen regions."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from recon_cli.report.chart import Axis, Series, draw_chart
 from recon_cli.report.gallery import data_uri
 from recon_cli.report.records import MODELS
 from recon_cli.report.stage_status import StageReports
-from recon_cli.trust.film_next import Suggestion
 from recon_cli.trust.heat_map import INVENTED, TRUSTED, legend_stops
+from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.scene_trust import FOLDER, ModelTrust, TrustRecord
 from recon_cli.trust.surface import MIN_SPAN_DEG, MIN_VIEWS
 
@@ -33,8 +33,7 @@ class TrustSection:
     agreement: Table | None = None  # None without held-out views
     reliability: Markup | None = None
     pictures: tuple[tuple[str, Markup, Markup], ...] = ()  # (view, render, heat map)
-    places: tuple[str, ...] = ()  # where to film next, one a line, in the order of the plan
-    no_places: str = ""
+    regions: tuple[str, ...] = ()  # poorly seen, one a line, in the order of the plan
     stops: str = ""  # CSS colours of the heat maps
     ends: tuple[float, float] = (TRUSTED, INVENTED)
 
@@ -50,13 +49,13 @@ def read_record(stages: StageReports) -> TrustRecord | None:
         raise FormatError(error.message) from error
 
 
-def read_suggestions(stages: StageReports) -> tuple[Suggestion, ...]:
-    """Returns where to film next, for the plan; none where nothing can be read."""
+def read_regions(stages: StageReports) -> tuple[PoorlySeenRegion, ...]:
+    """Returns the poorly seen regions, for the plan; none where nothing can be read."""
     try:
         record = read_record(stages)
     except FormatError:  # which the section says
         return ()
-    return record.film_next if record else ()
+    return record.poorly_seen if record else ()
 
 
 def read_trust(stages: StageReports) -> TrustSection:
@@ -77,8 +76,8 @@ def read_trust(stages: StageReports) -> TrustSection:
         f"{MIN_VIEWS} views or more that span {MIN_SPAN_DEG:g} degrees or more.",
         _surface_table(models), _agreement_table(models), _draw_reliability(models),
         _read_pictures(stages["evaluate"].folder, next(iter(models))),
-        tuple(each.describe(record.unit) for each in record.film_next),
-        record.no_places, ", ".join(legend_stops()))
+        tuple(each.describe(record.unit) for each in record.poorly_seen),
+        ", ".join(legend_stops()))
 
 
 def _surface_table(models: dict[str, ModelTrust]) -> Table:

@@ -38,8 +38,6 @@ class Scene:
     unregistered_test: tuple[str, ...]  # names of held-out frames that have no camera
     points: NDArray[np.float64]  # [P, 3] float64 sparse points in world units
     colors: NDArray[np.uint8]  # [P, 3] uint8 their RGB colours
-    # mean reprojection error of the points in pixels of the undistorted images; None if not known
-    error_px: float | None = None
     up: NDArray[np.float64] | None = None  # [3] unit vector; None where it is not known
     sparse: Path | None = None  # folder of the COLMAP model that all of it was read from
     cell: Cell | None = None  # the part that is modelled, of a block of a larger scene; None: all

@@ -73,7 +73,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig,
-          EvaluateSummary, 3, False, "recon_cli.stages.evaluate", renders=True),
+          EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
           export_record.ExportSummary, export_record.VERSION, False, "recon_cli.stages.export",
           renders=True, spares=("ingest", "sfm"), adds=True))

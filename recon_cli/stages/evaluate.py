@@ -174,7 +174,7 @@ def run(
         exported, folder, evaluation.config, evaluation.scene, evaluation.held_out,
         config.max_size or evaluation.config.max_size, evaluation.import_record,
         WorldSummary.read(inputs.folders["sfm"])), out, ctx) if config.trust else None
-    return EvaluateSummary(**means, film_next=tuple(trust.lines()) if trust else None)
+    return EvaluateSummary(**means, poorly_seen=tuple(trust.lines()) if trust else None)
 
 
 def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> _Evaluation:
@@ -182,9 +182,7 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
     scene = load_scene(inputs, validation=train_config.validation)
     size = config.max_size or train_config.max_size
     held_out = load_held_out_views(scene, size, ctx)
-    # where training refined its cameras, their images are no longer what these cameras show
-    splits = {"training": scene.train if train_config.poses != "on" else (),
-              "validation": scene.validation}
+    splits = {"training": scene.train, "validation": scene.validation}
     training_views = {name: views for name, split in splits.items() if (
         views := load_reference_views(
             evenly_spread(split, _SEEN_VIEWS), size, threads=ctx.threads))}

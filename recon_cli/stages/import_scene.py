@@ -85,7 +85,7 @@ def _equivalent_run_config(config: ImportConfig, splats: Splats) -> RunConfig:
     return RunConfig(
         max_size=config.max_size, validation=config.validation, sh_degree=splats.sh_degree,
         max_gaussians=max(MIN_GAUSSIANS, len(splats)), images="original", far="off",
-        stereo="off", exposure="off", poses="off")
+        stereo="off", exposure="off")
 
 
 def _describe(path: Path, scene: LoadedScene, alignment: Alignment | None) -> list[str]:

@@ -116,7 +116,7 @@ def _run_config(
         configs[0], iterations=max(1, steps), validation=config.validation,
         max_size=config.max_size or max(each.max_size for each in configs),
         sh_degree=degree, max_gaussians=max(MIN_GAUSSIANS, count), far="off", stereo="off",
-        poses="off", images="denoised" if denoised else "original",
+        images="denoised" if denoised else "original",
         exposure="on" if drifting else "off", early_stop=False)
 
 

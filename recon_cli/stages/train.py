@@ -31,7 +31,6 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     scene = load_scene(inputs, validation=config.validation)
     model = None if inputs.continues is None else FinishedModel.read(inputs.continues)
     task = plan_task(config, scene, out, ctx, model)
-    ctx.notice_idle(task.schedule.config.batch_views)
     if model is not None and not (out / CHECKPOINT).exists():
         model.hand_on(task.schedule, out, ctx)
     state = first_or_saved(task, scene, out / CHECKPOINT, model)
@@ -60,5 +59,4 @@ def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> T
         validation_psnr_db=last.validation_psnr_db, train_seconds=last.seconds,
         parts=model_parts(config), skipped_steps=state.skipped, estimated_seconds=plan.seconds,
         calibration_seconds=round(plan.cost["seconds"], 3),
-        processes=None if ctx.ranks.alone else ctx.ranks.count,
         cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0)

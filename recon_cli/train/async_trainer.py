@@ -44,8 +44,8 @@ def choose_trainer(
 
     `looks` tells whether somebody wants to see the state after a step.
     """
-    plain = importance is None and state.exposure is None and state.poses is None
-    if task.backend == "triton" and task.ranks.alone and plain:
+    plain = importance is None and state.exposure is None
+    if task.backend == "triton" and plain:
         return AsyncTrainer(state, task, looks).advance
     return Stepper(state, task, importance).step
 

@@ -1,4 +1,4 @@
-"""What a run will take, from a few timed steps, reports, checkpoints and exchanges before it."""
+"""What a run will take, from a few timed steps, reports and checkpoints before it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.context import ProcessGroup, TrainCallback
-from recon_cli.scene.splats import TERMS, Splats
+from recon_cli.context import TrainCallback
+from recon_cli.scene.splats import Splats
 from recon_cli.train import densification
 from recon_cli.train.fit import fit, report_every, validation_psnr
 from recon_cli.train.initialize import splats_from_points
@@ -24,7 +24,6 @@ from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import (
     LONG_SAVE,
     SAVE_SHARE,
-    DensificationStats,
     TrainState,
     new_state,
     save_state,
@@ -250,60 +249,3 @@ def _grow_splats(
         splats, _ = densification.densify_budget(splats, torch.ones(len(splats)), rule, generator)
     splats.logit_opacities = torch.logit(torch.full((len(splats),), _OPACITY))
     return splats
-
-
-EXCHANGE = 2  # what the leader says to have one timed
-_FEWEST, _MANY = 1000, 100_000  # Gaussians, at least and at most
-_ROUNDS, _WARM_UP = 7, 2
-_WIDTHS = 3, 4, 3, 1, 3  # numbers of a Gaussian, parameter by parameter, higher SH apart
-
-
-def with_exchange(
-    cost: CostModel, ranks: ProcessGroup, most: int, sh_degree: int, device: torch.device
-) -> CostModel:
-    """Returns the cost of steps that `ranks` take together, from that of one process's share."""
-    if ranks.alone:
-        return cost
-    begin = time.perf_counter()
-    many = min(_MANY, max(2 * _FEWEST, most))
-    low, high = (_lead_exchange(ranks, n, TERMS[sh_degree], device) for n in (_FEWEST, many))
-    each = max(0.0, (high - low) / ((many - _FEWEST) / 1000))
-    fixed = max(0.0, low - each * _FEWEST / 1000)
-    levels = tuple(
-        replace(level, fixed_ms=level.fixed_ms + fixed, each_ms=level.each_ms + each)
-        for level in cost.levels)
-    return replace(cost, levels=levels, seconds=cost.seconds + time.perf_counter() - begin)
-
-
-def _lead_exchange(ranks: ProcessGroup, count: int, terms: int, device: torch.device) -> float:
-    try:
-        ranks.broadcast_int(EXCHANGE)
-        for number in (count, terms, int(device.type == "cuda")):
-            ranks.broadcast_int(number)
-        return _exchange_ms(ranks, count, terms, device)
-    except BaseException:  # the others are in the middle of it, and hear of nothing else
-        ranks.leave()
-        raise
-
-
-def join_exchange(ranks: ProcessGroup) -> None:
-    """Takes part in an exchange that the leader times."""
-    count, terms, on_gpu = (ranks.broadcast_int(0) for _ in range(3))
-    _exchange_ms(ranks, count, terms, torch.device("cuda" if on_gpu else "cpu"))
-
-
-def _exchange_ms(ranks: ProcessGroup, count: int, terms: int, device: torch.device) -> float:
-    """Returns the median of what a step with so many Gaussians exchanges."""
-    gradients = [torch.zeros(count, width, device=device) for width in (*_WIDTHS, 3 * terms)]
-    results = torch.zeros(11, dtype=torch.float64)
-    gathered = DensificationStats.zeros(count, device)
-    marks = []
-    for _ in range(_ROUNDS + _WARM_UP + 1):
-        marks.append(time.perf_counter())
-        ranks.broadcast_int(0)
-        ranks.add(gradients)
-        ranks.add([results])
-        gathered.over(ranks)
-        float(gathered.radius[0])  # waits for a GPU
-    return 1e3 * statistics.median(
-        end - start for start, end in zip(marks[_WARM_UP:], marks[_WARM_UP + 1 :], strict=False))

@@ -27,6 +27,7 @@ from recon_cli.train.task import Task
 RESET_OPACITY = 0.01
 _SPLIT = 2  # Gaussians that replace one that is split
 _SHRINK = 1.6  # their scales are divided by this
+_CLONE_SCALE = 0.01  # x extent; up to it one is cloned, above it split (INRIA's percent_dense)
 _MAX_RADIUS = 20.0  # pixels on the screen
 _LARGE_SCALE = 0.1  # x extent; larger Gaussians are deleted once opacities were reset
 # of `budget`
@@ -202,8 +203,8 @@ def _reference(state: TrainState, task: Task) -> None:
     if schedule.densifies(state.iteration):
         large = _LARGE_SCALE * task.extent if schedule.deletes_large(state.iteration) else None
         rule = DensifyRule(
-            config.densify_gradient, config.densify_scale * task.extent, config.min_opacity,
-            large, config.max_gaussians)
+            config.densify_gradient, _CLONE_SCALE * task.extent, config.min_opacity, large,
+            config.max_gaussians)
         gathered = replace(
             state.gathered, pull=state.gathered.pull * task.inside(state.splats.means))
         replace_splats(state, *densify_reference(state.splats, gathered, rule, state.generator))

@@ -43,7 +43,10 @@ class Exposure:
         return np.asarray(np.exp(self._rows.value[image].numpy()), np.float32)
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
-        """Moves one image's gains against `gradient` [3] of their logarithms; see `Poses.step`."""
+        """Moves one image's gains against `gradient` [3] of their logarithms.
+
+        The rate falls as `done` goes from 0 to 1.
+        """
         self._rows.step(image, gradient, _RATE * (_FINAL_RATE / _RATE) ** done)
         self._rows.center()
 

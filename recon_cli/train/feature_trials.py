@@ -28,7 +28,6 @@ from recon_cli.train.background import FarContent, faces, far_content, look_at_o
 from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
-from recon_cli.train.poses import worth_a_trial
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.workspace.summaries import TrialDecision
@@ -114,7 +113,7 @@ _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
-PARTS = ("far", "stereo", "exposure", "poses", "images")
+PARTS = ("far", "stereo", "exposure", "images")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
@@ -174,11 +173,6 @@ def examine(scene: Candidate) -> Needs:
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
-    task = scene.task
-    error = None if task.camera_error is None else task.camera_error * task.train[0].camera.fx
-    settle("poses", "on" if worth_a_trial(error) else None,
-           "the reprojection error is not known" if error is None
-           else f"the reprojection error is {error:.2f} px of a training image")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
     return Needs(config, tuple(decisions))
@@ -282,8 +276,7 @@ class _Bench:
                                      means_rate=_FURTHER * recipe.means_rate)
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
-                     task.backend, task.device, nearness=task.nearness,
-                     camera_error=task.camera_error, stereo=task.stereo)
+                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
         # reduced views would be reduced once more in the search for what lies far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)

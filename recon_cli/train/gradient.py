@@ -17,10 +17,8 @@ from torch import Tensor
 from recon_cli.lazy import load
 from recon_cli.render import Statistics, render
 from recon_cli.render.contract import StepOptions, TargetImage
-from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.optimizer import SplatOptimizer
-from recon_cli.train.poses import camera_gradient
 
 if TYPE_CHECKING:
     from recon_cli.render.numba.step import PhotometricStep as NumbaStep
@@ -39,14 +37,6 @@ class GradientStep(Protocol):
     @property
     def log_gain_gradient(self) -> NDArray[np.float64]:
         """Gradient [3] of the logarithm of the gain, of the last view that was given one."""
-
-    def camera_gradient(
-        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
-    ) -> NDArray[np.float64]:
-        """Returns `poses.camera_gradient` [6] of the last view.
-
-        To be asked before the optimizer steps, and only where the view saw a Gaussian.
-        """
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
@@ -95,13 +85,6 @@ class _FusedStep:
     def log_gain_gradient(self) -> NDArray[np.float64]:
         return self._compute.log_gain_gradient
 
-    def camera_gradient(
-        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
-    ) -> NDArray[np.float64]:
-        gradient: NDArray[np.float64] = load("recon_cli.render.numba.step.camera_gradient")(
-            optimizer.splats, optimizer.gradients, camera, sh_degree)
-        return gradient
-
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
         gain: NDArray[np.float32] | None = None,
@@ -126,11 +109,6 @@ class _DeviceStep:
     @property
     def status(self) -> StepStatus:
         return self._compute.status
-
-    def camera_gradient(
-        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
-    ) -> NDArray[np.float64]:
-        return camera_gradient(optimizer.splats, optimizer.gradients, camera, sh_degree)
 
     def start(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
@@ -164,13 +142,6 @@ class _AutogradStep:
     def __init__(self, backend: str) -> None:
         self._backend = backend
         self.log_gain_gradient = np.zeros(3)
-
-    def camera_gradient(
-        self, optimizer: SplatOptimizer, camera: Camera, sh_degree: int
-    ) -> NDArray[np.float64]:
-        gradients = optimizer.splats.map(
-            lambda leaf: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
-        return camera_gradient(optimizer.splats, gradients, camera, sh_degree)
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,

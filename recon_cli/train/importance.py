@@ -13,15 +13,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon_cli.context import ProcessGroup
 from recon_cli.render import Statistics, render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 
-# all that are known; `recon prune` offers those that beat a random choice, and the paper's
-SCORES = ("loo", "paper", "lightgaussian", "blend_sum", "blend_max", "opacity", "random")
+# Beside the scores that `recon prune` offers: what each of them has to beat.
+RANDOM = "random"
 _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
-_BETA_SHIPPED = 0.1  # LightGaussian's --v_pow
 
 
 @dataclass(eq=False)
@@ -29,7 +27,6 @@ class Importance:
     """What the training views say about N Gaussians, added up; see `Statistics`."""
 
     hits: Tensor  # [N] int64, pixels that the Gaussian contributes to
-    blend_sum: Tensor  # [N] float64, sum of alpha T
     blend_max: Tensor  # [N] float64, greatest alpha T
     loo: Tensor  # [N] float64, squared error that removing it alone causes
     views: int = 0  # how many were added
@@ -41,14 +38,14 @@ class Importance:
         """Returns the record of no view, for every score."""
         zeros = torch.zeros(n, dtype=torch.float64, device=device)
         return Importance(
-            torch.zeros(n, dtype=torch.int64, device=device), zeros, zeros.clone(), zeros.clone())
+            torch.zeros(n, dtype=torch.int64, device=device), zeros, zeros.clone())
 
     @staticmethod
     def of_score(name: str, n: int, device: torch.device) -> Importance:
         """Returns the record of no view that gathers no more than one score needs."""
         importance = Importance.zeros(n, device)
         importance.leaves_out = name == "loo"
-        importance.weighs = name in ("paper", "lightgaussian", "blend_sum", "blend_max")
+        importance.weighs = name in ("paper", "blend_max")
         return importance
 
     @property
@@ -61,17 +58,9 @@ class Importance:
         self.views += 1
         if self.weighs:
             self.hits += statistics.hits
-            self.blend_sum += statistics.blend_sum
             self.blend_max = torch.maximum(self.blend_max, statistics.blend_max.double())
         if self.leaves_out:
             self.loo += statistics.loo
-
-    def over(self, ranks: ProcessGroup) -> None:
-        """Reduces the sums over the processes that train together."""
-        views = torch.tensor([self.views])
-        ranks.add([views, self.hits, self.blend_sum, self.loo])
-        ranks.all_reduce_max(self.blend_max)
-        self.views = int(views)
 
     def score(
         self, name: str, splats: Splats, *, beta: float, generator: torch.Generator
@@ -79,14 +68,10 @@ class Importance:
         """Returns the score [N] float64 by which Gaussians are ranked; the lowest go first."""
         if name == "paper":
             return paper_score(self.hits, splats, beta)
-        if name == "lightgaussian":
-            return lightgaussian_score(self.hits, splats)
-        if name == "opacity":
-            return splats.opacities.detach().double()
-        if name == "random":
+        if name == RANDOM:
             drawn = torch.rand(len(splats), generator=generator, dtype=torch.float64)
             return drawn.to(splats.means.device)
-        return {"blend_sum": self.blend_sum, "blend_max": self.blend_max, "loo": self.loo}[name]
+        return {"blend_max": self.blend_max, "loo": self.loo}[name]
 
 
 def paper_score(hits: Tensor, splats: Splats, beta: float) -> Tensor:
@@ -101,17 +86,6 @@ def paper_score(hits: Tensor, splats: Splats, beta: float) -> Tensor:
     reference = log_volumes.sort().values[rank]
     gamma = torch.exp(beta * (log_volumes - reference).clamp_max(0))
     return hits.double() * splats.opacities.detach().double() * gamma
-
-
-def lightgaussian_score(hits: Tensor, splats: Splats) -> Tensor:
-    """Returns hits_j o_j (V_j / V_k)^0.1, [N] float64, as LightGaussian's code has it.
-
-    Its volume is not clamped: V_k, that of the 90th percentile, cannot change the ranking.
-    """
-    log_volumes = _log_volumes(splats)
-    reference = log_volumes.sort(descending=True).values[int(_PERCENTILE * len(splats))]
-    ratio = torch.exp(_BETA_SHIPPED * (log_volumes - reference))
-    return hits.double() * splats.opacities.detach().double() * ratio
 
 
 def _log_volumes(splats: Splats) -> Tensor:

@@ -16,7 +16,6 @@ from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
-from recon_cli.train.poses import WORTH_PX, Poses
 from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.stereo_points import SurfacePoints
 from recon_cli.train.task import Task
@@ -95,10 +94,9 @@ def first_state(
     splats = dataclasses.replace(
         first_splats(config, points, colors, far, most=most),
         backdrop=Backdrop.behind(grey, centers) if grey else None)
-    exposure, poses = new_parts(task, gains)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
-        backend=task.backend, exposure=exposure, poses=poses)
+        backend=task.backend, exposure=new_exposure(task, gains))
 
 
 def surfaces_of(task: Task, sparse: int) -> SurfacePoints:
@@ -120,18 +118,16 @@ def restore_state(path: Path, task: Task) -> TrainState:
         FormatError: the file is truncated or of another version.
         TrainingError: it holds values that are not finite.
     """
-    exposure, poses = new_parts(task)
     return load_state(
         path, task.schedule.config, task.means_unit, task.device, backend=task.backend,
-        exposure=exposure, poses=poses)
+        exposure=new_exposure(task))
 
 
 def begin_state(splats: Splats, task: Task) -> TrainState:
     """Returns the state before the first step of a run that begins with these Gaussians."""
-    exposure, poses = new_parts(task)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.means_unit,
-        backend=task.backend, exposure=exposure, poses=poses)
+        backend=task.backend, exposure=new_exposure(task))
 
 
 def make_finished_state(splats: Splats, task: Task) -> TrainState:
@@ -144,21 +140,12 @@ def make_finished_state(splats: Splats, task: Task) -> TrainState:
     return state
 
 
-def new_parts(
+def new_exposure(
     task: Task, log_gains: NDArray[np.float64] | None = None
-) -> tuple[Exposure | None, Poses | None]:
-    """Returns the optional parts that the options switch on, before any step."""
-    config, images = task.schedule.config, len(task.train)
-    exposure = Exposure(images, start=log_gains) if config.exposure == "on" else None
-    poses = None
-    if config.poses == "on":
-        centers = np.stack([view.camera.center for view in task.train])
-        error = task.camera_error
-        if error is None:  # asked for without a sign: as far as makes it worth while
-            error = WORTH_PX / float(np.mean([view.camera.fx for view in task.train]))
-        visits = config.iterations * config.batch_views / images
-        poses = Poses(centers, task.extent, visits=visits, error=error)
-    return exposure, poses
+) -> Exposure | None:
+    """Returns the gains of the training images before any step; None unless they are fitted."""
+    on = task.schedule.config.exposure == "on"
+    return Exposure(len(task.train), start=log_gains) if on else None
 
 
 def first_splats(

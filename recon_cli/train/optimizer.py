@@ -248,11 +248,6 @@ class SparseAdam:
         self._exp_avg_sq = torch.zeros_like(self.value)
         self._count = torch.zeros(len(start), dtype=torch.float64)
 
-    @property
-    def complete(self) -> bool:
-        """Whether every row was stepped at least once."""
-        return bool((self._count > 0).all())
-
     def step(self, row: int, gradient: NDArray, rate: float) -> None:  # type: ignore[type-arg]
         """Moves one row against its gradient [D]; a gradient that is not finite moves nothing."""
         grad = torch.as_tensor(gradient, dtype=torch.float64)

@@ -22,7 +22,7 @@ from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig, TrainConfig
 from recon_cli.context import StageContext
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.cost import CostModel, calibrate, with_exchange
+from recon_cli.train.cost import CostModel, calibrate
 from recon_cli.train.feature_trials import Candidate, Needs, examine, model_parts
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.initialize import first_state, restore_state, surfaces_of
@@ -216,7 +216,7 @@ def plan_task(
     facts = Facts(count_detail(task.train), len(task.train), len(scene.points), fit_memory)
     spent = 0.0 if model is not None else needs.seconds + _search_surfaces(
         probe_config(asked, facts), facts, task)
-    cost = _measure_cost(asked, facts, task, scene, out, ctx)
+    cost = _measure_cost(asked, facts, task, scene, out)
     plan = make_plan(asked, facts, cost, spent=spent, model=model)
     if model is None and asked.minutes is not None:  # longer than the likely run, with more room
         spent += _search_surfaces(run_config(asked, plan), facts, task)
@@ -257,18 +257,16 @@ def _search_surfaces(config: RunConfig, facts: Facts, task: Task) -> float:
 
 
 def _measure_cost(
-    config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, ctx: StageContext
+    config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path
 ) -> CostModel:
-    """Returns the cost of a run by timed steps: one process's views, and what is exchanged."""
+    """Returns the cost of a run by timed steps."""
     seconds = CALIBRATION_SECONDS
     if config.minutes is not None:
         seconds = CALIBRATION_SHARE * 60 * config.minutes
-    probe = dataclasses.replace(
-        probe_config(config, facts), batch_views=ctx.ranks.most_of(config.batch_views))
-    cost = calibrate(
-        dataclasses.replace(task, schedule=Schedule(probe)), scene.points, scene.colors,
+    schedule = Schedule(probe_config(config, facts))
+    return calibrate(
+        dataclasses.replace(task, schedule=schedule), scene.points, scene.colors,
         scratch=out / "calibration.safetensors", seconds=seconds)
-    return with_exchange(cost, ctx.ranks, probe.max_gaussians, probe.sh_degree, task.device)
 
 
 def _report_plan(plan: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageContext) -> None:

@@ -8,13 +8,12 @@ and the next one scores what has recovered. `prune_run` keeps the progress on di
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from recon_cli.context import TrainCallback
-from recon_cli.scene.train_view import TrainView
 from recon_cli.train.densification import replace_splats
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance, add_views
@@ -104,7 +103,7 @@ class PruneRun:
                 self.advance(until, importance)
                 unseen = state.queue
             add_views(
-                importance, state.splats, [self._view(i) for i in sorted(unseen)],
+                importance, state.splats, [task.train[i] for i in sorted(unseen)],
                 sh_degree=task.schedule.sh_degree(max(1, state.iteration)), backend=task.backend)
         return importance.score(
             self._score, state.splats, beta=self._beta, generator=state.generator)
@@ -113,11 +112,6 @@ class PruneRun:
         """Removes all but the `count` Gaussians of the highest scores."""
         remove(self.state, survivors(score, count))
         self.removals_done += 1
-
-    def _view(self, index: int) -> TrainView:
-        """Returns a training view with its camera as it was refined."""
-        view, poses = self.task.train[index], self.state.poses
-        return view if poses is None else replace(view, camera=poses.camera(index, view.camera))
 
 
 def prune_loop(run: PruneRun, target: int) -> None:

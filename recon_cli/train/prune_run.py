@@ -97,7 +97,6 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
-    ctx.notice_idle(train_config.batch_views)
     path = train / "mid.safetensors" if config.at == "mid" else final
 
     def begin() -> TrainState:

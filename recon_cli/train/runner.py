@@ -15,7 +15,7 @@ from recon_cli.context import StageContext, TrainCallback, TrainReport
 from recon_cli.progress import Bar
 from recon_cli.scene.splats import Splats
 from recon_cli.signals import Interrupted, deferring
-from recon_cli.train.distributed.data_parallel import fit_together
+from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
 from recon_cli.train.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
 from recon_cli.train.task import Task
@@ -45,7 +45,7 @@ def run_fit(
     state: TrainState, task: Task, until: int, segment: Segment, ctx: StageContext,
     importance: Importance | None = None,
 ) -> None:
-    """Fits until `until` steps with all of `ctx.ranks`, saving the state as it goes.
+    """Fits until `until` steps, saving the state as it goes.
 
     No checkpoints are written while `importance` gets the scores of the steps: they hold no scores.
 
@@ -69,8 +69,7 @@ def run_fit(
         for callback in ctx.callbacks:
             callback.on_begin(
                 segment.label, segment.until, [view.camera for view in task.train], state.splats)
-        fit_together(state, dataclasses.replace(task, ranks=ctx.ranks), until, callbacks,
-                     importance, ctx.threads)
+        fit(state, task, until, callbacks, importance)
 
 
 logger = logging.getLogger("recon")

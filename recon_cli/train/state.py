@@ -12,14 +12,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.context import ProcessGroup
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.render import Statistics
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import Splats
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.optimizer import SplatOptimizer
-from recon_cli.train.poses import Poses
 from recon_cli.workspace.atomic import parse_json, replacing
 
 LONG_SAVE = 0.25  # seconds; a checkpoint that takes longer is written less often
@@ -59,11 +57,6 @@ class DensificationStats:
         self.count += statistics.radii > 0
         self.radius = torch.maximum(self.radius, statistics.radii)
 
-    def over(self, ranks: ProcessGroup) -> None:
-        """Reduces the statistics over the processes that train together."""
-        ranks.add([self.pull, self.count, self.variance])
-        ranks.all_reduce_max(self.radius)
-
     def times(self, factor: Tensor) -> DensificationStats:
         """Returns all of it times a factor, a number on the device."""
         return DensificationStats(*(value * factor for value in vars(self).values()))
@@ -97,7 +90,6 @@ class TrainState:
     looks: list[tuple[int, float]] = field(default_factory=list)
     jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it went on
     exposure: Exposure | None = None  # gains of the training images; None where that part is off
-    poses: Poses | None = None  # refinement of their cameras; None where that part is off
 
     @property
     def steps(self) -> int:
@@ -112,14 +104,14 @@ class TrainState:
 
 def new_state(
     splats: Splats, config: RunConfig, means_unit: float, *, backend: str = "torch",
-    exposure: Exposure | None = None, poses: Poses | None = None,
+    exposure: Exposure | None = None,
 ) -> TrainState:
     """Returns the state before the first step."""
     generator = torch.Generator().manual_seed(config.seed)
     gathered = DensificationStats.zeros(len(splats), splats.means.device)
     return TrainState(
         SplatOptimizer(splats, config, means_unit, backend=backend), gathered, generator,
-        first_count=len(splats), exposure=exposure, poses=poses)
+        first_count=len(splats), exposure=exposure)
 
 
 def save_state(path: Path, state: TrainState) -> None:
@@ -145,16 +137,14 @@ def tensors_of(state: TrainState) -> dict[str, Tensor]:
     for name, value in vars(state.gathered).items():
         tensors[f"gathered.{name}"] = value
     tensors["generator"] = state.generator.get_state()
-    for part in (state.exposure, state.poses):
-        tensors |= {} if part is None else part.tensors()
-    return tensors
+    return tensors if state.exposure is None else tensors | state.exposure.tensors()
 
 
 def load_state(
     path: Path, config: RunConfig, means_unit: float, device: torch.device, *,
-    backend: str = "torch", exposure: Exposure | None = None, poses: Poses | None = None,
+    backend: str = "torch", exposure: Exposure | None = None,
 ) -> TrainState:
-    """Returns the state that `save_state` wrote; `exposure` and `poses` take theirs back.
+    """Returns the state that `save_state` wrote; `exposure` takes its part back.
 
     Raises:
         FormatError: the file is truncated or of another version.
@@ -179,10 +169,9 @@ def load_state(
             int(scalars["skipped"]), [(int(at), float(psnr)) for at, psnr in scalars["looks"]],
             (int(scalars["jump"][0]), int(scalars["jump"][1])) if scalars["jump"] else None)
         state.optimizer.restore(tensors)
-        for part in (exposure, poses):
-            if part is not None:
-                part.restore(tensors)
-        state.exposure, state.poses = exposure, poses
+        if exposure is not None:
+            exposure.restore(tensors)
+        state.exposure = exposure
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise _unreadable(path, error) from error
     check_finite(tensors, f"The checkpoint {path} is damaged")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,18 +28,16 @@ class _BatchResult:
 
     loss: NDArray[np.float64]  # [B]
     visible: NDArray[np.float64]  # [B] 1 where the view saw a Gaussian
-    turn: NDArray[np.float64]  # [B, 6] gradients of the cameras
     gain: NDArray[np.float64]  # [B, 3] gradients of the log-gains
 
     @staticmethod
     def zeros(views: int) -> _BatchResult:
         """Returns the result of no view."""
-        return _BatchResult(
-            np.zeros(views), np.zeros(views), np.zeros((views, 6)), np.zeros((views, 3)))
+        return _BatchResult(np.zeros(views), np.zeros(views), np.zeros((views, 3)))
 
 
 class Stepper:
-    """Takes the steps of a call of `fit.fit`; `importance` gets scores of this process's views."""
+    """Takes the steps of a call of `fit.fit`; `importance` gets the scores of their views."""
 
     def __init__(self, state: TrainState, task: Task, importance: Importance | None) -> None:
         self._state, self._task, self._importance = state, task, importance
@@ -68,17 +66,17 @@ class Stepper:
         return loss
 
     def _gather(self, batch: list[int], iteration: int) -> _BatchResult:
-        """Looks at this process's share of the views and leaves their mean gradient."""
-        state, ranks = self._state, self._task.ranks
-        moves_sh = self._task.schedule.moves_sh(iteration)
-        result, gathers = _BatchResult.zeros(len(batch)), self._task.schedule.gathers(iteration)
-        several = len(batch) > 1 or not ranks.alone
-        # in a sum of its own, so that who looked at which view changes no bit
+        """Looks at the views and leaves their mean gradient."""
+        state, task = self._state, self._task
+        moves_sh = task.schedule.moves_sh(iteration)
+        result, gathers = _BatchResult.zeros(len(batch)), task.schedule.gathers(iteration)
+        several = len(batch) > 1
+        # added in a sum of its own: one by one would round otherwise
         gathered = state.gathered if not several else DensificationStats.zeros(
-            len(state.splats), self._task.device)
-        for place in range(ranks.rank, len(batch), ranks.count):
-            view = self._view(batch[place], iteration)
-            statistics = self._look(view, batch[place], place, result, iteration)
+            len(state.splats), task.device)
+        for place, index in enumerate(batch):
+            view = task.pyramid.view(index, task.schedule.level(iteration))
+            statistics = self._look(view, index, place, result, iteration)
             if statistics is None:
                 continue
             if gathers:
@@ -88,20 +86,10 @@ class Stepper:
             if several:
                 state.optimizer.accumulate(1 / len(batch), sh_rest=moves_sh)
         if several:
-            ranks.add(state.optimizer.take_accumulated(sh_rest=moves_sh))
-        if not ranks.alone:
-            ranks.add([torch.from_numpy(values) for values in vars(result).values()])
+            state.optimizer.take_accumulated(sh_rest=moves_sh)
             if gathers:
-                gathered.over(ranks)
-        if several and gathers:
-            state.gathered.join(gathered)
+                state.gathered.join(gathered)
         return result
-
-    def _view(self, index: int, iteration: int) -> TrainView:
-        view = self._task.pyramid.view(index, self._task.schedule.level(iteration))
-        if self._state.poses is None:
-            return view
-        return replace(view, camera=self._state.poses.camera(index, view.camera))
 
     def _look(
         self, view: TrainView, index: int, place: int, result: _BatchResult, iteration: int
@@ -115,7 +103,7 @@ class Stepper:
             details=schedule.gathers(iteration) and self._strategy.variance,
             scores=importance is not None and importance.weighs,
             loo=importance is not None and importance.leaves_out,
-            harmonics=schedule.moves_sh(iteration) or state.poses is not None)
+            harmonics=schedule.moves_sh(iteration))
         result.loss[place], statistics = self._compute(
             state.optimizer, view, options,
             None if state.exposure is None else state.exposure.gain(index))
@@ -124,8 +112,6 @@ class Stepper:
         result.visible[place] = 1
         if importance is not None:
             importance.add(statistics)
-        if state.poses is not None:
-            result.turn[place] = self._compute.camera_gradient(state.optimizer, view.camera, degree)
         if state.exposure is not None:
             result.gain[place] = self._compute.log_gain_gradient
         return statistics
@@ -136,8 +122,6 @@ class Stepper:
         for place, index in enumerate(batch):
             if not result.visible[place]:
                 continue
-            if state.poses is not None:
-                state.poses.step(index, result.turn[place], schedule.share(iteration))
             if state.exposure is not None:
                 state.exposure.step(index, result.gain[place], schedule.share(iteration))
         state.optimizer.step(

@@ -9,7 +9,6 @@ from functools import cache, cached_property
 import torch
 from torch import Tensor
 
-from recon_cli.context import SINGLE_PROCESS, ProcessGroup
 from recon_cli.io.images import reduce_view
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.image_file import ImageFile
@@ -30,10 +29,8 @@ class Task:
     device: torch.device  # where the tensors live
     nearness: float | None = None  # `Scene.nearness`; None where there are no points
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
-    camera_error: float | None = None  # how far cameras may be off, in rad; for their refinement
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
     stereo: StereoPoints | None = None  # of the training views; None where they are not known
-    ranks: ProcessGroup = SINGLE_PROCESS  # this process among those that take the steps together
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
         """Returns 1 for each position where Gaussians may be added, else 0."""

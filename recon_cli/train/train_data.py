@@ -63,11 +63,9 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     if ctx.device == "cuda":
         train = [view.page_locked() for view in train]
     nearness = scene.nearness if len(scene.points) else None
-    error = None if scene.error_px is None else scene.error_px / scene.train[0].camera.fx
     return Task(
         train, [*load_views(scene.validation, config, ctx, file)], Schedule(config), scene.extent,
-        ctx.backend, torch.device(ctx.device), nearness=nearness, camera_error=error,
-        cell=scene.cell,
+        ctx.backend, torch.device(ctx.device), nearness=nearness, cell=scene.cell,
         stereo=StereoPoints(
             train, lambda: _sparse_model(scene, [view.name for view in views]), ctx.progress))
 
@@ -240,7 +238,7 @@ def _free_bytes(ctx: StageContext) -> int:
 
 def _host_bytes(ctx: StageContext) -> int:
     """Returns the memory beside the CPU that this process may take."""
-    free = free_memory_bytes() // ctx.ranks.local
+    free = free_memory_bytes()
     return free if ctx.max_memory_bytes is None else min(free, ctx.max_memory_bytes)
 
 

@@ -1,4 +1,4 @@
-"""What `recon eval` finds out about trust: measured, checked, drawn, and where to film next."""
+"""What `recon eval` finds out about trust: measured, checked, drawn, and what is poorly seen."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.evaluation.reference_views import ReferenceView
+from recon_cli.evaluation.reference_views import ReferenceView, evenly_spread
 from recon_cli.io.images import write_png
 from recon_cli.io.ply import read_ply
 from recon_cli.io.records import ImportRecord
-from recon_cli.scene.gravity import find_gravity
 from recon_cli.scene.scene import Scene
-from recon_cli.scene.splats import Splats
-from recon_cli.trust.film_next import MAX_PLACES, Suggestion, suggest
 from recon_cli.trust.heat_map import heat_colors
+from recon_cli.trust.poorly_seen import find_poorly_seen
 from recon_cli.trust.scene_trust import (
     FOLDER,
-    Trust,
     TrustRecord,
     measure_trust,
     model_trust,
     views_looked_at,
     why_none,
 )
-from recon_cli.trust.standing_places import StandingPlaces, find_places
+from recon_cli.trust.support import MAX_VIEWS
+from recon_cli.trust.surface import find_cells, surface_shares
 from recon_cli.workspace.summaries import WorldSummary
 
 
@@ -61,14 +59,15 @@ def assess(task: TrustTask, out: Path, ctx: StageContext) -> TrustRecord:
         splats = read_ply(task.folder / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
         trust = measure_trust(splats, task.scene, task.config, task.max_size, ctx, bar.advance)
         trust.save(out, task.model)
+        cells = find_cells(splats, trust.support)
         assessed = model_trust(
-            trust, splats, task.held_out, gains=task.config.exposure == "on",
+            trust, splats, surface_shares(cells), task.held_out, gains=task.config.exposure == "on",
             backend=ctx.backend, on_view=_saver(out / FOLDER / task.model, bar.advance))
-        suggestions, no_places = film_next(splats, trust, task.scene, task.world, ctx)
+    frames = [view.name for view in evenly_spread(task.scene.train, MAX_VIEWS)]
     record = TrustRecord(
         models=(task.model,), base=assessed if task.model == "base" else None,
         pruned=assessed if task.model == "pruned" else None, metres=metres,
-        film_next=tuple(suggestions), no_places=no_places)
+        poorly_seen=find_poorly_seen(cells, trust.support, frames))
     record.write(out)
     return record
 
@@ -84,35 +83,3 @@ def _saver(
         advance()
 
     return save
-
-
-def film_next(
-    splats: Splats, trust: Trust, scene: Scene, world: WorldSummary | None, ctx: StageContext
-) -> tuple[list[Suggestion], str]:
-    """Returns where to film next, or none and why."""
-    places, reason = standing_places(splats, trust, scene, world)
-    if places is None:
-        return [], reason
-    suggestions = suggest(splats, trust.support, trust.error, places,
-                          (*scene.train, *scene.validation), backend=ctx.backend)
-    return suggestions, "" if suggestions else (
-        "no place is suggested, as every free one looks at something too near")
-
-
-def standing_places(
-    splats: Splats, trust: Trust, scene: Scene, world: WorldSummary | None
-) -> tuple[StandingPlaces | None, str]:
-    """Returns where somebody could stand, or None and why."""
-    views = (*scene.train, *scene.validation)
-    gravity = find_gravity(scene.points, np.stack([view.camera.viewmat for view in views]))
-    up, floor = gravity.up, gravity.floor.height if gravity.floor else None
-    if world is not None and world.evidence.up_found:
-        up = np.array([0.0, 0.0, 1.0])
-        floor = 0.0 if world.evidence.floor_found else floor
-    if up is None:
-        return None, f"no place is suggested, as up is not known: {gravity.reason}"
-    cameras = np.stack([view.camera.center for view in views])
-    places = find_places(splats, trust.support, up, floor, cameras, most=MAX_PLACES)
-    if not len(places.eyes):
-        return None, "no place is suggested, as no free standing place was found near the cameras"
-    return places, ""

@@ -73,24 +73,6 @@ class ErrorModel(JsonRecord):
         means = {name: np.full(1, value, np.float32) for name, value in self.means.items()}
         return self.expect(means | gaussian_terms(support, sight))
 
-    def expect_seen(
-        self, count: Array, angle: Array, residual: Array, nearer: Array
-    ) -> Array:
-        """Returns the expected error of Gaussians, arrays that fit together by broadcasting.
-
-        `count` views show each, the nearest ray `angle` away in rad; `nearer` as in `Sight`.
-        """
-        terms = {name: np.full(1, value) for name, value in self.means.items()}
-        terms.update(_shape_terms(1 / (1 + count), angle, residual, nearer))
-        log = sum(self.weights[name] * terms[name] for name in TERMS) + self.bias
-        return np.asarray(np.exp(np.minimum(log, 0)), np.float64)
-
-    def expect_hole(self) -> float:
-        """Returns the expected error where nothing is drawn."""
-        values = {**self.means, "hole": 1.0, "few": 0.0, "angle": float(np.log1p(np.pi / _ANGLE))}
-        return float(self.expect({
-            name: np.full(1, value, np.float32) for name, value in values.items()})[0])
-
 
 def gaussian_terms(support: Support, sight: Sight) -> dict[str, NDArray[np.float32]]:
     """Returns the terms [N] that are known for Gaussians without a picture."""

@@ -21,10 +21,10 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
 from recon_cli.trust.agreement import ause, reliability
 from recon_cli.trust.error_model import ErrorModel, calibrate, picture_terms
-from recon_cli.trust.film_next import Suggestion
 from recon_cli.trust.heat_map import FULL
+from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.support import MAX_VIEWS, Support, error_image, measure_support
-from recon_cli.trust.surface import SurfaceShares, surface_shares
+from recon_cli.trust.surface import SurfaceShares
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.summaries import JsonRecord
 
@@ -60,15 +60,14 @@ class ModelTrust(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class TrustRecord(JsonRecord):
-    """trust.json: the models of a workspace, and where to film next."""
+    """trust.json: the models of a workspace, and the largest poorly seen regions."""
 
     models: tuple[str, ...]
     base: ModelTrust | None = None
     pruned: ModelTrust | None = None
     reason: str = ""  # why there is no trust; empty where there is
     metres: bool = False  # world units are metres
-    film_next: tuple[Suggestion, ...] = ()
-    no_places: str = ""  # why no place is suggested
+    poorly_seen: tuple[PoorlySeenRegion, ...] = ()  # of the model that export takes
 
     @staticmethod
     def read(evaluate: Path) -> TrustRecord | None:
@@ -94,13 +93,9 @@ class TrustRecord(JsonRecord):
         return "m" if self.metres else "scene units"
 
     def lines(self) -> list[str]:
-        """Returns where to film next in words, a line each, or why there is none."""
-        if self.reason:
-            return []
-        if not self.film_next:
-            return [f"film next: {self.no_places}"]
-        return [f"film next ({number}) {suggestion.describe(self.unit)}"
-                for number, suggestion in enumerate(self.film_next, 1)]
+        """Returns the poorly seen regions in words, a line each."""
+        return [f"poorly seen ({number}) {region.describe(self.unit)}"
+                for number, region in enumerate(self.poorly_seen, 1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +179,11 @@ def measure_trust(
 
     `max_size` is the longest side in pixels at which errors are compared.
     """
-    gains, refined = config.exposure == "on", config.poses == "on"
+    gains = config.exposure == "on"
     support = measure_support(
         splats, _in_turn(evenly_spread(scene.train, MAX_VIEWS), max_size, ctx.threads),
-        sh_degree=config.sh_degree, backend=ctx.backend, gains=gains, compare=not refined,
-        on_view=on_view, digest=digest_of(splats))
+        sh_degree=config.sh_degree, backend=ctx.backend, gains=gains, on_view=on_view,
+        digest=digest_of(splats))
     validation = load_reference_views(evenly_spread(scene.validation, _CALIBRATION), max_size)
     train = [] if validation else load_reference_views(
         evenly_spread(scene.train, _CALIBRATION), max_size)
@@ -205,7 +200,8 @@ def _in_turn(views: Sequence[View], max_size: int, threads: int) -> Iterator[Ref
 
 
 def model_trust(
-    trust: Trust, splats: Splats, views: Sequence[ReferenceView], *, gains: bool, backend: str,
+    trust: Trust, splats: Splats, surface: SurfaceShares, views: Sequence[ReferenceView], *,
+    gains: bool, backend: str,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _error: None,
 ) -> ModelTrust:
     """Returns what is known about a model's trust, checked on views that did not calibrate it.
@@ -237,4 +233,4 @@ def model_trust(
             expected=tuple(round(value, 6) for value in bins.expected),
             real=tuple(round(value, 6) for value in bins.real), gap=round(bins.gap, 4))
     return ModelTrust(views=len(trust.support.rows), error=trust.error, agreement=agreement,
-                      surface=surface_shares(splats, trust.support))
+                      surface=surface)

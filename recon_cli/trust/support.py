@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -93,26 +93,6 @@ class Support:
         return Sight(torch.arccos(cosine.clamp(-1, 1)),
                      torch.where(torch.isinf(nearest), torch.zeros_like(nearer), nearer))
 
-    def with_view(self, rows: Tensor, center: NDArray[np.float64]) -> Support:
-        """Returns what there would be with one more view that shows `rows`."""
-        count = self.count.clone()
-        count[rows] += 1
-        return Support((*self.rows, rows), np.vstack([self.centers, center]), self.residual, count,
-                       self.digest)
-
-    def select(self, rows: Tensor) -> Support:
-        """Returns the support of the Gaussians at `rows` [K], in that order."""
-        at = torch.full((len(self.residual),), -1, dtype=torch.int64, device=rows.device)
-        at[rows] = torch.arange(len(rows), device=rows.device)
-        shown = (at[view] for view in self.rows)
-        return Support(tuple(view[view >= 0] for view in shown), self.centers, self.residual[rows],
-                       self.count[rows])
-
-    def thinned(self, most: int) -> Support:
-        """Returns the rays of at most so many of the views, evenly spread; counts stay."""
-        step = max(1, -(-len(self.rows) // most))
-        return replace(self, rows=self.rows[::step], centers=self.centers[::step])
-
     def save(self, path: Path) -> None:
         """Writes the support as safetensors, whole or not at all."""
         shown = np.zeros((len(self.rows), len(self.residual)), bool)
@@ -154,13 +134,12 @@ def _directions(means: Tensor, place: NDArray[np.float64]) -> tuple[Tensor, Tens
 
 def measure_support(
     splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str,
-    gains: bool = False, compare: bool = True, on_view: Callable[[], None] = lambda: None,
+    gains: bool = False, on_view: Callable[[], None] = lambda: None,
     digest: str = "",
 ) -> Support:
     """Returns what training views show of the Gaussians, by one forward pass over them.
 
-    `gains` compares after the best gain per channel, as where exposures were trained. Without
-    `compare`, where cameras were refined and photos do not fit them, residuals are all alike.
+    `gains` compares after the best gain per channel, as where exposures were trained.
     """
     device = splats.means.device
     weights = torch.zeros(len(splats), dtype=torch.float64, device=device)
@@ -175,7 +154,7 @@ def measure_support(
         statistics = output.statistics
         rows = torch.nonzero(statistics.blend_max >= CARRIES)[:, 0]
         shown.append(rows)
-        if compare and len(rows):
+        if len(rows):
             error, counts = error_image(output.rgb.cpu().numpy(), view, gains=gains)
             # the mean over the pixels around that count
             blurred = cv2.blur(error * counts, (_BLUR, _BLUR)) / np.maximum(

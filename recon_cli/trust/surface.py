@@ -18,7 +18,7 @@ MIN_SPAN_DEG = 10.0  # below, depth hangs on a fraction of a pixel
 # Median distances from the middle beyond which a surface is outside, as through a window. The
 # corner of an oblong room is two away.
 _ROOM = 3.0
-_CELL = 0.03  # median distances: some centimetres in a room
+CELL = 0.03  # median distances: some centimetres in a room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,23 +50,45 @@ def _distances(splats: Splats, rows: torch.Tensor) -> tuple[NDArray[np.float64],
     return distances / median, median
 
 
-def surface_shares(splats: Splats, support: Support) -> SurfaceShares:
-    """Returns the shares by area: cells of space that surfaces pass through, each counted once."""
+@dataclass(frozen=True, eq=False)
+class SurfaceCells:
+    """Cells of space that the surface passes through, and how well views see the surface there."""
+
+    rows: torch.Tensor  # [K] of the Gaussians that are the surface
+    views: NDArray[np.int64]  # [K] that show each
+    span_deg: NDArray[np.float32]  # [K] angle that the rays of these views span
+    cell: NDArray[np.int64]  # [K] number of its cell
+    size: float  # of a cell, world units
+    grid: NDArray[np.int64]  # [C, 3] position of the cells in units of `size`
+    few: NDArray[np.float64]  # [C] share that too few views show, by opacity
+    narrow: NDArray[np.float64]  # [C] share that views show from one direction
+
+
+def find_cells(splats: Splats, support: Support) -> SurfaceCells:
+    """Returns the cells of the surface; none where no view shows any."""
     rows = surface_rows(splats, support)
-    if not len(rows):
-        return SurfaceShares(well=0.0, narrow=0.0, few=0.0, cells=0)
+    views = support.count[rows].cpu().numpy()
+    span_deg = np.degrees(support.span(splats.means)[rows].cpu().numpy())
+    several, wide = views >= MIN_VIEWS, span_deg >= MIN_SPAN_DEG
     means = splats.means[rows].detach().cpu().double().numpy()
-    size = _CELL * _distances(splats, rows)[1]
-    _, cell = np.unique(np.floor(means / size).astype(np.int64), axis=0, return_inverse=True)
+    size = CELL * _distances(splats, rows)[1] if len(rows) else 1.0
+    grid, cell = np.unique(np.floor(means / size).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     opacity = splats.opacities[rows].detach().cpu().double().numpy()
-    several = (support.count >= MIN_VIEWS)[rows].cpu().numpy()
-    span = support.span(splats.means)[rows].cpu().numpy() >= np.radians(MIN_SPAN_DEG)
     total = np.bincount(cell, opacity)
 
-    def share(which: NDArray[np.bool_]) -> float:
-        return float((np.bincount(cell, opacity * which) / total).mean())
+    def share(which: NDArray[np.bool_]) -> NDArray[np.float64]:
+        return np.asarray(np.bincount(cell, opacity * which) / total)
 
+    return SurfaceCells(rows, views, span_deg, cell, size, grid, share(~several),
+                        share(several & ~wide))
+
+
+def surface_shares(cells: SurfaceCells) -> SurfaceShares:
+    """Returns the shares by area: each cell counts once."""
+    if not len(cells.grid):
+        return SurfaceShares(well=0.0, narrow=0.0, few=0.0, cells=0)
+    few, narrow = float(cells.few.mean()), float(cells.narrow.mean())
     return SurfaceShares(
-        well=round(share(several & span), 4), narrow=round(share(several & ~span), 4),
-        few=round(share(~several), 4), cells=len(total))
+        well=round(1 - few - narrow, 4), narrow=round(narrow, 4), few=round(few, 4),
+        cells=len(cells.grid))

@@ -355,7 +355,6 @@ class TrainSummary(JsonRecord):
     skipped_steps: int  # the loss was not finite
     estimated_seconds: float
     calibration_seconds: float
-    processes: int | None = None  # None for one
     cuda_peak_bytes: int
 
 
@@ -402,7 +401,7 @@ class EvaluateSummary(JsonRecord):
     pruned_gaussians: int | None = None
     base_gain_psnr_db: float | None = None  # after the best gain of each view, with --exposure
     pruned_gain_psnr_db: float | None = None
-    film_next: tuple[str, ...] | None = None  # where to film next, a line each; docs/trust.md
+    poorly_seen: tuple[str, ...] | None = None  # largest regions, a line each; docs/trust.md
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -106,7 +106,7 @@ def main(
     click.echo("| scene | asked | steps | Gaussians | calibration s | estimate s | took s "
                "| error | took over told, by fifths |\n|---|---|---:|---:|---:|---:|---:|---:|---|")
     parts = TrainConfig(
-        early_stop=False, sh_degree=3, far="on", stereo="off", exposure="off", poses="off",
+        early_stop=False, sh_degree=3, far="on", stereo="off", exposure="off",
         images="original", max_size=max_size)
     configs = [dataclasses.replace(parts, minutes=one) for one in minutes]
     configs += [dataclasses.replace(parts, quality=one) for one in quality]

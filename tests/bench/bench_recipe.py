@@ -154,7 +154,7 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
     base = RunConfig(
         iterations=iterations, max_size=max_size, validation=validation,
         max_gaussians=max_gaussians or 1000,  # until the plan's is known
-        images="original", far="on", exposure="off", poses="off",
+        images="original", far="on", exposure="off",
         early_stop=False)
     shared = {name: value for text in common for name, value in parsed(text).items()}
     click.echo("| scene | change | PSNR / SSIM | deviation | training views | Gaussians | CPU s |\n"

@@ -42,7 +42,7 @@ DEGREE = "sh-degree"
 ALL = (*PARTS, DEGREE)
 SWITCHED = {  # the other value of a part
     "far": ("off", "on"), "stereo": ("off", "on"), "exposure": ("off", "on"),
-    "poses": ("off", "on"), "images": ("original", "denoised")}
+    "images": ("original", "denoised")}
 
 
 class Capture:

@@ -31,6 +31,7 @@ from recon_cli.trust.agreement import ause
 from recon_cli.trust.error_model import picture_terms
 from recon_cli.trust.scene_trust import Trust, measure_trust, model_trust
 from recon_cli.trust.support import error_image
+from recon_cli.trust.surface import find_cells, surface_shares
 
 
 def bounds(splats: Splats, trust: Trust, views: Sequence[ReferenceView]) -> tuple[float, float]:
@@ -65,7 +66,9 @@ def main(workspaces: Sequence[Path]) -> None:
         trust = measure_trust(splats, scene, config, config.max_size, ctx)
         took = process_time() - start
         views = load_reference_views(scene.test, config.max_size, ctx)
-        row = model_trust(trust, splats, views, gains=config.exposure == "on", backend="numba")
+        surface = surface_shares(find_cells(splats, trust.support))
+        row = model_trust(
+            trust, splats, surface, views, gains=config.exposure == "on", backend="numba")
         agreement, (low, high) = row.agreement, bounds(splats, trust, views)
         assert agreement is not None
         trained = seconds_at(workspace / "train" / LOG, 1 << 62, clock="cpu_seconds")

@@ -2,8 +2,9 @@
 
     python tests/bench/fit_trust_weights.py WORKSPACE... [--max-size 320]
 
-A third of the training views of each capture is taken away in one stretch, as bench_film_next.py
-does; the rest is trained, and the weights of the expected error are fitted to the real errors in
+A third of the training views of each capture is taken away in one stretch, the middle third by
+name, and with it the points that fewer than two of the others see; the rest is trained, and the
+weights of the expected error are fitted to the real errors in
 the stretch, without the pull towards PRIOR, for each capture by itself and for all with a bias
 each. The last row is what PRIOR is rounded from. Held-out views are not looked at.
 """
@@ -12,15 +13,25 @@ from __future__ import annotations
 
 import zlib  # noqa: F401 - before pycolmap, which brings a zlib of its own
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
 import numpy as np
-from bench_film_next import open_capture
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from recon_cli.train.train_data import load_views
+from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.machine import usable_threads
+from recon_cli.scene.covisibility import observe_points
+from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.splats import Splats
+from recon_cli.train.fit import fit
+from recon_cli.train.initialize import first_state
+from recon_cli.train.schedule import make_schedule
+from recon_cli.train.train_data import load_task, load_views
 from recon_cli.trust.error_model import PRIOR, TERMS, picture_terms
 from recon_cli.trust.scene_trust import measure_trust
 from recon_cli.trust.support import error_image
@@ -28,13 +39,55 @@ from recon_cli.trust.support import error_image
 PIXELS = 60_000  # of each capture
 MOST = 6.0  # of a weight
 
+SEES = 2  # views that a point needs, as in any mapping
+
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture with a hole."""
+
+    scene: Scene  # without the stretch
+    taken: tuple[View, ...]  # the stretch
+    config: RunConfig
+    ctx: StageContext
+
+    def train(self) -> tuple[Splats, Scene]:
+        """Returns a short training, and what it was trained on."""
+        scene = self.scene
+        sees = observe_points(scene.points, [view.camera for view in scene.train])
+        kept = np.bincount(sees.point, minlength=len(scene.points)) >= SEES
+        scene = replace(scene, points=scene.points[kept], colors=scene.colors[kept])
+        task = replace(load_task(scene, self.config, self.ctx), schedule=make_schedule(
+            self.config, None))
+        state = first_state(task, scene.points, scene.colors, most=self.config.max_gaussians // 2)
+        fit(state, task, self.config.iterations)
+        return state.splats.map(lambda tensor: tensor.detach()), scene
+
+
+def open_capture(workspace: Path, max_size: int, iterations: int) -> Capture:
+    """Returns the capture of a workspace without its middle third."""
+    inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
+    scene = load_scene(inputs, validation=0.05)
+    every, third = scene.train, len(scene.train) // 3
+    stretch = every[third:2 * third]
+    names = {view.name for view in stretch}
+    low, high = min(names), max(names)
+    config = RunConfig(iterations=iterations, max_size=max_size, max_gaussians=30_000, sh_degree=1,
+                       images="original", far="off", exposure="off")
+    return Capture(
+        replace(scene, train=tuple(view for view in every if view.name not in names),
+                # a validation view in the stretch would show what is missing
+                validation=tuple(view for view in scene.validation
+                                 if not low <= view.name <= high)),
+        tuple(stretch), config, StageContext(backend="numba", threads=usable_threads()))
 
 
 def read_stretch(workspace: Path, max_size: int, iterations: int) -> tuple[Array, Array]:
     """Returns the terms [P, K] of pixels in the stretch that was taken away, and their errors."""
-    capture = open_capture(workspace, max_size, iterations, removed=False)
-    splats, scene = capture.train(())
+    capture = open_capture(workspace, max_size, iterations)
+    splats, scene = capture.train()
     support = measure_trust(splats, scene, capture.config, max_size, capture.ctx).support
     columns: list[Array] = []
     errors: list[Array] = []

@@ -33,6 +33,7 @@ def test_toml_round_trips_every_section(tmp_path: Path) -> None:
     ("[trian]\niterations = 3", "section trian", "Did you mean train?"),
     ("[train]\niteration = 3", "train.iteration,", "Did you mean iterations?"),
     ("[train]\nxyz = 3", "train.xyz", "quality, minutes"),
+    ("[train]\nposes = 'off'", "train.poses, which does not exist", "leave it out"),  # a past one
     ("train = 3", "it is a section", "[train]"),
     ("[train]\ndensify = 'swarm'", "train.densify is 'swarm'", "--densify"),
     ("[prune]\nratio = 2", "prune.ratio is 2.0", "--ratio"),

@@ -76,8 +76,7 @@ def test_the_table_of_the_paper_sets_two_models_side_by_side_by_data_set():
     ({"sh_degree": 1}, False),
 ])
 def test_only_the_recipe_of_3dgs_is_the_reference(changes, expected):
-    plain = {"densify": "reference", "far": "off", "stereo": "off", "exposure": "off",
-             "poses": "off"}
+    plain = {"densify": "reference", "far": "off", "stereo": "off", "exposure": "off"}
     assert RunConfig(**{**plain, **changes}).is_reference is expected
 
 

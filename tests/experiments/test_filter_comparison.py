@@ -13,8 +13,8 @@ from recon_cli.experiments import filter_comparison
 from recon_cli.experiments.filter_comparison import FilterScore, edges_kept
 
 
-def score(name, psnr, edges, *, noise=5.0, offered=True):
-    return FilterScore(name, 4.0, offered, noise, psnr, edges, 0.1)
+def score(name, psnr, edges, *, noise=5.0):
+    return FilterScore(name, 4.0, noise, psnr, edges, 0.1)
 
 
 def test_all_edges_of_the_truth_itself_are_kept():
@@ -57,7 +57,7 @@ def test_every_filter_is_scored_at_every_level_and_each_run_is_counted():
         [plain_room()[90:150, 40:140]], levels, on_run=lambda: ran.append(1))
     assert len(ran) == len(scores) == len(levels) * len(filter_comparison.VARIANTS)
     names = {one.filter for one in scores}
-    assert {"none", "joint", "bilateral", "guided", "non-local means"} == names
+    assert {"none", "joint", "bilateral"} == names
     untouched = [one for one in scores if one.filter == "none"]
     for one, level in zip(untouched, levels, strict=True):
         assert one.psnr_db == pytest.approx(20 * np.log10(255 / level), abs=0.3)
@@ -73,10 +73,10 @@ def test_the_same_noise_is_added_every_time():
     assert scores[0] == scores[1]
 
 
-def test_the_best_is_the_closest_that_is_offered_and_keeps_the_edges():
+def test_the_best_is_the_closest_that_keeps_the_edges():
     scores = [
         score("none", 34, 1.0), score("joint", 39, 0.97), score("bilateral", 40, 0.9),
-        score("non-local means", 41, 1.0, offered=False), score("none", 24, 1.0, noise=15.0)]
+        score("none", 24, 1.0, noise=15.0)]
     assert filter_comparison.best(scores, 5.1).filter == "joint"
     assert filter_comparison.gain_db(scores, scores[1]) == 5
 
@@ -106,7 +106,6 @@ def test_what_each_filter_would_do_is_printed_and_written_beside_the_stages(work
     assert main(["denoise", "--compare", "-w", str(workspace)]) == 0
     said = capsys.readouterr().out
     assert "joint" in said
-    assert "(non-local means)" in said
     assert "recon denoise would use --filter joint --strength 4." in said
     found = json.loads((workspace / "compare.json").read_text())
     # A low percentile of small tiles lies under the mean.

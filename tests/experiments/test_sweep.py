@@ -7,8 +7,7 @@ from posed_sets import make_replica
 
 from recon_cli.cli import main
 from recon_cli.evaluation.scores import MeanScore, Sweep, SweepTrial
-from recon_cli.experiments.sweep import count_trials, table
-from recon_cli.train.importance import SCORES
+from recon_cli.experiments.sweep import SCORES, count_trials, table
 
 RATIOS = (0.5, 0.9)
 

@@ -40,7 +40,6 @@ images = "original"
 far = "off"
 stereo = "off"
 exposure = "off"
-poses = "off"
 [prune]
 rounds = 1
 recovery = 8

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
@@ -20,6 +21,14 @@ def camera_at(width: int = 50, height: int = 37, *, focal: float = 40.0) -> Came
         [math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
     viewmat[:3, 3] = [0.1, -0.05, 0.2]
     return Camera(width, height, focal, 1.1 * focal, width / 2 + 1.3, height / 2 - 0.7, viewmat)
+
+
+def move_camera(camera: Camera, turn: np.ndarray, move: np.ndarray) -> Camera:
+    """The camera, turned about its centre by a rotation vector in world axes, and then moved."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = camera.viewmat[:3, :3] @ Rotation.from_rotvec(turn).as_matrix().T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (camera.center + move)
+    return replace(camera, viewmat=viewmat)
 
 
 def random_splats(n: int, *, seed: int = 0, dtype: torch.dtype = torch.float64) -> Splats:

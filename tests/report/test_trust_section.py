@@ -9,11 +9,11 @@ from recon_cli.io.colmap import read_scene
 from recon_cli.report.capture import draw_plan, find_axes
 from recon_cli.report.trust_section import TrustSection
 from recon_cli.scene.scene import Scene
-from recon_cli.trust.film_next import Suggestion
+from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.scene_trust import RECORD
 
-NEXT = Suggestion(position=(0.1, 0.2, 1.5), forward=(0.0, 1.0, 0.0), near="000001.png",
-                  distance=1.0, turn_deg=0.0, expected_error=0.1, reason="<b>low</b> surfaces")
+REGION = PoorlySeenRegion(position=(0.1, 0.2, 1.5), size=1.0, share=0.05, few=True, views=2,
+                          span_deg=3.0, frame="<b>000001</b>.png")
 
 
 def change(workspace, **fields):
@@ -27,19 +27,19 @@ def test_shares_reliability_and_heat_maps_are_shown(workspace):
     assert "AUSE" in shown
     assert "calibrated nothing" in shown
     assert shown.count("Expected error of") == 3  # held-out views
-    assert "No place is suggested" in shown
+    assert "Nowhere is a large region" in shown
 
 
-def test_suggestions_are_listed_escaped_and_drawn_in_the_plan(workspace):
-    change(workspace, film_next=[NEXT.to_json()])
+def test_poorly_seen_regions_are_listed_escaped_and_drawn_in_the_plan(workspace):
+    change(workspace, poorly_seen=[REGION.to_json()])
     page = page_of(workspace)
     shown = section(page, "trust")
-    assert "&lt;b&gt;low" in shown
-    assert "<b>low" not in page
-    assert "scene units from 000001.png" in shown
+    assert "&lt;b&gt;000001" in shown
+    assert "<b>000001" not in page
+    assert "1 scene units across" in shown
     assert 'class="next"' in section(page, "capture")
-    change(workspace, film_next=[NEXT.to_json()], metres=True)
-    assert "1 m from 000001.png" in section(page_of(workspace), "trust")
+    change(workspace, poorly_seen=[REGION.to_json()], metres=True)
+    assert "1 m across" in section(page_of(workspace), "trust")
 
 
 def test_a_reason_stands_in_place_of_trust(workspace):
@@ -54,14 +54,14 @@ def test_damaged_or_missing_files_are_said(workspace):
     assert "Trust is not shown" in section(page_of(workspace), "trust")
     (workspace / "evaluate" / "trust" / RECORD).unlink()
     assert "Trust was not measured" in section(page_of(workspace), "trust")
-    assert TrustSection("none").places == ()
+    assert TrustSection("none").regions == ()
 
 
-def test_a_place_off_the_path_fits_into_the_plan(workspace):
+def test_a_region_off_the_path_fits_into_the_plan(workspace):
     scene: Scene = read_scene(
         workspace / "sfm" / "undistorted", held_out=frozenset(), validation=0.0)
-    far = Suggestion(**{**vars(NEXT), "position": (30.0, -20.0, 1.0)})
-    plan = str(draw_plan(scene, find_axes(scene, z_up=True), metres=False, suggestions=[far]))
+    far = PoorlySeenRegion(**{**vars(REGION), "position": (30.0, -20.0, 1.0)})
+    plan = str(draw_plan(scene, find_axes(scene, z_up=True), metres=False, regions=[far]))
     texts = plan.split('class="next" x="')[1]
     x = float(texts.split('"')[0])
     assert 0 < x < 640

@@ -99,10 +99,10 @@ def test_the_count_grows_to_a_higher_cap(inputs, tmp_path, monkeypatch):
 def test_it_keeps_the_parts_of_the_model_without_a_trial(inputs, tmp_path, monkeypatch):
     (tmp_path / "short").mkdir()
     asked = replace(SHORT, sh_degree=None)
-    train.run(replace(asked, exposure="on", poses="on"), inputs, tmp_path / "short", CONTEXT)
+    train.run(replace(asked, exposure="on"), inputs, tmp_path / "short", CONTEXT)
     monkeypatch.setattr(planning, "choose_parts", None)  # would fail if it were called
     summary = go_on(replace(asked, iterations=200), inputs, tmp_path / "short", tmp_path / "long")
-    assert summary.parts["exposure"] == summary.parts["poses"] == "on"
+    assert summary.parts["exposure"] == "on"
     assert TrainPlan.read(tmp_path / "long").needs == TrainPlan.read(tmp_path / "short").needs
 
 

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 ON_TRITON = replace(CONTEXT, backend="triton", device=DEVICE)
 CONFIG = RunConfig(
     iterations=8, densify_every=4, max_gaussians=80, sh_degree=0, far="off", exposure="off",
-    poses="off", images="original", checkpoint_every=3, early_stop=False)
+    images="original", checkpoint_every=3, early_stop=False)
 FILES = ("splats.ply", "mid.safetensors", "final.safetensors")
 
 

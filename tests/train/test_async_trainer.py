@@ -12,7 +12,6 @@ from scenes import camera_at, random_splats
 from tiny_task import STRATEGIES, Hooks, same
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from recon_cli.context import ProcessGroup
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
@@ -304,11 +303,10 @@ def test_a_step_never_waits_for_the_device(views):
 
 
 def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
-    def chosen(backend="triton", importance=None, *, exposure=False, ranks=None, **changes):
+    def chosen(backend="triton", importance=None, *, exposure=False, **changes):
         config = dataclasses.replace(CONFIG, **changes)
         state, task = first(backend, config), task_of(backend, config)
         state.exposure = Exposure(3) if exposure else None
-        task = dataclasses.replace(task, ranks=ranks) if ranks else task
         found = async_trainer.choose_trainer(state, task, importance, lambda _: False)
         return type(found.__self__)
 
@@ -317,4 +315,3 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
     assert chosen(importance=Importance.zeros(COUNT, torch.device("cpu"))) is Stepper
     assert chosen(exposure=True) is Stepper
     assert chosen(batch_views=2) is async_trainer.AsyncTrainer
-    assert chosen(ranks=ProcessGroup(0, 2)) is Stepper

@@ -2,13 +2,11 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, tiny_task
 
 from recon_cli.train.fit import fit
-from recon_cli.train.poses import Poses
 from recon_cli.train.stepper import Stepper
 
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
@@ -117,19 +115,3 @@ def test_a_batch_with_a_loss_that_is_not_finite_comes_to_nothing(backend):
     Stepper(before, task, None).step()
     assert same(state, before)
     assert state.optimizer.count == before.optimizer.count == 1
-
-
-def test_cameras_of_a_batch_each_move_by_their_own_gradient():
-    states = {}
-    for views in (1, 2):
-        config = with_batches(views)
-        task, state = tiny_task(config, backend="numba"), first_state(config, backend="numba")
-        centers = np.stack([view.camera.center + i for i, view in enumerate(task.train)])
-        state.poses = Poses(centers, 1.0, visits=10, error=1e-3)
-        state.queue = [1, 0][2 - views:]
-        Stepper(state, task, None).step()
-        states[views] = state.poses._rows
-    first = states[1]._exp_avg[0]
-    assert first.abs().max() > 0
-    assert torch.allclose(states[2]._exp_avg[0], first, rtol=1e-6)
-    assert states[2]._exp_avg[1].abs().max() > 0

@@ -16,7 +16,7 @@ def reasons(needs):
 
 def test_a_plain_scene_needs_nothing_and_pays_nothing():
     needs = examine(scene())
-    assert (needs.config.far, needs.config.exposure, needs.config.poses) == ("off",) * 3
+    assert needs.config.far == needs.config.exposure == "off"
     assert needs.seconds == 0
     assert "cover all" in reasons(needs)["far"]
     assert "differs by" in reasons(needs)["exposure"]
@@ -44,7 +44,7 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 
 def test_what_the_options_say_is_not_tried():
-    config = replace(CONFIG, far="off", stereo="on", exposure="on", poses="off")
+    config = replace(CONFIG, far="off", stereo="on", exposure="on")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config
@@ -54,13 +54,6 @@ def test_too_few_views_switch_nothing_on():
     needs = examine(scene(window=True, drift=0.15, views=6))
     assert needs.config.exposure == needs.config.far == "off"
     assert "too few views" in reasons(needs)["exposure"]
-
-
-@pytest.mark.parametrize("error", [None, 0.1 / 90])
-def test_good_cameras_are_left_alone_untried(error):
-    needs = examine(scene(error=error))
-    assert needs.config.poses == "off"
-    assert next(one for one in needs.decisions if one.name == "poses").mean_db is None
 
 
 def test_matt_colours_get_no_harmonics():

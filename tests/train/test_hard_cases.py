@@ -18,7 +18,7 @@ from recon_cli.train.schedule import Schedule
 
 STEPS = 200
 PLAIN = replace(
-    CONFIG, iterations=STEPS, densify_every=20, far="off", exposure="off", poses="off",
+    CONFIG, iterations=STEPS, densify_every=20, far="off", exposure="off",
     early_stop=False)
 
 

@@ -6,17 +6,12 @@ import torch
 from scenes import camera_at, joined, one_splat, random_splats
 from tiny_task import importance_of
 
-from recon_cli.config.stages import RunConfig
+from recon_cli.config.stages import PRUNE_SCORES, RunConfig
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step
-from recon_cli.train.importance import (
-    SCORES,
-    Importance,
-    lightgaussian_score,
-    paper_score,
-)
+from recon_cli.train.importance import RANDOM, Importance, paper_score
 from recon_cli.train.optimizer import SplatOptimizer
 
 CPU = torch.device("cpu")
@@ -44,45 +39,21 @@ def test_the_papers_score_is_hits_times_opacity_times_normalised_volume():
         assert score[i].item() == pytest.approx(i * 0.5 * gamma, rel=1e-12)
 
 
-def test_lightgaussians_score_is_not_clamped_and_its_reference_only_scales_it():
-    splats = joined(*[
-        one_splat((0.0, 0.0, 2.0), scale=0.1 * (i + 1), opacity=0.5, color=(0.5, 0.5, 0.5))
-        for i in range(10)])
-    score = lightgaussian_score(torch.arange(10), splats)
-    for i in range(10):  # of ten descending volumes the tenth, the smallest, is taken
-        volume = (0.1 * (i + 1)) ** 3 / 0.1**3
-        assert score[i].item() == pytest.approx(i * 0.5 * volume**0.1, rel=1e-6)
-    plain = torch.arange(10) * 0.5 * splats.scales.double().prod(-1) ** 0.1
-    assert torch.equal(score.argsort(), plain.argsort())
-
-
-def test_the_papers_clamp_ranks_large_gaussians_otherwise_than_lightgaussian():
-    sizes = [0.1] * 18 + [1.0, 3.0]  # the 90th percentile is .1
-    splats = joined(*[
-        one_splat((0.0, 0.0, 2.0), scale=size, opacity=0.5, color=(0.5, 0.5, 0.5))
-        for size in sizes])
-    hits = torch.full((20,), 10)
-    hits[18] = 11
-    assert paper_score(hits, splats, beta=0.1).argmax() == 18
-    assert lightgaussian_score(hits, splats).argmax() == 19
-
-
 def test_a_beta_of_zero_leaves_the_volume_out():
     splats = random_splats(20)
     hits = torch.full((20,), 7)
     assert torch.allclose(paper_score(hits, splats, beta=0.0), 7 * splats.opacities)
 
 
-@pytest.mark.parametrize("of", [lambda h, s: paper_score(h, s, beta=0.1), lightgaussian_score])
-def test_volumes_beyond_the_range_of_float32_are_still_ranked(of):
+def test_volumes_beyond_the_range_of_float32_are_still_ranked():
     splats = random_splats(10).map(lambda tensor: tensor.float())
     splats.log_scales[:] = torch.linspace(-60, -40, 10)[:, None]
-    score = of(torch.ones(10, dtype=torch.int64), splats)
+    score = paper_score(torch.ones(10, dtype=torch.int64), splats, beta=0.1)
     assert torch.isfinite(score).all()
     assert (score > 0).all()
 
 
-@pytest.mark.parametrize("name", ["paper", "lightgaussian", "blend_sum", "blend_max", "loo"])
+@pytest.mark.parametrize("name", PRUNE_SCORES)
 def test_a_gaussian_behind_an_opaque_wall_scores_zero(name):
     wall = joined(*[
         one_splat((0.0, 0.0, 2.0 + 0.01 * i), scale=9.0, opacity=0.98, color=(0.5, 0.5, 0.5))
@@ -100,13 +71,12 @@ def test_one_gaussian_alone_has_the_score_that_its_picture_gives():
     found = importance_of(splats, [blank(camera)] * 2, sh_degree=0, backend="torch")
     assert found.views == 2
     assert found.hits.item() == 2 * (alpha > 0).sum()
-    assert found.blend_sum.item() == pytest.approx(2 * alpha.sum().item())
     assert found.blend_max.item() == pytest.approx(alpha.max().item())
     squares = 0.9**2 + 0.5**2 + 0.1**2  # of the colour over black
     assert found.loo.item() == pytest.approx(2 * squares * alpha.square().sum().item())
 
 
-@pytest.mark.parametrize("name", [name for name in SCORES if name != "random"])
+@pytest.mark.parametrize("name", PRUNE_SCORES)
 def test_a_view_whose_mask_ignores_all_adds_nothing(name):
     splats, camera = random_splats(30), camera_at(30, 20)
     views = [blank(camera), blank(camera, np.zeros((20, 30), bool))]
@@ -120,7 +90,7 @@ def test_a_view_whose_mask_ignores_all_adds_nothing(name):
 def test_scores_add_up_over_views():
     splats = random_splats(30)
     cameras = [camera_at(30, 20), camera_at(41, 33, focal=30.0)]
-    for name in ("blend_sum", "loo", "lightgaussian"):
+    for name in ("loo", "paper"):
         both = scored(name, splats, cameras)
         parts = [scored(name, splats, [camera]) for camera in cameras]
         assert torch.allclose(both, parts[0] + parts[1]), name
@@ -141,7 +111,7 @@ def test_a_training_step_leaves_the_scores_of_its_view(backend):
     trained = Importance.zeros(60, CPU)
     trained.add(statistics)
     expected = importance_of(splats, [view], sh_degree=0, backend=backend)
-    for name in ("hits", "blend_sum", "blend_max", "loo"):
+    for name in ("hits", "blend_max", "loo"):
         assert torch.allclose(getattr(trained, name), getattr(expected, name)), name
     assert trained.loo.max() > 0
 
@@ -149,6 +119,6 @@ def test_a_training_step_leaves_the_scores_of_its_view(backend):
 def test_the_random_score_is_seeded():
     splats = random_splats(8)
     draws = [Importance.zeros(8, CPU).score(
-        "random", splats, beta=0.1, generator=torch.Generator().manual_seed(3))
+        RANDOM, splats, beta=0.1, generator=torch.Generator().manual_seed(3))
         for _ in range(2)]
     assert torch.equal(*draws)

@@ -8,10 +8,10 @@ import torch
 from scenes import camera_at, random_splats
 from tiny_task import importance_of
 
-from recon_cli.config.stages import RunConfig
+from recon_cli.config.stages import PRUNE_SCORES, RunConfig
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit import fit
-from recon_cli.train.importance import SCORES
+from recon_cli.train.importance import RANDOM
 from recon_cli.train.prune_loop import (
     LAST_ROUND,
     PruneRun,
@@ -122,7 +122,7 @@ def test_removed_gaussians_are_gone_and_the_others_keep_their_moments():
     fit(state, task, 106)  # and training goes on
 
 
-@pytest.mark.parametrize("name", SCORES)
+@pytest.mark.parametrize("name", [*PRUNE_SCORES, RANDOM])
 def test_scoring_takes_exactly_the_steps_that_it_was_given(name):
     task, state = task_of(), state_of()
     score = run_of(task, state, name).score(112)
@@ -136,8 +136,8 @@ def test_scoring_takes_exactly_the_steps_that_it_was_given(name):
 def test_every_view_counts_once_however_few_steps_there_are(steps, monkeypatch):
     task, state = task_of(), state_of()
     monkeypatch.setattr(type(state.optimizer), "step", lambda *_, **__: None)  # nothing moves
-    score = run_of(task, state, "blend_sum").score(100 + steps)
-    expected = importance_of(state.splats, task.train, sh_degree=3, backend="torch").blend_sum
+    score = run_of(task, state, "loo").score(100 + steps)
+    expected = importance_of(state.splats, task.train, sh_degree=3, backend="torch").loo
     assert torch.allclose(score, expected)
 
 

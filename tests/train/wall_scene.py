@@ -45,7 +45,7 @@ def outside():
     return 60 * ahead, colors
 
 
-def scene(*, window=False, drift=0.0, config=CONFIG, views=VIEWS, error=None):
+def scene(*, window=False, drift=0.0, config=CONFIG, views=VIEWS):
     points, colors = wall(window)
     far_points, far_colors = outside()
     near, far = splats_at(points, colors, 0.06), splats_at(far_points, far_colors, 1.6)
@@ -61,6 +61,5 @@ def scene(*, window=False, drift=0.0, config=CONFIG, views=VIEWS, error=None):
             rgb = render(truth, camera, torch.zeros(3), 0, backend="numba").rgb.numpy()
         gain = np.exp(drift * rng.normal(size=3))
         shots.append(TrainView(camera, (np.clip(rgb * gain, 0, 1) * 255).round().astype(np.uint8)))
-    task = Task(shots, [], Schedule(config), EXTENT, "numba", torch.device("cpu"),
-                camera_error=error)
+    task = Task(shots, [], Schedule(config), EXTENT, "numba", torch.device("cpu"))
     return Candidate(task, points, (255 * colors).clip(0, 255).astype(np.uint8), None)

@@ -81,4 +81,3 @@ def test_holes_and_sides_that_no_view_shows_are_not_trusted():
     picture, sky = expect([0.3, 0.1, 9.0])  # no ceiling
     assert picture.alpha[12, 16] < 0.01
     assert sky[12, 16] >= np.median(unseen)
-    assert model.expect_hole() > np.median(seen)

@@ -41,20 +41,6 @@ def test_a_place_is_compared_with_the_nearest_ray_and_the_nearest_distance():
     assert float(sight.nearer[0]) == pytest.approx(np.log(2), abs=1e-5)  # half as far
     farther = support.seen_from(splats.means, np.array([0.0, -9.0, 0.0]))
     assert float(farther.nearer[0]) == 0
-    filmed = support.with_view(torch.tensor([0]), np.array([0.0, 0.0, 3.0]))
-    assert float(filmed.seen_from(splats.means, np.array([0.0, 0, 1])).angle[0]) < 1e-3
-    assert filmed.count.tolist() == [3]
-
-
-def test_a_selection_has_the_support_of_its_gaussians():
-    splats = dots([[0, 0, 0], [0.4, 0, 0.1], [0, -9, 0], [-0.3, 0.1, 0]], radius=0.1)
-    support = measure(splats, [photo(splats, camera(eye, [0, 0, 0])) for eye in EYES])
-    rows, place = torch.tensor([3, 0, 2]), np.array([0.3, -1.0, 0.2])
-    some, every = (each.seen_from(splats.means[chosen], place) for each, chosen in (
-        (support.select(rows), rows), (support, torch.arange(4))))
-    torch.testing.assert_close(some.angle, every.angle[rows])
-    torch.testing.assert_close(some.nearer, every.nearer[rows])
-    assert support.select(rows).count.tolist() == support.count[rows].tolist()
 
 
 def test_an_unseen_gaussian_is_at_the_widest_angle():
@@ -75,7 +61,6 @@ def test_the_residual_is_the_error_of_the_pixels():
     left, right = measure(splats, [other]).residual.tolist()
     assert left == pytest.approx(0, abs=2e-3)
     assert 0.03 < right < 0.12  # of up to .1, less towards its rim
-    assert measure(splats, [other], compare=False).residual.tolist() == [0, 0]
 
 
 def test_a_gain_is_no_error_where_exposures_are_trained():

@@ -6,13 +6,17 @@ import torch
 from small_room import dots, room
 
 from recon_cli.trust.support import Support
-from recon_cli.trust.surface import surface_rows, surface_shares
+from recon_cli.trust.surface import find_cells, surface_rows, surface_shares
 
 
 def support_of(n, seen):
     """`seen` are by view the centre and the Gaussians that it shows."""
     return Support.of([torch.as_tensor(rows) for _, rows in seen],
                       np.array([center for center, _ in seen], float), torch.zeros(n))
+
+
+def shares_of(splats, seen):
+    return surface_shares(find_cells(splats, support_of(len(splats), seen)))
 
 
 def test_shares_are_of_area():
@@ -22,8 +26,8 @@ def test_shares_are_of_area():
     splats = dots(np.concatenate([floor, crowd]))
     every = np.arange(len(splats))
     right = np.setdiff1d(np.arange(len(floor)), left)
-    shares = surface_shares(splats, support_of(len(splats), [
-        ([0, 0, 5], every), ([20, 0, 5], right), ([20, 10, 5], right)]))
+    shares = shares_of(splats, [
+        ([0, 0, 5], every), ([20, 0, 5], right), ([20, 10, 5], right)])
     assert shares.well == pytest.approx(0.5, abs=0.01)
     assert shares.few == pytest.approx(0.5, abs=0.01)
     assert shares.well + shares.narrow + shares.few == pytest.approx(1, abs=1e-3)
@@ -32,8 +36,7 @@ def test_shares_are_of_area():
 def test_views_from_one_direction_do_not_make_a_surface_well_seen():
     splats = dots(room())
     every = np.arange(len(splats))
-    shares = surface_shares(splats, support_of(len(splats), [
-        ([0, 0, 30 + i / 10], every) for i in range(6)]))
+    shares = shares_of(splats, [([0, 0, 30 + i / 10], every) for i in range(6)])
     assert shares.narrow == pytest.approx(1)
 
 
@@ -48,5 +51,5 @@ def test_what_lies_beyond_a_window_or_was_never_seen_is_no_surface():
 
 def test_a_scene_that_no_view_shows_has_no_surface():
     splats = dots(room())
-    shares = surface_shares(splats, support_of(len(splats), [([0, 0, 1], np.arange(0))]))
+    shares = shares_of(splats, [([0, 0, 1], np.arange(0))])
     assert (shares.cells, shares.well) == (0, 0)

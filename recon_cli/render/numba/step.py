@@ -113,10 +113,10 @@ def camera_gradient(
 ) -> NDArray[np.float64]:
     """Returns the gradient [6] of a turn and a move of the camera, from those of the Gaussians.
 
-    The derivation stands in recon_cli.train.poses. Here the torque of the colours is sum (G_i
-    sh_rest) . dL/dsh_rest with the generators G_i, without direction or derivative of the basis.
-    Each block of Gaussians has sums of its own: the same bits for any number of threads. Splats are
-    float32 on the CPU; sh_rest is not read at degree 0.
+    The derivation stands in recon_cli.render.camera_gradient. Here the torque of the colours is
+    sum (G_i sh_rest) . dL/dsh_rest with the generators G_i, without direction or derivative of the
+    basis. Each block of Gaussians has sums of its own: the same bits for any number of threads.
+    Splats are float32 on the CPU; sh_rest is not read at degree 0.
     """
     sums = np.zeros((-(-len(splats) // _SUM_BLOCK), 6))
     sh_degree = min(sh_degree, splats.sh_degree)

@@ -1,1 +1,0 @@
-"""Data-parallel training: several processes that torchrun started train one model."""
