@@ -13,6 +13,7 @@ from recon_cli.progress import NullProgress, Progress
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from recon_cli.config.stages import ComputeConfig
     from recon_cli.scene.camera import Camera
     from recon_cli.scene.splats import Splats
     from recon_cli.scene.train_view import TrainView
@@ -155,6 +156,7 @@ class StageContext:
     ranks: ProcessGroup = SINGLE_PROCESS  # the processes that train together, which this one leads
     max_memory_bytes: int | None = None  # that a stage may take; None: what is free
     scratch: Path | None = None  # folder for files without a name; None: the system's
+    compute: ComputeConfig | None = None  # as typed, for work on other machines; None: as here
 
     def notice(self, text: str) -> None:
         """Tells the user one line that must not be missed; unprintable characters are escaped."""
