@@ -121,7 +121,7 @@ class SfmConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_scale_between(self.scale_between)
-        _check_number_of("segments", self.segments)
+        _check_number_of("sfm", "segments", self.segments)
         if self.segments.isdecimal() and self.pairs != "auto":
             raise ConfigError(
                 f"segments is {self.segments} and pairs is {self.pairs}, but segments choose pairs "
@@ -129,12 +129,12 @@ class SfmConfig(StageConfig):
                 hint="Leave out --segments or --pairs.")
 
 
-def _check_number_of(name: str, asked: str) -> None:
+def _check_number_of(section: str, name: str, asked: str) -> None:
     """Raises ConfigError unless auto, off or a number of at least 1 is asked for."""
     if asked not in ("auto", "off") and not (asked.isdecimal() and int(asked) >= 1):
         raise ConfigError(
             f"{name} is {asked!r}, but needs auto, off or a number of {name}.",
-            hint=f"Give --{name} auto, or set {name} to auto in recon.toml.")
+            hint=f"Give --{name} auto, or --set {section}.{name}=auto to a verb without --{name}.")
 
 
 def _check_scale_between(value: tuple[str, str, float] | None) -> None:
@@ -246,7 +246,7 @@ class TrainConfig(StageConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_number_of("blocks", self.blocks)
+        _check_number_of("train", "blocks", self.blocks)
         if self.mid < DENSIFY_UNTIL:
             raise ConfigError(
                 f"mid is {self.mid:g}, but densification runs until {DENSIFY_UNTIL:g} of the run "

@@ -44,7 +44,7 @@ def _count_blocks(
     else:
         raise ConfigError(
             f"blocks is {config.blocks}, but a finished scene is trained further as one model.",
-            hint="Give --blocks off, or set blocks to off in recon.toml.")
+            hint="Give --blocks off.")
     if count > 1 and not ctx.ranks.alone:
         raise ConfigError("torchrun trains one model on several GPUs.", hint="Give --blocks off.")
     if count == 1 and config.on == "ray":

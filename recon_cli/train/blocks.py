@@ -66,7 +66,8 @@ def count_blocks(views: int, asked: str) -> int:
     if int(asked) > most:
         raise ConfigError(
             f"{views} views are too few for {asked} blocks: each takes {LEAST_VIEWS} or more.",
-            hint=f"Give --blocks {most} or fewer, or set blocks to that in recon.toml.")
+            hint=f"Give --blocks {most} or fewer, or --set train.blocks={most} to a verb without "
+            "--blocks.")
     return int(asked)
 
 
@@ -210,7 +211,8 @@ def train_blocks(jobs: Sequence[BlockJob], config: TrainConfig, ctx: StageContex
         logs = ", ".join(str(job.folder / OUTPUT) for job in unfinished if job.name in failed)
         raise ReconstructionError(
             describe_failures(failed, len(jobs), "blocks"),
-            hint=f"The others are kept; the same command tries these again. They printed {logs}.")
+            hint="The same command, without --again, keeps the others and tries these again. They "
+            f"printed {logs}.")
 
 
 def train_block(file: Path, ctx: StageContext) -> None:

@@ -80,7 +80,8 @@ def merge_blocks(
     splats = joined([part.with_degree(degree) for part in parts])[0]
     if not len(splats):
         raise ReconstructionError(
-            "No block has a Gaussian in its cell.", hint="Type `recon train --blocks off`.")
+            "No block has a Gaussian in its cell.",
+            hint="Train one model by `recon train --blocks off`.")
     before = sum(block.summary.iterations for block in blocks)
     steps = round(_FINETUNE * before)
     config = dataclasses.replace(
