@@ -24,6 +24,7 @@ from recon_cli.processes import CHILD, start_module
 from recon_cli.workspace.layout import LOCK
 
 PROGRAM = "recon_cli"  # the module that is run
+NEEDS_GPU = {"auto": None, "cpu": False, "cuda": True}  # by --device; None: if a machine has one
 CORES = 4  # of a command where nothing is said; more shorten it by little
 TRIES = 3  # of a command whose process is killed, by the system for want of memory or by somebody
 _ENDED = (ExitCode.HANGUP, ExitCode.TERMINATED)  # by a signal that recon handles

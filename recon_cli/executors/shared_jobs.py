@@ -54,11 +54,11 @@ def run_jobs(
     Raises:
         BackendError: the machines cannot be reached any more.
     """
-    shares, lock = [job.look()[0] for job in jobs], threading.Lock()  # what was done before
+    shares, lock = [_look(job)[0] for job in jobs], threading.Lock()  # what was done before
     total = sum(job.weight for job in jobs)
 
     def look(index: int) -> tuple[int, str]:
-        share, text = jobs[index].look()
+        share, text = _look(jobs[index])
         with lock:
             shares[index] = share
             record(sum(job.weight * part for job, part in zip(jobs, shares, strict=True)) / total)
@@ -97,6 +97,14 @@ def describe_failures(failed: Mapping[str, str], total: int, what: str) -> str:
     """Returns in a sentence how many of `total` failed and why; `failed` are reasons by name."""
     reasons = list_names([f"{name}: {reason.rstrip('.')}" for name, reason in failed.items()])
     return f"{len(failed)} of {total} {what} failed ({reasons})."
+
+
+def _look(job: SharedJob) -> tuple[float, str]:
+    """Returns how far a job is; nothing where its folder cannot be read, of which it tells."""
+    try:
+        return job.look()
+    except OSError:
+        return 0.0, ""
 
 
 @contextmanager

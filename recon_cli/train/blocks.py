@@ -8,9 +8,10 @@ machine; what it has finished stays for the next run of the stage.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -25,7 +26,7 @@ from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, ManifestError, ReconstructionError
 from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.executors.executor import CORES, Command, Executor, start_executor
+from recon_cli.executors.executor import CORES, NEEDS_GPU, Command, Executor, start_executor
 from recon_cli.executors.shared_jobs import SharedJob, describe_failures, run_jobs
 from recon_cli.io.colmap import read_observations, write_part
 from recon_cli.scene.cells import Cell
@@ -96,7 +97,7 @@ class BlockJob:
     def key(self) -> ResultKey:
         """Everything that decides what comes out of it."""
         part = {"views": sorted(self.views), "validation": sorted(self.validation),
-                "owned": np.flatnonzero(self.cell.owned).tolist()}
+                "owned": hashlib.sha256(self.cell.owned.tobytes()).hexdigest()}
         return ResultKey(
             STAGE, _VERSION, self.config.hashed_fields(), (),
             {**self.inputs.digests, "block": sha256_json(part)}, verb=COMMAND)
@@ -281,9 +282,6 @@ def _start_executor(
     if config.on == "ray":
         return start_executor(
             config.on, folder, inputs=list(jobs[0].inputs.folders.values()), slots=config.jobs,
-            cores=compute.threads, gpu=_GPU[compute.device])
+            cores=compute.threads, gpu=NEEDS_GPU[compute.device])
     slots = min(config.jobs or max(1, ctx.threads // CORES), len(jobs))
     return start_executor(config.on, folder, slots=slots, cores=max(1, ctx.threads // slots))
-
-
-_GPU: Mapping[str, bool | None] = {"auto": None, "cpu": False, "cuda": True}

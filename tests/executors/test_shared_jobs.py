@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 
 from recon_cli.errors import BackendError
@@ -67,6 +69,16 @@ def test_the_share_of_all_work_counts_jobs_by_their_weight(tmp_path):
     run_jobs([make_job(tmp_path, "a", 0, weight=3), make_job(tmp_path, "b", 1)], Fake(),
              NullProgress(), record=shares.append)
     assert shares == [0.75, 0.75]
+
+
+def test_a_folder_that_cannot_be_read_counts_as_nothing_done(tmp_path):
+    def refuse():
+        raise PermissionError
+
+    job, shares = make_job(tmp_path, "a", 0), []
+    job = dataclasses.replace(job, look=refuse)
+    assert run_jobs([job], Fake(), NullProgress(), record=shares.append) == [JobEnd(0, "")]
+    assert shares == [0.0]
 
 
 def test_failures_are_counted_and_named():
