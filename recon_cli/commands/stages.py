@@ -81,8 +81,7 @@ def sfm(call: Call) -> None:
     PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"),
     expert=("max_mb", "rounds", "score", "recovery"), lead="With --prune: ")
 @click.option(
-    "--view", "with_view", is_flag=True,
-    help="Show the training in the browser; of blocks, the fine-tuning of all.  [default: off]")
+    "--view", "with_view", is_flag=True, help="Show the training in the browser.  [default: off]")
 @options.from_import
 @options.stage(TrainConfig, renders=True)
 @pass_call

@@ -232,8 +232,7 @@ class TrainConfig(StageConfig):
         minimum=0.05, maximum=1.0, expert=True)
     seed: int = option(0, "Random seed.", minimum=0)
     blocks: str = option(
-        "auto", "Blocks to train apart and merge: auto (1 for each 1,200 views), N or off.",
-        metavar="N")
+        "auto", "Blocks to train: auto, N or off.", metavar="N")
     jobs: int | None = option(
         None, "Blocks at once.", minimum=1, hashed=False, expert=True,
         automatic="one for each 4 cores, or as many as the cluster has room for")
