@@ -46,7 +46,7 @@ VERBS = {
 }
 
 # Verbs that recon types itself
-HIDDEN = {"map-segment": "hidden.map_segment", "train-block": "hidden.train_block"}
+HIDDEN = {"map-segment": "segments.map_segment", "train-block": "train_block.train_block"}
 
 logger = logging.getLogger("recon")
 
