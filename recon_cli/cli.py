@@ -28,7 +28,6 @@ VERBS = {
     "sfm": ("stages.sfm", "Estimate cameras and a sparse point cloud."),
     "train": ("stages.train", "Fit Gaussians; denoise and sfm run first where needed."),
     "import": ("stages.import_scene", "Import a splat file instead of training."),
-    "merge": ("blocks.merge", "Put the blocks of `recon train --blocks` together."),
     "prune": ("stages.prune", "Remove the least important Gaussians and fine-tune the rest."),
     "eval": ("stages.evaluate", "Score every model on the held-out views."),
     "export": ("stages.export", "Write a .ply and other formats that viewers open; verify each."),
@@ -45,7 +44,8 @@ VERBS = {
     "study": ("bench.study", "Repeat the paper's experiment: 3DGS against ours."),
 }
 
-HIDDEN = {"map-segment": "segments.map_segment"}  # verbs that recon types itself
+# Verbs that recon types itself
+HIDDEN = {"map-segment": "segments.map_segment", "train-block": "train_block.train_block"}
 
 logger = logging.getLogger("recon")
 

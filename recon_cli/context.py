@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from recon_cli.progress import NullProgress, Progress
 
 if TYPE_CHECKING:
+    from recon_cli.config.stages import ComputeConfig
     from recon_cli.scene.camera import Camera
     from recon_cli.scene.splats import Splats
 
@@ -102,6 +103,7 @@ class StageContext:
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
     max_memory_bytes: int | None = None  # that a stage may take; None: what is free
     scratch: Path | None = None  # folder for files without a name; None: the system's
+    compute: ComputeConfig | None = None  # as typed, for work on other machines; None: as here
 
     def notice(self, text: str) -> None:
         """Tells the user one line that must not be missed; unprintable characters are escaped."""

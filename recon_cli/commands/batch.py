@@ -12,6 +12,7 @@ from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.errors import ReconstructionError, WorkspaceError
+from recon_cli.executors.shared_jobs import describe_failures
 from recon_cli.pipeline.batch import CaptureResult, name_captures, run_batch
 from recon_cli.progress import TqdmProgress, format_duration, hide_bars
 from recon_cli.workspace.layout import disk_errors, hold_lock
@@ -82,11 +83,11 @@ def batch(
     page = write_batch_page(results, out)
     click.echo(batch_text(results))
     click.echo(f"The page of this table is {page}")
-    failed = [result.capture for result in results if not result.succeeded]
+    failed = {result.capture: result.reason for result in results if not result.succeeded}
     if failed:
         raise ReconstructionError(
-            f"{len(failed)} of {len(results)} captures have no scene.",
-            hint=f"The reasons are above and in {page}; the same command tries them again.")
+            describe_failures(failed, len(results), "captures"),
+            hint=f"The reasons are in {page}, too; the same command tries these again.")
 
 
 def _report(result: CaptureResult) -> None:

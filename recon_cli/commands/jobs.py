@@ -14,7 +14,7 @@ from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import TrainCallback
-from recon_cli.executors.executor import Executor, start_executor
+from recon_cli.executors.executor import NEEDS_GPU, Executor, start_executor
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.plan import Job, Outcome, Target
@@ -115,6 +115,6 @@ def open_executor(
     place: str, jobs: int | None, compute: ComputeConfig, folder: Path, inputs: Sequence[Path] = ()
 ) -> tuple[Executor, int]:
     """Returns what runs commands on `folder`, and how many threads each of them has."""
-    gpu = {"auto": None, "cpu": False, "cuda": True}[compute.device]
     return start_executor(
-        place, folder, inputs=inputs, slots=jobs, cores=compute.threads, gpu=gpu)
+        place, folder, inputs=inputs, slots=jobs, cores=compute.threads,
+        gpu=NEEDS_GPU[compute.device])

@@ -206,16 +206,15 @@ def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
     return stack([of(config), where, again, print_config, common()])
 
 
-def executor(what: str, *, expert: bool = False) -> Decorator:
+def executor(what: str) -> Decorator:
     """Returns a decorator that adds where commands run, and how many (of `what`) at once."""
     return stack([
         click.option(
-            "--on", "place", cls=Option, expert=expert, type=click.Choice(["local", "ray"]),
-            default="local",
+            "--on", "place", type=click.Choice(["local", "ray"]), default="local",
             help="Run in processes of this machine, or on the Ray cluster at RAY_ADDRESS.  "
                  "[default: local]"),
         click.option(
-            "--jobs", cls=Option, expert=expert, type=click.IntRange(min=1), metavar="N",
+            "--jobs", type=click.IntRange(min=1), metavar="N",
             help=f"{what} at once.  [default: one for each {CORES} cores]")])
 
 

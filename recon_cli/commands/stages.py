@@ -9,7 +9,6 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.blocks import train_in_blocks
 from recon_cli.commands.jobs import open_job_with, run_stages
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.view import show_training
@@ -83,24 +82,13 @@ def sfm(call: Call) -> None:
     expert=("max_mb", "rounds", "score", "recovery"), lead="With --prune: ")
 @click.option(
     "--view", "with_view", is_flag=True, help="Show the training in the browser.  [default: off]")
-@click.option(
-    "--blocks", default="auto", metavar="N",
-    help="Blocks to train: auto, N or off.  [default: auto]")
-@options.executor("Blocks", expert=True)
 @options.from_import
 @options.stage(TrainConfig, renders=True)
 @pass_call
-def train(
-    call: Call, with_prune: bool, with_view: bool, blocks: str, place: str, jobs: int | None
-) -> None:
+def train(call: Call, with_prune: bool, with_view: bool) -> None:
     """Fit Gaussians; denoise and sfm run first where needed."""
     for name in call.settings.get("prune", {}) if not with_prune else ():
         raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
-    whole = call.print_config or call.from_import
-    if not whole and train_in_blocks(call, blocks, place, jobs):
-        if with_prune:  # there is no middle of one run to prune at
-            run_stages(call, "train --prune", ["prune"])
-        return
     with show_training(call) if with_view and not call.print_config else nullcontext() as live:
         callbacks = () if live is None else (live,)
         if with_prune:

@@ -19,7 +19,6 @@ from recon_cli.config.stages import (
     ExportConfig,
     ImportConfig,
     IngestConfig,
-    MergeConfig,
     PruneConfig,
     SfmConfig,
     TrainConfig,
@@ -35,7 +34,7 @@ SECTIONS: dict[str, type[StageConfig]] = {
     "prune": PruneConfig,
     "evaluate": EvaluateConfig,
     "export": ExportConfig,
-    "import": ImportConfig, "merge": MergeConfig,
+    "import": ImportConfig,
     "compute": ComputeConfig,
 }
 

@@ -125,16 +125,20 @@ class SfmConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_scale_between(self.scale_between)
-        if self.segments not in ("auto", "off") and not (
-                self.segments.isdigit() and int(self.segments) >= 1):
-            raise ConfigError(
-                f"segments is {self.segments!r}, but needs auto, off or a number of segments.",
-                hint="Type `recon sfm --segments 4`, for example.")
-        if self.segments.isdigit() and self.pairs != "auto":
+        _check_number_of("sfm", "segments", self.segments)
+        if self.segments.isdecimal() and self.pairs != "auto":
             raise ConfigError(
                 f"segments is {self.segments} and pairs is {self.pairs}, but segments choose pairs "
                 "by themselves.",
                 hint="Leave out --segments or --pairs.")
+
+
+def _check_number_of(section: str, name: str, asked: str) -> None:
+    """Raises ConfigError unless auto, off or a number of at least 1 is asked for."""
+    if asked not in ("auto", "off") and not (asked.isdecimal() and int(asked) >= 1):
+        raise ConfigError(
+            f"{name} is {asked!r}, but needs auto, off or a number of {name}.",
+            hint=f"Give --{name} auto, or --set {section}.{name}=auto to a verb without --{name}.")
 
 
 def _check_scale_between(value: tuple[str, str, float] | None) -> None:
@@ -225,12 +229,21 @@ class TrainConfig(StageConfig):
         0.6, "Point of the run whose state is kept for pruning in mid-training.", unit="share",
         minimum=0.05, maximum=1.0, expert=True)
     seed: int = option(0, "Random seed.", minimum=0)
+    blocks: str = option(
+        "auto", "Blocks to train: auto, N or off.", metavar="N")
+    jobs: int | None = option(
+        None, "Blocks at once.", minimum=1, hashed=False, expert=True,
+        automatic="one for each 4 cores, or as many as the cluster has room for")
+    on: str = option(
+        "local", "Train blocks in processes of this machine, or on the Ray cluster at RAY_ADDRESS.",
+        choices=("local", "ray"), hashed=False, expert=True)
     checkpoint_every: int = option(
         250, "Interval between checkpoints; longer where saving takes over a tenth of the time.",
         unit="steps", minimum=1, hashed=False, expert=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _check_number_of("train", "blocks", self.blocks)
         if self.mid < DENSIFY_UNTIL:
             raise ConfigError(
                 f"mid is {self.mid:g}, but densification runs until {DENSIFY_UNTIL:g} of the run "
@@ -428,19 +441,6 @@ class ImportConfig(StageConfig):
         automatic="what the file says, else y-down, as in viewers")
     max_size: int = option(
         600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
-    validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
-
-
-@dataclass(frozen=True)
-class MergeConfig(StageConfig):
-    """How the blocks of a scene are put together."""
-
-    iterations: int | None = option(
-        None, "Steps of fine-tuning the merged scene on all views; 0: none.", minimum=0,
-        automatic="a quarter of those of all blocks")
-    max_size: int | None = option(
-        None, "Longest side of the images.", unit="pixels", minimum=16,
-        automatic="that of the blocks")
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
 
 

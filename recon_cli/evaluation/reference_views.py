@@ -30,7 +30,7 @@ from recon_cli.evaluation.metrics import (
 from recon_cli.evaluation.scores import MeanScore, ViewScore
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fit_camera, read_masked_image, to_uint8
-from recon_cli.io.records import BlockRecord, read_frame_list
+from recon_cli.io.records import read_frame_list
 from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.image_file import ImageFile
@@ -67,15 +67,20 @@ def held_out_names(ingest: Path) -> frozenset[str]:
     return frozenset(frame.name for frame in read_frame_list(ingest).frames if frame.held_out)
 
 
-def load_scene(inputs: StageInputs, *, validation: float) -> Scene:
-    """Returns the views and points that sfm left, split by what each may be used for."""
-    sfm = inputs.folders["sfm"]
-    held_out, block = held_out_names(inputs.folders["ingest"]), BlockRecord.read(sfm)
-    scene = read_scene(sfm / "undistorted", held_out=held_out,
-                       validation=validation if block is None else block.validation)
+def load_scene(
+    inputs: StageInputs, *, validation: float | frozenset[str], sparse: Path | None = None
+) -> Scene:
+    """Returns the views and points that sfm left, split by what each may be used for.
+
+    `validation` are the names of views to look at only, or their share; `sparse` is the folder of a
+    model with a part of the views and points.
+    """
+    sfm, held_out = inputs.folders["sfm"], held_out_names(inputs.folders["ingest"])
+    scene = read_scene(
+        sfm / "undistorted", held_out=held_out, validation=validation, sparse=sparse)
     world = WorldSummary.read(sfm)
     up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
-    return dataclasses.replace(scene, up=up, cell=None if block is None else block.cell)
+    return dataclasses.replace(scene, up=up)
 
 
 def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:

@@ -10,29 +10,23 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 from filelock import FileLock, Timeout
 
 from recon_cli import machine
 from recon_cli.errors import ExitCode
 from recon_cli.processes import CHILD, start_module
-from recon_cli.progress import Bar
 from recon_cli.workspace.layout import LOCK
 
-T = TypeVar("T")
-R = TypeVar("R")
-
 PROGRAM = "recon_cli"  # the module that is run
+NEEDS_GPU = {"auto": None, "cpu": False, "cuda": True}  # by --device; None: if a machine has one
 CORES = 4  # of a command where nothing is said; more shorten it by little
 TRIES = 3  # of a command whose process is killed, by the system for want of memory or by somebody
 _ENDED = (ExitCode.HANGUP, ExitCode.TERMINATED)  # by a signal that recon handles
-_LOOK_SECONDS = 1.0  # between two looks at how far the commands are
 _LOCK_SECONDS = 60.0  # within which a process that lost its parent is gone
 _STOP_SECONDS = 60.0  # for saving a checkpoint
 
@@ -183,64 +177,3 @@ def _wait_until_free(workspace: Path) -> None:
     with contextlib.suppress(Timeout):
         lock.acquire(timeout=_LOCK_SECONDS)
         lock.release()
-
-
-def run_all(
-    executor: Executor, items: Sequence[T], run: Callable[[T], R], report: Callable[[T, R], None]
-) -> dict[T, R]:
-    """Returns what `run` returned for each item, as many at once as the executor has slots.
-
-    `report` gets each result when it is there. Where anything fails or the user interrupts, running
-    commands are stopped.
-    """
-    results = {}
-    with ThreadPoolExecutor(executor.slots) as threads:
-        futures = {threads.submit(run, item): item for item in items}
-        try:
-            for future in as_completed(futures):
-                item = futures[future]
-                results[item] = future.result()
-                report(item, results[item])
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            executor.stop()
-            raise
-    return {item: results[item] for item in items}
-
-
-@contextmanager
-def watching(bar: Bar, look: Callable[[], tuple[int, str]]) -> Iterator[None]:
-    """Shows on a bar what `look` returns: units that are done, and what is going on."""
-    ended = threading.Event()
-
-    def watch() -> None:
-        shown = 0
-        while not ended.wait(_LOOK_SECONDS):
-            done, text = look()
-            bar.note(text)
-            bar.advance(max(0, done - shown))
-            shown = max(done, shown)
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
-
-def find_reason(log: Path, code: int) -> str:
-    """Returns why a command failed, by its last error message; empty where it did not."""
-    if code == 0:
-        return ""
-    if code == ExitCode.INTERRUPTED:
-        return "interrupted"
-    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
-    _, found, message = text.rpartition("\nerror: " if "\nerror: " in text else "error: ")
-    if found:
-        return message.partition("\nhint: ")[0].strip()
-    if code > ExitCode.SIGNAL:
-        return f"its process was killed by signal {code - ExitCode.SIGNAL}, {TRIES} times"
-    return text.strip().splitlines()[-1] if text.strip() else "it left no message"

@@ -13,7 +13,8 @@ from recon_cli.errors import ConfigError
 
 _MID = RunConfig().mid  # where `recon train --prune` branches off
 # options that all recipes of a benchmark share, or that have no effect here
-_SHARED = {"iterations", "seed", "max_size", "quality", "minutes", "early_stop", "mid"}
+_SHARED = {"iterations", "seed", "max_size", "quality", "minutes", "early_stop", "mid", "blocks",
+           "jobs", "on"}
 
 
 @dataclass(frozen=True)

@@ -40,18 +40,19 @@ class Pinhole:
 
 def read_scene(
     undistorted: Path, *, held_out: frozenset[str], validation: float | frozenset[str],
-    denoised: Path | None = None,
+    denoised: Path | None = None, sparse: Path | None = None,
 ) -> Scene:
     """Returns the registered views and the points of an undistorted model.
 
     `undistorted` has images/ and sparse/, as COLMAP's image_undistorter lays them out, and masks/
-    with a gray image of the name of each masked frame; `denoised` defaults to denoised/ in it.
+    with a gray image of the name of each masked frame; `denoised` defaults to denoised/ in it, and
+    `sparse` to sparse/, of which it may be a part.
     `held_out` are names of frames; `validation` are those of the validation views, or their share
     of the other frames.
     FormatError if the model is missing, damaged, empty or not of pinhole cameras, or an image or
     its mask is missing or not of its camera's size.
     """
-    sparse = undistorted / "sparse"
+    sparse = undistorted / "sparse" if sparse is None else sparse
     twins = undistorted / "denoised" if denoised is None else denoised
     views = []
     for name, inner, viewmat in _read_views(sparse):

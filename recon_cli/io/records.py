@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,22 +16,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from recon_cli.errors import FormatError, ReconError
 from recon_cli.io.calibration import make_lens
 from recon_cli.scene.camera import Lens
-from recon_cli.scene.cells import Cell
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import JsonRecord
 
 FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = "Run `recon ingest --again`."
 POSES, POINTS = "poses.json", "points.safetensors"
-BLOCK = "block.safetensors"
 _IMPORT = "import.json"
-BLOCKS = "blocks"  # format of a scene that was merged from blocks
 NEEDS_VIEWS_HINT = (
     "Run `recon ingest CAPTURE` and `recon sfm` in this workspace, then `recon import` again.")
 
@@ -164,39 +160,6 @@ def read_poses(path: Path) -> KnownPoses:
         raise FormatError(f"{path} holds no poses.", hint=AGAIN) from error
 
 
-@dataclass(frozen=True, eq=False)
-class BlockRecord:
-    """What the workspace of a block knows of the whole scene; beside its cameras."""
-
-    cell: Cell
-    validation: frozenset[str]  # names of the views that no block is trained on
-
-    def write(self, folder: Path) -> None:
-        """Writes it into the folder of sfm."""
-        with atomic.replacing(folder / BLOCK) as temporary:
-            save_file(
-                {"points": np.ascontiguousarray(self.cell.points),
-                 "owned": self.cell.owned.astype(np.uint8)},
-                temporary, metadata={"validation": json.dumps(sorted(self.validation))})
-
-    @staticmethod
-    def read(folder: Path) -> BlockRecord | None:
-        """Returns the record, None for a whole scene; FormatError for a damaged file."""
-        path = folder / BLOCK
-        if not path.exists():
-            return None
-        try:
-            with safe_open(path, "numpy") as file:
-                names = atomic.parse_json(file.metadata()["validation"], list)
-                cell = Cell(file.get_tensor("points"), file.get_tensor("owned").astype(np.bool_))
-            return BlockRecord(cell, frozenset(names))
-        except (KeyError, TypeError, ValueError, OSError, RecursionError,
-                SafetensorError) as error:
-            raise FormatError(
-                f"{path} is no record of a block.",
-                hint="Run `recon train --blocks N` on the whole scene again.") from error
-
-
 def choose_held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:
     """Returns which of all frames are held out for the score.
 
@@ -224,9 +187,9 @@ def prepare_frames_folder(stage: Path) -> Path:
 class ImportRecord(JsonRecord):
     """What is known about an imported scene."""
 
-    file: str  # name of the file that it was read from; in words what it was merged from
-    format: str  # of the file, by its name in `io.splats.registry`, or BLOCKS
-    sha256: str  # of the file, or of the digests of the blocks
+    file: str  # name of the file that it was read from
+    format: str  # of the file, by its name in `io.splats.registry`
+    sha256: str  # of the file
     gaussians: int  # count
     sh_degree: int  # of the colours
     z_up: bool  # up is z in the file; else it is -y. Given or assumed, never measured
@@ -246,8 +209,6 @@ class ImportRecord(JsonRecord):
 
     def warnings(self) -> list[str]:
         """Returns the caveats of every score of this scene."""
-        if self.format == BLOCKS:
-            return []
         return [*([self.doubt] if self.doubt else []),
                 f"the scene was imported from {self.file}: whoever trained it may have trained on "
                 "the held-out views too"]

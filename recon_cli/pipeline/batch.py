@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon_cli.errors import ConfigError, ReconError, WorkspaceError
-from recon_cli.executors.executor import Command, Executor, find_reason, run_all, watching
+from recon_cli.errors import ConfigError, ReconError
+from recon_cli.executors.executor import Command, Executor
+from recon_cli.executors.shared_jobs import JobEnd, SharedJob, run_jobs
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job, last_sources
 from recon_cli.progress import Progress
@@ -108,28 +109,24 @@ def run_batch(
     """
     for capture in captures:
         _refuse_other_capture(capture)
-    results = {capture: _read_result(capture, None, "") for capture in captures}
+    results = {capture.name: _read_result(capture, None, "") for capture in captures}
+    by_name = {capture.name: capture for capture in captures}
 
-    def run(capture: Capture) -> CaptureResult:
-        command = Command(
-            ("run", str(capture.source), "-w", str(capture.workspace), *words), capture.workspace,
-            capture.log)
-        try:
-            with progress.bar(capture.name, 100, unit="%") as bar, watching(
-                    bar, lambda: _look(Workspace(capture.workspace))):
-                code = executor.run(command)
-        except OSError as error:  # of a full disk, say
-            return _read_result(capture, WorkspaceError.exit_code, str(error))
-        return _read_result(capture, code, find_reason(capture.log, code))
-
-    def note(capture: Capture, result: CaptureResult) -> None:
-        results[capture] = result
+    def note(job: SharedJob, end: JobEnd) -> None:
+        results[job.name] = _read_result(by_name[job.name], end.code, end.reason)
         _write(out, results.values())
-        report(result)
+        report(results[job.name])
 
     _write(out, results.values())
-    run_all(executor, captures, run, note)
+    run_jobs([_job(capture, words) for capture in captures], executor, progress, report=note)
     return tuple(results.values())
+
+
+def _job(capture: Capture, words: Sequence[str]) -> SharedJob:
+    command = Command(
+        ("run", str(capture.source), "-w", str(capture.workspace), *words), capture.workspace,
+        capture.log)
+    return SharedJob(capture.name, command, lambda: _look(Workspace(capture.workspace)))
 
 
 def _refuse_other_capture(capture: Capture) -> None:
@@ -141,8 +138,8 @@ def _refuse_other_capture(capture: Capture) -> None:
             hint="Give another folder with --out, or move that one.")
 
 
-def _look(workspace: Workspace) -> tuple[int, str]:
-    """Returns how much of a run is done, in percent, and what it is at."""
+def _look(workspace: Workspace) -> tuple[float, str]:
+    """Returns the share of a run that is done, and what it is at."""
     before = 0
     for row in STAGES:
         after = _DONE_AFTER[row.name]
@@ -150,10 +147,10 @@ def _look(workspace: Workspace) -> tuple[int, str]:
         if partial:
             share = partial.done / partial.total if partial.total else 0.0
             progress = describe_progress(partial.done, partial.total) if partial.total else ""
-            return before + int(share * (after - before)), f"{row.name} {progress}".rstrip()
+            return (before + share * (after - before)) / 100, f"{row.name} {progress}".rstrip()
         if workspace.folder(row.name).exists():
             before = after
-    return before, ""
+    return before / 100, ""
 
 
 def _read_result(capture: Capture, code: int | None, reason: str) -> CaptureResult:

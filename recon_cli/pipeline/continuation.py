@@ -11,9 +11,8 @@ import dataclasses
 import logging
 from enum import Enum
 
-from recon_cli.config.stages import ImportConfig
 from recon_cli.errors import ManifestError, StageError
-from recon_cli.stages import IMPORT, MERGE, Stage
+from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import (
     Manifest,
@@ -24,6 +23,8 @@ from recon_cli.workspace.manifest import (
 )
 
 _LENGTH = ("iterations", "minutes")  # options that decide only how long a training is
+# The verb `merge`, which put blocks together, is gone; no record of it has a verb. Its version:
+_MERGE_VERSION = 2
 
 logger = logging.getLogger("recon")
 
@@ -36,21 +37,24 @@ class Start(Enum):
     IMPORTED = "imported"  # the imported scene
 
 
+def made_by(key: ResultKey) -> str:
+    """Returns the verb that made a result; empty where an older record leaves that to the stage.
+
+    Training itself reads no file of the user.
+    """
+    if key.verb or not key.sources or key.stage != IMPORT.name:
+        return key.verb
+    return "merge" if key.version == _MERGE_VERSION else IMPORT.verb
+
+
 def is_imported(key: ResultKey) -> bool:
-    """Returns whether a scene was imported or merged: training itself reads no file of the user."""
-    return key.stage == IMPORT.name and bool(key.sources)
-
-
-def is_merged(key: ResultKey) -> bool:
-    """Returns whether a scene was merged from blocks."""
-    return is_imported(key) and set(key.config) != set(ImportConfig().hashed_fields())
+    """Returns whether a scene was imported."""
+    return made_by(key) == IMPORT.verb
 
 
 def origin_row(row: Stage, key: ResultKey) -> Stage:
     """Returns the row that a result in the place of `row` came from."""
-    if not is_imported(key):
-        return row
-    return MERGE if is_merged(key) else IMPORT
+    return IMPORT if is_imported(key) else row
 
 
 def may_resume(workspace: Workspace, partial: PartialRun) -> bool:
@@ -77,6 +81,8 @@ def find_start(workspace: Workspace, row: Stage, key: ResultKey, start: Start) -
             workspace, partial, key):
         return partial.key.continues
     finished = workspace.manifest(row.name)
+    if finished and made_by(finished.key) not in ("", row.verb, IMPORT.verb):
+        finished = None
     if finished and is_imported(finished.key):
         return _find_imported(workspace, row, key, finished, start)
     origin = finished.run.summary.get("imported_from") if finished else None
@@ -132,6 +138,8 @@ def _obstacles(
     """Returns in words why a run of `key` does not prolong a finished one."""
     reasons = differences(_without_length(finished.key), _without_length(key), section=row.name)
     reasons += find_changed_outputs(workspace.folder(row.name), finished, row.volatile)
+    if finished.run.summary.get("blocks"):
+        reasons.append("the finished run was trained in blocks")
     if not _is_longer(key, finished):
         reasons.append(f"{row.name}.iterations is not above the "
                        f"{finished.run.summary.get('planned_iterations', 0):,} of the finished run")

@@ -77,7 +77,9 @@ def run_stage(
     workspace = job.workspace
     if sources is None:
         sources = _read_last_sources(job, row) if row.takes else ()
-    key = ResultKey(row.name, row.version, config.hashed_fields(), sources, checks.upstream(row))
+    key = ResultKey(
+        row.name, row.version, config.hashed_fields(), sources, checks.upstream(row),
+        verb=row.verb)
     _warn_of_stale_uses(checks, row)
     if again:
         workspace.discard(row.name)
@@ -239,7 +241,8 @@ def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> S
     if row.renders:
         context = render_context(job.compute, job.progress)
         return dataclasses.replace(
-            context, record=record, callbacks=job.callbacks, scratch=job.workspace.partial(""))
+            context, record=record, callbacks=job.callbacks, scratch=job.workspace.partial(""),
+            compute=job.compute)
     threads = job.compute.threads or machine.usable_threads()
     return StageContext(progress=job.progress, threads=threads, record=record)
 

@@ -18,7 +18,7 @@ from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.errors import ConfigError, ManifestError
-from recon_cli.pipeline.continuation import is_imported, may_resume, origin_row
+from recon_cli.pipeline.continuation import is_imported, made_by, may_resume, origin_row
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, read_source
 from recon_cli.workspace.layout import Workspace
@@ -157,6 +157,10 @@ class WorkspaceCheck:
     ) -> StageCheck:
         if manifest is None:
             return StageCheck(row, None, partial_run=self._resumable(row))
+        verb = made_by(manifest.key)
+        if verb not in ("", row.verb):
+            reason = f"it was made by `recon {verb}`"
+            return StageCheck(row, manifest, (reason,), partial_run=self._resumable(row))
         gone: tuple[str, ...] = ()
         if sources is None:
             gone, sources = self._read_again(manifest.key.sources)
@@ -184,7 +188,8 @@ class WorkspaceCheck:
         for need in row.needs:  # what is missing now may well come out as it was
             upstream[need] = upstream[need] or stored.upstream.get(need)
         return ResultKey(
-            row.name, row.version, config.hashed_fields(), sources, upstream, stored.continues)
+            row.name, row.version, config.hashed_fields(), sources, upstream, stored.continues,
+            row.verb)
 
     def _read_again(self, stored: tuple[Source, ...]) -> tuple[tuple[str, ...], tuple[Source, ...]]:
         """Returns the paths of sources that cannot be read any more, and all as they are now."""

@@ -23,7 +23,7 @@ from typing import Any
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
 from recon_cli.errors import ManifestError, StageError
 from recon_cli.pipeline.compile_ahead import compile_ahead
-from recon_cli.pipeline.continuation import Start, is_imported, is_merged, may_resume
+from recon_cli.pipeline.continuation import Start, is_imported, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
 from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
 from recon_cli.stages import IMPORT, Stage
@@ -131,29 +131,16 @@ def _raise_failure(job: Job, outcome: Outcome) -> None:
         raise failure
 
 
-def run_needs(job: Job, verb: str, stage: str) -> None:
-    """Runs what a stage needs, with the options that each had, as `run` would do before it."""
-    root = job.workspace.root
-    with disk_errors(root, f"running {verb}"), job.workspace.writing(verb), _log_to(root / LOG):
-        steps = plan(job.inspect(), stage)
-        job = dataclasses.replace(job, asked=(stage,))
-        with compile_ahead(job, [*(step.name for step in steps), stage], again=False):
-            for step in steps:
-                for outcome in _run_if_needed(job, step):
-                    job.report(outcome)
-
-
 def refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
     """Raises StageError where training or import would replace the scene of the other."""
     for row in [row for row in job.table if row.name == IMPORT.name and row.name in stages]:
         finished, partial = job.workspace.manifest(row.name), job.workspace.partial_run(row.name)
-        importing = bool(row.takes)
+        importing = row.verb == IMPORT.verb
         if finished and is_imported(finished.key) is not importing:
             if partial and partial.key.continues and may_resume(job.workspace, partial):
                 continue  # it is trained further already
             sources = finished.key.sources
-            scene = (f"the scene merged from {len(sources)} blocks" if is_merged(finished.key)
-                     else f"the scene imported from {Path(sources[0].path).name}" if sources
+            scene = (f"the scene imported from {Path(sources[0].path).name}" if sources
                      else "a scene that was trained")
         elif importing and partial and partial.done and not is_imported(partial.key):
             scene = f"a training that was interrupted at {partial.done} of {partial.total}"
@@ -273,8 +260,7 @@ def _find_fresh(
     check = checks.check_against(target.stage, target.config, sources)
     manifest = check.manifest
     if manifest is None or not check.fresh:
-        # a trained scene in the place of an imported one differs in everything
-        if manifest and bool(manifest.key.sources) is bool(checks.row(target.stage).takes):
+        if manifest:
             logger.info("%s is stale: %s", target.stage, "; ".join(check.reasons))
         return None
     if sources and sources != manifest.key.sources:

@@ -25,13 +25,8 @@ from recon_cli.errors import (
     SfmError,
     WorkspaceError,
 )
-from recon_cli.executors.executor import (
-    Command,
-    Executor,
-    find_reason,
-    run_all,
-    watching,
-)
+from recon_cli.executors.executor import Command, Executor
+from recon_cli.executors.shared_jobs import JobEnd, SharedJob, run_jobs
 from recon_cli.io.tracks import Tracks
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.sfm.job import SPLIT, MappingJob, StepLog
@@ -180,28 +175,33 @@ def _run_all(
     """Returns why segments failed, by index."""
     total = sum(len(job.names) for job in jobs)
 
-    def look() -> tuple[int, str]:
-        done = int(sum(_share(job) * len(job.names) for job in jobs))
-        record(done, 2 * total)  # the join is the other half
-        return done, ""
+    def shared(index: int) -> SharedJob:
+        job, file = jobs[index], jobs[index].out / JOB
 
-    def run(index: int) -> str:
-        folder = jobs[index].out
-        left = (deadline - time.monotonic()) / 60
-        if left <= 0:
-            return "there was no time left for it"
-        dataclasses.replace(jobs[index], max_minutes=left).write(folder / JOB)
-        code = executor.run(Command((COMMAND, str(folder / JOB)), folder, folder / OUTPUT))
-        reason = find_reason(folder / OUTPUT, code)
-        if 0 < code < ExitCode.SIGNAL and code != SfmError.exit_code:  # no fault of the segment
-            raise _ERRORS.get(code, SfmError)(
-                f"Segment {index} could not be mapped: {reason}",
-                hint=f"Finished segments are kept. What was printed is in {folder / OUTPUT}.")
-        return reason
+        def look() -> tuple[float, str]:
+            share = _share(job)
+            return share, f"{share * len(job.names):.0f}/{len(job.names)} frames"
 
-    with progress.bar("mapping segments", total, unit="frame") as bar, watching(bar, look):
-        reasons = run_all(executor, range(len(jobs)), run, lambda *_: None)
-    return {index: reason for index, reason in reasons.items() if reason}
+        def prepare() -> str:
+            left = (deadline - time.monotonic()) / 60
+            if left <= 0:
+                return "there was no time left for it"
+            dataclasses.replace(job, max_minutes=left).write(file)
+            return ""
+
+        command = Command((COMMAND, str(file)), job.out, job.out / OUTPUT)
+        return SharedJob(f"segment {index}", command, look, len(job.names), prepare)
+
+    def refuse(shared: SharedJob, end: JobEnd) -> None:
+        if 0 < end.code < ExitCode.SIGNAL and end.code != SfmError.exit_code:  # no fault of its own
+            raise _ERRORS.get(end.code, SfmError)(
+                f"{shared.name.capitalize()} could not be mapped: {end.reason}",
+                hint=f"Finished segments are kept. What was printed is in {shared.command.log}.")
+
+    ends = run_jobs(
+        [shared(index) for index in range(len(jobs))], executor, progress, report=refuse,
+        record=lambda share: record(int(share * total), 2 * total))  # the join is the other half
+    return {index: end.reason for index, end in enumerate(ends) if end.reason}
 
 
 def _share(job: MappingJob) -> float:

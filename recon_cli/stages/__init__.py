@@ -1,7 +1,6 @@
 """The table of stages. A stage's module holds one `run(config, inputs, out, ctx) -> summary`.
 
-IMPORT and MERGE are the rows of a scene that was imported, or merged from blocks that were trained
-apart: it takes the place (and folder) of a trained one.
+IMPORT is the row of a scene that was imported: it takes the place (and folder) of a trained one.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from recon_cli.config.stages import (
     ExportConfig,
     ImportConfig,
     IngestConfig,
-    MergeConfig,
     PruneConfig,
     SfmConfig,
     TrainConfig,
@@ -27,7 +25,6 @@ from recon_cli.workspace.summaries import (
     ImportSummary,
     IngestSummary,
     JsonRecord,
-    MergeSummary,
     PruneSummary,
     SfmSummary,
     TrainSummary,
@@ -80,10 +77,6 @@ STAGES: tuple[Stage, ...] = (
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, takes="FILE")
-
-
-MERGE = Stage("train", "merge", ("ingest", "sfm"), (), MergeConfig, MergeSummary, 2, False,
-              "recon_cli.stages.merge", ("log.jsonl",), renders=True, takes="BLOCK")
 
 
 def stage(name: str) -> Stage:

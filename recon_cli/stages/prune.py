@@ -46,7 +46,7 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     run.clear()
     left = len(state.splats)
     return PruneSummary(
-        at=config.at, score=config.score, ratio=round(1 - left / n, 4), gaussians_before=n,
+        at=source.config.at, score=config.score, ratio=round(1 - left / n, 4), gaussians_before=n,
         gaussians=left,
         validation_psnr_db_pruned=run.done[0].validation_psnr_db_removed if run.done else None,
         rounds=tuple(RoundSummary(

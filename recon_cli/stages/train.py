@@ -2,61 +2,64 @@
 
 Leaves splats.ply, the states at the middle (where pruning branches off) and the end of the run,
 plan.json, config.json, and log.jsonl with loss, validation PSNR, count and seconds. It begins with
-the points of sfm, or goes on from a finished model: of a shorter run, or imported.
+the points of sfm, or goes on from a finished model: of a shorter run, or imported. A large scene is
+trained in blocks, by jobs of their own, and has no state at the end: its blocks were trained apart.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene, size_summary
-from recon_cli.io.ply import write_ply
-from recon_cli.io.records import ImportRecord
-from recon_cli.train.feature_trials import model_parts
+from recon_cli.errors import ConfigError
+from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.scene.scene import Scene
+from recon_cli.train import blocks
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.plan import first_or_saved, plan_task
-from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
-from recon_cli.train.state import TrainState, save_state
-from recon_cli.train.task import Task
-from recon_cli.workspace.atomic import delete
-from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
+from recon_cli.train.merge_blocks import merge_blocks
+from recon_cli.train.one_model import fit_scene
+from recon_cli.workspace.summaries import TrainSummary
 
 
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs, validation=config.validation)
     model = None if inputs.continues is None else FinishedModel.read(inputs.continues)
-    task = plan_task(config, scene, out, ctx, model)
-    if model is not None and not (out / CHECKPOINT).exists():
-        model.hand_on(task.schedule, out, ctx)
-    state = first_or_saved(task, scene, out / CHECKPOINT, model)
-    until = task.schedule.config.iterations
-    run_fit(state, task, until, Segment(
-        out, "train", until, first=task.schedule.first,
-        keep={task.schedule.mid: "mid.safetensors"}), ctx)
-    save_state(out / "final.safetensors", state)
-    write_ply(out / "splats.ply", state.splats)
-    delete(out / CHECKPOINT)
-    return _summarize(state, task, out, ctx)
+    count = _count_blocks(config, scene, model, ctx)
+    if count > 1:
+        return _train_in_blocks(config, count, scene, inputs, out, ctx)
+    return fit_scene(config, scene, out, ctx, model)
 
 
-def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> TrainSummary:
-    config, plan, last = task.schedule.config, TrainPlan.read(out), LogRow.read_all(out / LOG)[-1]
-    import_record = ImportRecord.read(out)
-    return TrainSummary(
-        imported_from=import_record.file if import_record else None,
-        continued_from_step=plan.continues_at or None,
-        iterations=state.steps, gaussians=len(state.splats),
-        initial_gaussians=state.first_count, max_gaussians=config.max_gaussians,
-        max_size=config.max_size, planned_iterations=config.iterations,
-        stopped_early_at=state.jump[0] if state.jump else None,
-        training_views=len(task.train), validation_views=len(task.validation),
-        **size_summary([view.camera for view in task.train]),
-        validation_psnr_db=last.validation_psnr_db, train_seconds=last.seconds,
-        parts=model_parts(config), skipped_steps=state.skipped, estimated_seconds=plan.seconds,
-        calibration_seconds=round(plan.cost["seconds"], 3),
-        cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0)
+def _count_blocks(
+    config: TrainConfig, scene: Scene, model: FinishedModel | None, ctx: StageContext
+) -> int:
+    """Returns how many blocks a scene is trained in; 1 for one model, and tells what that means."""
+    views = len(scene.train) + len(scene.validation) + len(scene.test)
+    if model is None:
+        count = blocks.count_blocks(views, config.blocks)
+    elif config.blocks in ("auto", "off", "1"):
+        count = 1
+    else:
+        raise ConfigError(
+            f"blocks is {config.blocks}, but a finished scene is trained further as one model.",
+            hint="Give --blocks off.")
+    if count == 1 and config.on == "ray":
+        ctx.notice(f"The {views} views are trained as one model, on this machine: only blocks run "
+                   "on Ray (--blocks).")
+    if count > 1 and ctx.callbacks:
+        ctx.notice(f"The {count} blocks are trained by processes of their own, which the page does "
+                   "not show: it shows the fine-tuning of all after them.")
+    return count
+
+
+def _train_in_blocks(
+    config: TrainConfig, count: int, scene: Scene, inputs: StageInputs, out: Path,
+    ctx: StageContext,
+) -> TrainSummary:
+    jobs = blocks.cut_blocks(config, count, scene, inputs, out)
+    blocks.train_blocks(jobs, config, ctx)
+    summary = merge_blocks(jobs, scene, out, ctx)
+    blocks.remove_blocks(out)
+    return summary

@@ -87,20 +87,25 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     """
     train = inputs.folders["train"]
     final = train / "final.safetensors"
-    import_record = None if final.exists() else ImportRecord.read(train)
+    whole = final.exists()  # else the scene was imported, or merged from blocks
+    import_record = None if whole else ImportRecord.read(train)
     if import_record and config.at == "mid":
         raise ConfigError(
             f"at is mid, but the scene was imported from {import_record.file}: the middle of its "
             "training is not known.", hint="Prune it with --at end.")
     if import_record and import_record.doubt:
         ctx.notice(import_record.doubt)
+    if config.at == "mid" and not whole:
+        ctx.notice("The blocks that the scene was trained in have no common middle: the finished "
+                   "model is pruned.")
+        config = dataclasses.replace(config, at="end")
     train_config = read_config(train)
     scene = load_scene(inputs, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
     path = train / "mid.safetensors" if config.at == "mid" else final
 
     def begin() -> TrainState:
-        if import_record:
+        if not whole:
             return make_finished_state(read_ply(train / "splats.ply"), task)
         return restore_state(path, task)
 

@@ -3,7 +3,8 @@
 `.partial/<stage>.digests` lies beside the folder that a stage writes in. Before a file is put in
 place there, a line with its size and CRC-32 is added, and one without when it is there. A crash at
 any moment leaves each file as one of the last two lines of its name say, or not there yet. CRC-32
-takes a third of the time of SHA-256, and damage is no attack.
+takes a third of the time of SHA-256, and damage is no attack. Jobs that a stage shares out work in
+folders below `jobs`, perhaps on other machines, and keep digests of their own there.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from recon_cli.workspace.paths import is_plain_file
 
 PARTIAL = ".partial"  # the folder, in a workspace, of what is not finished
 SUFFIX = ".digests"
+JOBS = "jobs"  # the folder, in that of a stage, of jobs that it shares out
 _CHUNK = 1 << 20  # bytes
 
 
@@ -151,9 +153,9 @@ def _find(path: Path) -> tuple[Path, str] | None:
     """Returns the file of digests that covers `path`, and the name of `path` in it, if any."""
     for folder in path.parents:
         if folder.parent.name == PARTIAL:
-            journal = journal_path(folder)
-            return (journal, path.relative_to(folder).as_posix()) if (
-                is_plain_file(journal)) else None
+            journal, name = journal_path(folder), path.relative_to(folder)
+            kept = is_plain_file(journal) and name.parts[0] != JOBS
+            return (journal, name.as_posix()) if kept else None
     return None
 
 
@@ -193,7 +195,9 @@ def _read(journal: Path) -> dict[str, _History]:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
-    """Yields all but folders below a folder; links are not followed."""
+    """Yields all but folders below a folder, without those of jobs; links are not followed."""
     for parent, folders, files in os.walk(folder):
+        if Path(parent) == folder and JOBS in folders and not (folder / JOBS).is_symlink():
+            folders.remove(JOBS)
         for name in [*files, *(name for name in folders if (Path(parent) / name).is_symlink())]:
             yield Path(parent) / name

@@ -42,7 +42,7 @@ from recon_cli.workspace.paths import is_plain_file
 LOG = "recon.log"
 LOCK = ".lock"  # dropped by the system when its holder dies
 HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
-BLOCKS = "blocks"  # workspaces of `recon train --blocks`, by number
+BLOCKS = "blocks"  # workspaces that `recon train --blocks` made before it was one stage
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
 _OLD = ".old"  # results that were replaced
 

@@ -27,16 +27,17 @@ class ResultKey:
     stage: str  # its name
     version: int  # of the stage's code
     config: Mapping[str, Any]  # the hashed options
-    sources: tuple[Source, ...]  # the user's own files; only ingest has any
+    sources: tuple[Source, ...]  # the user's own files, of ingest and import
     # digest of what each earlier stage wrote; None where a stage is left out
     upstream: Mapping[str, str | None]
     # digest of the finished result of this stage that the run goes on from; None where it begins
     # anew
     continues: str | None = None
+    verb: str = ""  # that made it; empty in records of before verbs were kept
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over all of it; of the sources only the contents count."""
+        """SHA-256 over all but the verb, which the rest implies; of sources the contents count."""
         return sha256_json({
             "stage": self.stage, "version": self.version, "config": self.config,
             "sources": [source.contents() for source in self.sources], "upstream": self.upstream,
@@ -52,7 +53,7 @@ class ResultKey:
             "version": self.version,
             "config": dict(self.config),
             "inputs": [dataclasses.asdict(source) for source in self.sources],
-            "upstream": dict(self.upstream),
+            "upstream": dict(self.upstream), "verb": self.verb,
             **self._continues_json()}
 
     @classmethod
@@ -69,7 +70,7 @@ class ResultKey:
         return cls(
             _typed(value["stage"], str), _typed(value["version"], int),
             _typed(value["config"], dict), sources, upstream,
-            _typed(value.get("continues"), str, type(None)))
+            _typed(value.get("continues"), str, type(None)), _typed(value.get("verb", ""), str))
 
 
 @dataclass(frozen=True)

@@ -332,8 +332,20 @@ class LogRow(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MergeSummary(JsonRecord):
+    """The blocks of a scene put together, and what their seams cost."""
+
+    left_out: int  # Gaussians of blocks that lie in the cell of another one
+    iterations: int  # steps of fine-tuning on all views
+    seam_views: int  # validation views of more than one block; where 0, the next two are None
+    # their PSNR less that of the best block that trained beside them, mean and least
+    seam_change_db: float | None = None
+    worst_seam_db: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainSummary(JsonRecord):
-    """How a training ended."""
+    """How a training ended; one in blocks adds up steps and times of all of them."""
 
     imported_from: str | None = None  # name of the file that it started from
     continued_from_step: int | None = None  # of the finished run that it went on from
@@ -356,6 +368,8 @@ class TrainSummary(JsonRecord):
     estimated_seconds: float
     calibration_seconds: float
     cuda_peak_bytes: int
+    blocks: int | None = None  # that were trained apart; None for one model
+    merge: MergeSummary | None = None  # of these
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -420,21 +434,3 @@ class ImportSummary(JsonRecord):
     tried_psnr_db: Mapping[str, float] | None = None  # by frame
     transform: Mapping[str, Any] | None = None  # similarity from the file to the workspace
     notices: tuple[str, ...] | None = None  # for the user
-
-
-@dataclass(frozen=True, kw_only=True)
-class MergeSummary(JsonRecord):
-    """The scene put together from blocks, and what its seams cost."""
-
-    imported_from: str  # what it consists of, in words
-    blocks: int
-    gaussians: int
-    sh_degree: int
-    left_out: int  # Gaussians of blocks that lie in the cell of another one
-    iterations: int = 0  # steps of fine-tuning on all views
-    validation_psnr_db: float | None = None  # after them; None where there were none
-    train_seconds: float = 0.0  # they took
-    seam_views: int  # validation views of more than one block; where 0, the next two are None
-    # their PSNR less that of the best block that trained beside them, mean and least
-    seam_change_db: float | None = None
-    worst_seam_db: float | None = None

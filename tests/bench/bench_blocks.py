@@ -4,8 +4,7 @@ WORKSPACE has its sfm done and is only read: a capture with held-out views, such
 make_apartment.py. It is trained in blocks, then whole, with as many Gaussians as the merged model
 has and as many steps as all blocks and the fine-tuning took together. Printed are PSNR and SSIM on
 the held-out views, also of those alone that lie within a metre (--near) of a border between two
-blocks, with the CPU seconds of each training; the merged model before its fine-tuning; and, view by
-view, the best score of a block's model before the merge.
+blocks, with the CPU seconds of each training.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from recon_cli.evaluation.reference_views import (
     score_views,
 )
 from recon_cli.io.ply import read_ply
-from recon_cli.io.records import BlockRecord
 from recon_cli.scene.cells import Cell
+from recon_cli.train.blocks import cut_blocks
 from recon_cli.train.train_data import read_config
 
 PLACES = 500  # that are drawn around a camera
@@ -69,12 +68,6 @@ def score_model(
             np.array([score.ssim for score in scores]))
 
 
-def read_cells(workspace: Path) -> list[Cell]:
-    """Returns the cells of the blocks of a workspace."""
-    folders = sorted(path for path in (workspace / "blocks").iterdir() if path.is_dir())
-    return [BlockRecord.read(folder / "sfm").cell for folder in folders]
-
-
 def owners(cells: list[Cell], positions: NDArray[np.float64]) -> NDArray[np.int64]:
     """Returns the block of each position, [N]."""
     return np.argmax([cell.owns(positions) for cell in cells], axis=0)
@@ -104,12 +97,10 @@ def main(
 ) -> None:
     """Print the scores of WORKSPACE trained in blocks and as one model."""
     common = ["--max-size", str(max_size), "--no-early-stop", *settings]
-    untrained = ("train", "prune", "blocks")
+    untrained = ("train", "prune")
     parts = run_in_copy("blocks", workspace, out / "blocks", [
         "train", "--blocks", str(blocks), "--iterations", str(iterations), "--max-gaussians",
         str(max_gaussians), *common], untrained)
-    plain = run_in_copy("blocks, not fine-tuned", parts.workspace, out / "plain", [
-        "merge", "--iterations", "0", "--again"], ())
     merged = len(read_ply(parts.workspace / "train" / "splats.ply"))
     whole = run_in_copy("one model", workspace, out / "whole", [
         "train", "--blocks", "off", "--iterations",
@@ -117,22 +108,20 @@ def main(
         *common], untrained)
     ctx = StageContext(backend="numba")
     folders = {name: workspace / name for name in ("ingest", "denoise", "sfm")}
-    scene = load_scene(StageInputs(folders), validation=0.0)
+    config, inputs = read_config(parts.workspace / "train"), StageInputs(folders)
+    scene = load_scene(inputs, validation=config.validation)
     views = load_reference_views(scene.test, max_size, ctx)
-    cells = read_cells(parts.workspace)
+    cells = [job.cell for job in cut_blocks(config, blocks, scene, inputs, out / "cut")]
     border = np.array([near_border(cells, view.camera.center, near) for view in views])
     click.echo(f"{len(views)} held-out views, {border.sum()} within {near:g} of a border\n")
     click.echo("| model | Gaussians | PSNR / SSIM | near a border | CPU s |\n"
                "|---|---:|---:|---:|---:|")
-    for trained in (whole, parts, plain):
+    for trained in (whole, parts):
         count, psnr, ssim = score_model(trained.workspace / "train" / "splats.ply", views)
         columns = [f"{psnr[rows].mean():.2f} / {ssim[rows].mean():.3f}" if rows.any() else ""
                    for rows in (np.ones(len(views), bool), border)]
         click.echo(f"| {trained.name} | {count:,} | {columns[0]} | {columns[1]} "
                    f"| {trained.cpu_seconds:.0f} |")
-    alone = [score_model(parts.workspace / "blocks" / str(index) / "train" / "splats.ply", views)[1]
-             for index in range(blocks)]
-    click.echo(f"| the best block alone, of each view | | {np.max(alone, axis=0).mean():.2f} | | |")
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def test_a_batch_is_what_single_runs_are_and_goes_on_with_what_is_unfinished(tmp
              "--out", tmp_path / "out", "--jobs", "2", "--threads", "1",
              *(word for text in FAST for word in ("--set", text))]
     assert recon(*words) == 5
-    assert "1 of 3 captures have no scene" in capsys.readouterr().err
+    assert "1 of 3 captures failed (torn: " in capsys.readouterr().err
     rows = {row["capture"]: row for row in read(tmp_path)}
     assert [rows[name]["exit_code"] for name in ("kitchen", "torn", "hall")] == [0, 3, 0]
     assert "cannot be read as a video" in rows["torn"]["reason"]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import logging
 import shutil
+from pathlib import Path
 from typing import Any
 
 import fake_stages
@@ -17,7 +20,8 @@ from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import stage
 from recon_cli.workspace.atomic import write_bytes
-from recon_cli.workspace.manifest import Manifest
+from recon_cli.workspace.digests import read_source, sha256_json
+from recon_cli.workspace.manifest import NAME, Manifest
 
 
 def longer(iterations: int, **others: Any) -> Settings:
@@ -131,3 +135,51 @@ def test_without_an_imported_scene_there_is_none_to_start_from(job: Job) -> None
     with pytest.raises(StageError, match="no imported scene") as caught:
         plan.run(job, "train", [Target("train", config, start=Start.IMPORTED)], again=True)
     assert caught.value.hint == "Run `recon import FILE` first."
+
+
+def write_as_before_verbs(job: Job, finished: Manifest) -> None:
+    """Writes a manifest as a version did that kept no verb."""
+    folder = job.workspace.folder("train")
+    finished.write(folder)
+    content = json.loads((folder / NAME).read_text())
+    del content["verb"], content["self"]
+    (folder / NAME).write_text(json.dumps({**content, "self": sha256_json(content)}))
+
+
+def test_a_result_of_before_verbs_were_kept_stays_fresh(job: Job) -> None:
+    write_as_before_verbs(job, manifest(job))
+    assert manifest(job).key.verb == ""
+    assert stale(job) == {}
+
+
+def test_a_scene_merged_by_the_verb_of_before_is_stale_and_trained_again(
+    job: Job, tmp_path: Path
+) -> None:
+    (tmp_path / "block.ply").write_bytes(b"a block")
+    finished = manifest(job)
+    source = read_source(tmp_path / "block.ply", without=tmp_path / "ws")
+    key = dataclasses.replace(
+        finished.key, version=2, sources=(source,),
+        config={"iterations": None, "max_size": None, "validation": 0.05})
+    summary = {**finished.run.summary, "imported_from": "2 blocks", "blocks": 2}
+    run = dataclasses.replace(finished.run, summary=summary)
+    write_as_before_verbs(job, dataclasses.replace(finished, key=key, run=run))
+    assert stale(job)["train"] == ("it was made by `recon merge`",)
+    with pytest.raises(StageError) as caught:
+        bring(job, "evaluate")
+    assert caught.value.hint == "Run `recon train` first."
+    assert bring(job, "train") == ["train"]
+    assert manifest(job).key.verb == "train"
+    assert "train" not in stale(job)
+
+
+def test_a_training_in_blocks_is_not_prolonged(
+    job: Job, caplog: pytest.LogCaptureFixture
+) -> None:
+    finished = manifest(job)
+    run = dataclasses.replace(finished.run, summary={**finished.run.summary, "blocks": 2})
+    dataclasses.replace(finished, run=run).write(job.workspace.folder("train"))
+    with caplog.at_level(logging.INFO, logger="recon"):
+        bring(job, "train", changes=longer(6000))
+    assert seen["train"].continues is None
+    assert "the finished run was trained in blocks" in caplog.text

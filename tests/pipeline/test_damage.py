@@ -12,6 +12,7 @@ from fake_stages import NAMES, bring, job_at
 from recon_cli.errors import ManifestError
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, free_space
+from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.digests import sha256_json
 
 DAMAGES: dict[str, Callable[[Path], object]] = {
@@ -131,3 +132,26 @@ def test_clean_deletes_nothing_that_a_signed_manifest_names_elsewhere(
     path.write_text(json.dumps({**value, "self": sha256_json(value)}))
     free_space(job)
     assert victim.read_text() == "years of work"
+
+
+def test_jobs_of_a_stage_keep_digests_of_their_own_and_stay(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = job_at(folder / "ws")
+    job.workspace.remove("train")
+    with monkeypatch.context() as patch:
+        stop_in_mid_step("train", patch)
+        with pytest.raises(KeyboardInterrupt):
+            bring(job, "train")
+    shared = job.workspace.partial("train") / "jobs" / "0"
+    shared.mkdir(parents=True)
+    journal = job.workspace.root / ".partial" / "train.digests"
+    before = journal.read_bytes()
+    write_bytes(shared / "result.txt", b"of a job")
+    (shared / "log.txt").write_text("written as any program does")
+    assert journal.read_bytes() == before
+    (job.workspace.partial("train") / "strange.txt").write_text("of nobody")
+    bring(job, "train")
+    kept = job.workspace.folder("train")
+    assert {path.name for path in (kept / "jobs" / "0").iterdir()} == {"result.txt", "log.txt"}
+    assert not (kept / "strange.txt").exists()

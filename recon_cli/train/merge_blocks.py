@@ -1,9 +1,9 @@
-"""merge: blocks of a scene that were trained apart take the place of a trained one.
+"""One model of the blocks of a scene, which were trained apart.
 
 Each block keeps the Gaussians in its cell; what it trained around that, so that nothing floats at
 its border, belongs to others. Then all Gaussians are fine-tuned on all views: those at a wall reach
 through to the other side, which no view of their own block sees, and what lies far away was fitted
-by each block for itself. Writes what `import_scene` writes.
+by each block for itself.
 """
 
 from __future__ import annotations
@@ -16,26 +16,25 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon_cli.config.stages import MIN_GAUSSIANS, MergeConfig, RunConfig
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import FormatError, ReconstructionError, WorkspaceError
+from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig
+from recon_cli.context import StageContext
+from recon_cli.errors import FormatError, ReconstructionError
 from recon_cli.evaluation.metrics import psnr
-from recon_cli.evaluation.reference_views import load_reference_views, load_scene, render_view
-from recon_cli.io.colmap import read_pinholes
+from recon_cli.evaluation.reference_views import load_reference_views, render_view, size_summary
+from recon_cli.io.images import fit_camera
 from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.records import BLOCKS, BlockRecord, ImportRecord
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats, joined
+from recon_cli.train.blocks import MERGE_SHARE, BlockJob, record
+from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.initialize import begin_state, restore_state
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.schedule import make_schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.train_data import gaussians_that_fit, load_task, read_config, write_config
 from recon_cli.workspace.atomic import delete
-from recon_cli.workspace.digests import digest_file, sha256_json
-from recon_cli.workspace.manifest import Manifest
-from recon_cli.workspace.summaries import LogRow, MergeSummary
+from recon_cli.workspace.summaries import LogRow, MergeSummary, TrainSummary
 
 _FINETUNE = 0.25  # steps after the merge, of those of all blocks
 # Factor of all learning rates in these steps but the means', which restarts lower by itself. Those
@@ -52,69 +51,95 @@ class TrainedBlock:
     name: str
     splats: Splats
     cell: Cell
-    views: frozenset[str]  # names of those in its workspace
-    sha256: str  # of the model
+    views: frozenset[str]  # names of those that it was trained or checked on
     config: RunConfig  # options of its training
-    steps: int  # taken in it
+    summary: TrainSummary  # of its training
+
+    @staticmethod
+    def read(job: BlockJob) -> TrainedBlock:
+        """Returns the block whose job is finished."""
+        finished = job.finished()
+        assert finished is not None, f"block {job.name} is trained"
+        return TrainedBlock(
+            job.name, read_ply(job.model / "splats.ply"), job.cell, job.views,
+            read_config(job.model), TrainSummary.from_json(finished.run.summary))
 
 
-def run(config: MergeConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> MergeSummary:
-    """Writes the scene of the blocks into `out`; the sources are their splats.ply.
+def merge_blocks(
+    jobs: Sequence[BlockJob], scene: Scene, out: Path, ctx: StageContext
+) -> TrainSummary:
+    """Writes the model of trained blocks into `out`, fine-tuned on all views of the scene.
 
     Raises:
-        WorkspaceError: a model was changed by hand, or the blocks are not all of one scene.
         FormatError: a file is damaged.
         ReconstructionError: no Gaussian is left.
     """
-    blocks = [_read_block(path) for path in inputs.sources]
-    _check_cells(blocks)
+    blocks = [TrainedBlock.read(job) for job in jobs]
     parts = [_own(block) for block in blocks]
     degree = max(part.sh_degree for part in parts)
     splats = joined([part.with_degree(degree) for part in parts])[0]
     if not len(splats):
         raise ReconstructionError(
-            "No block has a Gaussian in its cell.", hint="Train with fewer --blocks.")
-    before = sum(block.steps for block in blocks)
-    steps = round(_FINETUNE * before) if config.iterations is None else config.iterations
-    run_config = _run_config(config, blocks, steps, len(splats), degree)
-    scene = load_scene(inputs, validation=config.validation)
-    state = _finetune(splats, steps, run_config, scene, out, ctx)
+            "No block has a Gaussian in its cell.",
+            hint="Train one model by `recon train --blocks off`.")
+    before = sum(block.summary.iterations for block in blocks)
+    steps = round(_FINETUNE * before)
+    config = dataclasses.replace(
+        _run_config(blocks, steps, len(splats), degree),
+        checkpoint_every=jobs[0].config.checkpoint_every)
+    state = _finetune(splats, steps, config, scene, out, ctx)
     if state is not None:
         splats = state.splats.map(lambda tensor: tensor.detach().cpu())
-    changes = _seam_changes(splats, blocks, run_config.max_size, scene, ctx)
+    changes = _seam_changes(splats, blocks, config.max_size, scene, ctx)
     for name, change in changes.items():
         if change < -SEAM_DROP_DB:
             ctx.notice(f"{name}, which shows the seam of two blocks, lost {-change:.2f} dB by the "
                        "merge")
-    record = ImportRecord(
-        f"{len(blocks)} blocks", BLOCKS, sha256_json([block.sha256 for block in blocks]),
-        len(splats), degree, z_up=False, views=True)
+    config = dataclasses.replace(config, iterations=before + (0 if state is None else state.steps))
     write_ply(out / "splats.ply", splats)
-    steps = 0 if state is None else state.steps
-    write_config(out, dataclasses.replace(run_config, iterations=before + steps))
-    record.write(out)
+    write_config(out, config)
     delete(out / CHECKPOINT)
     values = list(changes.values())
-    last = LogRow.read_all(out / LOG)[-1] if steps else None
-    return MergeSummary(
-        imported_from=record.file, blocks=len(blocks), gaussians=len(splats), sh_degree=degree,
+    merge = MergeSummary(
         left_out=sum(len(block.splats) for block in blocks) - sum(map(len, parts)),
-        iterations=steps, validation_psnr_db=last.validation_psnr_db if last else None,
-        train_seconds=last.seconds if last else 0.0, seam_views=len(values),
+        iterations=0 if state is None else state.steps, seam_views=len(values),
         seam_change_db=round(float(np.mean(values)), 3) if values else None,
         worst_seam_db=round(min(values), 3) if values else None)
+    last = None if state is None else LogRow.read_all(out / LOG)[-1]
+    return _summarize(config, [block.summary for block in blocks], merge, len(splats), scene, last)
+
+
+def _summarize(
+    config: RunConfig, blocks: Sequence[TrainSummary], merge: MergeSummary, gaussians: int,
+    scene: Scene, last: LogRow | None,
+) -> TrainSummary:
+    """Returns the summary of the whole; `last` is the end of the log of the fine-tuning, if any."""
+    cameras = [fit_camera(view.camera, config.max_size) for view in scene.train]
+    return TrainSummary(
+        iterations=config.iterations, gaussians=gaussians,
+        initial_gaussians=sum(block.initial_gaussians for block in blocks),
+        max_gaussians=config.max_gaussians, max_size=config.max_size,
+        planned_iterations=config.iterations, stopped_early_at=None,
+        training_views=len(scene.train), validation_views=len(scene.validation),
+        **size_summary(cameras), validation_psnr_db=last.validation_psnr_db if last else None,
+        train_seconds=round(
+            sum(block.train_seconds for block in blocks) + (last.seconds if last else 0.0), 3),
+        parts=model_parts(config), skipped_steps=sum(block.skipped_steps for block in blocks),
+        estimated_seconds=sum(block.estimated_seconds for block in blocks),
+        calibration_seconds=sum(block.calibration_seconds for block in blocks),
+        cuda_peak_bytes=max(block.cuda_peak_bytes for block in blocks), blocks=len(blocks),
+        merge=merge)
 
 
 def _run_config(
-    config: MergeConfig, blocks: Sequence[TrainedBlock], steps: int, count: int, degree: int
+    blocks: Sequence[TrainedBlock], steps: int, count: int, degree: int
 ) -> RunConfig:
     """Returns the options of the fine-tuning: what the blocks were trained with."""
     configs = [block.config for block in blocks]
     denoised = all(each.images == "denoised" for each in configs)
     drifting = steps > 0 and any(each.exposure == "on" for each in configs)
     return dataclasses.replace(
-        configs[0], iterations=max(1, steps), validation=config.validation,
-        max_size=config.max_size or max(each.max_size for each in configs),
+        configs[0], iterations=max(1, steps), max_size=max(each.max_size for each in configs),
         sh_degree=degree, max_gaussians=max(MIN_GAUSSIANS, count), far="off", stereo="off",
         images="denoised" if denoised else "original",
         exposure="on" if drifting else "off", early_stop=False)
@@ -142,39 +167,14 @@ def _finetune(
     task = dataclasses.replace(task, schedule=make_schedule(slower, 0))
     saved = out / CHECKPOINT
     state = restore_state(saved, task) if saved.exists() else begin_state(splats, task)
-    run_fit(state, task, steps, Segment(out, "merge", steps), ctx)
+
+
+    def record_all(done: int, total: int) -> None:
+        record(ctx, 1 - MERGE_SHARE * (1 - done / total))
+
+    run_fit(state, task, steps, Segment(out, "merge", steps),
+            dataclasses.replace(ctx, record=record_all))
     return state
-
-
-def _read_block(path: Path) -> TrainedBlock:
-    """Returns the block whose train/splats.ply is given; WorkspaceError if that was changed."""
-    root = path.parents[1]
-    finished = Manifest.read(path.parent)
-    known = finished.outputs.get(path.name)
-    digest = digest_file(path).sha256
-    if known is None or known.sha256 != digest:
-        raise WorkspaceError(
-            f"{path} is not what the training of block {root.name} wrote: it was changed by hand.",
-            hint=f"Train the block again: `recon train --again -w {root}`.")
-    record = BlockRecord.read(root / "sfm")
-    if record is None:
-        raise WorkspaceError(
-            f"{root} is no block of a scene: it has no cell.",
-            hint="Make blocks with `recon train --blocks N`.")
-    views = frozenset(read_pinholes(root / "sfm" / "undistorted" / "sparse"))
-    return TrainedBlock(
-        root.name, read_ply(path), record.cell, views, digest, read_config(path.parent),
-        int(finished.run.summary["iterations"]))
-
-
-def _check_cells(blocks: Sequence[TrainedBlock]) -> None:
-    """Raises WorkspaceError unless each point of one scene is owned by exactly one block."""
-    first = blocks[0].cell.points
-    same = all(np.array_equal(block.cell.points, first) for block in blocks)
-    if not same or not (np.sum([block.cell.owned for block in blocks], axis=0) == 1).all():
-        raise WorkspaceError(
-            f"The blocks {', '.join(block.name for block in blocks)} do not make up one scene.",
-            hint="Merge all blocks of one `recon train --blocks N`, each once.")
 
 
 def _own(block: TrainedBlock) -> Splats:

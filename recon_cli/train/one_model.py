@@ -1,0 +1,62 @@
+"""One model of a scene, from its plan to its .ply: of a whole scene, or of a block."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from recon_cli.config.stages import TrainConfig
+from recon_cli.context import StageContext
+from recon_cli.evaluation.reference_views import size_summary
+from recon_cli.io.ply import write_ply
+from recon_cli.io.records import ImportRecord
+from recon_cli.scene.scene import Scene
+from recon_cli.train.feature_trials import model_parts
+from recon_cli.train.finished_model import FinishedModel
+from recon_cli.train.plan import first_or_saved, plan_task
+from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
+from recon_cli.train.state import TrainState, save_state
+from recon_cli.train.task import Task
+from recon_cli.workspace.atomic import delete
+from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
+
+
+def fit_scene(
+    config: TrainConfig, scene: Scene, out: Path, ctx: StageContext,
+    model: FinishedModel | None = None,
+) -> TrainSummary:
+    """Fits Gaussians to the views of a scene and returns how far it came.
+
+    `model` is what the run goes on from, None for a run that begins anew.
+    """
+    task = plan_task(config, scene, out, ctx, model)
+    if model is not None and not (out / CHECKPOINT).exists():
+        model.hand_on(task.schedule, out, ctx)
+    state = first_or_saved(task, scene, out / CHECKPOINT, model)
+    until = task.schedule.config.iterations
+    run_fit(state, task, until, Segment(
+        out, "train", until, first=task.schedule.first,
+        keep={task.schedule.mid: "mid.safetensors"}), ctx)
+    save_state(out / "final.safetensors", state)
+    write_ply(out / "splats.ply", state.splats)
+    delete(out / CHECKPOINT)
+    return _summarize(state, task, out, ctx)
+
+
+def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> TrainSummary:
+    config, plan, last = task.schedule.config, TrainPlan.read(out), LogRow.read_all(out / LOG)[-1]
+    import_record = ImportRecord.read(out)
+    return TrainSummary(
+        imported_from=import_record.file if import_record else None,
+        continued_from_step=plan.continues_at or None,
+        iterations=state.steps, gaussians=len(state.splats),
+        initial_gaussians=state.first_count, max_gaussians=config.max_gaussians,
+        max_size=config.max_size, planned_iterations=config.iterations,
+        stopped_early_at=state.jump[0] if state.jump else None,
+        training_views=len(task.train), validation_views=len(task.validation),
+        **size_summary([view.camera for view in task.train]),
+        validation_psnr_db=last.validation_psnr_db, train_seconds=last.seconds,
+        parts=model_parts(config), skipped_steps=state.skipped, estimated_seconds=plan.seconds,
+        calibration_seconds=round(plan.cost["seconds"], 3),
+        cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0)
