@@ -67,7 +67,7 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
     def press(done, total):
         recorded.append((done, total))
 
-    original = runner.fit_together
+    original = runner.fit
 
     class Press(TrainCallback):
         def on_step(self, iteration, splats):  # noqa: ARG002
@@ -78,7 +78,7 @@ def test_ctrl_c_saves_the_state_and_training_goes_on_from_there(inputs, tmp_path
         original(state, task, until, (Press(), *callbacks), *others)
 
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "fit_together", fit_and_press)
+        patch.setattr(runner, "fit", fit_and_press)
         with pytest.raises(KeyboardInterrupt):
             run(train, CONFIG, inputs, tmp_path / "out", replace(CONTEXT, record=press))
     assert recorded[-1] == (10, 160)

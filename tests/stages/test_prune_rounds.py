@@ -116,15 +116,15 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
 def test_ctrl_c_while_scores_are_gathered_costs_no_byte_either(
     inputs, whole, tmp_path, monkeypatch
 ):
-    original = runner.fit_together
+    original = runner.fit
 
-    def interrupted(state, task, until, callbacks, importance, threads):
+    def interrupted(state, task, until, callbacks, importance):
         if importance is not None and state.iteration > 125:
             raise KeyboardInterrupt
-        original(state, task, until, callbacks, importance, threads)
+        original(state, task, until, callbacks, importance)
 
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "fit_together", interrupted)
+        patch.setattr(runner, "fit", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(THREE, inputs, tmp_path / "out")
     run(THREE, inputs, tmp_path / "out")
