@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -38,11 +39,24 @@ def reference() -> str:
     sections = [INTRODUCTION, _shared_section(shared), _section("recon", cli)]
     for name, command in commands.items():
         records = _records(command)
-        for param in command.get_params(_context(command)):
-            if isinstance(param, click.Option):
-                param.hidden = records.get(param) in (None, *shared)
-        sections.append(_section(name, command))
+        with _hidden(param for param in command.get_params(_context(command))
+                     if isinstance(param, click.Option)
+                     and records.get(param) in (None, *shared)):
+            sections.append(_section(name, command))
     return "\n".join(sections)
+
+
+@contextmanager
+def _hidden(options: Iterable[click.Option]) -> Iterator[None]:
+    """Hides options of commands, which are those of the program, and shows them again."""
+    changed = [option for option in options if not option.hidden]
+    for option in changed:
+        option.hidden = True
+    try:
+        yield
+    finally:
+        for option in changed:
+            option.hidden = False
 
 
 def _commands() -> Iterator[tuple[str, click.Command]]:

@@ -38,6 +38,13 @@ SECTIONS: dict[str, type[StageConfig]] = {
     "compute": ComputeConfig,
 }
 
+# Options that are gone, with the values that ask for what is done now: a file of an earlier
+# version, as `--print-config` wrote it, still means the same.
+GONE: dict[str, dict[str, tuple[Any, ...]]] = {
+    "train": {"poses": ("auto", "off"), "densify_scale": (0.01,)},
+    "merge": {"validation": (0.05,)},
+}
+
 FILE = "recon.toml"  # in the workspace
 Settings = dict[str, dict[str, Any]]  # section -> field -> value, only what was set
 C = TypeVar("C", bound=StageConfig)
@@ -57,6 +64,7 @@ def read_settings(path: Path) -> Settings:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
         raise ConfigError(
             f"{path} is not valid TOML: {reason}.", hint=f"Fix {path.name}.") from error
+    settings = _drop_gone(settings)
     for section, values in settings.items():
         _check_names(section, (), where=str(path))
         if not isinstance(values, dict):
@@ -66,6 +74,21 @@ def read_settings(path: Path) -> Settings:
         _check_names(section, values, where=str(path))
         _check_values(section, values, where=f"{path}: {section}.")
     return settings
+
+
+def _drop_gone(settings: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a file without options that are GONE and ask for nothing else."""
+    kept: dict[str, Any] = {}
+    for section, values in settings.items():
+        gone = GONE.get(section, {})
+        if not isinstance(values, dict):
+            kept[section] = values
+            continue
+        left = {name: value for name, value in values.items()
+                if name not in gone or value not in gone[name]}
+        if left or section in SECTIONS:
+            kept[section] = left
+    return kept
 
 
 def parse_assignment(text: str) -> Settings:
@@ -114,8 +137,9 @@ def _check_names(section: str, names: Iterable[str], *, where: str) -> None:
         if name not in known:
             raise ConfigError(
                 f"{where} sets {section}.{name}, which does not exist.",
-                hint=f"{_suggest(name, known, f'Options of [{section}]:')} "
-                "An option of an earlier version may be gone: leave it out.")
+                hint="It is gone since an earlier version: leave it out."
+                if name in GONE.get(section, {}) else
+                _suggest(name, known, f"Options of [{section}]:"))
 
 
 def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> None:

@@ -33,7 +33,7 @@ def test_toml_round_trips_every_section(tmp_path: Path) -> None:
     ("[trian]\niterations = 3", "section trian", "Did you mean train?"),
     ("[train]\niteration = 3", "train.iteration,", "Did you mean iterations?"),
     ("[train]\nxyz = 3", "train.xyz", "quality, minutes"),
-    ("[train]\nposes = 'off'", "train.poses, which does not exist", "leave it out"),  # a past one
+    ("[train]\nposes = 'on'", "train.poses, which does not exist", "leave it out"),  # a past one
     ("train = 3", "it is a section", "[train]"),
     ("[train]\ndensify = 'swarm'", "train.densify is 'swarm'", "--densify"),
     ("[prune]\nratio = 2", "prune.ratio is 2.0", "--ratio"),
@@ -135,3 +135,22 @@ def test_build_ignores_other_sections() -> None:
 def test_segments_that_cannot_be_are_refused(options: dict[str, str], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         SfmConfig(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("text", "left"), [
+    ('[train]\nposes = "off"\niterations = 60\n', {"train": {"iterations": 60}}),
+    ("[train]\ndensify_scale = 0.01\n", {"train": {}}),
+    ("[merge]\nvalidation = 0.05\n", {})])
+def test_options_that_are_gone_may_ask_for_what_is_done_anyway(text, left, tmp_path):
+    path = tmp_path / "recon.toml"
+    path.write_text(text, encoding="utf-8")
+    assert layers.read_settings(path) == left
+
+
+@pytest.mark.parametrize("text", ['[train]\nposes = "on"\n', "[merge]\nvalidation = 0.2\n"])
+def test_options_that_are_gone_are_refused_where_they_ask_for_more(text, tmp_path):
+    path = tmp_path / "recon.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match="does not exist") as caught:
+        layers.read_settings(path)
+    assert caught.value.hint

@@ -22,9 +22,6 @@ from recon_cli.experiments.bench_measure import (
 )
 from recon_cli.experiments.bench_scene import Accuracy
 from recon_cli.experiments.instruments import (
-    FLOPS_BACKWARD,
-    FLOPS_FORWARD,
-    OPERATIONS_PER_PAIR,
     Host,
     Timing,
     alternate,
@@ -108,13 +105,6 @@ def test_rates_and_fractions_of_the_peak() -> None:
     assert peak_fraction(2.0, 25, 100.0, 2) == 0.25
     assert peak_fraction(None, 25, 100.0, 1) is None
     assert peak_fraction(2.0, 25, None, 1) is None
-
-
-def test_the_operations_of_a_pair_are_the_sum_of_their_table_in_the_docs() -> None:
-    text = (Path(__file__).resolve().parents[2] / "docs" / "bench.md").read_text(encoding="utf-8")
-    rows = OPERATIONS_PER_PAIR | {"sum": (FLOPS_FORWARD, FLOPS_BACKWARD)}
-    for name, (forward, backward) in rows.items():
-        assert f"| {name} | {forward} | {backward} |" in text
 
 
 # ---- tables ----

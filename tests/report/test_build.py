@@ -237,8 +237,8 @@ def test_a_part_that_was_left_out_is_said_with_its_place_in_the_video(workspace)
     assert "3 left out, with a camera that is not trusted" in capture
     assert "1 without a camera" in capture
     assert "000091.png (left out, 9.5 s)" in capture
-    assert ("Trained on 8 of 16 frames; 4 frames left out, as they have no camera that can be "
-            "trusted, 1 of them held out and so not scored.") in section(page, "scores")
+    assert ("Trained on 8 of 16 frames; 4 frames left out, as they have no camera in this "
+            "model, 1 of them held out and so not scored.") in section(page, "scores")
 
 
 @pytest.mark.parametrize("place", ["train/report.html", "evaluate/truth/a.html", ".partial/a.html"])

@@ -127,7 +127,7 @@ def test_frames_that_sfm_left_out_are_counted_and_placed(inputs, tmp_path):
     assert (metrics["frames"], metrics["training_views"]) == (VIEWS + 3, train)
     assert metrics["unregistered"] == added
     line = (f"trained on {train} of {VIEWS + 3} frames; 3 frames left out, as they have no camera "
-            "that can be trusted, 1 of them held out and so not scored: "
+            "in this model, 1 of them held out and so not scored: "
             "999990.png to 999992.png (20.0 to 22.0 s)\n")
     for name in ("table.txt", "metrics.md"):
         assert line in (tmp_path / "out" / name).read_text()

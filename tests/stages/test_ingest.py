@@ -389,7 +389,7 @@ def test_what_was_done_to_a_video_is_said_once_for_each_thing(tmp_path, notices)
         "wide.mp4 has pixels of aspect 4/3: its frames of 128x96 are stretched to 171x96."]
 
 
-def test_many_frames_are_told_in_advance_with_what_sfm_will_take(
+def test_many_frames_are_told_in_advance(
     video, tmp_path, notices, monkeypatch
 ):
     take(video, tmp_path / "few")
@@ -397,4 +397,4 @@ def test_many_frames_are_told_in_advance_with_what_sfm_will_take(
     monkeypatch.setattr(ingest, "MOST_WHOLE", 10)
     summary = take(video, tmp_path / "many")
     notice, = (notice for notice in notices() if "frames are chosen" in notice)
-    assert_facts(notice, summary.frames, "for the way of the camera", "minutes", "--max-frames")
+    assert_facts(notice, summary.frames, "for the way of the camera", "--max-frames")
