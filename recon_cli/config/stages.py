@@ -113,8 +113,8 @@ class SfmConfig(StageConfig):
         None, "Time limit.", unit="minutes", minimum=0.01, hashed=False,
         automatic="20, and 12 s more for each image above 100")
     segments: str = option(
-        "auto", "Overlapping segments to map apart and join: auto (from 200 images on), N or off.",
-        metavar="N", hashed=False)
+        "auto", "Overlapping segments to map apart and join: auto (above 200 photos or keyframes), "
+        "N or off.", metavar="N", hashed=False)
     jobs: int | None = option(
         None, "Segments at once.", minimum=1, hashed=False, expert=True,
         automatic="one for each core, or as many as the cluster has room for")
