@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from recon_cli.io.tracks import Tracks
 
 # Shift between two frames as a share of the longer side, a third of a pixel at the tracker's size.
-# Repeats of 11 captures in 5 codecs at usual rates stay below .15 pixels, which is how far the
-# pictures differ, too; at a third of those rates codecs move pictures by up to .7. A camera that is
-# walked through a room moves .4 to 20 pixels from frame to frame.
+# Repeats of 11 captures in 5 codecs at usual rates stay below .25 pixels
+# (tests/bench/bench_capture_bounds.py); at a third of those rates codecs move them by up to .7. A
+# camera that is walked through a room moves .4 to 20 pixels from frame to frame.
 SAME_PICTURE = 0.0005
 MIN_SHARED = 8  # fewer corners agree by chance
 FEW = 0.1  # of the corners, those that move unlike the others: lost ones, and people
