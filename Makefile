@@ -14,17 +14,6 @@ PYTEST := $(BIN)/python -m pytest -q -rs $(ON_ALL)
 # The lowest versions that pyproject.toml allows, on the oldest Python that it allows.
 OLDEST ?= python3.11
 FLOORS := .venv-floors
-# A few tests of each dependency.
-FLOOR_TESTS := tests/test_floors.py tests/commands/test_cli.py tests/capture/test_images.py \
-    tests/capture/test_noise.py tests/capture/test_photos.py tests/capture/test_raw.py \
-    tests/capture/test_tracker.py tests/capture/test_video.py tests/evaluation/test_metrics.py \
-    tests/executors/test_executor.py tests/experiments/test_study_tables.py \
-    tests/export/test_cleanup_islands.py tests/flythrough/test_output.py \
-    tests/flythrough/test_paths.py tests/io/splats/test_coarsen.py \
-    tests/io/splats/test_registry.py tests/io/test_meshes.py tests/report/test_build.py \
-    tests/sfm/test_mapper.py tests/trust/test_standing_places.py tests/viewer/test_view_verb.py \
-    tests/test_end_to_end.py::test_the_sample_video_becomes_a_scene_with_a_table
-
 .PHONY: demo test test-floors test-rest test-all coverage faults check docs clean
 
 demo: $(READY)
@@ -36,7 +25,7 @@ test: $(DEV)
 # Kernels that one version of numba compiled are of no use to another: they have their own place.
 test-floors: $(FLOORS)/.ready
 	RECON_CACHE_DIR=$(CURDIR)/$(FLOORS)/cache $(FLOORS)/bin/python -m pytest -q $(ON_ALL) \
-	    -m "not (browser or slow)" $(FLOOR_TESTS)
+	    -m "floors and not (browser or slow)"
 
 # What `make test` leaves out, and the tests by Hypothesis again with all their examples.
 test-rest: $(DEV)

@@ -82,6 +82,7 @@ def finished(tmp_path_factory, sample_video):
     return workspace
 
 
+@pytest.mark.floors
 def test_the_sample_video_becomes_a_scene_with_a_table(finished):
     status = json.loads(recon("status", "--json", "-w", finished))
     assert {row["state"] for row in status["stages"]} == {"fresh"}

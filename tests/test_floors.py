@@ -15,6 +15,8 @@ from floors import floors, lowest, read_requirements
 
 import recon_cli
 
+pytestmark = pytest.mark.floors
+
 ROOT = Path(__file__).resolve().parents[1]
 PYPROJECT = ROOT / "pyproject.toml"
 # Of packages that do not belong to the project, the names that its code imports.

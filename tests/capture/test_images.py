@@ -20,6 +20,8 @@ from recon_cli.capture.images import (
 from recon_cli.errors import InputError
 from recon_cli.io.images import write_png
 
+pytestmark = pytest.mark.floors
+
 ORIENTATION, GPS = 0x0112, 0x8825
 
 

@@ -11,6 +11,8 @@ from recon_cli.config.stages import DenoiseConfig
 from recon_cli.errors import ConfigError
 from recon_cli.experiments.filter_comparison import edges_kept
 
+pytestmark = pytest.mark.floors
+
 
 @pytest.mark.parametrize("sigma", [3, 5, 10, 15, 25])
 def test_added_noise_is_estimated(sigma):

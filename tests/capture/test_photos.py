@@ -20,6 +20,8 @@ from recon_cli.capture.photos import (
 )
 from recon_cli.errors import InputError
 
+pytestmark = pytest.mark.floors
+
 
 def photo(name, width=64, height=48, focal=None):
     return Photo(Path(name), width, height, focal)

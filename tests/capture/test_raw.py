@@ -11,6 +11,8 @@ from recon_cli.capture.images import inspect_photo, read_photo
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
 from recon_cli.errors import InputError
 
+pytestmark = pytest.mark.floors
+
 SPREAD = 0.02  # of brightness over a set, after correction
 
 

@@ -7,6 +7,8 @@ from media import texture
 
 from recon_cli.capture.tracker import CELL, TRACK_SIZE, Tracker, find_corners
 
+pytestmark = pytest.mark.floors
+
 STEP = 3  # pixels a frame
 WIDE = texture(240, 640, coarseness=6)[:, :, 0]
 

@@ -18,6 +18,8 @@ from recon_cli.capture.video import (
 )
 from recon_cli.errors import InputError
 
+pytestmark = pytest.mark.floors
+
 # Two roundings (to YUV and back) of 8-bit values, and a little loss of the codec.
 COLOUR_TOLERANCE = 4
 BT709, BT601, LIMITED, FULL = 1, 5, 1, 2

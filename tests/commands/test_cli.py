@@ -17,6 +17,8 @@ from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import StageStatus
 from recon_cli.train.plan import QUALITIES
 
+pytestmark = pytest.mark.floors
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

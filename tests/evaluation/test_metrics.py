@@ -12,6 +12,8 @@ from recon_cli.evaluation.metrics import leaves_enough, load_lpips, psnr, ssim
 from recon_cli.io.images import to_uint8
 from recon_cli.train.gradient import photometric_loss
 
+pytestmark = pytest.mark.floors
+
 TRUTH = np.random.default_rng(0).integers(0, 256, (32, 40, 3), dtype=np.uint8)
 
 

@@ -7,6 +7,8 @@ import pytest
 from recon_cli.executors import executor
 from recon_cli.executors.executor import Command, LocalExecutor
 
+pytestmark = pytest.mark.floors
+
 # Stands for recon: counts its starts in the folder in which it runs, and does what it is told.
 STAND_IN = """
 import os, pathlib, signal, sys, time

@@ -9,6 +9,8 @@ import torch
 from recon_cli.export.cleanup import find_islands
 from recon_cli.scene.splats import Splats, joined
 
+pytestmark = pytest.mark.floors
+
 
 def gaussians(places, *, scales=(0.06, 0.06, 0.06), opacity=0.9):
     n = len(places)

@@ -25,6 +25,8 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import joined
 
+pytestmark = pytest.mark.floors
+
 SCALE = DepthScale(True, 1e-3, 1.0, 3.0, (0.0, 0.0, 0.0), 50.0)
 
 

@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 from recon_cli.flythrough.paths import orbit_path, smooth_path
 from recon_cli.scene.camera import looking_at
 
+pytestmark = pytest.mark.floors
+
 UP, AHEAD = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
 
 

@@ -13,6 +13,8 @@ from recon_cli.errors import FormatError
 from recon_cli.io.meshes import SUFFIXES, Mesh, read_mesh, simplify, write_mesh
 from recon_cli.io.splats.glb import Z_UP
 
+pytestmark = pytest.mark.floors
+
 
 def ball(subdivisions: int = 3) -> Mesh:
     sphere = trimesh.creation.icosphere(subdivisions)

@@ -18,6 +18,8 @@ from recon_cli.workspace.digests import read_source
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import Manifest, PartialRun
 
+pytestmark = pytest.mark.floors
+
 STALE = "The result shown here is out of date"
 
 

@@ -9,6 +9,8 @@ from recon_cli.sfm import mapper, merge_models
 from recon_cli.sfm.job import Reporter
 from recon_cli.sfm.mapper import triangulation_angles
 
+pytestmark = pytest.mark.floors
+
 
 def test_the_angle_of_a_point_is_that_of_its_widest_pair_of_rays():
     """Cameras at x = 0, 1 and 2 see a point one unit before the first: 0, 45 and 63.4 degrees."""

@@ -19,6 +19,8 @@ from recon_cli.commands import view
 from recon_cli.io.splats.registry import FORMATS, scene_file
 from recon_cli.viewer.content import load_file
 
+pytestmark = pytest.mark.floors
+
 
 @pytest.fixture
 def ended(monkeypatch):

@@ -10,6 +10,8 @@ from recon_cli.io.splats.coarsen import coarsen
 from recon_cli.render.registry import render
 from recon_cli.scene.splats import Splats
 
+pytestmark = pytest.mark.floors
+
 
 def one(mean=(0.0, 0, 3), scales=(0.3, 0.2, 0.1), opacity=0.2, color=(1.0, 0, 0)):
     return Splats(

@@ -7,6 +7,8 @@ from archive_splats import room
 from recon_cli.errors import FormatError
 from recon_cli.io.splats.registry import FORMATS, format_of, read_splats, scene_file
 
+pytestmark = pytest.mark.floors
+
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_each_format_reads_what_it_wrote_by_the_end_of_its_name(name, tmp_path):
